@@ -36,6 +36,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.paper.baselines.networks import CycleISP
 from rawaug.paper.baselines.upi import UPI, unprocess_pixels
 from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.draw import Draw
 
 COUNTED = 3 + 4 + 4
 """Bytes a pixel that any augmentation must move: uint8 in, noisy and clean RAW out in float32."""
@@ -74,7 +75,7 @@ def augmentations(device: torch.device) -> dict[str, RawAugment]:
     looking.use_encoders(True)
     return {
         "rawaug": RawAugment.from_pretrained("universal").to(device),
-        "rawaug, encoders": RawAugment.from_pretrained(looking, sampling="chosen").to(device),
+        "rawaug, encoders": RawAugment.from_pretrained(looking, draw=Draw(sampling="chosen")).to(device),
     }
 
 

@@ -30,7 +30,9 @@ from rawaug.metrics import psnr
 from rawaug.noise import noise_model
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import enlarged
+from rawaug.plugin.draw import Draw
 from rawaug.plugin.pictures import even_sided
+from rawaug.plugin.targets import Srgb
 
 LEVELS = (2e-3, 1e-5)
 SIDE, LAGS, BINS, DRAWS = 1024, 7, 20, 8
@@ -86,7 +88,7 @@ def curves(path: Path) -> dict[str, list[tuple[Tensor, Tensor]]]:
     found = {"RAW": [(frame.mosaic[0], (noisy_raw - frame.mosaic)[0])], "LibRaw": [(clean[1], (noisy - clean)[1])]}
     for method in bayer.METHODS:
         augment = RawAugment.from_pretrained(
-            "universal", noise=LEVELS, target="srgb", demosaicing=method, exposure=(0.0, 0.0)
+            "universal", LEVELS, target=Srgb(demosaicing=method), draw=Draw(exposure=0.0)
         )
         pairs = [augment(clean, torch.Generator().manual_seed(k)) for k in range(DRAWS)]
         found[f"rawaug, {method}"] = [(pair.clean[1], (pair.noisy - pair.clean)[1]) for pair in pairs]
@@ -117,7 +119,7 @@ def draw(found: dict[str, list[tuple[Tensor, Tensor]]], path: Path) -> None:
 
 def differences(pictures: Sequence[Tensor], method: str) -> list[float]:
     """Mean dB over uint8 pictures: developed clean RAW against the picture, and noisy against clean."""
-    augment = RawAugment.from_pretrained("universal", target="srgb", demosaicing=method, exposure=(-0.5, 0.0))
+    augment = RawAugment.from_pretrained("universal", target=Srgb(demosaicing=method), draw=Draw(exposure=(-0.5, 0.0)))
     rows = []
     for number, picture in enumerate(pictures):
         pair = augment(even_sided(picture), torch.Generator().manual_seed(number))

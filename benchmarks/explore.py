@@ -22,7 +22,7 @@ from rawaug.explore.page import as_html
 from rawaug.explore.view_state import Look
 from rawaug.explore.views import VIEWS, denoised
 from rawaug.io import read_picture, write_picture
-from rawaug.plugin.sampling_config import SamplingConfig
+from rawaug.plugin.config import AugmentConfig
 
 CAMERAS = ("Nikon D750", "Canon EOS 6D", "Sony ILCE-7M3", "Nikon D90", "Canon EOS 5D Mark II", "Nikon D800")
 
@@ -38,11 +38,11 @@ def picture(folder: Path, height: int, width: int) -> Path:
 def moves(file: Path, tab: str, repeats: int) -> dict[str, float]:
     """Milliseconds of the moves by kind and clock; the first move of a kind compiles, and is left out."""
     view = {**VIEWS, "Denoise": denoised}[tab]
-    look = Look(str(file), SamplingConfig())
+    look = Look(str(file), AugmentConfig())
     cameras = [CAMERAS[k % len(CAMERAS)] for k in range(repeats + 1)]
     kinds = {
         "seed": [replace(look, seed=k) for k in range(repeats + 1)],
-        "camera": [replace(look, drawing=SamplingConfig(camera=camera), seed=k) for k, camera in enumerate(cameras)],
+        "camera": [replace(look, config=AugmentConfig(camera=camera), seed=k) for k, camera in enumerate(cameras)],
     }
     medians: dict[str, float] = {}
     for kind, looks in kinds.items():

@@ -35,7 +35,7 @@ def panels() -> dict[str, Tensor]:
     srgb = read_picture(file)[:, PLACE[0] : PLACE[0] + SIDE, PLACE[1] : PLACE[1] + SIDE]
     noise = noise_model({"name": CAMERA, "settings": {"iso": ISO}})
     augment = rawaug.RawAugment.from_pretrained(
-        "universal", noise=noise, camera=CAMERA, light=5500, exposure=(0.0, 0.0)
+        "universal", noise, camera=CAMERA, draw=rawaug.Draw(light=5500, exposure=0.0)
     )
     pair = augment(srgb[None], generator=torch.Generator().manual_seed(0))
     model = denoisers.from_pretrained("rawaug-small")

@@ -27,6 +27,7 @@ from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs, enlarged
 from rawaug.plugin.pictures import even_sided
+from rawaug.plugin.targets import Srgb
 
 SIDE, LAGS = 256, 4
 BANDS = ((0.02, 0.04), (0.05, 0.08), (0.11, 0.14), (0.22, 0.28), (0.45, 0.5))
@@ -88,7 +89,7 @@ def real(spec: str) -> Iterator[Pictures]:
 
 def drawn(pictures: Sequence[Tensor], finish: bool, noise: Sequence[str], seed: int) -> Iterator[Pictures]:
     """Pairs of ``target="srgb"`` of the strengths of :data:`STRENGTHS`."""
-    augment = RawAugment.from_pretrained("universal", noise=noise, target="srgb", finish=finish)
+    augment = RawAugment.from_pretrained("universal", noise=noise, target=Srgb(finish=finish))
     scales = [ENLARGED[0] + (ENLARGED[1] - ENLARGED[0]) * (k % 10) / 9 for k in range(len(pictures))]
     larger = [enlarged(p, [round(s * side) for side in p.shape[1:]]) for p, s in zip(pictures, scales, strict=True)]  # type: ignore[arg-type]
     pairs = RawPairs([even_sided(picture) for picture in larger], augment, SIDE, seed=seed)

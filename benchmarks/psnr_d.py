@@ -37,6 +37,7 @@ from rawaug.paper.baselines import UPI
 from rawaug.paper.downstream import DownstreamConfig, DownstreamScore, MadeCrops, mean_of, score_on, trained_on
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.draw import Draw
 from rawaug.plugin.pictures import even_sided
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.stream import PictureCrops, RealCrops, Source
@@ -79,14 +80,14 @@ def sources(
     def universal() -> DictionaryISP:
         return DictionaryISP.from_pretrained("universal")
 
-    def made(isp: DictionaryISP, **settings: object) -> Source:
-        return PictureCrops(RawPairs(pictures, RawAugment(isp, noise, **settings), crop))  # type: ignore[arg-type]
+    def made(isp: DictionaryISP, draw: Draw = Draw()) -> Source:
+        return PictureCrops(RawPairs(pictures, RawAugment(isp, noise, draw=draw), crop))
 
     yield "universal", made(universal())
     upi = UPI()
     yield "UPI", MadeCrops(pictures, upi.draw, upi.cfa, noise, crop)
     yield "without tone", made(without_tone(universal()))
-    yield "without consistent gains", made(universal(), sampling="independent")
+    yield "without consistent gains", made(universal(), Draw(sampling="independent"))
     calibrated = RawAugment(universal(), noise_model({"pair_psnr": PAIR_PSNR}))
     yield f"pairs of {PAIR_PSNR} dB", PictureCrops(RawPairs(pictures, calibrated, crop))
     yield "without the wide hull", made(restrict_to_cameras(universal(), NARROW))

@@ -22,12 +22,16 @@ if TYPE_CHECKING:
     from rawaug.plugin.augment import RawAugment as RawAugment
     from rawaug.plugin.dataset import RawPairs as RawPairs
     from rawaug.plugin.dataset import RawPairStream as RawPairStream
+    from rawaug.plugin.draw import Draw as Draw
+    from rawaug.plugin.finishing import Finish as Finish
     from rawaug.plugin.loader import WrappedLoader as WrappedLoader
     from rawaug.plugin.loader import wrap as wrap
     from rawaug.plugin.params import AugmentParams as AugmentParams
     from rawaug.plugin.params import RawPair as RawPair
     from rawaug.plugin.params import load_params as load_params
     from rawaug.plugin.params import save_params as save_params
+    from rawaug.plugin.targets import Burst as Burst
+    from rawaug.plugin.targets import Srgb as Srgb
     from rawaug.synthesis.folder import synth as synth
 
 __version__ = "0.1.0"
@@ -42,8 +46,11 @@ _PUBLIC = {
     "rawaug.plugin.adapters": ("adapters", "isp_model"),
     "rawaug.plugin.augment": ("RawAugment",),
     "rawaug.plugin.dataset": ("RawPairStream", "RawPairs"),
+    "rawaug.plugin.draw": ("Draw",),
+    "rawaug.plugin.finishing": ("Finish",),
     "rawaug.plugin.loader": ("WrappedLoader", "wrap"),
     "rawaug.plugin.params": ("AugmentParams", "RawPair", "load_params", "save_params"),
+    "rawaug.plugin.targets": ("Burst", "Srgb"),
     "rawaug.synthesis.folder": ("synth",),
 }
 _MODULE_OF = {name: module for module, names in _PUBLIC.items() for name in names}

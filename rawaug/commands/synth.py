@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 from rawaug.commands import OPTIONS, value_of
 from rawaug.errors import escape
 from rawaug.evaluation.tables import print_rows
 from rawaug.io.pictures import MAX_PIXELS
-from rawaug.plugin.sampling_config import SamplingConfig
+from rawaug.plugin.config import AugmentConfig
+from rawaug.plugin.draw import Draw
 from rawaug.synthesis.folder import Synthesis, synth
 from rawaug.synthesis.maker import Format
 from rawaug.synthesis.shards import PER_SHARD
+
+
+@dataclass(frozen=True)
+class Options(AugmentConfig):
+    draw: Annotated[Draw, OPTIONS] = Draw()
 
 
 def run(
@@ -21,7 +28,7 @@ def run(
     *,
     format: Format = "dng",
     per_image: int = 1,
-    drawing: Annotated[SamplingConfig, OPTIONS] | None = None,
+    config: Annotated[Options, OPTIONS] = Options(),
     seed: int = 0,
     workers: int | None = None,
     max_pixels: int = MAX_PIXELS,
@@ -36,17 +43,16 @@ def run(
         format: 16-bit DNG of RAW, float32 NPZ, TIFF (float32, sRGB 16 bits), 8-bit PNG of sRGB, or tar shards for
             WebDataset and Hugging Face.
         per_image: pairs per picture.
-        drawing: what is drawn.
+        config: what is drawn.
         seed: random seed.
         workers: number of processes; by default one per core.
         max_pixels: larger pictures are refused before they are decoded.
         shard: K/N makes part K of N, K from 1 to N, for job arrays; all N write to the same folder.
         per_shard: pictures per tar file, with --format webdataset.
     """
-    drawn = vars(drawing or SamplingConfig())
-    noise = value_of(drawn["noise"]) if isinstance(drawn["noise"], str) else drawn["noise"]  # [shot_var, read_var]
+    noise = value_of(config.noise) if isinstance(config.noise, str) else config.noise  # [shot_var, read_var]
     rest: dict[str, Any] = {"workers": workers, "max_pixels": max_pixels, "shard": shard, "per_shard": per_shard}
-    print_synthesis(synth(pictures, out, format, per_image, seed=seed, **rest, **drawn | {"noise": noise}))
+    print_synthesis(synth(pictures, out, format, per_image, seed=seed, **rest, **vars(config) | {"noise": noise}))
 
 
 def print_synthesis(result: Synthesis) -> None:

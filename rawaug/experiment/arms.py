@@ -74,8 +74,7 @@ def training_stream(
     made: Source | None = None
     augment: RawAugment | None = None
     if arm.augmented:
-        draws: dict[str, Any] = {"exposure": arm.exposure, "target": recipe.target, "jpeg": arm.jpeg}
-        augment = RawAugment(isp, noise, arm.sampling, arm.strength, **draws)
+        augment = RawAugment(isp, noise, draw=arm.draw, target=arm.srgb or recipe.target)
     if arm.srgb_noise is not None:
         made = NoisyPictures(pictures, SRGB_NOISE.make(arm.srgb_noise), crop, arm.zoom)
     elif isinstance(estimator, SelfSupervised):

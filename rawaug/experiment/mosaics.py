@@ -128,7 +128,7 @@ class MosaicRun(TrainingRun):
 
     def stream(self, arm: str, isp: DictionaryISP, noise: NoiseModel, seed: int) -> TrainingStream:
         recipe, own = self.recipe, self.recipe.arms[arm]
-        augment = RawAugment(isp, noise, own.sampling, own.strength, exposure=own.exposure)
+        augment = RawAugment(isp, noise, draw=own.draw)
         crops = MosaicCrops(self.pictures, augment, recipe.train.crop, own.zoom, recipe.patterns)
         return TrainingStream(None, crops, recipe.train.batch, 1.0, derive_seed(seed, "stream"))
 

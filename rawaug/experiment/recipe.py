@@ -13,7 +13,8 @@ from rawaug.data.pairs import OWN_PICTURES, Pair
 from rawaug.files import yaml_value
 from rawaug.isp.fit import FitConfig
 from rawaug.kernels.runtime import find_device
-from rawaug.plugin.targets import Target, Targets
+from rawaug.plugin.draw import Draw
+from rawaug.plugin.targets import Srgb, Target
 from rawaug.registry import ESTIMATORS, EXPERIMENTS, SRGB_NOISE, require_between, split_spec, suggest
 from rawaug.training.config import MOST, DenoiserConfig, TrainConfig, Weighing
 
@@ -99,12 +100,10 @@ class ArmConfig:
 
     Args:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
-        sampling: convex, independent, perturb or chosen, see :class:`rawaug.RawAugment`.
+        draw: how the camera settings of pictures are drawn.
+        srgb: of sRGB targets: how pictures are developed; null draws every demosaicing, without JPEG.
         zoom: of supervised arms: half of the crops of pictures are enlarged by up to this factor, see
             :class:`rawaug.RawPairs`; 1 for none.
-        strength: of ``perturb``.
-        exposure: lowest and highest exposure of the RAW in stops; null for the ISP's own.
-        jpeg: of sRGB targets: lowest and highest quality of the JPEG that noisy pictures go through; null for none.
         srgb_noise: of sRGB targets: noise drawn on the pictures themselves, in place of the camera's: Gaussian, BSRGAN,
             or {name, settings}, see :mod:`rawaug.training.srgb_noise`.
         estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
@@ -119,11 +118,9 @@ class ArmConfig:
     """
 
     augmented: float = 0.0
-    sampling: Literal["convex", "independent", "perturb", "chosen"] = "convex"
+    draw: Draw = Draw()
+    srgb: Srgb | None = None
     zoom: float = 1.0
-    strength: float = 0.1
-    exposure: tuple[float, float] | None = None
-    jpeg: tuple[int, int] | None = None
     srgb_noise: str | dict[str, Any] | None = None
     estimator: str | dict[str, Any] = "supervised"
     search: dict[str, list[float]] | None = None
@@ -233,11 +230,11 @@ class Recipe:
             raise ValueError(f"arms: {self.target} targets are made from pictures; set augmented: 1 and no estimator")
         for label, arm in self.arms.items():
             try:
-                Targets(self.target, None, arm.jpeg, "RGGB")
                 if arm.srgb_noise is not None:
                     SRGB_NOISE.make(arm.srgb_noise)
-                    if self.target != "srgb":
-                        raise ValueError(f"srgb_noise is for target 'srgb', not {self.target!r}; omit it")
+                for key in ("srgb", "srgb_noise"):
+                    if getattr(arm, key) is not None and self.target != "srgb":
+                        raise ValueError(f"{key} is for target 'srgb', not {self.target!r}; omit it")
                 name, _ = split_spec(arm.estimator)
                 weigh, known = self.loop_of(label).weigh, ESTIMATORS[name].weighings
                 if weigh not in known:

@@ -24,7 +24,8 @@ from rawaug.explore.view_state import Look, command, iso_range, loaded, noises_o
 from rawaug.explore.views import VIEWS, Panel, denoised, seen_in
 from rawaug.files import WEIGHTS
 from rawaug.isp.cameras import LAMPS, load_cameras
-from rawaug.plugin.sampling_config import SamplingConfig
+from rawaug.plugin.config import AugmentConfig
+from rawaug.plugin.draw import Draw
 
 STYLE = """
 .panels {display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 240px), 1fr)); gap: 12px}
@@ -89,17 +90,19 @@ def look_of(values: Mapping[str, Any]) -> Look:
     if not picture:
         raise ValueError("choose a picture")
     light = values["light"]
-    drawing = SamplingConfig(
+    config = AugmentConfig(
         isp=values["isp"],
         camera=_given(values["camera"]),
-        light=int(light.removesuffix(" K")) if light.endswith(" K") else _given(light),
-        tone=_given(values["tone"]),
-        exposure=None if values["draw_exposure"] else values["exposure"],
         noise=values["noise"],
         iso=values["iso"] or None,
+        draw=Draw(
+            exposure=None if values["draw_exposure"] else values["exposure"],
+            light=int(light.removesuffix(" K")) if light.endswith(" K") else _given(light),
+            tone=_given(values["tone"]),
+        ),
         cfa=None if values["cfa"] == OWN else values["cfa"],
     )
-    return Look(str(picture), possible(drawing), int(values["seed"] or 0))
+    return Look(str(picture), possible(config), int(values["seed"] or 0))
 
 
 def _given(choice: str) -> str | None:
@@ -150,7 +153,7 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
 
 
 def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
-    isps, usual, made = sorted(file.stem for file in WEIGHTS.glob("*.safetensors")), SamplingConfig(), dict[str, Any]()
+    isps, usual, made = sorted(file.stem for file in WEIGHTS.glob("*.safetensors")), AugmentConfig(), dict[str, Any]()
     cameras = sorted(set(load_cameras().names), key=str.casefold)
     whole = {"num_choices_shown": None}  # in a list that is shown in part, a retyped choice gives way to the first one
     with gr.Group():
@@ -224,7 +227,7 @@ def _fitting(gr: Any, isp: str, tone: str, noise: str) -> list[Any]:
     """Cameras, lights and tones are those of published cameras; the noise of the ISP's own goes with it."""
     published, tones, noises = bool(loaded(isp).config.cameras), [ANY, *tones_of(isp)], noises_of(isp)
     toned = gr.update(interactive=published, choices=tones, **({} if tone in tones else {"value": ANY}))
-    usual = SamplingConfig().noise
+    usual = AugmentConfig().noise
     noised = gr.update(choices=noises, **({} if noise in noises else {"value": usual}))
     return [gr.update(interactive=published), gr.update(interactive=published), toned, noised]
 

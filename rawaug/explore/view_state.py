@@ -15,10 +15,11 @@ from rawaug.io import read_picture
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_levels, noise_names
 from rawaug.noise.cameras import ProfileLevels
-from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.augment import RawAugment, with_iso
+from rawaug.plugin.config import AugmentConfig, pair_generator
+from rawaug.plugin.draw import Draw
 from rawaug.plugin.params import RawPair
 from rawaug.plugin.pictures import even_sided
-from rawaug.plugin.sampling_config import SamplingConfig, draw_key
 from rawaug.registry import NOISE
 
 
@@ -27,7 +28,7 @@ class Look:
     """A picture's file, what is drawn for it, and the seed of the draws, as that of ``rawaug synth``."""
 
     picture: str
-    drawing: SamplingConfig = field(default_factory=SamplingConfig)
+    config: AugmentConfig = field(default_factory=AugmentConfig)
     seed: int = 0
 
 
@@ -46,8 +47,8 @@ def drawn(look: Look, number: int = 0) -> Drawn:
 
 @lru_cache(maxsize=16)
 def _drawn(look: Look, number: int, changed: int) -> Drawn:
-    srgb, augment = opened(look.picture, changed), augmentation(look.drawing)
-    return Drawn(srgb, augment, augment(srgb, draw_key(look.seed, Path(look.picture).name, number)))
+    srgb, augment = opened(look.picture, changed), augmentation(look.config)
+    return Drawn(srgb, augment, augment(srgb, pair_generator(look.seed, Path(look.picture).name, number)))
 
 
 @lru_cache(maxsize=2)
@@ -56,15 +57,13 @@ def opened(picture: str, changed: int) -> Tensor:
     return even_sided(read_picture(picture))
 
 
-def augmentation(drawing: SamplingConfig) -> RawAugment:
-    """What :meth:`SamplingConfig.make` makes, from an ISP that is baked once."""
-    form = tuple(drawing.form().items())
-    return _baked(drawing.isp, drawing.camera, drawing.cfa, form).redrawn(**drawing.draws())
+def augmentation(config: AugmentConfig) -> RawAugment:
+    """What :meth:`AugmentConfig.make` makes, from an ISP that is baked once."""
+    baked = _baked(AugmentConfig(config.isp, config.camera, target=config.target, burst=config.burst, cfa=config.cfa))
+    return baked.with_draws(with_iso(config.noise, config.iso), config.draw)
 
 
-@lru_cache(maxsize=4)
-def _baked(isp: str, camera: str | None, cfa: str | None, form: tuple[tuple[str, Any], ...]) -> RawAugment:
-    return RawAugment.from_pretrained(loaded(isp), camera=camera, cfa=cfa, **dict(form))
+_baked = lru_cache(maxsize=4)(AugmentConfig.make)
 
 
 @lru_cache(maxsize=4)
@@ -94,30 +93,33 @@ def iso_range(noise: str) -> tuple[float, float] | None:
     return limits
 
 
-def possible(drawing: SamplingConfig) -> SamplingConfig:
-    """Without what does not apply: light, tone and camera of a fitted ISP, the ISO of noise that has none."""
-    if not loaded(drawing.isp).config.cameras:
-        drawing = replace(drawing, camera=None, light=None, tone=None)
-    elif drawing.tone not in tones_of(drawing.isp):
-        drawing = replace(drawing, tone=None)
-    if not isinstance(drawing.noise, str) or iso_range(drawing.noise) is None:
-        drawing = replace(drawing, iso=None)
-    return drawing
+def possible(config: AugmentConfig) -> AugmentConfig:
+    """The settings without those that do not apply to their ISP and noise.
+
+    A fitted ISP has no light, tone and camera to choose, and noise that is not a measured camera's has no ISO.
+    """
+    if not loaded(config.isp).config.cameras:
+        config = replace(config, camera=None, draw=replace(config.draw, light=None, tone=None))
+    elif config.draw.tone not in tones_of(config.isp):
+        config = replace(config, draw=replace(config.draw, tone=None))
+    if not isinstance(config.noise, str) or iso_range(config.noise) is None:
+        config = replace(config, iso=None)
+    return config
 
 
 def command(look: Look, out: str = "pairs") -> str:
     """The command that writes the pair as ``NAME_0.npz``; with ``--per-image 8`` all eight draws of the page.
 
     Example:
-        >>> command(Look("cat.png", SamplingConfig(light=5500, exposure=-0.5), seed=3))
-        'rawaug synth cat.png pairs --format npz --light 5500 --exposure=-0.5 --seed 3'
+        >>> command(Look("cat.png", AugmentConfig(draw=Draw(light=5500, exposure=-0.5)), seed=3))
+        'rawaug synth cat.png pairs --format npz --exposure=-0.5 --light 5500 --seed 3'
     """
-    usual, words = SamplingConfig(), ["rawaug", "synth", look.picture, out, "--format", "npz"]
-    for name in (option.name for option in fields(SamplingConfig)):
-        value = getattr(look.drawing, name)
-        if value != getattr(usual, name):
-            text = _text(value)
-            words += [f"--{name}={text}"] if text.startswith("-") else [f"--{name}", text]
+    words = ["rawaug", "synth", look.picture, out, "--format", "npz"]
+    given = changes(look.config)
+    draw = given.pop("draw", None)
+    for name, value in {**given, **(changes(draw) if draw else {})}.items():
+        text = _text(value)
+        words += [f"--{name}={text}"] if text.startswith("-") else [f"--{name}", text]
     return shlex.join([*words, "--seed", str(look.seed)])
 
 
@@ -125,24 +127,34 @@ def python(look: Look) -> str:
     """The Python that makes the pair.
 
     Example:
-        >>> print(python(Look("cat.png", SamplingConfig(light=5500))))
+        >>> print(python(Look("cat.png", AugmentConfig(noise="upi", draw=Draw(light=5500)))))
         import rawaug
         from rawaug.io import read_picture
-        from rawaug.plugin.sampling_config import draw_key
+        from rawaug.plugin.config import pair_generator
         <BLANKLINE>
-        augment = rawaug.RawAugment.from_pretrained('universal', noise='cycleisp_sidd', light=5500)
-        pair = augment(read_picture('cat.png'), draw_key(0, 'cat.png', 0))
+        augment = rawaug.RawAugment.from_pretrained('universal', noise='upi', draw=rawaug.Draw(light=5500))
+        pair = augment(read_picture('cat.png'), pair_generator(0, 'cat.png', 0))
     """
-    arguments = "".join(f", {name}={value!r}" for name, value in look.drawing.arguments().items())
-    made = f"rawaug.RawAugment.from_pretrained({look.drawing.isp!r}{arguments})"
-    key = f"draw_key({look.seed}, {Path(look.picture).name!r}, 0)"
+    given = {"isp": look.config.isp, **changes(look.config)}
+    arguments = ", ".join([repr(given.pop("isp")), *(f"{name}={_code(value)}" for name, value in given.items())])
     return (
         "import rawaug\n"
         "from rawaug.io import read_picture\n"
-        "from rawaug.plugin.sampling_config import draw_key\n\n"
-        f"augment = {made}\n"
-        f"pair = augment(read_picture({look.picture!r}), {key})"
+        "from rawaug.plugin.config import pair_generator\n\n"
+        f"augment = rawaug.RawAugment.from_pretrained({arguments})\n"
+        f"pair = augment(read_picture({look.picture!r}), pair_generator({look.seed}, {Path(look.picture).name!r}, 0))"
     )
+
+
+def changes(settings: AugmentConfig | Draw) -> dict[str, Any]:
+    """The fields of a dataclass that differ from their defaults."""
+    return {f.name: value for f in fields(settings) if (value := getattr(settings, f.name)) != f.default}
+
+
+def _code(value: object) -> str:
+    if not isinstance(value, Draw):
+        return repr(value)
+    return f"rawaug.Draw({', '.join(f'{name}={one!r}' for name, one in changes(value).items())})"
 
 
 def _text(value: object) -> str:

@@ -30,8 +30,8 @@ from rawaug.isp.config import ISPParams
 from rawaug.isp.stages import frame_coordinates
 from rawaug.metrics import psnr
 from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.config import pair_generator
 from rawaug.plugin.pictures import even_sided
-from rawaug.plugin.sampling_config import draw_key
 
 DRAWS = 8
 HEIGHT, WIDTH = 512, 768
@@ -130,7 +130,7 @@ def draws(look: Look) -> list[Panel]:
     top, left, *_ = _centre(first.srgb)
     place = torch.tensor([[top, left, *first.srgb.shape[-2:], 0]])
     for number in range(DRAWS):
-        params = augment.sample(part[None], draw_key(look.seed, Path(look.picture).name, number), place)
+        params = augment.sample(part[None], pair_generator(look.seed, Path(look.picture).name, number), place)
         made = Drawn(part, augment, augment.apply(part[None], params).map(lambda tensor: tensor[0]))
         panels.append(Panel(f"draw {number}: {_setting(made)}; {_levels(made)}", _developed(first, _half(made), 2)))
     return panels
@@ -154,7 +154,8 @@ def developed(look: Look) -> list[Panel]:
     made = drawn(look)
     noisy, clean = (_crop(image) for image in (made.pair.noisy, made.pair.clean))
     quality = psnr(noisy[None], clean[None]).item()
-    method = made.augment.targets.names[int(made.pair.params.extras["demosaicing"])]
+    assert made.augment.srgb is not None
+    method = made.augment.srgb.methods[int(made.pair.params.extras["demosaicing"])]
     title = f"noisy: {_levels(made)}, demosaicing {method}; {quality:.1f} dB"
     return [Panel(title, _to_uint8(noisy)), Panel("clean: developed alike", _to_uint8(clean))]
 
@@ -185,7 +186,7 @@ FORMS: dict[str, dict[str, Any]] = {"sRGB": {"target": "srgb"}, "Burst": {"burst
 
 
 def seen_in(tab: str, look: Look) -> Look:
-    return replace(look, drawing=replace(look.drawing, **FORMS.get(tab, {})))
+    return replace(look, config=replace(look.config, **FORMS.get(tab, {})))
 
 
 @lru_cache(maxsize=1)

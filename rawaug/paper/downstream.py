@@ -30,6 +30,7 @@ from rawaug.noise import NoiseModel, noise_model
 from rawaug.paper.methods import Method
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.draw import Draw
 from rawaug.seeding import derive_seed, keyed_generator
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.loop import train
@@ -115,7 +116,8 @@ def _crops(model: Method, pictures: Sequence[Tensor], noise: NoiseModel, config:
     if not isinstance(model, DictionaryISP):
         return MadeCrops(pictures, model.draw, model.cfa, noise, config.train.crop)
     # The plugin keeps each crop's place in its frame.
-    augment = RawAugment(model, noise, exposure=None if model.config.cameras else config.exposure)
+    draw = Draw(exposure=None if model.config.cameras else config.exposure)
+    augment = RawAugment(model, noise, draw=draw)
     return PictureCrops(RawPairs(pictures, augment, config.train.crop))
 
 

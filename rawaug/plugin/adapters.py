@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.targets import reaching_white
+from rawaug.plugin.targets import keep_white
 
 
 class ISPModel:
@@ -22,7 +22,7 @@ class ISPModel:
         srgb = torch.from_numpy(np.ascontiguousarray(even, np.float32)).permute(2, 0, 1).clamp(0.0, 1.0)
         srgb = srgb.to(self.augment.device)
         params = self.augment.sample(srgb)
-        params = params._replace(isp=reaching_white(params.isp))  # or an overexposed picture would be brighter than hq
+        params = params._replace(isp=keep_white(params.isp))  # or an overexposed picture would be brighter than hq
         noisy: torch.Tensor = self.augment.apply(srgb, params).noisy
         return noisy[:, :height, :width].permute(1, 2, 0).cpu().numpy(), hq
 
@@ -44,6 +44,6 @@ def isp_model(augment: RawAugment) -> ISPModel:
         >>> lq.shape, lq.dtype
         ((31, 40, 3), dtype('float32'))
     """
-    if augment.targets.target != "srgb":
-        raise ValueError(f"isp_model needs an augmentation with target 'srgb', got {augment.targets.target!r}")
+    if augment.target != "srgb":
+        raise ValueError(f"isp_model needs an augmentation with target 'srgb', got {augment.target!r}")
     return ISPModel(augment)

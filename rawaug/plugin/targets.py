@@ -17,8 +17,8 @@ of its own. Lens shading and defects of the sensor stay where they are. What com
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Literal, get_args
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -35,60 +35,90 @@ from rawaug.plugin.params import AugmentParams
 Target = Literal["raw", "rgb", "srgb"]
 
 
-class Targets:
-    """The target of a :class:`rawaug.RawAugment`, whose settings these are, and what is drawn for it."""
+@dataclass(frozen=True, kw_only=True)
+class Srgb:
+    """The target ``"srgb"``: noisy and clean developed pictures, and how they are developed.
 
-    def __init__(
-        self,
-        target: Target,
-        demosaicing: str | Sequence[str] | None,
-        jpeg: tuple[int, int] | None,
-        pattern: str,
-        finish: Finish | bool = False,
-    ) -> None:
-        if target not in get_args(Target):
-            raise ValueError(f"target {target!r} is unknown; use one of {', '.join(get_args(Target))}")
-        if target != "srgb" and ((demosaicing, jpeg) != (None, None) or finish):
-            raise ValueError(f"demosaicing, jpeg and finish are for target 'srgb', not {target!r}; omit them")
-        if target == "srgb" and pattern not in bayer.CFA.__members__:
-            raise ValueError(f"target 'srgb' demosaics Bayer patterns, not {pattern}; use target 'rgb' or 'raw'")
-        if jpeg is not None and not (len(jpeg) == 2 and 1 <= jpeg[0] <= jpeg[1] <= 100):
-            raise ValueError(f"jpeg must be (lowest, highest) quality within 1 to 100, got {jpeg}")
-        names = list(bayer.METHODS) if demosaicing is None else demosaicing
-        self.names = (names,) if isinstance(names, str) else tuple(names)
-        for name in self.names:
+    Args:
+        demosaicing: a name of :data:`rawaug.bayer.METHODS`, or several, of which one is drawn for each picture. All by
+            default.
+        jpeg: lowest and highest quality of the JPEG that the noisy picture goes through. By default that of ``finish``,
+            or no JPEG without it.
+        finish: finish both pictures as cameras do, by noise reduction and sharpening, and the noisy one by JPEG: a
+            :class:`rawaug.Finish`, or true for its defaults.
+
+    Raises:
+        ValueError: if a demosaicing is unknown, or the quality out of range.
+    """
+
+    demosaicing: tuple[str, ...] | str | None = None
+    jpeg: tuple[int, int] | None = None
+    finish: Finish | bool = False
+
+    def __post_init__(self) -> None:
+        if self.jpeg is not None and not (len(self.jpeg) == 2 and 1 <= self.jpeg[0] <= self.jpeg[1] <= 100):
+            raise ValueError(f"jpeg must be (lowest, highest) quality within 1 to 100, got {self.jpeg}")
+        for name in self.methods:
             bayer.require_method(name)
-        self.finish = Finish() if finish is True else finish or None
-        if self.finish is not None and jpeg is None:
-            jpeg = self.finish.quality
-        self.target, self.jpeg = target, jpeg
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """The names of the demosaicings that are drawn from."""
+        if self.demosaicing is None:
+            return tuple(bayer.METHODS)
+        return (self.demosaicing,) if isinstance(self.demosaicing, str) else tuple(self.demosaicing)
+
+    @property
+    def finishing(self) -> Finish | None:
+        """The ranges of the finishing, None without it."""
+        return Finish() if self.finish is True else self.finish or None
 
     def sample(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """Number of the demosaicing and quality of the JPEG, each ``(batch,)``; nothing for RAW and linear RGB."""
-        if self.target != "srgb":
-            return {}
-        drawn = {"demosaicing": torch.randint(len(self.names), (batch,), generator=generator)}
-        if self.jpeg is not None:
-            drawn["quality"] = torch.randint(self.jpeg[0], self.jpeg[1] + 1, (batch,), generator=generator)
-        return drawn if self.finish is None else drawn | self.finish.sample(batch, generator)
+        """Draw for ``batch`` pictures what :class:`AugmentParams` keeps as ``extras``, each ``(batch, ...)``."""
+        drawn = {"demosaicing": torch.randint(len(self.methods), (batch,), generator=generator)}
+        finishing = self.finishing
+        quality = self.jpeg if self.jpeg or finishing is None else finishing.quality
+        if quality is not None:
+            drawn["quality"] = torch.randint(quality[0], quality[1] + 1, (batch,), generator=generator)
+        return drawn if finishing is None else drawn | finishing.sample(batch, generator)
 
-    def develop(self, forward: FastForward, raws: Sequence[Tensor], params: AugmentParams) -> list[Tensor]:
-        """Mosaics of the same pictures, ``(B, 1, H, W)`` each, to sRGB in [0, 1]; a saturated sensor is white."""
-        if min(raws[0].shape[-2:]) < 4:
-            raise ValueError(f"target 'srgb' demosaics pictures of at least 4 x 4, got {tuple(raws[0].shape[-2:])}")
-        methods = [self.names[number] for number in params.extras["demosaicing"].tolist()]
-        return forward.develop(raws, methods, reaching_white(params.isp), params.place)
+    def develop(
+        self, forward: FastForward, noisy: Tensor, clean: Tensor, params: AugmentParams
+    ) -> tuple[Tensor, Tensor]:
+        """Develop noisy and clean mosaics ``(B, 1, H, W)`` of the same pictures alike.
+
+        Args:
+            forward: the ISP's forward pass.
+            noisy: mosaics ``(B, 1, H, W)`` from 4 x 4 on; a saturated sensor becomes white.
+            clean: mosaics of the same shape.
+            params: what was drawn for them.
+
+        Returns:
+            Noisy and clean sRGB ``(B, 3, H, W)`` in [0, 1], the noisy one after its JPEG.
+        """
+        if min(noisy.shape[-2:]) < 4:
+            raise ValueError(f"target 'srgb' demosaics pictures of at least 4 x 4, got {tuple(noisy.shape[-2:])}")
+        methods = [self.methods[number] for number in params.extras["demosaicing"].tolist()]
+        noisy, clean = forward.develop((noisy, clean), methods, keep_white(params.isp), params.place)
+        if (finishing := self.finishing) is not None:
+            noisy, clean = finishing.apply(noisy, clean, params.extras["finish"])
+        if "quality" in params.extras:
+            noisy = compress_jpeg(noisy, params.extras["quality"], params.extras.get("chroma_420"))
+        return noisy, clean
 
 
-def reaching_white(setting: ISPParams) -> ISPParams:
-    """The setting with gains of at least 1: with RAW darkened to its picture, the sensor's white would be grey."""
+def keep_white(setting: ISPParams) -> ISPParams:
+    """Raise the gains ``(B, 3)`` of a setting to at least 1, so that a saturated sensor is developed to white.
+
+    Below 1, where the RAW was drawn brighter than its picture, the sensor's white would become grey.
+    """
     return setting._replace(gains=setting.gains / setting.gains.amin(dim=-1, keepdim=True).clamp_max(1.0))
 
 
-def through_jpeg(srgb: Tensor, quality: Tensor, chroma_420: Tensor | None = None) -> Tensor:
-    """sRGB ``(B, 3, H, W)`` in [0, 1] as JPEGs of these qualities ``(B,)`` show it.
+def compress_jpeg(srgb: Tensor, quality: Tensor, chroma_420: Tensor | None = None) -> Tensor:
+    """Compress sRGB ``(B, 3, H, W)`` in [0, 1] as JPEGs of the qualities ``(B,)``, and decode it again.
 
-    Chroma is 4:2:2, or, where ``chroma_420`` ``(B,)`` is given, 4:2:0 where it says so and 4:4:4 elsewhere.
+    Chroma is 4:2:2, or, where ``chroma_420`` ``(B,)`` is given, 4:2:0 where it is true and 4:4:4 elsewhere.
     """
     from rawaug.io.pictures import through_jpeg  # OpenImageIO
 
@@ -98,53 +128,60 @@ def through_jpeg(srgb: Tensor, quality: Tensor, chroma_420: Tensor | None = None
     return torch.stack(shown).to(srgb) / 255.0
 
 
-MOTION = (2.0, 0.5)
-"""Largest shift in pixels, and rotation in degrees."""
-
-
+@dataclass(frozen=True)
 class Burst:
-    """How many frames there are, and how they move."""
+    """Several noisy frames of a scene from a hand that moves.
 
-    def __init__(
-        self, frames: int, motion: tuple[float, float] | None = None, stops: Sequence[float] | None = None
-    ) -> None:
-        motion = MOTION if motion is None else motion
-        if not isinstance(frames, int) or frames < 1:
-            raise ValueError(f"burst must be a number of frames, at least 1, got {frames!r}")
-        if len(motion) != 2 or not min(motion) >= 0:
-            raise ValueError(f"motion must be (pixels, degrees), both at least 0, got {motion}")
-        if stops is not None and len(stops) != frames:
-            raise ValueError(f"stops must be one exposure for each of {frames} frames, got {len(stops)}")
-        self.frames, self.motion, self.stops = frames, motion, tuple(stops or (0.0,) * frames)
+    Args:
+        frames: number N of frames.
+        motion: largest shift in pixels and largest rotation in degrees.
+        stops: exposure of each frame in stops, for brackets; all alike by default.
+
+    Raises:
+        ValueError: if there is no frame, a motion is negative, or the exposures are not one for each frame.
+    """
+
+    frames: int
+    motion: tuple[float, float] = (2.0, 0.5)
+    stops: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.frames, int) or self.frames < 1:
+            raise ValueError(f"burst must be a number of frames, at least 1, got {self.frames!r}")
+        if len(self.motion) != 2 or not min(self.motion) >= 0:
+            raise ValueError(f"motion must be (pixels, degrees), both at least 0, got {self.motion}")
+        if self.stops is not None and len(self.stops) != self.frames:
+            raise ValueError(f"stops must be one exposure for each of {self.frames} frames, got {len(self.stops)}")
 
     def sample(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """``motion`` ``(batch, N, 3)``: dy, dx (pixels), angle (radians); and ``frame_seed`` ``(batch, N)``."""
+        """Draw ``frame_seed`` ``(batch, N)`` and ``motion`` ``(batch, N, 3)``: dy, dx in pixels, angle in radians."""
         shift, degrees = self.motion
         motion = 2.0 * torch.rand(batch, self.frames, 3, generator=generator) - 1.0
         motion *= torch.tensor([shift, shift, math.radians(degrees)])
         motion[:, 0] = 0.0
         return {"motion": motion, "frame_seed": draw_seeds(batch * self.frames, generator).reshape(batch, self.frames)}
 
-    def frames_of(self, scene: Tensor, motion: Tensor) -> Tensor:
-        """Linear light ``(B, 3, H, W)`` as the frames see it, ``(B * N, 3, H, W)``."""
-        moving = moved(scene.repeat_interleave(self.frames, 0), motion.flatten(0, 1))
+    def move(self, scene: Tensor, motion: Tensor) -> Tensor:
+        """The frames ``(B * N, 3, H, W)`` that see linear light ``(B, 3, H, W)`` after their motions ``(B, N, 3)``."""
+        moving = move(scene.repeat_interleave(self.frames, 0), motion.flatten(0, 1))
         moving.clamp_(min=0.0)  # beside edges a bicubic curve undershoots
         first = (motion == 0.0).all(-1).flatten().nonzero()[:, 0].to(scene.device)
         moving[first] = scene[first // self.frames]  # which nothing interpolates
         return moving
 
-    def exposed(self, frames: Tensor) -> Tensor:
-        """Frames ``(B * N, 3, H, W)`` at their exposures, at most 1."""
-        stops = torch.tensor(self.stops, device=frames.device).repeat(len(frames) // self.frames)
+    def expose(self, frames: Tensor) -> Tensor:
+        """Frames ``(B * N, 3, H, W)`` at their exposures, clipped at 1, the sensor's white."""
+        stops = torch.tensor(self.stops or (0.0,) * self.frames, device=frames.device)
+        stops = stops.repeat(len(frames) // self.frames)
         return (frames * torch.exp2(stops)[:, None, None, None]).clamp_max(1.0)
 
 
-def moved(image: Tensor, motion: Tensor) -> Tensor:
-    """``(B, C, H, W)`` seen after a motion ``(B, 3)`` of dy, dx (pixels) and angle (radians) each.
+def move(image: Tensor, motion: Tensor) -> Tensor:
+    """Images ``(B, C, H, W)`` as they are seen after motions ``(B, 3)``: dy and dx in pixels, angle in radians.
 
     Example:
         >>> image, motion = torch.rand(1, 3, 16, 16), torch.tensor([[1.0, 2.0, 0.0]])
-        >>> torch.allclose(moved(image, motion)[..., 4:12, 4:12], image[..., 5:13, 6:14], atol=1e-4)
+        >>> torch.allclose(move(image, motion)[..., 4:12, 4:12], image[..., 5:13, 6:14], atol=1e-4)
         True
     """
     height, width = image.shape[-2:]

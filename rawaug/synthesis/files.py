@@ -13,6 +13,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from rawaug.io.pictures import encode_png
 from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, frame_coordinates
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import RawPair, load_params
-from rawaug.synthesis.maker import Format, Origin, PairMaker, noise_levels, replayed
+from rawaug.synthesis.maker import Format, Origin, PairMaker, noise_levels, replay_pair
 
 LONGEST_STEM = 200
 """Bytes of a picture's name in those of its pairs, which have at most 255."""
@@ -82,7 +83,7 @@ def _short(name: str) -> str:
 def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, origin: Origin) -> None:
     """Write a pair and its parameters to files whose names begin with ``stem``."""
     _WRITERS[format](stem, pair, augment)
-    header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(origin.stored())}
+    header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(asdict(origin))}
     write_tensors(pair.params.tensors(), header, f"{stem}.safetensors")
 
 
@@ -104,7 +105,7 @@ def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> None:
 
 def _write_tiffs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
     for end, image in _images(pair, augment).items():
-        if augment.targets.target == "srgb":  # which viewers take integers for
+        if augment.target == "srgb":  # which viewers take integers for
             image = (image * 65535.0).round().to(torch.uint16)
         write_tiff(Path(f"{stem}{end}.tif"), image, _stated(pair, augment))
 
@@ -133,12 +134,12 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
     drawn, header = load_params(params), read_header(params)
     if "origin" not in header:
         raise ValueError(f"{params}: not written by rawaug synth; use RawAugment.apply")
-    return replayed(drawn, Origin(**json.loads(header["origin"])), params, picture, isp)
+    return replay_pair(drawn, Origin(**json.loads(header["origin"])), params, picture, isp)
 
 
 def _stated(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
     """Metadata of the mosaics; colour that cannot be inverted is not stored."""
-    if augment.targets.target == "srgb":
+    if augment.target == "srgb":
         return noise_levels(pair)
     stated: dict[str, Any] = {"cfa": augment.cfa, **noise_levels(pair)}
     try:

@@ -25,7 +25,7 @@ import torch
 from rawaug.data.folders import PICTURE_EXTENSIONS
 from rawaug.files import LOCK, files_in, find_weights, locked, require_same_settings, sha256
 from rawaug.io.pictures import MAX_PIXELS
-from rawaug.plugin.sampling_config import SamplingConfig
+from rawaug.plugin.config import AugmentConfig
 from rawaug.progress import progress
 from rawaug.synthesis import shards
 from rawaug.synthesis.files import PictureTask, picture_tasks
@@ -60,7 +60,7 @@ def synth(
     max_pixels: int = MAX_PIXELS,
     shard: str = "1/1",
     per_shard: int = PER_SHARD,
-    **drawn: Any,
+    **settings: Any,
 ) -> Synthesis:
     """Make ``per_image`` pairs of every picture of a folder and its subfolders, or of one; existing pairs are kept.
 
@@ -78,7 +78,8 @@ def synth(
         max_pixels: larger pictures are refused before they are decoded.
         shard: ``"K/N"`` makes part K of N, for job arrays; all N write to the same folder.
         per_shard: pictures in a tar file.
-        drawn: ``isp``, ``noise``, ``camera``, ..., as in :class:`rawaug.plugin.sampling_config.SamplingConfig`.
+        settings: ``isp``, ``camera``, ``noise``, ``iso``, ``draw``, ``target``, ``burst`` and ``cfa``, as in
+            :meth:`rawaug.RawAugment.from_pretrained`.
 
     Raises:
         FileNotFoundError: if there is no such folder, picture or ISP.
@@ -92,23 +93,23 @@ def synth(
         raise ValueError(f"{out}: is inside the picture folder {source}; choose an output folder outside it")
     pictures = files_in(source, "picture", PICTURE_EXTENSIONS)
     source = source.parent if source.is_file() else source
-    settings = _settings(format, per_image, seed, drawn)
+    fixed = _settings(format, per_image, seed, AugmentConfig(**settings))
     if workers is not None and workers < 0:
         raise ValueError(f"workers must be at least 0, got {workers}")
     part, parts = part_of(shard)
-    PairMaker(settings, max_pixels)  # raises for a wrong name here, not in a worker
-    stored, tasks = settings.stored(), list[Task]()
+    PairMaker(fixed, max_pixels)  # raises for a wrong name here, not in a worker
+    stored, tasks = fixed.to_json(), list[Task]()
     with locked(out / (LOCK if parts == 1 else f"rawaug-{part}-of-{parts}.lock")):
         if format == "webdataset":
             tasks += shards.shard_tasks(pictures, source, out, per_image, per_shard)
-            stored["isp"] = Path(settings.drawing.isp).name  # its path differs between machines
+            stored["isp"] = Path(fixed.config.isp).name  # its path differs between machines
             stored |= shards.shard_settings(pictures, source, per_image, per_shard, max_pixels)
         else:
             tasks += picture_tasks(pictures, source, out, per_image)
         require_same_settings(out / "synth.json", stored)
-        result = _worked_off(out, tasks[part - 1 :: parts], settings, max_pixels, workers)
+        result = _worked_off(out, tasks[part - 1 :: parts], fixed, max_pixels, workers)
         if format == "webdataset":
-            shards.finish(out, len(tasks), settings)
+            shards.finish(out, len(tasks), fixed)
     result.seconds = time.perf_counter() - start
     if result.pictures and len(result.broken) == result.pictures:
         count, reason = result.pictures, min(result.broken.values())
@@ -123,17 +124,16 @@ def part_of(shard: str) -> tuple[int, int]:
     return int(first), int(second)
 
 
-def _settings(format: Format, per_image: int, seed: int, drawn: dict[str, Any]) -> Settings:
+def _settings(format: Format, per_image: int, seed: int, config: AugmentConfig) -> Settings:
     if format not in get_args(Format) or per_image < 1:
         wanted = f"format must be one of {', '.join(get_args(Format))} and per_image at least 1"
         raise ValueError(f"{wanted}, got {format} and {per_image}")
-    drawing = SamplingConfig(**drawn)
-    isp, target = Path(drawing.isp), drawing.target or "raw"
+    isp, target = Path(config.isp), config.target_name
     if target not in TARGETS.get(format, (target,)):
         able = [name for name in get_args(Format) if target in TARGETS.get(name, (target,))]
         raise ValueError(f"format {format} cannot hold target {target!r}; use {', '.join(able)}")
-    drawing = replace(drawing, isp=str(isp.resolve() if isp.suffix else isp))
-    return Settings(format, drawing, sha256(find_weights(isp)), seed)
+    config = replace(config, isp=str(isp.resolve() if isp.suffix else isp))
+    return Settings(format, config, sha256(find_weights(isp)), seed)
 
 
 def _worked_off(

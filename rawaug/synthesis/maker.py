@@ -5,8 +5,8 @@ The draws of a pair depend on (seed, picture's name, number) alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,12 +14,10 @@ from rawaug import __version__
 from rawaug.files import find_weights, sha256
 from rawaug.io import read_picture
 from rawaug.io.pictures import MAX_PIXELS
-from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.config import AugmentConfig, pair_generator
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided
-from rawaug.plugin.sampling_config import SamplingConfig, draw_key
 from rawaug.plugin.targets import Target
-from rawaug.registry import Spec
 
 Format = Literal["dng", "npz", "tiff", "png", "webdataset"]
 TARGETS: dict[Format, tuple[Target, ...]] = {"dng": ("raw",), "png": ("srgb",)}
@@ -31,12 +29,12 @@ class Settings:
     """The settings that the files depend on, besides the pictures; stored in ``synth.json`` beside them."""
 
     format: Format
-    drawing: SamplingConfig
+    config: AugmentConfig
     isp_sha256: str
     seed: int
 
-    def stored(self) -> dict[str, Any]:
-        return {"format": self.format, "isp_sha256": self.isp_sha256, "seed": self.seed, **self.drawing.stored()}
+    def to_json(self) -> dict[str, Any]:
+        return {"format": self.format, "isp_sha256": self.isp_sha256, "seed": self.seed, **self.config.to_json()}
 
 
 @dataclass(frozen=True)
@@ -45,15 +43,9 @@ class Origin:
 
     picture: str
     picture_sha256: str
-    isp: str
     isp_sha256: str
-    noise: Spec | Sequence[float]
+    settings: dict[str, Any]
     version: str = __version__
-    cfa: str | None = None
-    form: Mapping[str, Any] | None = None
-
-    def stored(self) -> dict[str, Any]:
-        return {key: value for key, value in vars(self).items() if value is not None}
 
 
 class PairMaker:
@@ -61,7 +53,7 @@ class PairMaker:
 
     def __init__(self, settings: Settings, max_pixels: int = MAX_PIXELS) -> None:
         self.settings, self.max_pixels = settings, max_pixels
-        self.augment = settings.drawing.make()
+        self.augment = settings.config.make()
 
     def pairs(self, picture: Path, key: str, numbers: Iterable[int]) -> tuple[Origin, Iterator[tuple[int, RawPair]]]:
         """The origin of a picture's pairs, and an iterator over (number, pair)."""
@@ -73,12 +65,10 @@ class PairMaker:
 
         def made() -> Iterator[tuple[int, RawPair]]:
             for number in numbers:
-                params = self.augment.sample(srgb, draw_key(self.settings.seed, key, number))
+                params = self.augment.sample(srgb, pair_generator(self.settings.seed, key, number))
                 yield number, self.augment.apply(srgb, params)
 
-        drawing = self.settings.drawing
-        isp, cfa, form = (drawing.isp, self.settings.isp_sha256), self.augment.cfa, drawing.form() or None
-        return Origin(str(picture), content, *isp, drawing.noise_spec, cfa=cfa, form=form), made()
+        return Origin(str(picture), content, self.settings.isp_sha256, self.settings.config.to_json()), made()
 
 
 def noise_levels(pair: RawPair) -> dict[str, float]:
@@ -86,17 +76,27 @@ def noise_levels(pair: RawPair) -> dict[str, float]:
     return {key: noise[key].item() for key in ("shot_var", "read_var") if key in noise}
 
 
-def replayed(
-    drawn: AugmentParams, origin: Origin, label: object, picture: str | Path | None, isp: str | Path | None
+def replay_pair(
+    params: AugmentParams, origin: Origin, label: object, picture: str | Path | None, isp: str | Path | None
 ) -> RawPair:
-    augment = RawAugment.from_pretrained(
-        str(isp or origin.isp), noise=origin.noise, cfa=origin.cfa, **origin.form or {}
-    )
-    found = Path(picture or origin.picture)
-    if sha256(find_weights(str(isp or origin.isp))) != origin.isp_sha256:
-        raise ValueError(f"{label}: the ISP {isp or origin.isp} is not the one this pair was made with")
+    """Make a pair again from its parameters.
+
+    Args:
+        params: those of one pair, without B.
+        origin: what the pair was made from.
+        label: names the pair in messages.
+        picture: the sRGB picture, if it has moved since.
+        isp: the ISP's file, if it has moved since.
+
+    Raises:
+        ValueError: if the picture or the ISP has changed.
+    """
+    config, found = AugmentConfig.from_json(origin.settings), Path(picture or origin.picture)
+    config = replace(config, isp=str(isp or config.isp))
+    if sha256(find_weights(config.isp)) != origin.isp_sha256:
+        raise ValueError(f"{label}: the ISP {config.isp} is not the one this pair was made with")
     srgb = even_sided(read_picture(found))
     if sha256(found) != origin.picture_sha256:
         raise ValueError(f"{label}: the picture {found} has changed since this pair was made")
-    pair: RawPair = augment.apply(srgb, drawn)
+    pair: RawPair = config.make().apply(srgb, params)
     return pair

@@ -16,6 +16,7 @@ import json
 import os
 import tarfile
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,10 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.files import digest, parse_object, replacing, write_json
+from rawaug.plugin.config import AugmentConfig
 from rawaug.plugin.params import AugmentParams, RawPair
-from rawaug.plugin.sampling_config import SamplingConfig
-from rawaug.synthesis.maker import Origin, PairMaker, Settings, noise_levels, replayed
+from rawaug.plugin.targets import Burst
+from rawaug.synthesis.maker import Origin, PairMaker, Settings, noise_levels, replay_pair
 
 PER_SHARD = 500
 """Pictures in a shard: of half a megapixel each, two gigabytes."""
@@ -114,7 +116,8 @@ def _names(pictures: Sequence[Path], source: Path) -> tuple[str, ...]:
 
 def _described(pair: RawPair, maker: PairMaker, origin: Origin, name: str, number: int) -> dict[str, Any]:
     """The JSON of a sample; paths are relative, so that machines with other folders write the same bytes."""
-    own = {**origin.stored(), "picture": name, "isp": Path(origin.isp).name, "number": number}
+    own = asdict(origin) | {"picture": name, "number": number, "cfa": maker.augment.cfa}
+    own["settings"]["isp"] = Path(own["settings"]["isp"]).name
     height, width = (pair.clean if len(pair.clean) == 3 else maker.augment.mosaic(pair.clean)).shape[-2:]
     params = {key: value.tolist() for key, value in pair.params.tensors().items()}
     return own | noise_levels(pair) | {"height": height, "width": width, "params": params}
@@ -145,7 +148,7 @@ def replay_sample(described: Mapping[str, Any], pictures: str | Path, isp: str |
     tensors = {key: torch.tensor(value) for key, value in described["params"].items()}
     origin = Origin(**{key: described[key] for key in Origin.__dataclass_fields__ if key in described})
     picture = Path(pictures) / described["picture"]
-    return replayed(AugmentParams.from_tensors(tensors), origin, described["picture"], picture, isp)
+    return replay_pair(AugmentParams.from_tensors(tensors), origin, described["picture"], picture, isp)
 
 
 def finish(out: Path, count: int, settings: Settings) -> None:
@@ -160,25 +163,28 @@ def finish(out: Path, count: int, settings: Settings) -> None:
         partial.write_text(card(shards, settings), encoding="utf-8")
 
 
-def _form(drawing: SamplingConfig) -> str:
+def _form(config: AugmentConfig) -> str:
     raw = "packed float32 RAW `(4, h, w)` in the order R, Gr, Gb, B"
-    if drawing.cfa is not None and drawing.cfa not in CFA.__members__:
-        raw = f"float32 RAW mosaics `(1, H, W)` of the pattern {drawing.cfa}"
+    if config.cfa is not None and config.cfa not in CFA.__members__:
+        raw = f"float32 RAW mosaics `(1, H, W)` of the pattern {config.cfa}"
     raw += ", black 0, white 1, not clipped at black"
     forms = {
         "rgb": f"clean linear camera RGB, float32 `(3, H, W)`, and noisy {raw}",
         "srgb": "developed sRGB, float32 `(3, H, W)` in [0, 1]",
     }
-    form = forms.get(drawing.target or "raw", raw)
-    return form if drawing.burst is None else f"{form}; noisy has an axis of {drawing.burst} frames before these"
+    form, burst = forms.get(config.target_name, raw), config.burst
+    frames = burst.frames if isinstance(burst, Burst) else burst
+    return form if frames is None else f"{form}; noisy has an axis of {frames} frames before these"
 
 
 def card(shards: Sequence[Mapping[str, Any]], settings: Settings) -> str:
     """The dataset card, with the header that Hugging Face reads."""
     pairs, size = (sum(shard[key] for shard in shards) for key in ("nsamples", "filesize"))
-    drawing = settings.drawing
-    own = ("isp", "noise", "sampling")
-    rows = "".join(f"\n| {key} | {value} |" for key, value in drawing.stored().items() if key not in own)
+    config = settings.config
+    others = {key: value for key, value in config.to_json().items() if key not in ("isp", "noise")}
+    rows = "".join(
+        f"\n| {key} | {value if isinstance(value, str) else json.dumps(value)} |" for key, value in others.items()
+    )
     category = next((name for limit, name in _SIZES if pairs < limit), "n>10M")
     return f"""---
 configs:
@@ -200,12 +206,11 @@ tags:
 
 | setting | value |
 |---|---|
-| ISP | {Path(drawing.isp).name} (SHA-256 {settings.isp_sha256}) |
-| noise | {drawing.noise} |
-| sampling of cameras | {drawing.sampling} |
+| ISP | {Path(config.isp).name} (SHA-256 {settings.isp_sha256}) |
+| noise | {config.noise} |
 | seed | {settings.seed} |{rows}
 
-Each sample has `clean.npy` and `noisy.npy`, {_form(drawing)};
+Each sample has `clean.npy` and `noisy.npy`, {_form(config)};
 and `json`: the picture and its SHA-256, `cfa`, `height` and `width` of the mosaic, the noise levels
 and the parameters that replay the pair. The pictures' licences apply to the pairs: name them here.
 """

@@ -22,7 +22,7 @@ from rawaug.isp.stages import as_float
 from rawaug.noise.levels import uniform
 from rawaug.noise.models import Params, draw_normals, draw_seeds, per_picture, poisson
 from rawaug.plugin.dataset import crop_size, random_patch
-from rawaug.plugin.targets import through_jpeg
+from rawaug.plugin.targets import compress_jpeg
 from rawaug.registry import SRGB_NOISE, require_between
 from rawaug.seeding import keyed_generator
 
@@ -101,7 +101,7 @@ class BsrganNoise:
                 light = torch.einsum("c,chw->hw", _LUMA.to(picture), picture)[None] if grey else picture
                 normals = draw_normals(light[None], [generator])[0]
                 picture += poisson(light * photons, normals) / photons - light
-        return through_jpeg(noisy.clamp_(0.0, 1.0), params["quality"])
+        return compress_jpeg(noisy.clamp_(0.0, 1.0), params["quality"])
 
 
 def _mixing(basis: Tensor, scales: Tensor) -> Tensor:

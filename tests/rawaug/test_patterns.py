@@ -15,6 +15,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import ColourBias
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.draw import Draw
 
 XTRANS = pattern("XTRANS")
 patterns = st.sampled_from(list(PATTERNS.values()))
@@ -119,7 +120,7 @@ def test_clean_raw_is_that_of_bayer_wherever_both_keep_the_same_colour(
 
 
 def test_the_noise_obeys_its_law_at_every_site_of_the_mosaic(isp: DictionaryISP) -> None:
-    augment = RawAugment(isp, noise=(1e-3, 1e-5), sampling="chosen", cfa="XTRANS")
+    augment = RawAugment(isp, noise=(1e-3, 1e-5), draw=Draw(sampling="chosen"), cfa="XTRANS")
     pair = augment(torch.full((1, 3, 516, 516), 128, dtype=torch.uint8))
     for plane in XTRANS.planes(516, 516):
         here = plane.bool()[None, None]
@@ -137,7 +138,7 @@ def test_a_dataset_of_x_trans_pairs_begins_every_crop_at_the_cell(isp: Dictionar
     assert pair.noisy.shape == (1, 24, 24)
     assert torch.equal(pairs.replay(0, pair.params).clean, pair.clean)
     red = torch.tensor([255, 0, 0], dtype=torch.uint8)[:, None, None].expand(3, 24, 24)
-    reds = RawPairs([red], RawAugment(isp, noise=(0.0, 0.0), sampling="chosen", cfa="XTRANS"), crop=24)
+    reds = RawPairs([red], RawAugment(isp, noise=(0.0, 0.0), draw=Draw(sampling="chosen"), cfa="XTRANS"), crop=24)
     clean, sites = reds[0].clean[0], XTRANS.planes(24, 24).bool()
     assert clean[sites[0]].min() > clean[sites[1]].max(), "red is not at the red sites"
 

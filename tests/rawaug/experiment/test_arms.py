@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from rawaug.commands.run import with_values
 from rawaug.data import demo_pictures
 from rawaug.experiment.arms import chosen, training_stream, validation_samples
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
-from rawaug.plugin.targets import Target
+from rawaug.plugin.targets import Srgb, Target
 from rawaug.training.config import TrainConfig
 
 
@@ -23,7 +24,7 @@ def test_other_targets_are_trained_and_watched_on(aim: Target, noisy: tuple[int,
     class Aimed(Recipe):
         target: Target = aim  # type: ignore[misc]
 
-    arms = {"one": ArmConfig(1.0, jpeg=(10, 10) if aim == "srgb" else None), "other": ArmConfig(1.0)}
+    arms = {"one": ArmConfig(1.0, srgb=Srgb(jpeg=(10, 10)) if aim == "srgb" else None), "other": ArmConfig(1.0)}
     recipe = Aimed(data=DataConfig(pairs=None), camera="universal", arms=arms, train=TrainConfig(crop=32))
     isp, noise, pictures = DictionaryISP(), noise_model((1e-4, 1e-6)), demo_pictures(2)
     one, other = (training_stream(recipe, arm, [], pictures, isp, noise, 0)[0] for arm in recipe.arms.values())
@@ -34,16 +35,17 @@ def test_other_targets_are_trained_and_watched_on(aim: Target, noisy: tuple[int,
 
 
 def test_a_target_that_an_arm_cannot_have_is_refused() -> None:
-    class Srgb(Recipe):
+    class Developed(Recipe):
         target: Target = "srgb"  # type: ignore[misc]
 
-    with pytest.raises(ValueError, match=r"arms\.one: demosaicing, jpeg and finish are for target 'srgb', not 'raw'"):
-        Recipe(arms={"one": ArmConfig(1.0, jpeg=(40, 95))})
-    with pytest.raises(ValueError, match=r"arms\.one: jpeg must be .* within 1 to 100"):
-        Srgb(arms={"one": ArmConfig(1.0, jpeg=(40, 101))})
+    with pytest.raises(ValueError, match=r"arms\.one: srgb is for target 'srgb', not 'raw'"):
+        Recipe(arms={"one": ArmConfig(1.0, srgb=Srgb(jpeg=(40, 95)))})
+    content = {"arms": {"one": {"augmented": 1.0, "srgb": {"jpeg": [40, 101]}}}}
+    with pytest.raises(ValueError, match=r"arms\.one\.srgb: jpeg must be .* within 1 to 100"):
+        with_values(Developed, content, "recipe")
     for arm in (ArmConfig(0.5), ArmConfig(1.0, estimator="noise2noise")):
         with pytest.raises(ValueError, match="srgb targets are made from pictures"):
-            Srgb(arms={"one": arm})
+            Developed(arms={"one": arm})
 
 
 def searching(**search: list[float]) -> ArmConfig:

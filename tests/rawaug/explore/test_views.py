@@ -18,7 +18,8 @@ from rawaug.explore.figures import variance_by_signal
 from rawaug.explore.page import as_html, message
 from rawaug.explore.view_state import Look, command, drawn, iso_range, noises_of, possible, python
 from rawaug.io import read_picture, write_picture
-from rawaug.plugin.sampling_config import SamplingConfig
+from rawaug.plugin.config import AugmentConfig
+from rawaug.plugin.draw import Draw
 
 LEVELS = (1e-4, 1e-6)
 
@@ -32,17 +33,23 @@ def picture(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.mark.parametrize(
-    "drawing",
+    "config",
     [
-        SamplingConfig("universal", "Nikon D750", 4000.0, "Nikon D750", -0.5, "Nikon D750", 1600.0, cfa="GRBG"),
-        SamplingConfig(light="LED-B3", noise=LEVELS, cfa="XTRANS"),
-        SamplingConfig("canon-powershot", exposure=0.25, noise="any camera"),
-        SamplingConfig(target="srgb"),
-        SamplingConfig(burst=3),
+        AugmentConfig(
+            camera="Nikon D750",
+            noise="Nikon D750",
+            iso=1600.0,
+            draw=Draw(exposure=-0.5, light=4000.0, tone="Nikon D750"),
+            cfa="GRBG",
+        ),
+        AugmentConfig(noise=LEVELS, draw=Draw(light="LED-B3"), cfa="XTRANS"),
+        AugmentConfig("canon-powershot", noise="any camera", draw=Draw(exposure=0.25)),
+        AugmentConfig(target="srgb"),
+        AugmentConfig(burst=3),
     ],
 )
-def test_command_and_python_make_the_pair_bit_for_bit(picture: str, drawing: SamplingConfig, tmp_path: Path) -> None:
-    look = Look(picture, drawing, seed=5)
+def test_command_and_python_make_the_pair_bit_for_bit(picture: str, config: AugmentConfig, tmp_path: Path) -> None:
+    look = Look(picture, config, seed=5)
     pair = drawn(look).pair
     words = shlex.split(command(look, str(tmp_path)))
     assert words[0] == "rawaug" and main([*words[1:], "--workers", "0"]) == 0
@@ -55,7 +62,7 @@ def test_command_and_python_make_the_pair_bit_for_bit(picture: str, drawing: Sam
 
 def test_developed_without_noise_it_is_the_picture_again(picture: str) -> None:
     for isp, most in (("universal", 2), ("gopro-hero", 6)):  # of a learned tone network the curve of greys alone
-        look = Look(picture, SamplingConfig(isp, exposure=0.0, noise=(1e-12, 1e-12)))
+        look = Look(picture, AugmentConfig(isp, noise=(1e-12, 1e-12), draw=Draw(exposure=0.0)))
         noisy, clean = views.pair(look)
         truth = read_picture(picture)[:, :96, :144].permute(1, 2, 0).numpy().astype(float)
         for panel in (noisy, clean):
@@ -65,7 +72,7 @@ def test_developed_without_noise_it_is_the_picture_again(picture: str) -> None:
 
 
 def test_every_view_has_titled_pictures_and_the_draws_differ(picture: str) -> None:
-    look = Look(picture, SamplingConfig(noise=LEVELS))
+    look = Look(picture, AugmentConfig(noise=LEVELS))
     panels = {name: view(views.seen_in(name, look)) for name, view in views.VIEWS.items()}
     assert {name: len(found) for name, found in panels.items()} == {
         "Pair": 2, "Stages": 5, "RAW": 6, "Camera": 2, "Noise": 2, "Eight draws": 8, "sRGB": 2, "Burst": 4
@@ -76,13 +83,13 @@ def test_every_view_has_titled_pictures_and_the_draws_differ(picture: str) -> No
     assert panels["Burst"][0].title.startswith("frame 0: +0.0 pixels down") and np.abs(first - second).mean() > 1
     means = {tuple(panel.image.mean(axis=(0, 1)).round(1)) for panel in panels["Eight draws"]}
     assert len(means) == 8, "eight cameras in eight lights"
-    fixed = replace(look.drawing, camera="Nikon D750", light=5500.0, tone="linear", exposure=0.0)
-    same = np.stack([panel.image.mean(axis=(0, 1)) for panel in views.draws(replace(look, drawing=fixed))])
+    fixed = replace(look.config, camera="Nikon D750", draw=Draw(exposure=0.0, light=5500.0, tone="linear"))
+    same = np.stack([panel.image.mean(axis=(0, 1)) for panel in views.draws(replace(look, config=fixed))])
     assert same.std(axis=0).max() < 5, "what is fixed does not vary"
 
 
 def test_other_patterns_have_no_packed_planes_and_no_network(picture: str) -> None:
-    look = Look(picture, SamplingConfig(cfa="XTRANS"))
+    look = Look(picture, AugmentConfig(cfa="XTRANS"))
     assert [panel.title.partition(":")[0] for panel in views.raw(look)] == ["XTRANS", "histograms"]
     assert views.pair(look)[0].image.shape == (96, 144, 3)
     with pytest.raises(ValueError, match="denoises Bayer RAW, not"):
@@ -90,7 +97,7 @@ def test_other_patterns_have_no_packed_planes_and_no_network(picture: str) -> No
 
 
 def test_the_shipped_network_removes_noise(picture: str) -> None:
-    look = Look(picture, SamplingConfig(noise=(5e-3, 1e-4), exposure=0.0, light=5500.0, cfa="BGGR"))
+    look = Look(picture, AugmentConfig(noise=(5e-3, 1e-4), draw=Draw(exposure=0.0, light=5500.0), cfa="BGGR"))
     noisy, denoised = views.denoised(look)
     before, after = (float(panel.title.split()[-2]) for panel in (noisy, denoised))
     assert after > before + 3
@@ -100,7 +107,7 @@ def test_the_shipped_network_removes_noise(picture: str) -> None:
 
 def test_large_pictures_are_shown_in_part(tmp_path: Path) -> None:
     write_picture(tmp_path / "large.png", demo_pictures(1)[0].repeat(1, 2, 2))
-    look = Look(str(tmp_path / "large.png"), SamplingConfig())
+    look = Look(str(tmp_path / "large.png"), AugmentConfig())
     assert drawn(look).srgb.shape == (3, 1024, 1024)
     assert [panel.image.shape for panel in views.pair(look)] == [(512, 768, 3)] * 2
     assert {max(panel.image.shape) for panel in views.stages(look)} == {512}
@@ -119,11 +126,11 @@ def test_measured_variance_follows_the_law() -> None:
 
 
 def test_what_does_not_apply_is_left_out() -> None:
-    assert possible(SamplingConfig("gopro-hero", "Nikon D750", 5500.0, "linear")) == SamplingConfig("gopro-hero")
-    assert possible(SamplingConfig("universal-small", tone="nokia like", noise="upi", iso=800.0)) == SamplingConfig(
-        "universal-small", noise="upi"
-    )
-    kept = SamplingConfig(noise="Nikon D750", iso=800.0, tone="linear")
+    fitted = AugmentConfig("gopro-hero", "Nikon D750", draw=Draw(light=5500.0, tone="linear"))
+    assert possible(fitted) == AugmentConfig("gopro-hero")
+    preset = AugmentConfig("universal-small", noise="upi", iso=800.0, draw=Draw(tone="nokia like"))
+    assert possible(preset) == AugmentConfig("universal-small", noise="upi")
+    kept = AugmentConfig(noise="Nikon D750", iso=800.0, draw=Draw(tone="linear"))
     assert possible(kept) == kept
     assert "camera" in noises_of("gopro-hero") and "camera" not in noises_of("universal")
     assert iso_range("any camera") is not None and iso_range("camera") is None

@@ -19,7 +19,9 @@ from rawaug.isp.config import ISPConfig, ISPParams
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.draw import Draw
 from rawaug.plugin.params import AugmentParams, RawPair, load_params, save_params
+from rawaug.plugin.targets import Srgb
 
 
 @pytest.fixture
@@ -40,7 +42,7 @@ def assert_same(a: Any, b: Any) -> None:
 
 @pytest.mark.parametrize("sampling", ["convex", "independent", "perturb", "chosen"])
 def test_parameters_replay_the_pair(isp: DictionaryISP, srgb: Tensor, sampling: Any) -> None:
-    augment = RawAugment(isp, sampling=sampling)
+    augment = RawAugment(isp, draw=Draw(sampling=sampling))
     pair = augment(srgb)
     assert pair.noisy.shape == pair.clean.shape == pair.variance.shape == (3, 4, 8, 10)
     assert_same(augment.apply(srgb, pair.params), pair)
@@ -71,7 +73,7 @@ def test_exposure_darkens_by_its_stops_and_replays(isp: DictionaryISP) -> None:
     as_is, draws = RawAugment(isp, noise=(0.0, 0.0)), torch.Generator()
     clean = as_is(dim, draws.manual_seed(1)).clean
     for low, high in ((-1.0, -1.0), (-2.0, 1.0)):
-        augment = RawAugment(isp, noise=(0.0, 0.0), exposure=(low, high))
+        augment = RawAugment(isp, noise=(0.0, 0.0), draw=Draw(exposure=(low, high)))
         pair = augment(dim, draws.manual_seed(1))
         stops = (pair.clean / clean).log2().mean((1, 2, 3))
         assert low - 1e-4 <= stops.min() <= low + 0.02 and high - 0.02 <= stops.max() <= high + 1e-4
@@ -83,16 +85,16 @@ def test_wrong_settings_are_refused(isp: DictionaryISP) -> None:
     with pytest.raises(ValueError, match="order"):
         RawAugment(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))
     with pytest.raises(ValueError, match="convex, independent, perturb, chosen"):
-        RawAugment(isp, sampling="random")  # type: ignore[arg-type]
+        Draw(sampling="random")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"\(lowest, highest\) in stops"):
-        RawAugment(isp, exposure=(1.0, -1.0))
+        Draw(exposure=(1.0, -1.0))
 
 
 def test_raw_is_developed_by_the_setting_that_made_it(isp: DictionaryISP) -> None:
     """As the target sRGB has it, of a batch and of one sample; and near the picture, which demosaicing alone blurs."""
     smooth = torch.nn.functional.interpolate(torch.rand(2, 3, 4, 5), (32, 40), mode="bicubic").clamp(0.1, 0.9)
     augment = RawAugment(isp, noise=(0.0, 0.0))
-    developed = RawAugment(isp, noise=(0.0, 0.0), target="srgb", demosaicing="malvar")
+    developed = RawAugment(isp, noise=(0.0, 0.0), target=Srgb(demosaicing="malvar"))
     pair, draws = augment(smooth, torch.Generator().manual_seed(1)), torch.Generator().manual_seed(1)
     srgb = augment.develop(pair.clean, pair.params)
     assert torch.equal(srgb, developed(smooth, draws).clean) and srgb.shape == smooth.shape
@@ -120,7 +122,9 @@ def test_printed_it_says_what_is_drawn(isp: DictionaryISP) -> None:
         "  noise: upi",
         "  target: raw, RGGB, bursts of 3 frames",
     ]
-    any_of_them = RawAugment.from_pretrained("universal", noise=("upi", "rawir"), light=5500.0, target="srgb")
+    any_of_them = RawAugment.from_pretrained(
+        "universal", noise=("upi", "rawir"), draw=Draw(light=5500.0), target="srgb"
+    )
     assert re.fullmatch(
         r"RawAugment, camera: one of \d+ published, convex, light 5500.0, exposure -0.5 to 1 stops\n"
         r"  noise: \('upi', 'rawir'\)\n  target: srgb, RGGB",
@@ -138,7 +142,7 @@ def test_the_iso_is_that_of_the_camera_s_noise(srgb: Tensor) -> None:
     other = RawAugment.from_pretrained("universal", camera="Sony ILCE-7M3", noise="Nikon D750", iso=(100, 200))
     assert "noise: Nikon D750, iso (100, 200)" in repr(other)
     for settings, message in (
-        ({"iso": 800}, "give its name as camera= or noise="),
+        ({"iso": 800}, "omit iso, or use one of the cameras"),
         ({"camera": "Sony ILCE-7M3", "iso": 10**7}, "outside the measured range of Sony ILCE-7M3"),
         ({"noise": "upi", "iso": 800}, "does not depend on ISO"),
     ):
@@ -170,7 +174,7 @@ def test_a_single_picture_makes_a_single_pair_that_replays(augment: RawAugment) 
 
 
 def test_raw_stays_float32_in_mixed_precision(isp: DictionaryISP, srgb: Tensor) -> None:
-    augment, generator = RawAugment(isp, sampling="perturb"), torch.Generator()
+    augment, generator = RawAugment(isp, draw=Draw(sampling="perturb")), torch.Generator()
     expected = augment(srgb, generator.manual_seed(0))
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert_same(augment(srgb, generator.manual_seed(0)), expected)

@@ -11,13 +11,13 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from rawaug import DictionaryISP, RawAugment, RawPairs
+from rawaug import Burst, DictionaryISP, Draw, RawAugment, RawPairs, Srgb
 from rawaug.bayer import pack_rgb
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.stages import LensShading
 from rawaug.metrics import psnr
 from rawaug.noise import DefectPixels, RowNoise
-from rawaug.plugin.targets import moved
+from rawaug.plugin.targets import move
 
 N = 8
 
@@ -33,7 +33,7 @@ def srgb() -> Tensor:
 
 
 def test_the_mean_of_still_frames_gains_ten_log_n(universal: DictionaryISP, srgb: Tensor) -> None:
-    pair = RawAugment(universal, noise=(1e-4, 1e-4), burst=N, motion=(0, 0))(srgb, seeded())
+    pair = RawAugment(universal, noise=(1e-4, 1e-4), burst=Burst(N, motion=(0, 0)))(srgb, seeded())
     assert pair.noisy.shape == pair.variance.shape == (2, N, 4, 48, 64) and pair.clean.shape == (2, 4, 48, 64)
     one, mean = psnr(pair.noisy[:, 0], pair.clean), psnr(pair.noisy.mean(1), pair.clean)
     assert (mean - one).mean().item() == pytest.approx(10 * math.log10(N), abs=0.2)
@@ -47,7 +47,7 @@ def test_the_first_frame_is_the_single_one(universal: DictionaryISP, srgb: Tenso
 
 def test_defects_of_the_sensor_stay_and_its_noise_does_not(universal: DictionaryISP, srgb: Tensor) -> None:
     for noise, same in ((DefectPixels(dead=0.02, hot=0.02), True), (RowNoise(1e-4), False)):
-        pair = RawAugment(universal, noise=noise, burst=2, motion=(0, 0))(srgb, seeded())
+        pair = RawAugment(universal, noise=noise, burst=Burst(2, motion=(0, 0)))(srgb, seeded())
         assert not torch.equal(pair.noisy[:, 0], pair.clean)
         assert torch.equal(pair.noisy[:, 0], pair.noisy[:, 1]) == same
 
@@ -61,7 +61,7 @@ def test_the_shading_of_the_lens_does_not_move_with_the_scene(attention: bool) -
     if lens.reverse_attention is not None:
         list(lens.reverse_attention.parameters())[-2].data.normal_(std=0.1, generator=seeded())
     wall = torch.full((1, 3, 64, 96), 0.5)
-    pair = RawAugment(isp, noise=(0.0, 0.0), burst=3, motion=(8.0, 4.0))(wall, seeded())
+    pair = RawAugment(isp, noise=(0.0, 0.0), burst=Burst(3, motion=(8.0, 4.0)))(wall, seeded())
     still = RawAugment(isp, noise=(0.0, 0.0))(wall, seeded())
     assert still.clean.std() > 0.05 * still.clean.mean()
     torch.testing.assert_close(pair.noisy, still.clean[:, None].expand_as(pair.noisy), atol=1e-4, rtol=0)
@@ -71,15 +71,15 @@ def undone(frames: Tensor, motion: Tensor) -> Tensor:
     """Frames ``(B, N, 3, H, W)`` where the first one is, without their margins."""
     dy, dx, angle = motion.flatten(0, 1).unbind(1)
     back = torch.stack([angle.sin() * dx - angle.cos() * dy, -angle.sin() * dy - angle.cos() * dx, -angle], dim=1)
-    return moved(frames.flatten(0, 1), back).unflatten(0, frames.shape[:2])[..., 16:-16, 16:-16]
+    return move(frames.flatten(0, 1), back).unflatten(0, frames.shape[:2])[..., 16:-16, 16:-16]
 
 
 def test_a_frame_shows_the_scene_where_its_motion_says() -> None:
     """``R(angle) (p - c) + c + (dy, dx)`` in rows that go down: after a quarter turn what was below is on the right."""
     scene = torch.rand(1, 3, 24, 24, generator=seeded())
-    turned = moved(scene, torch.tensor([[0.0, 0.0, math.pi / 2]]))
+    turned = move(scene, torch.tensor([[0.0, 0.0, math.pi / 2]]))
     torch.testing.assert_close(turned, torch.rot90(scene, 1, (-2, -1)), atol=1e-3, rtol=0)
-    both = moved(scene, torch.tensor([[3.0, -2.0, math.pi / 2]]))
+    both = move(scene, torch.tensor([[3.0, -2.0, math.pi / 2]]))
     inner = (..., slice(6, 18), slice(6, 18))
     torch.testing.assert_close(
         both[inner], torch.rot90(scene.roll((-3, 2), (-2, -1)), 1, (-2, -1))[inner], atol=1e-3, rtol=0
@@ -90,7 +90,7 @@ def test_a_frame_shows_the_scene_where_its_motion_says() -> None:
 def test_a_moved_frame_is_not_darker_than_black(universal: DictionaryISP, target: Any) -> None:
     stripes = torch.zeros(1, 3, 64, 96)
     stripes[..., ::8] = stripes[..., 1::8] = 1.0
-    pair = RawAugment(universal, noise=(0.0, 0.0), burst=4, motion=(2.0, 2.0), target=target)(stripes, seeded())
+    pair = RawAugment(universal, noise=(0.0, 0.0), burst=Burst(4, motion=(2.0, 2.0)), target=target)(stripes, seeded())
     assert pair.noisy.min() >= 0.0 and pair.clean.min() >= 0.0 and pair.noisy.max() > 0.3
 
 
@@ -98,9 +98,9 @@ def test_a_moved_frame_is_not_darker_than_black(universal: DictionaryISP, target
 def test_undoing_the_saved_motion_gives_the_scene_back(universal: DictionaryISP, noise: float) -> None:
     coarse = torch.rand(2, 3, 3, 4, generator=seeded())
     smooth = F.interpolate(coarse, size=(96, 128), mode="bicubic").clamp(0.1, 0.9)
-    settings: dict[str, Any] = {"noise": (noise, noise), "burst": N, "target": "srgb", "demosaicing": "bilinear"}
-    still = RawAugment(universal, motion=(0, 0), **settings)(smooth, seeded())
-    pair = RawAugment(universal, motion=(3.0, 1.0), **settings)(smooth, seeded())
+    settings: dict[str, Any] = {"noise": (noise, noise), "target": Srgb(demosaicing="bilinear")}
+    still = RawAugment(universal, burst=Burst(N, motion=(0, 0)), **settings)(smooth, seeded())
+    pair = RawAugment(universal, burst=Burst(N, motion=(3.0, 1.0)), **settings)(smooth, seeded())
     motion, clean = pair.params.extras["motion"], pair.clean[..., 16:-16, 16:-16]
     assert not motion[:, 0].any() and motion[:, 1:, :2].abs().max() <= 3 and motion[..., 2].abs().max() < 0.0175
     reached = psnr(undone(pair.noisy, motion).mean(1), clean)
@@ -111,7 +111,8 @@ def test_undoing_the_saved_motion_gives_the_scene_back(universal: DictionaryISP,
 
 
 def test_brackets_change_light_and_replay(universal: DictionaryISP, srgb: Tensor) -> None:
-    augment = RawAugment(universal, noise=(1e-4, 1e-6), burst=3, motion=(0, 0), stops=(0, -2, 1), exposure=(-1, -1))
+    bracket = Burst(3, motion=(0, 0), stops=(0, -2, 1))
+    augment = RawAugment(universal, noise=(1e-4, 1e-6), burst=bracket, draw=Draw(exposure=-1))
     pair = augment(srgb, seeded())
     low = (pair.noisy[:, 1].mean() / pair.noisy[:, 0].mean()).item()
     assert low == pytest.approx(0.25, rel=0.02) and pair.noisy.max() <= 1
@@ -142,13 +143,13 @@ def test_linear_rgb_is_the_first_frame_s(universal: DictionaryISP, srgb: Tensor)
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"burst": 0}, "at least 1, got 0"),
-        ({"burst": 2, "motion": (-1, 0)}, "motion must be"),
-        ({"burst": 2, "stops": (0,)}, "each of 2 frames, got 1"),
-        ({"motion": (1, 0)}, "are those of a burst; give burst"),
-        ({"stops": (0, 1)}, "are those of a burst; give burst"),
+        ({"frames": 0}, "at least 1, got 0"),
+        ({"frames": 2, "motion": (-1, 0)}, "motion must be"),
+        ({"frames": 2, "stops": (0,)}, "each of 2 frames, got 1"),
     ],
 )
 def test_bursts_without_meaning_are_refused(universal: DictionaryISP, settings: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        RawAugment(universal, **settings)
+        Burst(**settings)
+    with pytest.raises(ValueError, match="burst must be a number of frames"):
+        RawAugment(universal, burst=0)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.finishing import Finish, blurred
+from rawaug.plugin.targets import Srgb
 
 SIDE = 96
 
@@ -75,7 +76,7 @@ def test_sharpening_raises_the_noise_and_keeps_flat_areas() -> None:
 
 
 def test_pairs_replay_and_do_not_depend_on_their_neighbours() -> None:
-    augment = RawAugment.from_pretrained("universal", noise=(1e-2, 1e-4), target="srgb", finish=True)
+    augment = RawAugment.from_pretrained("universal", noise=(1e-2, 1e-4), target=Srgb(finish=True))
     pictures = torch.rand(3, 3, 32, 32, generator=torch.Generator().manual_seed(1))
     pair = augment(pictures, torch.Generator().manual_seed(2))
     again = augment.apply(pictures, pair.params)
@@ -90,7 +91,7 @@ def test_jpeg_is_on_the_noisy_picture_alone() -> None:
 
     def pair(quality: tuple[int, int]) -> tuple[Tensor, Tensor]:
         finish = Finish(quality=quality)
-        augment = RawAugment.from_pretrained("universal", noise=(1e-3, 1e-5), target="srgb", finish=finish)
+        augment = RawAugment.from_pretrained("universal", noise=(1e-3, 1e-5), target=Srgb(finish=finish))
         made = augment(pictures, torch.Generator().manual_seed(3))
         return made.noisy, made.clean
 
@@ -108,10 +109,8 @@ def test_shares_are_of_pictures() -> None:
     assert torch.equal(Finish().apply(noisy, clean, torch.zeros(1, 6))[0], noisy)
 
 
-def test_ranges_out_of_order_and_other_targets_are_refused() -> None:
+def test_ranges_out_of_order_are_refused() -> None:
     with pytest.raises(ValueError, match=r"finish: luma_blur must be \(lowest, highest\)"):
         Finish(luma_blur=(1.0, 0.5))
     with pytest.raises(ValueError, match="finish: edges must be a share"):
         Finish(edges=1.5)
-    with pytest.raises(ValueError, match="finish are for target 'srgb'"):
-        RawAugment.from_pretrained("universal", finish=True)

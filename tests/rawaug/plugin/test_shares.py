@@ -15,6 +15,7 @@ from torch.utils.data import BatchSampler, DataLoader, DistributedSampler, Rando
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairStream
+from rawaug.plugin.draw import Draw
 from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
 
@@ -24,7 +25,7 @@ LEVELS = range(0, 200, 25)
 
 @pytest.fixture(scope="module")
 def augment(isp: DictionaryISP) -> RawAugment:
-    return RawAugment(isp, noise=(0.0, 0.0), sampling="chosen")
+    return RawAugment(isp, noise=(0.0, 0.0), draw=Draw(sampling="chosen"))
 
 
 def pictures() -> list[Tensor]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,9 +15,11 @@ from torch.utils.data import DataLoader
 from rawaug import (
     AugmentParams,
     DictionaryISP,
+    Draw,
     RawAugment,
     RawPair,
     RawPairs,
+    Srgb,
     isp_model,
     load_params,
     save_params,
@@ -54,7 +56,7 @@ def test_linear_rgb_is_what_the_mosaic_was_taken_from(universal: DictionaryISP) 
 def test_without_noise_the_setting_develops_to_the_picture(isp: str, demosaicing: str) -> None:
     srgb = smooth(2, 192, 256)
     augment = RawAugment.from_pretrained(
-        isp, noise=(0.0, 0.0), target="srgb", demosaicing=demosaicing, sampling="chosen", exposure=(0, 0)
+        isp, (0.0, 0.0), draw=Draw(sampling="chosen", exposure=0), target=Srgb(demosaicing=demosaicing)
     )
     pair = augment(srgb, seeded())
     assert pair.variance.shape == (2, 0) and torch.equal(pair.noisy, pair.clean)
@@ -67,7 +69,7 @@ def test_noise_of_a_plain_camera_is_the_raw_law() -> None:
     assert isp.tone is not None
     isp.tone.curves.copy_(torch.linspace(0.0, 1.0, isp.tone.curves.shape[1]))
     augment, grey = (
-        RawAugment(isp, noise=(1e-3, 1e-5), target="srgb", exposure=(0, 0)),
+        RawAugment(isp, noise=(1e-3, 1e-5), target="srgb", draw=Draw(exposure=0)),
         torch.full((1, 3, 512, 512), 0.3),
     )
     params = augment.sample(grey, seeded())
@@ -84,12 +86,12 @@ def test_noise_of_a_plain_camera_is_the_raw_law() -> None:
 @pytest.mark.parametrize("stops", [-0.5, 0.0, 1.0])
 def test_saturated_highlights_are_white_at_any_exposure(universal: DictionaryISP, stops: float) -> None:
     white = torch.ones(4, 3, 16, 16)
-    pair = RawAugment(universal, noise=(1e-6, 1e-8), target="srgb", exposure=(stops, stops))(white, seeded())
+    pair = RawAugment(universal, noise=(1e-6, 1e-8), target="srgb", draw=Draw(exposure=stops))(white, seeded())
     assert pair.clean.min() > 0.98
 
 
 def test_a_replay_is_exact_and_goes_through_a_file(universal: DictionaryISP, tmp_path: Path) -> None:
-    augment = RawAugment(universal, target="srgb", jpeg=(40, 95))
+    augment = RawAugment(universal, target=Srgb(jpeg=(40, 95)))
     srgb = (smooth() * 255).to(torch.uint8)
     pair = augment(srgb, seeded(3))
     assert pair.noisy.shape == pair.clean.shape == (2, 3, 48, 64)
@@ -106,10 +108,10 @@ def test_a_replay_is_exact_and_goes_through_a_file(universal: DictionaryISP, tmp
 
 def test_every_demosaicing_and_quality_is_drawn_and_a_low_quality_costs_more(universal: DictionaryISP) -> None:
     srgb = smooth(64)
-    drawn = RawAugment(universal, target="srgb", jpeg=(10, 12)).sample(srgb, seeded()).extras
+    drawn = RawAugment(universal, target=Srgb(jpeg=(10, 12))).sample(srgb, seeded()).extras
     assert set(drawn["demosaicing"].tolist()) == {0, 1, 2, 3} and set(drawn["quality"].tolist()) == {10, 11, 12}
     without, high, low = (
-        RawAugment(universal, noise=(1e-4, 0.0), target="srgb", demosaicing="malvar", jpeg=jpeg)(srgb[:2], seeded())
+        RawAugment(universal, (1e-4, 0.0), target=Srgb(demosaicing="malvar", jpeg=jpeg))(srgb[:2], seeded())
         for jpeg in (None, (95, 95), (10, 10))
     )
     assert psnr(high.noisy, without.noisy).min() > psnr(low.noisy, without.noisy).max()
@@ -117,13 +119,13 @@ def test_every_demosaicing_and_quality_is_drawn_and_a_low_quality_costs_more(uni
 
 def test_the_target_of_a_jpeg_is_the_picture_before_it_was_compressed(universal: DictionaryISP) -> None:
     srgb = smooth()
-    settings: dict[str, Any] = {"noise": (1e-3, 1e-5), "target": "srgb", "demosaicing": "malvar"}
-    without, low = (RawAugment(universal, jpeg=jpeg, **settings)(srgb, seeded()) for jpeg in (None, (10, 10)))
+    targets = (Srgb(demosaicing="malvar", jpeg=jpeg) for jpeg in (None, (10, 10)))
+    without, low = (RawAugment(universal, (1e-3, 1e-5), target=target)(srgb, seeded()) for target in targets)
     assert torch.equal(low.clean, without.clean) and not torch.equal(low.noisy, without.noisy)
 
 
 def test_datasets_and_loaders_collate_them(universal: DictionaryISP) -> None:
-    augment = RawAugment(universal, target="srgb", jpeg=(80, 90))
+    augment = RawAugment(universal, target=Srgb(jpeg=(80, 90)))
     pictures = list((smooth(4) * 255).to(torch.uint8))
     pairs = RawPairs(pictures, augment, crop=32)
     pairs.set_epoch(0)
@@ -143,7 +145,7 @@ def degradation(img: np.ndarray, hq: np.ndarray, isp_model: Any) -> tuple[np.nda
 
 
 def test_kair_s_call_gets_camera_noise_on_the_picture_and_its_target_back(universal: DictionaryISP) -> None:
-    augment = RawAugment(universal, noise=(1e-3, 1e-5), target="srgb", jpeg=(60, 90))
+    augment = RawAugment(universal, noise=(1e-3, 1e-5), target=Srgb(jpeg=(60, 90)))
     srgb = smooth(1, 48, 64)[0].permute(1, 2, 0).numpy().astype(np.float64)[:47, :63]
     hq = np.zeros((94, 126, 3))
     first, same = degradation(srgb, hq, isp_model(augment))
@@ -156,18 +158,16 @@ def test_kair_s_call_gets_camera_noise_on_the_picture_and_its_target_back(univer
         isp_model(RawAugment(universal))
 
 
-def test_settings_without_meaning_are_refused(universal: DictionaryISP) -> None:
-    for settings, message in (
-        ({"target": "jpg"}, "target 'jpg' is unknown; use one of raw, rgb, srgb"),
-        ({"jpeg": (40, 95)}, "for target 'srgb', not 'raw'"),
-        ({"target": "srgb", "jpeg": (0, 95)}, "within 1 to 100"),
-        ({"target": "srgb", "jpeg": (95, 40)}, "within 1 to 100"),
-        (
-            {"target": "srgb", "demosaicing": "lmmse"},
-            "demosaicing 'lmmse' is unknown; use one of bilinear, malvar, adams",
-        ),
-        ({"target": "srgb", "cfa": "XTRANS"}, "demosaics Bayer patterns, not XTRANS"),
-    ):
-        given: Any = settings
-        with pytest.raises(ValueError, match=message):
-            RawAugment(universal, **given)
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda isp: RawAugment(isp, target=cast(Any, "jpg")), "target 'jpg' is unknown; use one of raw, rgb, srgb"),
+        (lambda isp: RawAugment(isp, target="srgb", cfa="XTRANS"), "demosaics Bayer patterns, not XTRANS"),
+        (lambda _: Srgb(jpeg=(0, 95)), "within 1 to 100"),
+        (lambda _: Srgb(jpeg=(95, 40)), "within 1 to 100"),
+        (lambda _: Srgb(demosaicing="lmmse"), "demosaicing 'lmmse' is unknown; use one of bilinear, malvar, adams"),
+    ],
+)
+def test_settings_without_meaning_are_refused(universal: DictionaryISP, make: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(universal)

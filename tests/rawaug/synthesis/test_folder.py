@@ -12,7 +12,7 @@ import rawpy
 import tifffile
 import torch
 
-from rawaug import DictionaryISP, ISPConfig, RawAugment
+from rawaug import Burst, DictionaryISP, ISPConfig, RawAugment, Srgb
 from rawaug.bayer import pack
 from rawaug.cli import main
 from rawaug.files import replacing
@@ -72,10 +72,9 @@ def test_bursts_of_every_target_replay(
     tmp_path: Path, pictures: Path, target: str, format: str, ends: set[str]
 ) -> None:
     picture, out = pictures / "sub" / "b.png", tmp_path / "out"
-    drawn: dict[str, Any] = {"target": target, "burst": 2, "motion": (1.0, 0.1), "workers": 0, "noise": FIXED}
-    if target == "srgb":
-        drawn["jpeg"] = (50, 90)
-    synth(picture, out, format=format, **drawn)  # type: ignore[arg-type]
+    held = Srgb(jpeg=(50, 90)) if target == "srgb" else target
+    settings: dict[str, Any] = {"format": format, "noise": FIXED, "target": held, "burst": Burst(2, motion=(1.0, 0.1))}
+    synth(picture, out, workers=0, **settings)
     pair = replay(out / "b_0.safetensors")
     assert {file.name for file in out.iterdir()} == {f"b_0{end}" for end in ends} | {"b_0.safetensors", "synth.json"}
     noisy = {k: pair.noisy[k] for k in (0, 1)}
@@ -99,9 +98,9 @@ def test_bursts_of_every_target_replay(
         clean = torch.from_numpy(tifffile.imread(out / "b_0_clean.tif").astype(np.float32)).permute(2, 0, 1)
         scale = 65535 if target == "srgb" else 1
         torch.testing.assert_close(clean / scale, pair.clean, atol=0.51 / 65535, rtol=0)
-    assert synth(picture, out, format=format, **drawn).made == 0  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"synth\.json: made with motion \[1.0, 0.1\], not None"):
-        synth(picture, out, format=format, **drawn | {"motion": None})  # type: ignore[arg-type]
+    assert synth(picture, out, workers=0, **settings).made == 0
+    with pytest.raises(ValueError, match=r"synth\.json: made with burst .*\[1.0, 0.1\].*, not 2"):
+        synth(picture, out, workers=0, **settings | {"burst": 2})
 
 
 def test_pairs_do_not_depend_on_what_was_there(tmp_path: Path, pictures: Path) -> None:

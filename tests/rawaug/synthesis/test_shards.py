@@ -14,6 +14,7 @@ import torch
 
 from rawaug.files import replacing
 from rawaug.io import write_picture
+from rawaug.plugin.targets import Srgb
 from rawaug.synthesis import shards as pair_shards
 from rawaug.synthesis.folder import Synthesis, part_of, synth
 from rawaug.synthesis.shards import replay_sample
@@ -96,7 +97,7 @@ def test_the_pairs_are_those_of_other_formats(pictures: Path, whole: Path, tmp_p
     assert (described["height"], described["width"]) == (16, 18)
     replayed = replay_sample(described, pictures)
     assert np.array_equal(replayed.noisy.numpy(), np.load(io.BytesIO(sample["noisy.npy"])))
-    assert described["shot_var"] == pytest.approx(FIXED[0]) and described["isp"] == "universal"
+    assert described["shot_var"] == pytest.approx(FIXED[0]) and described["settings"]["isp"] == "universal"
 
 
 def test_a_sample_is_replayed_only_from_its_picture(pictures: Path, whole: Path, tmp_path: Path) -> None:
@@ -108,7 +109,7 @@ def test_a_sample_is_replayed_only_from_its_picture(pictures: Path, whole: Path,
 
 
 def test_bursts_of_developed_pictures_are_replayed(pictures: Path, tmp_path: Path) -> None:
-    form: dict[str, Any] = {"target": "srgb", "jpeg": (60, 90), "burst": 2}
+    form: dict[str, Any] = {"target": Srgb(jpeg=(60, 90)), "burst": 2}
     synth(pictures / "z.png", tmp_path, "webdataset", noise=FIXED, workers=0, **form)
     (sample,) = samples(tmp_path).values()
     noisy, clean = (torch.from_numpy(np.load(io.BytesIO(sample[f"{name}.npy"]))) for name in ("noisy", "clean"))

@@ -30,7 +30,7 @@ def bsrgan(**given: Any) -> Tensor:
 @pytest.fixture
 def uncompressed(monkeypatch: pytest.MonkeyPatch) -> None:
     """No JPEG, which halves the resolution of colour noise."""
-    monkeypatch.setattr(srgb_noise, "through_jpeg", lambda srgb, quality: srgb)
+    monkeypatch.setattr(srgb_noise, "compress_jpeg", lambda srgb, quality: srgb)
 
 
 def test_white_noise_has_the_drawn_deviation_between_its_limits() -> None:

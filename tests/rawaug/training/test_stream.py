@@ -15,7 +15,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
-from rawaug.plugin.targets import Target
+from rawaug.plugin.targets import Srgb, Target
 from rawaug.seeding import keyed_generator
 from rawaug.training.stream import RealCrops, StepSampler, TrainingStream
 
@@ -83,7 +83,7 @@ def test_samples_depend_on_seed_and_index_alone() -> None:
 
 @pytest.mark.parametrize("target", ["raw", "srgb"])
 def test_a_step_made_at_once_is_that_of_the_plugin_one_by_one(target: Target) -> None:
-    augment = RawAugment(DictionaryISP(), target=target, jpeg=(50, 60) if target == "srgb" else None)
+    augment = RawAugment(DictionaryISP(), target=Srgb(jpeg=(50, 60)) if target == "srgb" else target)
     small = [picture[:, :96, :112] for picture in demo_pictures(3)]
     pictures = RawPairs(small, augment, crop=32, zoom=2.0)
     stream = TrainingStream(None, pictures, batch=4, augmented=1.0, seed=1)
