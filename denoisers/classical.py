@@ -40,7 +40,7 @@ class Classical(ABC):
 
     @classmethod
     def missing(cls) -> str | None:
-        """The line that says what is not installed; None where everything is."""
+        """Say in a line which library is missing and how to install it; None where all are there."""
         name = next((name for name in cls.needs if find_spec(name) is None), None)
         return name and f"{name} is not installed; {cls.advice}"
 
@@ -51,7 +51,7 @@ class Classical(ABC):
 
     @abstractmethod
     def denoise(self, planes: Planes) -> Planes:
-        """``(h, w, 4)`` with white noise of deviation 1 to the estimate without it, same shape."""
+        """Estimate the picture ``(h, w, 4)`` beneath white noise of deviation 1; the result has the same shape."""
 
     def __call__(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
         """Denoise ``(B, 4, h, w)`` by the mean of each picture's variance; one without noise is returned as it is.
@@ -93,6 +93,7 @@ class NonLocalMeans(Classical):
     needs = ("skimage",)
 
     def denoise(self, planes: Planes) -> Planes:
+        """Filter ``(h, w, 4)``, patches compared over all four planes at once."""
         denoise_nl_means = self.library("skimage.restoration").denoise_nl_means
         settings = {"patch_size": 5, "patch_distance": 6, "fast_mode": True, "channel_axis": -1}
         return denoise_nl_means(planes, h=0.8 * self.strength, sigma=1.0, **settings)
@@ -105,17 +106,13 @@ class Wavelet(Classical):
     needs = ("skimage", "pywt")
 
     def denoise(self, planes: Planes) -> Planes:
+        """Filter ``(h, w, 4)``, each plane by itself."""
         denoise_wavelet = self.library("skimage.restoration").denoise_wavelet
         height, width, channels = planes.shape
         # VisuShrink cuts at sigma sqrt(2 log n); the factor is taken out, since on photographs it smooths too much.
         sigma = 3 * self.strength / np.sqrt(2 * np.log(height * width))
-        settings: dict[str, Any] = {
-            "sigma": [sigma] * channels,
-            "wavelet": "haar",
-            "method": "VisuShrink",
-            "mode": "hard",
-        }
-        settings |= {"rescale_sigma": False, "channel_axis": -1}
+        settings: dict[str, Any] = {"wavelet": "haar", "method": "VisuShrink", "mode": "hard", "rescale_sigma": False}
+        settings |= {"sigma": [sigma] * channels, "channel_axis": -1}
         settings["wavelet_levels"] = min(4, min(height, width).bit_length() - 1)
         mean = np.zeros_like(planes)
         for shift in product(range(4), repeat=2):
@@ -131,6 +128,7 @@ class TotalVariation(Classical):
     needs = ("skimage",)
 
     def denoise(self, planes: Planes) -> Planes:
+        """Filter ``(h, w, 4)``, each plane by itself."""
         denoise_tv_chambolle = self.library("skimage.restoration").denoise_tv_chambolle
         return denoise_tv_chambolle(planes, weight=0.4 * self.strength, channel_axis=-1)
 
@@ -148,6 +146,7 @@ class BM3D(Classical):
     advice = "licensed for non-commercial use only; run: pip install 'rawaug[bm3d]'"
 
     def denoise(self, planes: Planes) -> Planes:
+        """Filter ``(h, w, 4)`` in luminance and three differences of colour."""
         bm3d = self.library("bm3d")
         # Blocks are matched on the first channel: let that be the luminance, whose noise is lowest.
         return bm3d.bm3d(planes @ _HADAMARD, sigma_psd=[self.strength] * 4) @ _HADAMARD
@@ -157,10 +156,10 @@ class Transform(Protocol):
     """A variance-stabilising transform: after ``forward`` the noise has variance 1; ``inverse`` is free of bias."""
 
     def forward(self, y: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
-        """``(B, 4, h, w)`` RAW of var(y) = shot_var y + read_var, both ``(B,)``, to unit variance."""
+        """Transform RAW ``(B, 4, h, w)`` of var(y) = shot_var y + read_var, both ``(B,)``, to unit variance."""
 
     def inverse(self, z: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
-        """The estimate in the transform's domain back to RAW."""
+        """Transform an estimate ``(B, 4, h, w)`` in this domain back to RAW."""
 
 
 class Stabilised:

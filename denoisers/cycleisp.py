@@ -10,12 +10,12 @@ from __future__ import annotations
 import os
 import pickle
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
 import torch
 from torch import Tensor, nn
 
-from denoisers.network import PACKED, Denoiser, require_bounded, require_width
+from denoisers.network import Denoiser, Shared, conv, require_bounded, require_width
 from rawaug.registry import DENOISERS
 
 RENAMED = (("head.0.", "head."), ("SA.spatial.conv.", "spatial."), ("CA.conv_du.", "channel."), ("conv1x1.", "merge."))
@@ -25,17 +25,18 @@ UNUSED = ("blur.", "merge.0.")
 
 
 class DualAttentionBlock(nn.Module):
-    """``v + merge([spatial attention, channel attention] of conv(act(conv(v))))``."""
+    """A residual block whose features pass through attention over space and over channels; see the module."""
 
     def __init__(self, features: int, reduction: int, act: nn.PReLU) -> None:
         super().__init__()
         squeezed = features // reduction
         self.body = nn.Sequential(conv(features, features), act, conv(features, features))
-        self.spatial = nn.Conv2d(2, 1, 3, padding=1, bias=False)
-        self.channel = nn.Sequential(nn.Conv2d(features, squeezed, 1), nn.ReLU(), nn.Conv2d(squeezed, features, 1))
-        self.merge = nn.Conv2d(2 * features, features, 1)
+        self.spatial = conv(2, 1, bias=False)
+        self.channel = nn.Sequential(conv(features, squeezed, 1), nn.ReLU(), conv(squeezed, features, 1))
+        self.merge = conv(2 * features, features, 1)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Features ``(B, C, h, w)`` to features of the same shape."""
         f = self.body(x)
         where = self.spatial(torch.cat([f.amax(1, keepdim=True), f.mean(1, keepdim=True)], dim=1)).sigmoid()
         which = self.channel(f.mean((2, 3), keepdim=True)).sigmoid()
@@ -43,7 +44,14 @@ class DualAttentionBlock(nn.Module):
 
 
 class ResidualGroup(nn.Module):
-    """Dual-attention blocks and a convolution, added to their input."""
+    """Dual-attention blocks and a convolution, whose result is added to their input.
+
+    Args:
+        features: channels that come in and go out.
+        blocks: number of dual-attention blocks.
+        reduction: factor by which channel attention narrows the features.
+        act: the PReLU that all blocks of the network share.
+    """
 
     def __init__(self, features: int, blocks: int, reduction: int, act: nn.PReLU) -> None:
         super().__init__()
@@ -51,11 +59,22 @@ class ResidualGroup(nn.Module):
         self.body = nn.Sequential(*layers, conv(features, features))
 
     def forward(self, x: Tensor) -> Tensor:
+        """Features ``(B, C, h, w)`` to features of the same shape."""
         return x + self.body(x)
 
 
 class Trunk(nn.Module):
-    """What the three networks share: a first convolution, groups, a convolution and the one PReLU used all over."""
+    """The layers that all three of CycleISP's networks have: a first convolution, groups and a last convolution.
+
+    One PReLU, with a slope for each feature, is used all over.
+
+    Args:
+        inputs: channels that come in.
+        features: channels of all layers but the first.
+        groups: number of residual groups.
+        blocks: dual-attention blocks of each group.
+        reduction: factor by which channel attention narrows the features.
+    """
 
     def __init__(self, inputs: int, features: int, groups: int, blocks: int, reduction: int) -> None:
         super().__init__()
@@ -65,12 +84,10 @@ class Trunk(nn.Module):
         self.body = nn.Sequential(*layers, conv(features, features), act)
 
 
-def conv(inputs: int, outputs: int) -> nn.Conv2d:
-    return nn.Conv2d(inputs, outputs, 3, padding=1)
-
-
 def load_published(network: nn.Module, path: str | os.PathLike[str], part: str) -> None:
-    """Take the weights of a published checkpoint; nothing in it is run as code; ``part`` names the network in messages.
+    """Load the weights of a published checkpoint into a network; nothing in the file is run as code.
+
+    ``part`` is what messages call the network.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -99,7 +116,7 @@ def _read_state(path: Path) -> dict[str, Tensor]:
 
 
 def _own_names(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Published names of layers to those here, without the layers that are of no use."""
+    """Rename the layers of a published checkpoint to those here, and leave out :data:`UNUSED` ones."""
     renamed = {}
     for name, value in state.items():
         key = name.removeprefix("module.")
@@ -128,6 +145,7 @@ class CycleISPDenoiser(Denoiser):
         torch.Size([1, 4, 20, 30])
     """
 
+    defaults: ClassVar[Shared] = {**Denoiser.defaults, "deviation": False}
     tiny: ClassVar[dict[str, Any]] = {"width": 8, "groups": 1, "blocks": 1, "reduction": 4}
 
     def __init__(
@@ -136,34 +154,30 @@ class CycleISPDenoiser(Denoiser):
         groups: int = 4,
         blocks: int = 8,
         reduction: int = 16,
-        channels: int = PACKED,
-        variance_map: bool = True,
-        deviation: bool = False,
-        domain: str = "linear",
-        seed: int = 0,
+        **shared: Unpack[Shared],
     ) -> None:
         require_width(width, multiple=max(reduction, 1))
         if min(groups, blocks, reduction) < 1:
             raise ValueError(f"groups, blocks and reduction must be at least 1, got {groups}, {blocks}, {reduction}")
-        require_bounded(seed, blocks=groups * blocks)
+        require_bounded(blocks=groups * blocks)
         config = {"width": width, "groups": groups, "blocks": blocks, "reduction": reduction}
-        super().__init__(channels, variance_map, deviation, 1, config, domain)
-        with torch.random.fork_rng(devices=[]):  # every weight is drawn anew below, from the seed
-            self.trunk = Trunk(self.inputs, width, groups, blocks, reduction)
-            last = conv(width, channels)
+        super().__init__(config, **shared)
+        self.trunk = Trunk(self.inputs, width, groups, blocks, reduction)
+        last = conv(width, self.channels)
         self.trunk.tail = nn.Sequential(last)
         # As in DHDN: thirty-two residual blocks one after another stay tame when each starts as the identity.
         ends = [module.merge for module in self.modules() if isinstance(module, DualAttentionBlock)]
-        self.initialise(seed, last, *ends)
+        self.initialise(self.seed, last, *ends)
 
     def residual(self, features: Tensor) -> Tensor:
+        """Compute the correction ``(B, channels, h, w)`` from features ``(B, inputs, h, w)``."""
         trunk = self.trunk
         correction: Tensor = trunk.tail(trunk.body(trunk.head(features)))  # type: ignore[operator]
         return correction
 
     @classmethod
     def from_published(cls, path: str | os.PathLike[str]) -> CycleISPDenoiser:
-        """The network with the weights of a published checkpoint (``sidd_denoising_raw.pth``), in eval mode.
+        """Make the network with the weights of a published checkpoint (``sidd_denoising_raw.pth``), in eval mode.
 
         The weights are for RAW in RGGB, clipped to [0, 1]; errors are those of :func:`load_published`.
         """

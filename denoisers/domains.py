@@ -31,9 +31,9 @@ _LEAST_RATIO = 1e-3
 
 
 def fit_levels(noisy: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """shot_var and read_var ``(B, 1, 1, 1)`` of a noise map ``(B, C, h, w)``, by least squares; neither is negative.
+    """Fit shot_var and read_var, each ``(B, 1, 1, 1)``, to a noise map ``(B, C, h, w)`` by least squares.
 
-    What ``noisy`` has beyond C channels, such as planes of colours, does not count.
+    Neither is negative. Channels that ``noisy`` has beyond the map's C, such as planes of colours, do not count.
     """
     light, axes = noisy[:, : variance.shape[1]].clamp_min(0.0), (1, 2, 3)
     mean, level = light.mean(axes, keepdim=True), variance.mean(axes, keepdim=True)
@@ -44,40 +44,48 @@ def fit_levels(noisy: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Domain(ABC):
-    """A transform of RAW ``(B, C, h, w)``, and back; levels are ``(B, 1, 1, 1)``."""
+    """A transform of RAW ``(B, C, h, w)`` of shot_var and read_var ``(B, 1, 1, 1)``, and its inverse."""
 
     least_shot: ClassVar[float]
 
     def forward(self, y: Tensor, shot: Tensor, read: Tensor) -> Tensor:
-        """RAW to what the network sees."""
+        """Transform RAW ``(B, C, h, w)`` to the signal that the network sees."""
         shot = self.bounded(shot, read)
         return self.encode(y / shot + read / shot.square())
 
     def inverse(self, z: Tensor, shot: Tensor, read: Tensor) -> Tensor:
-        """What the network gives back to RAW."""
+        """Transform a network's clean signal ``(B, C, h, w)`` back to RAW."""
         shot = self.bounded(shot, read)
         return shot * (self.decode(z) - read / shot.square())
 
     def bounded(self, shot: Tensor, read: Tensor) -> Tensor:
-        """The shot_var that photons are counted with."""
+        """The shot_var ``(B, 1, 1, 1)`` that photons are counted with: at least :attr:`least_shot`."""
         return torch.maximum(shot.clamp_min(self.least_shot), _LEAST_RATIO * read.sqrt())
 
     def relative_deviation(self, y: Tensor, variance: Tensor, shot: Tensor, read: Tensor) -> Tensor:
-        """The noise's deviation over what the transform takes it for: below 1 where shot_var is below its bound."""
+        """Divide the noise's deviation by the one that the transform takes it for.
+
+        The quotient, of the shape of ``y``, is 1, and below 1 where shot_var is below its bound.
+
+        Args:
+            y: RAW ``(B, C, h, w)``.
+            variance: the noise variance of each value, of the same shape.
+            shot, read: the levels ``(B, 1, 1, 1)``.
+        """
         expected = noise_variance(y, self.bounded(shot, read), read)
         return (variance / expected.clamp_min(1e-20)).sqrt().clamp_max(1.0)
 
     @abstractmethod
     def encode(self, u: Tensor) -> Tensor:
-        """Of a signal whose noise has the variance u."""
+        """Transform a count u, ``(B, C, h, w)``, whose noise has the variance u."""
 
     @abstractmethod
     def decode(self, z: Tensor) -> Tensor:
-        """The inverse of :meth:`encode`."""
+        """Transform a signal ``(B, C, h, w)`` back to counts, the inverse of :meth:`encode`."""
 
 
 class KSigma(Domain):
-    """PMRID's: noise as that of ISO 1600, in PMRID's units. White grows with 1 / s, so its bound is a high one."""
+    """PMRID's domain: every noise becomes that of ISO 1600. White grows with 1 / s, so ``least_shot`` is high."""
 
     least_shot = 6e-4
     shot = 5.995267e-4 * 1600 + 8.68861e-3
@@ -85,11 +93,11 @@ class KSigma(Domain):
     scale = 256.0 / 959.0
 
     def encode(self, u: Tensor) -> Tensor:
-        """Linear in u."""
+        """Scale and shift counts ``(B, C, h, w)`` to PMRID's units."""
         return (u * self.shot - self.read / self.shot) * self.scale
 
     def decode(self, z: Tensor) -> Tensor:
-        """Linear in z."""
+        """Scale and shift PMRID's units ``(B, C, h, w)`` to counts."""
         return (z / self.scale + self.read / self.shot) / self.shot
 
 
@@ -100,16 +108,16 @@ class Anscombe(Domain):
     offset = 0.375
 
     def encode(self, u: Tensor) -> Tensor:
-        """The root of u + 3/8, below u = 0 its tangent."""
+        """Take the root of u + 3/8 of counts ``(B, C, h, w)``; below u = 0 follow its tangent."""
         root = 2.0 * (u.clamp_min(0.0) + self.offset).sqrt()
         return root + u.clamp_max(0.0) / math.sqrt(self.offset)
 
     def decode(self, z: Tensor) -> Tensor:
-        """The square, below the root's value at 0 the tangent's inverse."""
+        """Square a signal ``(B, C, h, w)``; below the root's value at 0 invert the tangent."""
         least = 2.0 * math.sqrt(self.offset)
         square = (z.clamp_min(least) / 2.0).square() - self.offset
         return square + (z - least).clamp_max(0.0) * math.sqrt(self.offset)
 
 
 DOMAINS = MappingProxyType({"ksigma": KSigma(), "anscombe": Anscombe()})
-"""Name to transform; ``linear`` is none."""
+"""The transforms by name; ``linear`` needs none."""

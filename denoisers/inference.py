@@ -15,11 +15,11 @@ from denoisers.network import PACKED
 from rawaug import bayer
 
 OVERLAP = 96
-"""Of tiles, at least."""
+"""Packed pixels by which tiles overlap where nothing else is said."""
 
 
 def _pieces(size: int, tile: int, overlap: int, stride: int) -> tuple[list[int], int]:
-    """Where the tiles begin along a side, and how long they are, at most ``tile``; the last one reaches the end."""
+    """The starts of the tiles along a side, the last of which reaches the end, and their length, at most ``tile``."""
     count = max(1, -(-(size - 2 * overlap) // (tile - 2 * overlap)))
     step = -(-(size - 2 * overlap) // (count * stride)) * stride if count > 1 else tile - 2 * overlap
     side = max(step + 2 * overlap, 2 * stride)
@@ -91,14 +91,14 @@ VIEWS = (4, bayer.N_VIEWS)
 
 
 def to_view(packed: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
-    """``(B, 4, h, w)`` to the turned picture with the same CFA: a side is one cell longer where the pattern moved."""
+    """Turn packed RAW ``(B, 4, h, w)`` and keep its CFA: a side is one cell longer where the pattern has moved."""
     rows, columns = cfa.turn(view).shift_to(cfa)
     turned = bayer.turn(bayer.unpack(packed, cfa), view)
     return bayer.pack(F.pad(turned, (columns, columns, rows, rows), mode="reflect"), cfa)
 
 
 def from_view(image: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
-    """The inverse of :func:`to_view`, of packed RAW or of full colour ``(B, 3, 2h, 2w)``."""
+    """Undo :func:`to_view` on packed RAW ``(B, 4, h, w)`` or on full colour ``(B, 3, 2h, 2w)``."""
     packed = image.shape[1] == PACKED
     turned = bayer.crop_to_cfa(bayer.unpack(image, cfa) if packed else image, cfa, cfa.turn(view))
     upright = bayer.turn_back(turned, view)
@@ -165,11 +165,17 @@ class SelfEnsemble(nn.Module):
 
 
 class Recorrupted(nn.Module):
-    """A denoiser averaged over ``draws`` of extra noise, ``mean of f(y + alpha m)``: ``draws + 1`` times the work.
+    """A denoiser averaged over draws of extra noise, ``mean of f(y + alpha m)``: ``draws + 1`` times the work.
 
     A network that was trained on recorrupted frames gets the input it knows, and the average removes most of what the
-    added noise costs. ``m`` has the noise's variance at ``f(y)``, as at ``y`` it would follow the noise, and is the
-    same in every call; ``alpha`` is its deviation over that of the noise. Source: Pang et al., CVPR 2021, section 3.3.
+    added noise costs. ``m`` has the noise's variance at ``f(y)``, since at ``y`` it would follow the noise, and is the
+    same in every call. Source: Pang et al., CVPR 2021, section 3.3.
+
+    Args:
+        model: ``model(noisy, variance) -> denoised``, all ``(B, 4, h, w)``.
+        alpha: the deviation of the added noise over that of the frame's own.
+        draws: how many noisier copies are averaged.
+        seed: the added noise is drawn from it.
     """
 
     def __init__(

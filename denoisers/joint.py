@@ -26,7 +26,7 @@ REACH = 2
 
 
 def _stencils() -> Tensor:
-    """``(12, 1, 6, 6)``: of each colour and site of a cell, what D takes of the cell and its neighbours."""
+    """For each colour and site of a cell, the weights that D gives the cell and its neighbours: ``(12, 1, 6, 6)``."""
     found, kinds = demosaicing_stencils(CFA.RGGB, "malvar")
     side = 2 * REACH + 1
     own = torch.zeros(1, side, side, device="cpu")
@@ -72,8 +72,8 @@ class JointDRUNet(DRUNet):
         domain: str = "anscombe",
         seed: int = 0,
     ) -> None:
-        require_bounded(seed, refine=refine)
-        super().__init__(width, scales, blocks, limits, mend, PACKED, False, True, domain, seed)
+        require_bounded(refine=refine)
+        super().__init__(width, scales, blocks, limits, mend, variance_map=False, domain=domain, seed=seed)
         own = {"width": width, "scales": scales, "blocks": blocks, "limits": limits, "mend": mend}
         self.config = {**own, "refine": refine, "domain": domain}
         self.refine = nn.Sequential(*(ResidualBlock(width) for _ in range(refine)))
@@ -83,11 +83,12 @@ class JointDRUNet(DRUNet):
         self.initialise(seed, self.tail, self.detail, *ends, gain=1.0)
 
     def residual(self, features: Tensor) -> Tensor:
+        """Compute the correction of full colour ``(B, 3, 2h, 2w)`` from features ``(B, inputs, h, w)``."""
         x = self.body(features)
         return self.base_image(self.tail(x)) + F.pixel_shuffle(self.detail(self.refine(x)), 2)
 
     def base_image(self, packed: Tensor) -> Tensor:
-        """D of packed RAW, as :func:`rawaug.bayer.demosaic` gives it."""
+        """Demosaic packed RAW ``(B, 4, h, w)`` by D to ``(B, 3, 2h, 2w)``, as :func:`rawaug.bayer.demosaic` does."""
         device = packed.device.type
         # in bfloat16 the signal would lose the digits that hold its noise
         full = torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()

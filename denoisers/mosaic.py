@@ -14,6 +14,7 @@ hold a red, two greens and a blue as well. At half its sides every mosaic become
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -34,27 +35,36 @@ SPREAD = RGB * SITES
 Levels = tuple[Tensor, Tensor]
 """shot_var and read_var, ``(B, 1, 1, 1)``, or of every pixel ``(B, 1, H, W)``."""
 
-
 _MET = ("RGGB", "XTRANS", "QUAD-RGGB+1+1")
-"""Where every 2 x 2 square has all colours, as far as the pattern lets it."""
+"""The phases in which a network meets the patterns: most of the 2 x 2 squares then hold all three colours."""
 
 
 def entry_pattern(pattern: bayer.Pattern) -> bayer.Pattern:
-    """The pattern from where a network is trained to meet it: its origin, or one line before it either way."""
+    """The pattern as a network is trained to meet it: from its own origin, or from one line above or to the left."""
     places = {known.shift(i, j) for known in map(bayer.pattern, _MET) for i in range(0, 6, 2) for j in range(0, 6, 2)}
     return next(moved for i in (0, 1) for j in (0, 1) if (moved := pattern.shift(-i, -j)) in places)
 
 
 def with_planes(mosaic: Tensor, pattern: bayer.Pattern) -> Tensor:
-    """A mosaic ``(B, 1, H, W)`` and the planes of its colours, ``(B, 4, H, W)``."""
+    """Put the planes of its colours behind a mosaic ``(B, 1, H, W)``: ``(B, 4, H, W)``."""
     planes = pattern.planes(*mosaic.shape[-2:]).to(mosaic)
     return torch.cat([mosaic, planes.expand(len(mosaic), -1, -1, -1)], dim=1)
 
 
 def denoise_mosaic(run: Callable[[Tensor, Tensor], Tensor], mosaic: Tensor, variance: Tensor, cfa: str) -> Tensor:
-    """A mosaic ``(1, 1, H, W)`` of any pattern denoised by ``run``, such as a :class:`MosaicDRUNet`, or its tiles.
+    """Denoise a mosaic of any pattern and phase.
 
-    It gets a mirrored line above or on the left where the network is trained to meet the pattern one line earlier.
+    Where the network is trained to meet the pattern one line earlier, the mosaic gets a mirrored line above or on the
+    left, which is cropped from the result.
+
+    Args:
+        run: a :class:`MosaicDRUNet`, or a function that denoises by one tile after the other.
+        mosaic: ``(1, 1, H, W)``, white = 1.
+        variance: the noise variance of each value, of the same shape.
+        cfa: the name of the pattern.
+
+    Returns:
+        The denoised mosaic ``(1, 1, H, W)``.
     """
     known = bayer.pattern(cfa)
     top, left = next((i, j) for i in (0, 1) for j in (0, 1) if known.shift(-i, -j) == entry_pattern(known))
@@ -63,10 +73,11 @@ def denoise_mosaic(run: Callable[[Tensor, Tensor], Tensor], mosaic: Tensor, vari
 
 
 def mend_mosaic(signal: Tensor, planes: Tensor) -> Tensor:
-    """A mosaic ``(B, 1, H, W)`` with noise of deviation 1, hot and dead pixels replaced by their neighbours' mean.
+    """Replace the hot and dead pixels of a mosaic ``(B, 1, H, W)``, whose noise has deviation 1.
 
-    A defect lies beyond all pixels of its colour within two of it by :data:`denoisers.network.DEFECT`; the pixels that
-    touch it do not depart from theirs as much.
+    ``planes`` ``(B, 3, H, W)`` say which colour each pixel has. A defect lies beyond all pixels of its colour within
+    two of it by :data:`denoisers.network.DEFECT`, while the pixels that touch it depart less from theirs. It becomes
+    the mean of its neighbours without their lowest and highest.
     """
     near = _neighbours(torch.cat([signal, planes.argmax(1, keepdim=True).to(signal)], dim=1), 2)
     colour = planes.argmax(1, keepdim=True)
@@ -125,7 +136,9 @@ class MosaicDRUNet(DRUNet):
     ) -> None:
         if domain == "linear":
             raise ValueError("domain linear is for networks of packed RAW; choose ksigma or anscombe")
-        super().__init__(width, scales, blocks, limits, mend, PACKED, False, True, domain, seed, 1, pyramid)
+        super().__init__(
+            width, scales, blocks, limits, mend, pyramid=pyramid, variance_map=False, domain=domain, seed=seed
+        )
         own = {"width": width, "scales": scales, "blocks": blocks, "limits": limits, "mend": mend}
         self.config = {**own, "domain": domain} | ({"pyramid": pyramid} if pyramid else {})
         self.multiple, self.stride = 2 * self.multiple, 2 * self.stride
@@ -137,7 +150,7 @@ class MosaicDRUNet(DRUNet):
 
     @torch.no_grad()
     def start_from(self, model: Denoiser) -> None:
-        """Take the weights of another of this class, or of a DRUNet of packed RAW, each of whose planes is spread."""
+        """Take the weights of a network of this class, or of a DRUNet of packed RAW, spreading its planes by site."""
         state = model.state_dict()
         if not isinstance(model, MosaicDRUNet):
             head = state["head.weight"].unflatten(1, (-1, PACKED))
@@ -156,17 +169,11 @@ class MosaicDRUNet(DRUNet):
             raise ValueError(f"{name} takes a mosaic and its planes, (B, 4, H >= 4, W >= 4), got {tuple(noisy.shape)}")
         self._require_type(noisy, "noisy")
         raw, planes = noisy[:, :1], noisy[:, 1:]
-        variance = self._required(raw, variance)
+        variance = self._require_variance(raw, variance)
         levels = fit_levels(raw.float(), variance.float())
-        whole = self._repaired(raw, planes, levels) if self.mend else raw
+        whole = self._mend(raw, levels, partial(mend_mosaic, planes=planes)) if self.mend else raw
         denoised = self._at_halves(whole, planes, levels, (whole >= 1.0).to(raw), self.pyramid)
         return torch.where(variance > 0, denoised, raw)
-
-    def _repaired(self, raw: Tensor, planes: Tensor, levels: Levels) -> Tensor:
-        domain = DOMAINS[self.domain]
-        signal = domain.forward(raw.float(), *levels)
-        repaired = mend_mosaic(signal, planes)
-        return torch.where(repaired == signal, raw, domain.inverse(repaired, *levels).to(raw.dtype))
 
     def _at_halves(self, raw: Tensor, planes: Tensor, levels: Levels, clipped: Tensor, halvings: int) -> Tensor:
         """As a network of packed RAW has it: ``g(y) = f(y) + U k(g(B y) - B f(y))``; B y is a mosaic of RGGB."""
@@ -199,7 +206,7 @@ class MosaicDRUNet(DRUNet):
         return domain.inverse(signal + correction, *levels).to(raw.dtype)
 
     def residual(self, features: Tensor) -> Tensor:
-        """Planes, signal and limits ``(B, 4 or 6, H, W)`` to the correction ``(B, 1, H, W)``."""
+        """Compute the correction ``(B, 1, H, W)`` from planes, signal and limits ``(B, 4 or 6, H, W)``."""
         planes, maps = features[:, :RGB], features[:, RGB:]
         sites = F.pixel_unshuffle(planes, 2)
         spread = [F.pixel_unshuffle(planes * one, 2) for one in maps.split(1, dim=1)]
@@ -214,7 +221,7 @@ class MosaicDRUNet(DRUNet):
 
 
 class BayerAdapter(nn.Module):
-    """A :class:`MosaicDRUNet` as a network of packed RAW, ``(B, 4, h, w)`` of RGGB, like the others."""
+    """A :class:`MosaicDRUNet` that is called like a network of packed RAW, ``(B, 4, h, w)`` of RGGB."""
 
     reads_variance = True
 
@@ -225,7 +232,7 @@ class BayerAdapter(nn.Module):
         self.mixed = network.mixed
 
     def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
-        """Packed RAW and its variance to packed RAW, as any :class:`denoisers.Denoiser`."""
+        """Denoise packed RAW ``(B, 4, h, w)`` with a variance map of the same shape."""
         raw, told = (bayer.unpack(x, bayer.CFA.RGGB) for x in (noisy, variance))
         return bayer.pack(self.network(with_planes(raw, bayer.pattern("RGGB")), told), bayer.CFA.RGGB)
 

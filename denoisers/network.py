@@ -17,10 +17,12 @@ identity.
 
 from __future__ import annotations
 
+import inspect
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from functools import reduce
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypedDict, Unpack
 
 import torch
 from torch import Tensor, nn
@@ -63,7 +65,19 @@ def conv(
     groups: int = 1,
     padding: int | None = None,
 ) -> nn.Conv2d:
-    """A convolution that keeps the size, or divides it by ``stride``; :meth:`Denoiser.initialise` draws its weights."""
+    """A convolution that keeps the sides of a picture or divides them by ``stride``.
+
+    Its weights are left as they are in memory; :meth:`Denoiser.initialise` draws those of the whole network.
+
+    Args:
+        inputs: channels that come in, a multiple of ``groups``.
+        outputs: channels that go out.
+        size: side of the square kernel.
+        bias: whether the layer adds a constant to each channel.
+        stride: step from one output pixel to the next.
+        groups: parts of the channels that do not see each other; as many as there are inputs for a depthwise layer.
+        padding: zeros around the picture, half of ``size`` by default.
+    """
     settings = {"stride": stride, "groups": groups, "padding": size // 2 if padding is None else padding}
     return nn.utils.skip_init(
         nn.Conv2d, inputs, outputs, size, bias=bias, device=torch.get_default_device(), **settings
@@ -89,17 +103,17 @@ def require_width(width: int, multiple: int = 1) -> None:
     require_between("width", width, 1, MOST_FEATURES)
 
 
-def require_bounded(seed: int, **layers: int) -> None:
-    """Refuse what would never be built: more than :data:`MOST_LAYERS` of what is counted, or no seed of PyTorch's."""
-    require_between("seed", seed, -(2**63), 2**63 - 1)
+def require_bounded(**layers: int) -> None:
+    """Refuse more layers than :data:`MOST_LAYERS`, which no machine would build; each by the name of its setting."""
     for key, number in layers.items():
         require_between(key, number, 0, MOST_LAYERS)
 
 
 def mend_planes(signal: Tensor) -> Tensor:
-    """Packed RAW ``(B, 4, h, w)`` with noise of deviation 1, hot and dead pixels replaced by their neighbours' mean.
+    """Replace the hot and dead pixels of packed RAW ``(B, 4, h, w)``, whose noise has deviation 1.
 
-    A defect lies beyond all eight neighbours of its colour by :data:`DEFECT`; the other colours of its cell do not.
+    A pixel is a defect if it lies beyond all eight neighbours of its colour by :data:`DEFECT` while the other colours
+    of its cell follow theirs. It becomes the mean of its neighbours without their lowest and highest.
     """
     height, width = signal.shape[-2:]
     padded = F.pad(signal, (1, 1, 1, 1), mode="reflect")
@@ -110,19 +124,26 @@ def mend_planes(signal: Tensor) -> Tensor:
     deviations, share = DEFECT
     beyond = (signal > high + share * high.abs() + deviations) | (signal < low - share * low.abs() - deviations)
     departure = (signal - mean).abs()
+    # An edge or a small light moves several colours of a cell at once, a defect one alone.
     alone = departure > 4.0 * departure.topk(2, dim=1).values[:, 1:]
     return torch.where(beyond & alone, mean, signal)
 
 
 def halve(picture: Tensor) -> Tensor:
-    """A picture at half its sides; packed RAW, whose sites are those of RGGB, is binned around the new sites."""
+    """Average a picture ``(B, C, h, w)``, sides even, to half its sides, ``(B, C, h/2, w/2)``.
+
+    Packed RAW, whose sites are those of RGGB, is binned around the places of the new sites.
+    """
     if picture.shape[1] != PACKED:
         return F.avg_pool2d(picture, 2)
     return bayer.pack(bayer.bin_mosaic(bayer.unpack(picture, bayer.CFA.RGGB), bayer.CFA.RGGB, 2), bayer.CFA.RGGB)
 
 
 def double(picture: Tensor) -> Tensor:
-    """A picture at twice its sides, linear between its places, which for packed RAW are those of :func:`halve`."""
+    """Interpolate a picture ``(B, C, h, w)`` linearly to twice its sides, ``(B, C, 2h, 2w)``.
+
+    The sites of packed RAW are where :func:`halve` puts them.
+    """
     if picture.shape[1] != PACKED:
         return F.interpolate(picture, scale_factor=2, mode="bilinear")
     taps = torch.tensor([[3.0, 7, 5, 1], [1, 5, 7, 3]], device=picture.device) / 8  # of the first and second site
@@ -131,28 +152,50 @@ def double(picture: Tensor) -> Tensor:
     return F.conv_transpose2d(padded, kernels.to(picture.dtype), stride=2, padding=3, groups=PACKED)
 
 
+class Shared(TypedDict, total=False):
+    """The settings that every network takes besides its own; :class:`Denoiser` explains them."""
+
+    channels: int
+    variance_map: bool
+    deviation: bool
+    domain: str
+    seed: int
+
+
 class Denoiser(nn.Module, ABC):
     """Base of the networks: ``model(noisy, variance=None) -> denoised``, all ``(B, channels, h, w)``, white = 1.
 
-    The networks also take ``seed``, from which :meth:`initialise` draws their weights.
+    A network's constructor takes its own settings and ``**shared``, and hands the latter on.
 
     Args:
-        channels: of the picture, 4 for packed RAW, at most 65536.
-        variance_map: feed the noise map as ``channels`` more inputs; calls must then pass ``variance``.
-        deviation: feed the standard deviation, sqrt(variance), in place of the variance; matters to a noise map only.
-        stride: sides are padded to multiples of this inside.
-        config: the constructor's arguments, kept with the weights so that the same network can be built again.
-        domain: ``linear``, or a transform of :mod:`denoisers.domains`; calls must then pass ``variance``, a map
-            ``shot_var max(noisy, 0) + read_var``.
+        config: the network's own settings, kept with the weights so that the same network can be built again.
+        stride: inside, the sides of a picture are padded to multiples of this.
         limits: feed, as two times ``channels`` more inputs, how far the transformed signal is above 0 and below white,
             at most :data:`NEAR`: where photons are few, and where the sensor clips. Not in the domain ``linear``.
         mend: put :func:`mend_planes` before the network, of packed RAW. Not in the domain ``linear``.
         pyramid: times, 0 to 4, that the sides are halved to denoise there too, where wide noise is narrow, and to take
             what is wide from there; a quarter to a third more work. Not where the result is demosaiced.
+        channels: of the picture, 1 to 65536; 4, packed RAW, by default.
+        variance_map: feed the noise map as ``channels`` more inputs; calls must then pass ``variance``.
+        deviation: feed the standard deviation, sqrt(variance), in place of the variance; matters to a noise map only.
+        domain: ``linear``, or a transform of :mod:`denoisers.domains`; calls must then pass ``variance``, a map
+            ``shot_var max(noisy, 0) + read_var``.
+        seed: the network draws its first weights from it.
 
     Raises:
-        ValueError: if there is no such domain, or it does not go with the rest.
+        TypeError: if there is no such setting.
+        ValueError: if there is no such domain, it does not go with the rest, or a number is out of range.
     """
+
+    defaults: ClassVar[Shared] = {
+        "channels": PACKED,
+        "variance_map": True,
+        "deviation": True,
+        "domain": "linear",
+        "seed": 0,
+    }
+    """What the shared settings are where a call leaves them out."""
+    __signature__: ClassVar[inspect.Signature]
 
     tiny: ClassVar[dict[str, Any]] = {}
     """Settings of a network of a few thousand weights, for the smoke form of a recipe."""
@@ -161,19 +204,29 @@ class Denoiser(nn.Module, ABC):
     upscale: ClassVar[int] = 1
     """Sides of the result over those of packed RAW: 2 where it is demosaiced, ``(B, 3, 2h, 2w)``."""
 
+    def __init_subclass__(cls) -> None:
+        """Let ``help`` and recipes see the shared settings by name, in place of ``**shared``."""
+        own = inspect.signature(cls.__init__).parameters
+        shown = [parameter for name, parameter in own.items() if name not in ("self", "shared")]
+        for name, value in cls.defaults.items() if "shared" in own else ():
+            keyword = inspect.Parameter.KEYWORD_ONLY
+            shown.append(inspect.Parameter(name, keyword, default=value, annotation=type(value).__name__))
+        cls.__signature__ = inspect.Signature(shown)
+
     def __init__(
         self,
-        channels: int,
-        variance_map: bool,
-        deviation: bool,
-        stride: int,
         config: dict[str, Any],
-        domain: str = "linear",
+        stride: int = 1,
         limits: bool = False,
         mend: bool = False,
         pyramid: int = 0,
+        **shared: Unpack[Shared],
     ) -> None:
         super().__init__()
+        if unknown := shared.keys() - Denoiser.defaults.keys():
+            raise TypeError(f"{type(self).__name__} has no setting {min(unknown)!r}")
+        settings: Shared = {**self.defaults, **shared}
+        channels, domain, self.seed = settings["channels"], settings["domain"], settings["seed"]
         if (limits or mend) and domain == "linear":
             raise ValueError("limits and mend need a transformed signal; choose domain ksigma or anscombe")
         if mend and channels != PACKED:
@@ -181,15 +234,14 @@ class Denoiser(nn.Module, ABC):
         if domain != "linear" and domain not in DOMAINS:
             raise ValueError(f"domain {domain!r} is unknown; use one of linear, {', '.join(DOMAINS)}")
         require_between("channels", channels, 1, MOST_FEATURES)
+        require_between("seed", self.seed, -(2**63), 2**63 - 1)
         require_between("pyramid", pyramid, 0, MOST_HALVINGS)
         self.domain, self.limits, self.mend, self.pyramid = domain, limits, mend, pyramid
         self.channels = channels
-        self.variance_map = variance_map
-        self.deviation = deviation
-        self.multiple = stride
-        self.stride = stride << pyramid
-        shared = {"channels": channels, "variance_map": variance_map, "deviation": deviation}
-        self.config: dict[str, Any] = {**config, **shared} | ({} if domain == "linear" else {"domain": domain})
+        self.variance_map, self.deviation = settings["variance_map"], settings["deviation"]
+        self.multiple, self.stride = stride, stride << pyramid
+        self.config = {**config, **{key: value for key, value in settings.items() if key not in ("domain", "seed")}}
+        self.config |= {} if domain == "linear" else {"domain": domain}
 
     @property
     def inputs(self) -> int:
@@ -203,10 +255,13 @@ class Denoiser(nn.Module, ABC):
 
     @abstractmethod
     def residual(self, features: Tensor) -> Tensor:
-        """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction, of the result's shape."""
+        """Compute the correction ``(B, channels, h, w)`` from features ``(B, inputs, h, w)``.
+
+        The sides are multiples of ``stride``. A network with :attr:`upscale` 2 gives the correction of its result.
+        """
 
     def base_image(self, packed: Tensor) -> Tensor:
-        """What the correction is added to: the input itself, or what it is in the result's shape."""
+        """The picture that the correction is added to: ``(B, channels, h, w)`` itself, unless the result is larger."""
         return packed
 
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
@@ -220,14 +275,16 @@ class Denoiser(nn.Module, ABC):
             raise ValueError(f"{name} takes (B, {self.channels}, h >= 2, w >= 2), got {tuple(noisy.shape)}")
         self._require_type(noisy, "noisy")
         if self.reads_variance:
-            variance = self._required(noisy, variance)
-        whole = noisy if variance is None or not self.mend else self._mended(noisy, variance)
+            variance = self._require_variance(noisy, variance)
+        whole = noisy
+        if variance is not None and self.mend:
+            whole = self._mend(noisy, fit_levels(noisy.float(), variance.float()), mend_planes)
         denoised = self._at_scales(whole, variance, (whole >= 1.0).to(noisy.dtype), self.pyramid)
         if variance is None or self.domain == "linear" or self.upscale > 1:
             return denoised
         return torch.where(variance > 0, denoised, noisy)
 
-    def _required(self, noisy: Tensor, variance: Tensor | None) -> Tensor:
+    def _require_variance(self, noisy: Tensor, variance: Tensor | None) -> Tensor:
         name = type(self).__name__
         if variance is None:
             needed = "variance_map=True" if self.variance_map else f"domain={self.domain!r}"
@@ -253,14 +310,14 @@ class Denoiser(nn.Module, ABC):
         correction = maps[0] * correction if self.variance_map else correction
         return domain.inverse(self.base_image(signal) + correction, *levels).to(noisy.dtype)
 
-    def _mended(self, noisy: Tensor, variance: Tensor) -> Tensor:
-        domain, levels = DOMAINS[self.domain], fit_levels(noisy.float(), variance.float())
+    def _mend(self, noisy: Tensor, levels: tuple[Tensor, Tensor], mend: Callable[[Tensor], Tensor]) -> Tensor:
+        domain = DOMAINS[self.domain]
         signal = domain.forward(noisy.float(), *levels)
-        repaired = mend_planes(signal)
+        repaired = mend(signal)
         return torch.where(repaired == signal, noisy, domain.inverse(repaired, *levels).to(noisy.dtype))
 
     def _at_scales(self, noisy: Tensor, variance: Tensor | None, clipped: Tensor, halvings: int) -> Tensor:
-        """``g(y) = f(y) + U k(g(B y) - B f(y))``, f at one scale, ``clipped`` the share of clipped values."""
+        """The recursion ``g(y) = f(y) + U k(g(B y) - B f(y))``; ``clipped`` is the share of clipped values."""
         denoised = self._at_one_scale(noisy, variance)
         if not halvings:
             return denoised
@@ -286,14 +343,14 @@ class Denoiser(nn.Module, ABC):
         return next((p.dtype for p in self.parameters()), torch.get_default_dtype())
 
     def _require_type(self, image: Tensor, what: str) -> None:
-        """Weights and RAW are of one type, but for mixed precision, which converts by itself."""
+        """Raise ValueError unless an image has the type of the weights; mixed precision converts by itself."""
         if not image.is_floating_point():
             raise ValueError(f"{what} must be floating-point RAW with white at 1, got {image.dtype}")
         if image.dtype != self._dtype and not torch.is_autocast_enabled(image.device.type):
             raise ValueError(f"{what} is {image.dtype} but the network is {self._dtype}; convert one of them")
 
     def start_from(self, model: Denoiser) -> None:
-        """Take the weights of a network of this class, or of one of its bases: what it has beyond them is kept."""
+        """Take the weights of a network of this class or of one of its bases; layers beyond those stay as they are."""
         self.load_state_dict(model.state_dict(), strict=type(self) is type(model))
 
     @torch.no_grad()

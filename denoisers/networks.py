@@ -5,13 +5,13 @@ The settings that they share are those of :class:`denoisers.Denoiser`. Any heigh
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.network import LEAK, MOST_SCALES, PACKED, RESIDUAL_GAIN, Denoiser, conv, require_bounded, require_width
+from denoisers.network import LEAK, MOST_SCALES, RESIDUAL_GAIN, Denoiser, Shared, conv, require_bounded, require_width
 from rawaug.registry import DENOISERS, require_between
 
 PUBLISHED_WIDTH = 32
@@ -46,28 +46,18 @@ class UNet(Denoiser):
 
     tiny: ClassVar[dict[str, Any]] = {"width": 4, "scales": 2}
 
-    def __init__(
-        self,
-        width: int = PUBLISHED_WIDTH,
-        scales: int = 5,
-        channels: int = PACKED,
-        variance_map: bool = True,
-        deviation: bool = True,
-        domain: str = "linear",
-        seed: int = 0,
-    ) -> None:
+    def __init__(self, width: int = PUBLISHED_WIDTH, scales: int = 5, **shared: Unpack[Shared]) -> None:
         require_width(width)
         require_between("scales", scales, 1, MOST_SCALES)
-        require_bounded(seed)
-        config = {"width": width, "scales": scales}
-        super().__init__(channels, variance_map, deviation, 2 ** (scales - 1), config, domain)
+        super().__init__({"width": width, "scales": scales}, 2 ** (scales - 1), **shared)
         sizes = [width * 2**k for k in range(scales)]
         self.encoder = nn.ModuleList(_triple_conv(a, b) for a, b in zip([self.inputs, *sizes], sizes, strict=False))
         self.decoder = nn.ModuleList(_triple_conv(3 * size, size) for size in reversed(sizes[:-1]))
-        self.last = conv(width, channels)
-        self.initialise(seed, self.last)
+        self.last = conv(width, self.channels)
+        self.initialise(self.seed, self.last)
 
     def residual(self, features: Tensor) -> Tensor:
+        """Go down the scales and up again: ``(B, inputs, h, w)`` to the correction ``(B, channels, h, w)``."""
         skips = []
         for k, block in enumerate(self.encoder):
             features = block(F.max_pool2d(features, 2) if k else features)
@@ -94,6 +84,7 @@ class DCRBlock(nn.Module):
         self.activation = nn.PReLU()
 
     def forward(self, features: Tensor) -> Tensor:
+        """Features ``(B, C, h, w)`` to features of the same shape."""
         dense = torch.cat([features, self.first(features)], dim=1)
         dense = torch.cat([dense, self.second(dense)], dim=1)
         return features + self.activation(self.third(dense))
@@ -128,18 +119,9 @@ class DHDN(Denoiser):
 
     tiny: ClassVar[dict[str, Any]] = {"width": 4}
 
-    def __init__(
-        self,
-        width: int = 16,
-        channels: int = PACKED,
-        variance_map: bool = True,
-        deviation: bool = True,
-        domain: str = "linear",
-        seed: int = 0,
-    ) -> None:
+    def __init__(self, width: int = 16, **shared: Unpack[Shared]) -> None:
         require_width(width, multiple=2)
-        require_bounded(seed)
-        super().__init__(channels, variance_map, deviation, 2 ** (LEVELS - 1), {"width": width}, domain)
+        super().__init__({"width": width}, 2 ** (LEVELS - 1), **shared)
         sizes = [width * 2**k for k in range(LEVELS)]
         self.first = _pointwise(self.inputs, width)
         self.encoder = nn.ModuleList(_level(size) for size in sizes)
@@ -147,12 +129,13 @@ class DHDN(Denoiser):
         # What comes up and what was kept have a level's features each, so its decoder works on twice as many.
         self.up = nn.ModuleList(_pointwise(2 * size, 2 * size) for size in reversed(sizes[1:]))
         self.decoder = nn.ModuleList(_level(2 * size) for size in reversed(sizes[:-1]))
-        self.last = conv(2 * width, channels, size=1)
+        self.last = conv(2 * width, self.channels, size=1)
         # Fourteen residual blocks one after another stay tame when each starts as the identity (Goyal et al. 2017).
         ends = [module.third for module in self.modules() if isinstance(module, DCRBlock)]
-        self.initialise(seed, self.last, *ends)
+        self.initialise(self.seed, self.last, *ends)
 
     def residual(self, features: Tensor) -> Tensor:
+        """Go down the levels and up again: ``(B, inputs, h, w)`` to the correction ``(B, channels, h, w)``."""
         features = self.first(features)
         skips = []
         for level, down in zip(self.encoder, self.down, strict=False):
@@ -191,30 +174,63 @@ class DnCNN(Denoiser):
 
     tiny: ClassVar[dict[str, Any]] = {"width": 8, "depth": 3}
 
-    def __init__(
-        self,
-        width: int = 64,
-        depth: int = 17,
-        batch_norm: bool = True,
-        channels: int = PACKED,
-        variance_map: bool = True,
-        deviation: bool = True,
-        domain: str = "linear",
-        seed: int = 0,
-    ) -> None:
+    def __init__(self, width: int = 64, depth: int = 17, batch_norm: bool = True, **shared: Unpack[Shared]) -> None:
         require_width(width)
         if depth < 2:
             raise ValueError(f"depth must be at least 2, got {depth}")
-        require_bounded(seed, depth=depth)
-        config = {"width": width, "depth": depth, "batch_norm": batch_norm}
-        super().__init__(channels, variance_map, deviation, 1, config, domain)
+        require_bounded(depth=depth)
+        super().__init__({"width": width, "depth": depth, "batch_norm": batch_norm}, **shared)
         middle = [layer for _ in range(depth - 2) for layer in _layer(width, batch_norm)]
-        last = conv(width, channels)
+        last = conv(width, self.channels)
         self.layers = nn.Sequential(conv(self.inputs, width), nn.ReLU(inplace=True), *middle, last)
-        self.initialise(seed, last)
+        self.initialise(self.seed, last)
 
     def residual(self, features: Tensor) -> Tensor:
+        """Run the chain: ``(B, inputs, h, w)`` to the correction ``(B, channels, h, w)``, the negative of the noise."""
         return self.layers(features)
+
+
+@DENOISERS.register("FFDNet")
+class FFDNet(Denoiser):
+    """FFDNet (Zhang, Zuo and Zhang, TIP 2018), of sRGB by default; its normalisations are folded into the convolutions.
+
+    It computes ``x - S(f([sigma, S^-1(x)]))`` with the pixel shuffle S, the deviation sigma of each channel as a plane
+    and 3 x 3 convolutions f, all at half the sides, for white noise of a level that it is told.
+
+    Args:
+        width: features of each layer but the last.
+        depth: convolutions, 3 to 1000; 12 is published for colour, 15 with a width of 64 for grey.
+        channels, seed: see :class:`denoisers.Denoiser`.
+
+    Example:
+        >>> noisy = torch.rand(1, 3, 33, 50)
+        >>> FFDNet(width=8, depth=3)(noisy, torch.full_like(noisy, (15 / 255) ** 2)).shape
+        torch.Size([1, 3, 33, 50])
+    """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 8, "depth": 3}
+
+    def __init__(self, width: int = 96, depth: int = 12, channels: int = 3, seed: int = 0) -> None:
+        require_width(width)
+        require_bounded(depth=depth)
+        if depth < 3:
+            raise ValueError(f"depth must be at least 3, got {depth}")
+        super().__init__({}, 2, channels=channels, seed=seed)
+        self.config = {"width": width, "depth": depth, "channels": channels}
+        sizes = [5 * channels, *[width] * (depth - 1), 4 * channels]
+        for k in range(depth):
+            self.add_module(f"conv{k:02d}", conv(sizes[k], sizes[k + 1]))
+        self.depth = depth
+        self.initialise(seed, self.get_submodule(f"conv{depth - 1:02d}"), gain=2.0**0.5)  # type: ignore[arg-type]
+
+    def residual(self, features: Tensor) -> Tensor:
+        """Compute the correction ``(B, channels, h, w)`` from the picture and its deviations, ``(B, inputs, h, w)``."""
+        picture, deviation = features.split(self.channels, dim=1)
+        x = torch.cat([F.avg_pool2d(deviation, 2), F.pixel_unshuffle(picture, 2)], dim=1)
+        for k in range(self.depth):
+            x = self.get_submodule(f"conv{k:02d}")(x)
+            x = x.relu_() if k + 1 < self.depth else x
+        return -F.pixel_shuffle(x, 2)
 
 
 class ChannelNorm(nn.Module):
@@ -226,18 +242,19 @@ class ChannelNorm(nn.Module):
         self.bias = nn.Parameter(torch.zeros(width))
 
     def forward(self, x: Tensor) -> Tensor:
+        """Normalise ``(B, C, h, w)``, each pixel over its C channels."""
         normed = F.layer_norm(x.permute(0, 2, 3, 1), self.weight.shape, self.weight, self.bias, 1e-6)
         return normed.permute(0, 3, 1, 2)
 
 
-def _gated(x: Tensor) -> Tensor:
-    """The first half of the channels times the second."""
+def _gate(x: Tensor) -> Tensor:
+    """Multiply the first half of the channels by the second."""
     first, second = x.chunk(2, dim=1)
     return first * second
 
 
 class NAFBlock(nn.Module):
-    """Two gated residuals; see :class:`NAFNet`."""
+    """A block of :class:`NAFNet`: two residuals whose features gate each other."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -249,9 +266,10 @@ class NAFBlock(nn.Module):
         self.gamma = nn.Parameter(torch.zeros(1, width, 1, 1))
 
     def forward(self, x: Tensor) -> Tensor:
-        y = _gated(self.conv2(self.conv1(self.norm1(x))))
+        """Features ``(B, C, h, w)`` to features of the same shape."""
+        y = _gate(self.conv2(self.conv1(self.norm1(x))))
         x = x + self.beta * self.conv3(y * self.attention(y.mean((2, 3), keepdim=True)))
-        return x + self.gamma * self.conv5(_gated(self.conv4(self.norm2(x))))
+        return x + self.gamma * self.conv5(_gate(self.conv4(self.norm2(x))))
 
 
 @DENOISERS.register("NAFNet")
@@ -284,19 +302,15 @@ class NAFNet(Denoiser):
         encoder: tuple[int, ...] = (2, 2, 4, 8),
         middle: int = 12,
         decoder: tuple[int, ...] = (2, 2, 2, 2),
-        channels: int = PACKED,
-        variance_map: bool = True,
-        deviation: bool = True,
-        domain: str = "linear",
-        seed: int = 0,
+        **shared: Unpack[Shared],
     ) -> None:
         require_width(width)
         if len(encoder) != len(decoder) or min((*encoder, *decoder, middle), default=0) < 0 or not encoder:
             raise ValueError(f"encoder and decoder must have the same number of scales, got {encoder} and {decoder}")
         require_between("scales", len(encoder), 1, MOST_SCALES)
-        require_bounded(seed, middle=middle, encoder=max(encoder), decoder=max(decoder))
+        require_bounded(middle=middle, encoder=max(encoder), decoder=max(decoder))
         config = {"width": width, "encoder": list(encoder), "middle": middle, "decoder": list(decoder)}
-        super().__init__(channels, variance_map, deviation, 2 ** len(encoder), config, domain)
+        super().__init__(config, 2 ** len(encoder), **shared)
         sizes = [width * 2**k for k in range(len(encoder) + 1)]
         self.intro = conv(self.inputs, width)
         self.encoder = nn.ModuleList(_blocks(c, n) for c, n in zip(sizes, encoder, strict=False))
@@ -304,10 +318,11 @@ class NAFNet(Denoiser):
         self.middle = _blocks(sizes[-1], middle)
         self.ups = nn.ModuleList(conv(2 * c, 4 * c, 1, bias=False) for c in reversed(sizes[:-1]))
         self.decoder = nn.ModuleList(_blocks(c, n) for c, n in zip(reversed(sizes[:-1]), decoder, strict=True))
-        self.ending = conv(width, channels)
-        self.initialise(seed, self.ending, gain=RESIDUAL_GAIN)
+        self.ending = conv(width, self.channels)
+        self.initialise(self.seed, self.ending, gain=RESIDUAL_GAIN)
 
     def residual(self, features: Tensor) -> Tensor:
+        """Go down the scales and up again: ``(B, inputs, h, w)`` to the correction ``(B, channels, h, w)``."""
         x, skips = self.intro(features), []
         for blocks, down in zip(self.encoder, self.downs, strict=True):
             x = blocks(x)
@@ -325,7 +340,7 @@ def _blocks(width: int, number: int) -> nn.Sequential:
 
 
 CONTEXT = 4
-"""Sides, in cells of DRUNet's last scale, of the squares whose mean that scale is without."""
+"""DRUNet's last scale sees its signal less the mean over squares of so many of its cells a side."""
 
 
 class ResidualBlock(nn.Module):
@@ -336,6 +351,7 @@ class ResidualBlock(nn.Module):
         self.conv1, self.conv2 = conv(width, width, bias=False), conv(width, width, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Features ``(B, C, h, w)`` to features of the same shape."""
         return x + self.conv2(self.conv1(x).relu_())
 
 
@@ -377,27 +393,23 @@ class DRUNet(Denoiser):
         blocks: int = 4,
         limits: bool = False,
         mend: bool = False,
-        channels: int = PACKED,
-        variance_map: bool = True,
-        deviation: bool = True,
-        domain: str = "linear",
-        seed: int = 0,
         patch: int = 1,
         pyramid: int = 0,
         light: bool = False,
+        **shared: Unpack[Shared],
     ) -> None:
         require_width(width)
         require_between("scales", scales, 1, MOST_SCALES)
         require_between("patch", patch, 1, 8)
-        require_bounded(seed, blocks=blocks)
+        require_bounded(blocks=blocks)
         config = {"width": width, "scales": scales, "blocks": blocks, "limits": limits, "mend": mend}
         config |= ({} if patch == 1 else {"patch": patch}) | ({"pyramid": pyramid} if pyramid else {})
         config |= {"light": True} if light else {}
         cell = 2 ** (scales - 1)
         stride = patch * CONTEXT * cell
-        super().__init__(channels, variance_map, deviation, stride, config, domain, limits, mend, pyramid)
+        super().__init__(config, stride, limits, mend, pyramid, **shared)
         self.cell, self.patch = cell, patch
-        planes = channels * patch**2
+        planes = self.channels * patch**2
         sizes = [width * 2**k for k in range(scales)]
         self.light = light or not self.reads_variance
         self.head = conv(self.inputs * patch**2 + self.light * planes, width, bias=False)
@@ -409,13 +421,14 @@ class DRUNet(Denoiser):
         self.tail = conv(width, planes, bias=False)
         # As in DHDN: residual blocks one after another stay tame when each starts as the identity.
         ends = [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
-        self.initialise(seed, self.tail, *ends, gain=1.0)
+        self.initialise(self.seed, self.tail, *ends, gain=1.0)
 
     def residual(self, features: Tensor) -> Tensor:
+        """Compute the correction ``(B, channels, h, w)`` from features ``(B, inputs, h, w)``."""
         return F.pixel_shuffle(self.tail(self.body(F.pixel_unshuffle(features, self.patch))), self.patch)
 
     def body(self, features: Tensor) -> Tensor:
-        """All layers but the last: ``(B, width, h, w)``."""
+        """Run all layers but the last: features ``(B, inputs, h, w)`` to ``(B, width, h, w)``."""
         planes = self.coarse.in_channels
         signal, maps = features[:, :planes], features[:, planes:]
         mean = F.avg_pool2d(signal, self.cell)
@@ -427,7 +440,11 @@ class DRUNet(Denoiser):
         return self.trunk(x, self.coarse(self.cell * (mean - wide)))
 
     def trunk(self, x: Tensor, coarse: Tensor) -> Tensor:
-        """The pyramid, from the first layer's features and those that join at the last scale."""
+        """Run the pyramid.
+
+        Features ``x`` ``(B, width, h, w)`` come from the first layer, and ``coarse`` ``(B, C, h', w')``, of the size of
+        the last scale, join there; the result has the shape of ``x``.
+        """
         skips = []
         for k, blocks in enumerate(self.encoder):
             x = self.downs[k - 1](x) if k else x

@@ -7,21 +7,28 @@ published weights. ReLUs and sums work in place: on a CPU fresh memory costs mor
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
 import torch
 from torch import Tensor, nn
 
-from denoisers.network import PACKED, RESIDUAL_GAIN, Denoiser, conv, require_bounded, require_width
+from denoisers.network import RESIDUAL_GAIN, Denoiser, Shared, conv, require_width
 from rawaug.registry import DENOISERS
 
 PUBLISHED_WIDTH = 16
 BLOCKS = (2, 2, 4, 4)
-"""Of the encoder's stages."""
+"""Bottleneck blocks of the encoder's four stages."""
 
 
 class Separable(nn.Module):
-    """Depthwise ``size x size`` without bias, then pointwise."""
+    """A depthwise convolution without bias, then a pointwise one.
+
+    Args:
+        inputs: channels that come in.
+        outputs: channels that go out.
+        size: side of the depthwise kernel.
+        stride: step of the depthwise convolution.
+    """
 
     def __init__(self, inputs: int, outputs: int, size: int, stride: int = 1) -> None:
         super().__init__()
@@ -29,6 +36,7 @@ class Separable(nn.Module):
         self.pointwise = conv(inputs, outputs, 1)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Features ``(B, inputs, h, w)`` to ``(B, outputs, h / stride, w / stride)``."""
         y: Tensor = self.pointwise(self.depthwise(x))
         return y
 
@@ -43,6 +51,7 @@ class EncoderBlock(nn.Module):
         self.proj = Separable(inputs, outputs, 3, stride) if stride > 1 or inputs != outputs else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
+        """Features ``(B, inputs, h, w)`` to ``(B, outputs, h / stride, w / stride)``."""
         y: Tensor = self.conv2(self.conv1(x).relu_())
         return y.add_(self.proj(x)).relu_()
 
@@ -56,12 +65,13 @@ class Residual(nn.Module):
         self.conv1 = Separable(width, width, 3)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Features ``(B, C, h, w)`` to features of the same shape."""
         y: Tensor = self.conv1(self.conv0(x).relu_())
         return y.add_(x)
 
 
 class DecoderStage(nn.Module):
-    """A residual, then twice the size, plus the encoder's features of that size."""
+    """A residual and a transposed convolution to twice the size, to which the encoder's features are added."""
 
     def __init__(self, inputs: int, outputs: int, skip: int) -> None:
         super().__init__()
@@ -72,6 +82,7 @@ class DecoderStage(nn.Module):
         self.proj_conv = Separable(skip, outputs, 3)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
+        """Features ``(B, inputs, h, w)`` and ``skip`` ``(B, skip, 2h, 2w)`` to ``(B, outputs, 2h, 2w)``."""
         y: Tensor = self.upsample(self.decode_conv(x))
         return y.add_(self.proj_conv(skip).relu_())
 
@@ -95,22 +106,14 @@ class PMRID(Denoiser):
         torch.Size([2, 4, 33, 50])
     """
 
+    defaults: ClassVar[Shared] = {**Denoiser.defaults, "variance_map": False, "domain": "ksigma"}
     tiny: ClassVar[dict[str, Any]] = {"width": 4}
 
-    def __init__(
-        self,
-        width: int = PUBLISHED_WIDTH,
-        channels: int = PACKED,
-        variance_map: bool = False,
-        deviation: bool = True,
-        domain: str = "ksigma",
-        seed: int = 0,
-    ) -> None:
+    def __init__(self, width: int = PUBLISHED_WIDTH, **shared: Unpack[Shared]) -> None:
         require_width(width)
-        require_bounded(seed)
-        super().__init__(channels, variance_map, deviation, 16, {"width": width}, domain)
+        super().__init__({"width": width}, 16, **shared)
         sizes = [width, 4 * width, 8 * width, 16 * width, 32 * width]
-        self.conv0 = _named(conv(self.inputs, width))
+        self.conv0 = _under_conv(conv(self.inputs, width))
         for k, blocks in enumerate(BLOCKS, start=1):
             first = EncoderBlock(sizes[k - 1], sizes[k], stride=2)
             rest = [EncoderBlock(sizes[k], sizes[k], stride=1) for _ in range(blocks - 1)]
@@ -120,11 +123,12 @@ class PMRID(Denoiser):
         for k, ((inputs, outputs), skip) in enumerate(zip(decoder, reversed(sizes[:4]), strict=True), start=1):
             self.add_module(f"dec{k}", DecoderStage(inputs, outputs, skip))
         self.out0 = Residual(width)
-        last = conv(width, channels)
-        self.out1 = _named(last)
-        self.initialise(seed, last, gain=RESIDUAL_GAIN)
+        last = conv(width, self.channels)
+        self.out1 = _under_conv(last)
+        self.initialise(self.seed, last, gain=RESIDUAL_GAIN)
 
     def residual(self, features: Tensor) -> Tensor:
+        """Go down the stages and up again: ``(B, inputs, h, w)`` to the correction ``(B, channels, h, w)``."""
         x = self.conv0(features).relu_()
         skips = []
         for k in range(1, 5):
@@ -137,6 +141,6 @@ class PMRID(Denoiser):
         return correction
 
 
-def _named(layer: nn.Conv2d) -> nn.Sequential:
-    """The layer under the name ``conv``, as the published file has it."""
+def _under_conv(layer: nn.Conv2d) -> nn.Sequential:
+    """Put a layer under the name ``conv``, as the published file has it."""
     return nn.Sequential(OrderedDict(conv=layer))

@@ -19,17 +19,17 @@ from rawaug.registry import Registry
 PACKAGE = """
 import torch
 
-from denoisers.network import PACKED, Denoiser, conv
+from denoisers.network import Denoiser, conv
 from rawaug.noise import Compose, RowNoise, ShotReadNoise, noise_levels
 
 TAPS = torch.ones(3).tolist()
 
 
 class Shallow(Denoiser):
-    def __init__(self, width=16, channels=PACKED, variance_map=True, deviation=True, domain="linear", seed=0):
-        super().__init__(channels, variance_map, deviation, 1, {"width": width}, domain)
-        self.first, self.last = conv(self.inputs, width), conv(width, channels)
-        self.initialise(seed, self.last)
+    def __init__(self, width=16, **shared):
+        super().__init__({"width": width}, **shared)
+        self.first, self.last = conv(self.inputs, width), conv(width, self.channels)
+        self.initialise(self.seed, self.last)
 
     def residual(self, features):
         return self.last(self.first(features).relu())

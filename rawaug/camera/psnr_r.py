@@ -35,7 +35,7 @@ def psnr_r(isp: DictionaryISP, pair: Pair, white_balance: bool = False, patches:
         return windows_psnr(made, pair, patches)
     blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
     params = staged.with_white_balance(isp, isp.choose(blocks.srgb[None]), given, None)
-    return block_psnr(isp.reverse_pixels(blocks.srgb[None], params, blocks.place)[0], blocks.raw, blocks.clipped)
+    return block_psnr(isp.reverse_pixels(blocks.srgb[None], params, blocks.coordinates)[0], blocks.raw, blocks.clipped)
 
 
 def block_psnr(made: Tensor, raw: Tensor, clipped: Tensor) -> float:

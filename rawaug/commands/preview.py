@@ -76,7 +76,7 @@ def _draw_stages(augment: RawAugment, whole: Tensor, count: int, seed: int) -> A
     top, left = (frame[0] - height) // 4 * 2, (frame[1] - width) // 4 * 2
     srgb = bayer.crop(whole, top, left, height, width)
     place = frame_coordinates(height, width, (top, left), frame)
-    setting = isp.reverse(srgb[None], place=place).params
+    setting = isp.reverse(srgb[None], coordinates=place).params
     panels = stage_pictures(augment, srgb, setting, place)
     generator = keyed_generator(seed, "preview")
     for k in range(count):

@@ -72,7 +72,7 @@ def stage_pictures(
     augment: RawAugment, srgb: Tensor, setting: ISPParams | None, place: Tensor | None = None
 ) -> dict[str, Tensor]:
     """What the stages make of sRGB uint8 ``(3, H, W)``, by title: ``(3, H, W)`` in [0, 1] for the eye."""
-    result = augment.isp.reverse(srgb[None], setting, place=place, intermediates=True)
+    result = augment.isp.reverse(srgb[None], setting, coordinates=place, intermediates=True)
     names = {f"x{stage.makes}": stage.name for stage in augment.isp.ordered_stages}
     shown = {"sRGB x": srgb / 255.0}
     image = srgb[None]

@@ -46,19 +46,24 @@ XYZ_TO_SRGB = torch.linalg.inv(SRGB_TO_XYZ)
 
 
 class CameraMatrices(NamedTuple):
-    """Matrices from CIE XYZ to camera RGB, each scaled to a green response of 1 to D65."""
+    """Matrices from CIE XYZ to camera RGB, each scaled to a green response of 1 to D65.
+
+    Args:
+        names: makers and models of the P cameras.
+        xyz_to_camera: float64 ``(P, 3, 3)``.
+    """
 
     names: tuple[str, ...]
     xyz_to_camera: Tensor
 
     def select(self, names: Sequence[str]) -> Tensor:
-        """The matrices ``(len(names), 3, 3)`` of these cameras, whatever the case of the letters."""
+        """The matrices ``(N, 3, 3)`` of N cameras by name, whatever the case of the letters; ValueError if unknown."""
         return self.xyz_to_camera[[self.names.index(find_camera(name, self.names)) for name in names]]
 
 
 @cache
 def load_cameras() -> CameraMatrices:
-    """The cameras of the package's table; where two sources name one camera LibRaw's comes first."""
+    """Load the cameras of the package's table; where two sources name one camera, LibRaw's comes first."""
     text = resources.files("rawaug.isp").joinpath("facts/camera_matrices.tsv").read_text("utf-8")
     rows = [line.split("\t") for line in text.splitlines()[2:]]
     matrices = torch.tensor([[float(value) for value in row[2:11]] for row in rows], dtype=torch.float64)
@@ -68,18 +73,18 @@ def load_cameras() -> CameraMatrices:
 
 
 def camera_from_srgb(xyz_to_camera: Tensor) -> Tensor:
-    """C, linear sRGB to white-balanced camera RGB: ``(..., 3, 3)`` whose rows sum to 1."""
+    """Compute C, from linear sRGB to white-balanced camera RGB: ``(..., 3, 3)`` whose rows sum to 1."""
     matrix = xyz_to_camera @ SRGB_TO_XYZ.to(xyz_to_camera)
     return matrix / matrix.sum(dim=-1, keepdim=True)
 
 
 def responses(xyz_to_camera: Tensor, light: Tensor) -> Tensor:
-    """RAW ``(..., 3)`` of a white surface under a light of white point ``(..., 3)``."""
+    """Compute the RAW ``(..., 3)`` of a white surface in a light of white point ``(..., 3)``."""
     return torch.einsum("...ij,...j->...i", xyz_to_camera, light.to(xyz_to_camera))
 
 
 def gains_in_light(xyz_to_camera: Tensor, light: Tensor) -> Tensor:
-    """Gains ``(..., 3)`` that make a white surface grey under a light of white point ``(..., 3)``; green is 1."""
+    """Compute the gains ``(..., 3)``, green 1, that make white grey in a light of white point ``(..., 3)``."""
     response = responses(xyz_to_camera, light)
     return response[..., 1:2] / response
 
@@ -114,10 +119,10 @@ DUV_SPREAD = 0.003
 
 
 class LightRange(NamedTuple):
-    """What lights are drawn from: any locus alike within limits of the temperature in kelvin, lamps, and daylight.
+    """The lights that pictures are taken in: on both loci alike within limits, among lamps, and by day.
 
     Args:
-        kelvin: within 1,000 to 15,000.
+        kelvin: limits of the colour temperature, within 1,000 to 15,000.
         lamps: share of the draws that are one of ``among``, whatever its colour temperature.
         among: chromaticities of lamps, ``(L, 2)``.
         by_day: share of the draws that are daylight as in most photographs.
@@ -135,7 +140,7 @@ PHOTOGRAPHS = LightRange(by_day=DAYLIGHT_SHARE)
 
 
 def light_range(light: float | str | None) -> LightRange:
-    """Lights of one colour temperature in kelvin, or one of :data:`LAMPS` by name; by default :data:`PHOTOGRAPHS`."""
+    """The lights of one colour temperature in kelvin, one of :data:`LAMPS` by name, or those of :data:`PHOTOGRAPHS`."""
     if light is None:
         return PHOTOGRAPHS
     if isinstance(light, str):
@@ -149,12 +154,12 @@ def light_range(light: float | str | None) -> LightRange:
 
 
 def planckian(kelvin: Array) -> Array:
-    """Chromaticity ``(..., 2)`` of a black body at 1,000 to 15,000 K."""
+    """Compute the chromaticity ``(..., 2)`` of a black body at 1,000 to 15,000 K."""
     return _xy_from_uv(_planckian_uv(kelvin)[0])
 
 
 def daylight(kelvin: Array) -> Array:
-    """Chromaticity ``(..., 2)`` of daylight at 4,000 to 25,000 K."""
+    """Compute the chromaticity ``(..., 2)`` of daylight at 4,000 to 25,000 K."""
     t = (1e3 / kelvin)[..., None]
     c0, c1, c2, c3 = _DAYLIGHT
     both = ((c3 * t + c2) * t + c1) * t + c0
@@ -163,19 +168,19 @@ def daylight(kelvin: Array) -> Array:
 
 
 def move_off_locus(xy: Array, kelvin: Array, duv: Array) -> Array:
-    """``xy`` ``(..., 2)`` moved by ``duv`` ``(...)`` along the Planckian locus' normal at ``kelvin`` ``(...)``."""
+    """Move ``xy`` ``(..., 2)`` by ``duv`` ``(...)`` along the normal of the Planckian locus at ``kelvin`` ``(...)``."""
     rate = _planckian_uv(kelvin)[1]
     normal = rate[..., ::-1] * (1.0, -1.0)  # to higher v: the locus runs to lower u as it gets hotter
     return _xy_from_uv(_uv_from_xy(xy) + (duv / np.hypot(rate[..., 0], rate[..., 1]))[..., None] * normal)
 
 
 def white_point(xy: Array | tuple[float, float]) -> Tensor:
-    """XYZ ``(..., 3)`` with Y = 1, float64, of chromaticities ``(..., 2)``."""
+    """Convert chromaticities ``(..., 2)`` to XYZ ``(..., 3)`` with Y = 1, float64."""
     return torch.from_numpy(_white_point(np.asarray(xy, dtype=np.float64)))
 
 
 def sample_lights(batch: int, generator: torch.Generator, lights: LightRange = ALL_LIGHTS) -> Array:
-    """White points ``(batch, 3)``, XYZ with Y = 1; where both loci are defined, each as often as the other."""
+    """Draw white points ``(batch, 3)``, XYZ with Y = 1; where both loci are defined, each as often as the other."""
     kelvin, lamps, among, by_day = lights
     drawn = torch.rand(batch, 4, generator=generator, dtype=torch.float64).numpy()
     duv = DUV_SPREAD * torch.randn(batch, generator=generator, dtype=torch.float64).numpy()

@@ -80,7 +80,7 @@ SMALL = ISPConfig(colour_atoms=8, gain_atoms=8, encoder_widths=(16, 32, 64))
 
 
 class ISPParams(NamedTuple):
-    """One camera setting per picture; replays a pass. Leading dimension B everywhere.
+    """The camera settings of B pictures, which replay a pass.
 
     Args:
         colour_weights: ``(B, N)`` weights of the colour atoms.
@@ -99,7 +99,13 @@ class ISPParams(NamedTuple):
 
 @dataclass
 class ISPResult:
-    """Result of a pass: ``raw`` ``(B, 1, H, W)`` or ``srgb`` ``(B, 3, H, W)``, the parameters; x1 ... x5 on request."""
+    """The result of a pass.
+
+    Args:
+        image: the mosaic ``(B, 1, H, W)`` or the picture ``(B, 3, H, W)``, also called ``raw`` and ``srgb``.
+        params: the settings that were used, which replay the pass.
+        intermediates: x1 ... x5 by name, where they were asked for.
+    """
 
     image: Tensor
     params: ISPParams
@@ -107,8 +113,10 @@ class ISPResult:
 
     @property
     def raw(self) -> Tensor:
+        """The mosaic ``(B, 1, H, W)`` of a reverse pass."""
         return self.image
 
     @property
     def srgb(self) -> Tensor:
+        """The picture ``(B, 3, H, W)`` of a forward pass."""
         return self.image

@@ -48,7 +48,7 @@ _STEPS = 400
 
 
 def l1_normalise(matrices: Tensor) -> Tensor:
-    """``(..., 3, 3)`` with every row divided by its l1 norm."""
+    """Divide every row of matrices ``(..., 3, 3)`` by its l1 norm."""
     return F.normalize(matrices, p=1.0, dim=-1)
 
 
@@ -70,20 +70,23 @@ class ColourDictionary(nn.Module):
         self.register_buffer("spread", torch.tensor(torch.inf))
 
     def atoms(self) -> Tensor:
-        """``(N, 3, 3)``, rows of l1 norm 1."""
+        """The matrices ``(N, 3, 3)``, rows of l1 norm 1."""
         return l1_normalise(self.matrices)
 
     def combine(self, weights: Tensor) -> Tensor:
-        """Weights ``(B, N)`` to matrices ``(B, 3, 3)``."""
+        """Mix the atoms by weights ``(B, N)`` into matrices ``(B, 3, 3)``."""
         return torch.einsum("bn,nij->bij", weights, self.atoms())
 
     def weights_for(self, white_balance: Tensor) -> Tensor:
-        """Weights ``(B, N)`` of the atoms seen in such light, given as-shot multipliers ``(B, 3)``."""
+        """Weigh the atoms by how near their light is to that of as-shot multipliers ``(B, 3)``: ``(B, N)``."""
         distance = (log_light(white_balance)[:, None] - self.light) ** 2
         return torch.softmax(-distance.sum(2) / (2.0 * self.spread**2), dim=1)
 
     def gains_for(self, white_balance: Tensor, weights: Tensor) -> Tensor:
-        """Channel gains ``(B, 3)`` under which grey becomes ``1 / white_balance``, times the digital gain."""
+        """Compute the gains ``(B, 3)`` under which grey becomes ``1 / white_balance``, digital gain included.
+
+        ``white_balance`` is ``(B, 3)``, and ``weights`` ``(B, N)`` are those of the atoms.
+        """
         return white_balance * (weights @ self.neutral).exp() * self.combine(weights).sum(2)
 
 
@@ -104,38 +107,38 @@ class CameraDictionary(ColourDictionary):
 
     @property
     def typical(self) -> Tensor:
-        """Weights ``(N,)`` where nothing is known of the camera: the mean of the known ones."""
+        """The weights ``(N,)`` where nothing is known of the camera: the mean over the known ones."""
         return self.known.mean(dim=0)
 
     @torch.no_grad()
     def set_cameras(self, xyz_to_camera: Tensor, known: Tensor) -> None:
-        """Take matrices ``(N, 3, 3)`` from XYZ to camera for the atoms, and weights ``(P, N)`` of the known cameras."""
+        """Set the atoms from matrices ``(N, 3, 3)`` from XYZ to camera, and the known cameras by weights ``(P, N)``."""
         self.matrices.copy_(camera_from_srgb(xyz_to_camera))
         self.light.copy_(log_light(gains_in_light(xyz_to_camera, white_point(D65))))
         self.known.copy_(known)
 
     def atoms(self) -> Tensor:
-        """``(N, 3, 3)``, rows of sum 1."""
+        """The matrices ``(N, 3, 3)``, rows of sum 1."""
         return self.matrices / self.matrices.sum(dim=2, keepdim=True)
 
     def responses(self) -> Tensor:
-        """Responses of the atoms to D65 ``(N, 3)``, float64, green 1."""
+        """The responses of the atoms to D65, float64 ``(N, 3)``, green 1."""
         red, blue = (-self.light.double()).exp().unbind(1)
         return torch.stack([red, torch.ones_like(red), blue], dim=1)
 
     def xyz_to_camera(self, weights: Tensor) -> Tensor:
-        """Weights ``(B, N)`` to matrices from XYZ to camera ``(B, 3, 3)``, float64, green response 1 to D65."""
+        """Mix the atoms by weights ``(B, N)`` into float64 matrices ``(B, 3, 3)`` from XYZ, green 1 in D65."""
         weights = weights.double()
         matrix = torch.einsum("bn,nij->bij", weights, self.atoms().double())
         return (weights @ self.responses())[:, :, None] * matrix @ XYZ_TO_SRGB.to(matrix)
 
     def weights_for(self, white_balance: Tensor) -> Tensor:
-        """The typical camera ``(B, N)``: as-shot multipliers ``(B, 3)`` are of an unknown light, and name no camera."""
+        """The typical weights ``(B, N)``: multipliers ``(B, 3)`` of an unknown light tell nothing of the camera."""
         return self.typical.expand(len(white_balance), -1)
 
 
 def log_light(white_balance: Tensor) -> Tensor:
-    """Log of the red and blue multipliers over green, ``(B, 3)`` to ``(B, 2)``."""
+    """Take the logarithm of the red and blue multipliers over green, ``(B, 3)`` to ``(B, 2)``."""
     return (white_balance[:, 0::2] / white_balance[:, 1:2]).log()
 
 
@@ -147,21 +150,21 @@ class GainDictionary(nn.Module):
         self.log_gains = nn.Parameter((1.0 + torch.rand(atoms, 3)).log())
 
     def atoms(self) -> Tensor:
-        """``(M, 3)``: g_d, g_r, g_b."""
+        """The triplets g_d, g_r, g_b, ``(M, 3)``."""
         return self.log_gains.exp()
 
     def channel_gains(self) -> Tensor:
-        """``(M, 3)``: what R, G and B are multiplied by in the forward pass: g_d g_r, g_d, g_d g_b."""
+        """The factors of R, G and B in the forward pass, ``(M, 3)``: g_d g_r, g_d, g_d g_b."""
         digital, red, blue = self.atoms().unbind(1)
         return torch.stack([digital * red, digital, digital * blue], dim=1)
 
     def combine(self, weights: Tensor) -> Tensor:
-        """Weights ``(B, M)`` to channel gains ``(B, 3)``."""
+        """Mix the inverse gains by weights ``(B, M)``, and invert the mixture to channel gains ``(B, 3)``."""
         return 1.0 / (weights @ (1.0 / self.channel_gains()))
 
 
 def project_to_simplex(weights: Tensor) -> Tensor:
-    """The nearest point of the simplex, row by row: ``(B, N)`` to ``(B, N)`` (Duchi et al., ICML 2008, algorithm 1)."""
+    """Move each row of ``(B, N)`` to the nearest point of the simplex (Duchi et al., ICML 2008, algorithm 1)."""
     ordered = weights.sort(dim=1, descending=True).values
     excess = ordered.cumsum(dim=1) - 1.0
     rank = torch.arange(1, weights.shape[1] + 1, device=weights.device)
@@ -171,13 +174,13 @@ def project_to_simplex(weights: Tensor) -> Tensor:
 
 
 def perturb(weights: Tensor, strength: float, generator: torch.Generator) -> Tensor:
-    """Dictionary augmentation: ``w + strength * N(0, I)``, brought back to the simplex; ``(B, N)`` to ``(B, N)``."""
+    """Augment weights ``(B, N)``: add ``strength * N(0, I)`` and project them back to the simplex."""
     noise = torch.randn(weights.shape, generator=generator, device=generator.device, dtype=torch.float32).to(weights)
     return project_to_simplex(weights + strength * noise)
 
 
 def convex_weights(batch: int, atoms: int, generator: torch.Generator) -> Tensor:
-    """Weights ``(batch, atoms)`` uniform on the simplex: dictionary augmentation without encoders."""
+    """Draw weights ``(batch, atoms)`` uniformly from the simplex: augmentation without encoders."""
     # Normalised exponentials follow the flat Dirichlet distribution. They do not fill the hull evenly: with more atoms,
     # more of the mixtures are near its middle.
     uniform = torch.rand(batch, atoms, generator=generator, device=generator.device, dtype=torch.float32)
@@ -186,7 +189,17 @@ def convex_weights(batch: int, atoms: int, generator: torch.Generator) -> Tensor
 
 
 def sparse_shares(batch: int, atoms: int, mixed: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Indices of atoms ``(batch, mixed)``, drawn with replacement, and their shares, float64: Dirichlet(1/2)."""
+    """Draw a few atoms for each picture, with replacement, and their Dirichlet(1/2) shares.
+
+    Args:
+        batch: number of pictures B.
+        atoms: number of atoms to draw from.
+        mixed: how many are drawn for each picture.
+        generator: on the CPU.
+
+    Returns:
+        Indices and float64 shares, both ``(batch, mixed)``.
+    """
     # Squares of normals, divided by their sum, crowd the corners and edges of a hull.
     chosen = torch.randint(atoms, (batch, mixed), generator=generator)
     squares = torch.randn(batch, mixed, generator=generator, dtype=torch.float64) ** 2
@@ -194,9 +207,12 @@ def sparse_shares(batch: int, atoms: int, mixed: int, generator: torch.Generator
 
 
 def nearest_in_hull(points: Tensor, atoms: Tensor) -> tuple[Tensor, Tensor]:
-    """The convex combinations of ``atoms`` ``(..., N, D)``, one hull or several, nearest to ``points`` ``(P, D)``.
+    """Find the convex combinations of ``atoms`` ``(..., N, D)``, one hull or several, nearest to points ``(P, D)``.
 
-    Accelerated projected gradients (Beck and Teboulle, FISTA, 2009) with restarts; returns weights and squared errors.
+    By accelerated projected gradients (Beck and Teboulle, FISTA, 2009) with restarts.
+
+    Returns:
+        Weights ``(..., P, N)`` and squared errors ``(..., P)``.
     """
     gram, correlation = atoms @ atoms.mT, points @ atoms.mT
     rate = 1.0 / torch.linalg.eigvalsh(gram)[..., -1:, None]
@@ -214,7 +230,14 @@ def nearest_in_hull(points: Tensor, atoms: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class CameraSampler:
-    """Draws settings of an ISP whose colour atoms are published cameras, as these are now, on the CPU."""
+    """Draws settings of an ISP whose colour atoms are published cameras, on the CPU.
+
+    Args:
+        cameras: the atoms; later changes of them do not reach the sampler.
+        tone_atoms: number of tone curves, 0 where the tone is learned.
+        lights: what lights are drawn.
+        consistent: whether colour and gains are of one camera in one light; if not, the gains are drawn apart.
+    """
 
     def __init__(
         self, cameras: CameraDictionary, tone_atoms: int, lights: LightRange = PHOTOGRAPHS, consistent: bool = True
@@ -226,7 +249,10 @@ class CameraSampler:
         self.tone_atoms, self.lights, self.consistent = tone_atoms, lights, consistent
 
     def sample(self, batch: int, generator: torch.Generator, device: torch.device | str = "cpu") -> ISPParams:
-        """Settings of ``batch`` pictures, from a generator on the CPU; gains have no weights, they follow the light."""
+        """Draw the settings of ``batch`` pictures from a generator on the CPU, as tensors on ``device``.
+
+        Their gain weights are ``(batch, 0)``, as the gains follow from the light.
+        """
         weights, balance = self._cameras_in_light(batch, generator)
         if not self.consistent:
             _, balance = self._cameras_in_light(batch, generator)
@@ -242,7 +268,7 @@ class CameraSampler:
         return ISPParams(colour_weights, none, matrices, channel_gains, tones)
 
     def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Array, Array]:
-        """Weights ``(B, N)`` and balances ``(B, 3)``; implausible gains are drawn again."""
+        """Draw weights ``(B, N)`` and balances ``(B, 3)``, again where the gains are implausible."""
         weights, balance = np.empty((batch, self.known.shape[1])), np.empty((batch, 3))
         open_ = np.arange(batch)
         for _ in range(_ROUNDS):
@@ -258,13 +284,13 @@ class CameraSampler:
         )
 
     def balance(self, weights: Array, light: Array) -> Array:
-        """White balance ``(B, 3)``, green 1, of mixtures ``(B, N)`` of atoms in light of white points ``(B, 3)``."""
+        """Compute the white balance ``(B, 3)``, green 1, of mixtures ``(B, N)`` in light of white points ``(B, 3)``."""
         linear = light @ XYZ_TO_SRGB.numpy().T
         response = weights @ self.responses * np.einsum("bij,bj->bi", (weights @ self.atoms).reshape(-1, 3, 3), linear)
         return np.asarray(response[:, 1:2] / response)
 
 
 def is_plausible(balance: Array) -> NDArray[np.bool_]:
-    """Which white balances ``(B, 3)`` are within :data:`PLAUSIBLE_GAINS`, ``(B,)``."""
+    """Say which white balances ``(B, 3)`` lie within :data:`PLAUSIBLE_GAINS`: booleans ``(B,)``."""
     low, high = PLAUSIBLE_GAINS
     return np.asarray(((balance >= low) & (balance <= high)).all(axis=1))

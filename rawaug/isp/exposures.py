@@ -39,15 +39,15 @@ _SCENE_WHITE = 0.999
 
 
 def confidence(srgb: Tensor) -> Tensor:
-    """m: confidence ``(B, 1, H, W)`` that pixels of sRGB ``(B, 3, H, W)`` in [0, 1] are not clipped."""
+    """Compute m ``(B, 1, H, W)``: how sure it is that a pixel of sRGB ``(B, 3, H, W)`` in [0, 1] is not clipped."""
     return ((_CLIPPED - srgb.amax(dim=1, keepdim=True)) / _RAMP).clamp(0.0, 1.0)
 
 
 @torch.no_grad()
 def merge_exposures(isp: DictionaryISP, pictures: Sequence[Tensor], ev: Sequence[float]) -> ISPResult:
-    """The RAW of a scene at 0 EV from aligned pictures of it; from one picture, its own divided by its exposure.
+    """Merge aligned pictures of a scene into its RAW at 0 EV; one picture alone is divided by its exposure.
 
-    All share the setting that the ISP chooses for the picture nearest to 0 EV.
+    All pictures share the setting that the ISP chooses for the one nearest to 0 EV.
 
     Args:
         isp: the camera.
@@ -55,8 +55,8 @@ def merge_exposures(isp: DictionaryISP, pictures: Sequence[Tensor], ev: Sequence
         ev: exposure of each in stops.
 
     Returns:
-        As ``image`` the RAW ``(B, 3, H, W)``, all colours at every pixel and above 1 where the scene is brighter than
-        white at 0 EV, and the setting.
+        The RAW ``(B, 3, H, W)`` as ``image``, with all colours at every pixel, above 1 where the scene is brighter
+        than white at 0 EV, and the setting.
 
     Raises:
         ValueError: if exposures or shapes do not fit the pictures, or two exposures are equal.
@@ -77,25 +77,35 @@ def merge_exposures(isp: DictionaryISP, pictures: Sequence[Tensor], ev: Sequence
 
 @torch.no_grad()
 def render_exposure(isp: DictionaryISP, raw: Tensor, params: ISPParams, ev: float = 0.0) -> Tensor:
-    """RAW ``(B, 3, H, W)`` of :func:`merge_exposures` times ``2**ev``, as sRGB in [0, 1], highlights compressed."""
+    """Develop the RAW of :func:`merge_exposures` at another exposure, highlights compressed.
+
+    Args:
+        isp: the camera that merged it.
+        raw: ``(B, 3, H, W)``.
+        params: the setting that came with it.
+        ev: exposure in stops; RAW is multiplied by ``2**ev``.
+
+    Returns:
+        sRGB ``(B, 3, H, W)`` in [0, 1].
+    """
     raw = raw * 2.0**ev
     light = raw
     for stage in reversed(isp.ordered_stages):
         light = stage.forward(light, params) if stage.makes > 2 else light
     light = light.amax(dim=1, keepdim=True)
-    return isp.forward_pixels(raw * _compressed(light) / light.clamp_min(MIDDLE_GREY), params).clamp(0.0, 1.0)
+    return isp.forward_pixels(raw * _compress(light) / light.clamp_min(MIDDLE_GREY), params).clamp(0.0, 1.0)
 
 
 def _linear_reverse(isp: DictionaryISP, x: Tensor, params: ISPParams) -> Tensor:
-    """x to x5 with plain division by the gains: highlight-safe gains are not linear in the scene."""
+    """Compute x5 from x, dividing plainly by the gains: highlight-safe gains are not linear in the scene."""
     for stage in isp.ordered_stages:
         plain = isinstance(stage, WhiteBalance)
         x = inverse_gains(x, params.gains, knee=None) if plain else stage.reverse(x, params)
     return x
 
 
-def _compressed(light: Tensor) -> Tensor:
-    """f(L), held to at least a, so that its ratio to ``max(L, a)`` is 1 in the shadows."""
+def _compress(light: Tensor) -> Tensor:
+    """Compute f(L), held to at least a, so that its ratio to ``max(L, a)`` is 1 in the shadows."""
     flat = light.flatten(1)
     brightest = flat.kthvalue(max(round(_SCENE_WHITE * flat.shape[1]), 1), dim=1).values.clamp_min(1.0)
     white = ((brightest - MIDDLE_GREY) / (1.0 - MIDDLE_GREY)).reshape(-1, 1, 1, 1)

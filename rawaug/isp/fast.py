@@ -1,4 +1,4 @@
-r"""The fitted passes as a table and a matrix each: the same RAW and the same sRGB, dozens of times faster.
+r"""The passes of an ISP as a table and a matrix each: the same RAW and the same sRGB, dozens of times faster.
 
 ``y_c = sum_k C[c, k] T_k(x) * max(m + (1 - m) / g_c, 1 / g_c) * G(p) A(x4)``
 
@@ -67,7 +67,18 @@ class BakedISP(nn.Module):
 
     @torch.no_grad()
     def forward(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
-        """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to clean packed RAW ``(B, 4, H/2, W/2)``, float32."""
+        """Convert sRGB to clean packed RAW.
+
+        Args:
+            srgb: ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides.
+            params: the settings of the pictures.
+            place: where each lies in its frame, ``(B, 4 to 6)``: top, left, height and width of the frame, and, if the
+                crop was turned or enlarged, its view and how many rows of the frame it has; None for full frames.
+            white: the RAW value to clip at; nothing is clipped by default.
+
+        Returns:
+            float32 ``(B, 4, H/2, W/2)``, planes R, Gr, Gb, B.
+        """
         _require_batch(srgb, params, place)
         return _pass(srgb, self._camera(srgb, params, place), white)
 
@@ -75,7 +86,18 @@ class BakedISP(nn.Module):
     def colours(
         self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf, shaded: bool = True
     ) -> Tensor:
-        """RAW of all three colours at every site, ``(B, 3, H, W)``; without ``shaded`` x4, for :meth:`shade`."""
+        """Convert sRGB to RAW of all three colours at every pixel.
+
+        Args:
+            srgb: ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides.
+            params: the settings of the pictures.
+            place: as in :meth:`forward`.
+            white: as in :meth:`forward`.
+            shaded: whether the lens acts; if not, the result is x4, for :meth:`shade`.
+
+        Returns:
+            float32 ``(B, 3, H, W)``.
+        """
         _require_batch(srgb, params, place)
         camera, rgb = self._camera(srgb, params, place), []
         if not shaded:
@@ -87,7 +109,7 @@ class BakedISP(nn.Module):
 
     @torch.no_grad()
     def shade(self, x4: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor:
-        """x4 ``(B, 3, H, W)`` with the shading and attention of the lens, x5."""
+        """Apply the shading and attention of the lens to x4 ``(B, 3, H, W)``; the result is x5."""
         camera = self._camera(x4, params, place)
         mask = fall_off(camera, 0, *x4.shape[-2:])
         x5 = x4 if mask is None else x4 * mask
@@ -119,7 +141,7 @@ class FastForward(nn.Module):
             self.register_buffer(name, table)
 
     def forward(self, linear: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor:
-        """Linear camera RGB ``(B, 3, H, W)``, x5, to sRGB ``(B, 3, H, W)`` in [0, 1], float32.
+        """Develop linear camera RGB x5 ``(B, 3, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1], float32.
 
         Balanced light is clipped at the least gain, where a saturated sensor is neutral, as RAW developers do; the
         ISP's own pass clips sRGB alone, and its saturated highlights are magenta.
@@ -136,7 +158,17 @@ class FastForward(nn.Module):
     def develop(
         self, raws: Sequence[Tensor], methods: Sequence[str], params: ISPParams, place: Tensor | None = None
     ) -> list[Tensor]:
-        """Mosaics ``(B, 1, H, W)`` of the same pictures to sRGB, each picture demosaiced by its own method."""
+        """Develop mosaics to sRGB, each picture demosaiced by its own method.
+
+        Args:
+            raws: mosaics ``(B, 1, H, W)`` of the same B pictures, such as the noisy and the clean ones.
+            methods: B of :data:`rawaug.bayer.METHODS`.
+            params: the settings of the pictures.
+            place: as in :meth:`BakedISP.forward`.
+
+        Returns:
+            For each of ``raws`` sRGB ``(B, 3, H, W)`` in [0, 1].
+        """
         directional = any(method in bayer.DIRECTIONAL for method in methods)
         if directional and len(methods) > 1:  # a picture is the same whatever is beside it
             alone = []
@@ -156,7 +188,7 @@ class FastForward(nn.Module):
         return [fastest("develop", raw, display, self.cfa, methods, otherwise=partial(in_steps, raw)) for raw in raws]
 
     def _demosaic_balanced(self, raw: Tensor, method: str, gains: Tensor) -> Tensor:
-        """Balanced, and clipped at black, before a choice of direction, as RAW developers do it."""
+        """Demosaic ``(1, 1, H, W)``; a choice of direction needs balanced RAW clipped at black, as developers do it."""
         if method not in bayer.DIRECTIONAL:
             return bayer.demosaic(raw, self.cfa, method)
         balance = gains[:3, None, None]
@@ -184,7 +216,7 @@ class FastForward(nn.Module):
 @torch.no_grad()
 @one_thread()  # the same tables in every process
 def _tables(isp: DictionaryISP, nodes: int, forward: bool = False) -> tuple[Tensor, Tensor]:
-    """The tables of a pass: x2, or sRGB of the forward pass, and attention, empty for none."""
+    """Make the tables of a pass: x2, or sRGB of the forward pass, and attention, which is empty for none."""
     if any(first.makes >= second.makes for first, second in pairwise(isp.ordered_stages)):
         order = " ".join(isp.config.stages)
         raise ValueError(f"augmentation needs the ISP's stages in the usual order, got {order}; fit it anew")
@@ -228,7 +260,7 @@ def _require_batch(srgb: Tensor, params: ISPParams, place: Tensor | None) -> Non
 
 
 def _as_table(values: Tensor, nodes: int) -> Tensor:
-    """``(1, C, N, N * N)`` on the cube to ``(N, N, N, 4)``, the channels that are missing 0."""
+    """Bring values on the cube ``(1, C, N, N * N)`` to ``(N, N, N, 4)``; missing channels are 0."""
     channels_last = values[0].permute(1, 2, 0).reshape(nodes, nodes, nodes, -1)
     return F.pad(channels_last, (0, 4 - channels_last.shape[-1])).contiguous()
 

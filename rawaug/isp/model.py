@@ -27,7 +27,7 @@ from rawaug.isp.staged import StagedISP, thumbnail
 
 _ADVICE = "fit or copy it again"
 _INFINITE = ("colour.spread",)
-"""A width, which is infinite where the light says nothing of the colour."""
+"""Tensors that may hold infinity: this width is infinite where the light says nothing of the colour."""
 
 
 class DictionaryISP(StagedISP):
@@ -45,7 +45,13 @@ class DictionaryISP(StagedISP):
     def params_from_weights(
         self, colour_weights: Tensor, gain_weights: Tensor, tone_weights: Tensor | None = None
     ) -> ISPParams:
-        """Parameters from given weights ``(B, N)``, ``(B, M)`` and ``(B, K)``; of the typical tone by default."""
+        """Combine atoms by given weights into the settings of B pictures.
+
+        Args:
+            colour_weights: ``(B, N)``, weights of the colour atoms.
+            gain_weights: ``(B, M)``, weights of the gain atoms.
+            tone_weights: ``(B, K)``, weights of the tone curves; the typical ones by default.
+        """
         matrix, gains = self.colour.combine(colour_weights), self.gain.combine(gain_weights)
         if tone_weights is None:
             tone_weights = self.typical_tones().expand(len(matrix), -1)
@@ -63,16 +69,20 @@ class DictionaryISP(StagedISP):
         return self.params_from_weights(*(convex_weights(batch, n, generator).to(device) for n in atoms))
 
     def camera_sampler(self, consistent: bool = True, light: float | str | None = None) -> CameraSampler | None:
-        """What draws settings where the atoms are published cameras, as these are now; else None.
+        """Make the sampler that draws cameras in a light; None unless the colour atoms are published cameras.
 
-        ``light`` is a colour temperature in kelvin or one of :data:`rawaug.isp.cameras.LAMPS`; any light by default.
+        Later changes of the atoms do not reach it.
+
+        Args:
+            consistent: whether colour and gains are of one camera in one light; if not, the gains are drawn apart.
+            light: a colour temperature in kelvin or one of :data:`rawaug.isp.cameras.LAMPS`; any light by default.
         """
         if not isinstance(self.colour, CameraDictionary):
             return None
         return CameraSampler(self.colour, self.config.tone_atoms, light_range(light), consistent)
 
     def choose(self, srgb: Tensor) -> ISPParams:
-        """The parameters that the reverse encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``."""
+        """Choose the settings of pictures ``(B, 3, H, W)`` by the reverse encoders, or by their constants."""
         x2 = self.linear(thumbnail(stages.as_float(srgb)))
         candidates = torch.einsum("nij,bjhw->bnihw", self.colour.atoms(), x2)
         colour_weights = self.reverse_encoders.colour(candidates)
@@ -82,7 +92,7 @@ class DictionaryISP(StagedISP):
         return self.params_from_weights(colour_weights, self.reverse_encoders.gain(torch.stack(balanced, dim=1)))
 
     def choose_forward(self, x4: Tensor) -> ISPParams:
-        """The parameters that the forward encoders choose for a linear image before white balance ``(B, 3, H, W)``."""
+        """Choose the settings of linear images before white balance, x4 ``(B, 3, H, W)``, by the forward encoders."""
         small = thumbnail(x4)
         balanced = small[:, None] * self.gain.channel_gains()[None, :, :, None, None]
         gain_weights = self.forward_encoders.gain(balanced)
@@ -100,20 +110,20 @@ class DictionaryISP(StagedISP):
         white_balance: Tensor | tuple[float, ...] | None = None,
         digital_gain: Tensor | float | None = None,
         raw_samples: Tensor | None = None,
-        place: Tensor | None = None,
+        coordinates: Tensor | None = None,
         intermediates: bool = False,
     ) -> ISPResult:
-        """sRGB to RAW.
+        """Convert sRGB pictures to RAW.
 
         Args:
             srgb: ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides.
-            params: camera setting; chosen by the encoders (or their constants) if not given.
+            params: the settings of the pictures; by default the encoders, or their constants, choose them.
             white_balance: the camera's as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``; green is made 1. They
                 choose the colour atoms of such light as well.
             digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
             raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are solved for from these few readings
                 (:func:`rawaug.isp.staged.with_raw_samples`).
-            place: coordinates of the pixels in the full frame, ``(1 or B, 2, H, W)``
+            coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame
                 (:func:`rawaug.isp.stages.frame_coordinates`); the picture is taken for a full frame by default.
             intermediates: also return x1 ... x5.
 
@@ -132,13 +142,15 @@ class DictionaryISP(StagedISP):
             if len(params.gains) != len(x):
                 raise ValueError(f"the parameters are for {len(params.gains)} pictures, but the batch has {len(x)}")
             if raw_samples is not None:
-                params = staged.with_raw_samples(self, x, params, raw_samples, stages.coordinates_or_full(x, place))
+                params = staged.with_raw_samples(
+                    self, x, params, raw_samples, stages.coordinates_or_full(x, coordinates)
+                )
             seen: dict[str, Tensor] = {}
-            x5 = self.reverse_pixels(x, params, place, seen if intermediates else None)
+            x5 = self.reverse_pixels(x, params, coordinates, seen if intermediates else None)
             return ISPResult(bayer.mosaic(x5, self.cfa), params, seen)
 
     def _float32(self, like: Tensor) -> torch.autocast:
-        """RAW is float32, in mixed precision too."""
+        """Keep the pass in float32, in mixed precision too; ValueError if the ISP is of another type or device."""
         own = self.gain.log_gains
         if own.dtype != torch.float32:
             raise ValueError(f"RAW is float32, but this ISP was converted to {own.dtype}; call isp.float()")
@@ -152,23 +164,37 @@ class DictionaryISP(StagedISP):
         params: ISPParams | None = None,
         *,
         white_balance: Tensor | tuple[float, ...] | None = None,
-        place: Tensor | None = None,
+        coordinates: Tensor | None = None,
         intermediates: bool = False,
     ) -> ISPResult:
-        """RAW mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1]; arguments as in :meth:`reverse`."""
+        """Develop RAW mosaics to sRGB.
+
+        Args:
+            raw: ``(B, 1, H, W)`` with the ISP's CFA, floating point, white = 1.
+            params: the settings of the pictures; by default the forward encoders, or their constants, choose them.
+            white_balance: the camera's as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``.
+            coordinates: as in :meth:`reverse`.
+            intermediates: also return x5 ... x1.
+
+        Returns:
+            A :class:`ISPResult` whose ``srgb`` is ``(B, 3, H, W)`` in [0, 1].
+
+        Raises:
+            ValueError: if ``raw`` is no such mosaic or not finite, or what is given is for another number of pictures.
+        """
         with self._float32(raw):
             x5 = bayer.demosaic(_scene_referred(raw), self.cfa)
             if params is None:
-                params = self.choose_forward(self.remove_shading(x5, place))
+                params = self.choose_forward(self.remove_shading(x5, coordinates))
             params = staged.with_white_balance(self, params, white_balance, None)
             seen: dict[str, Tensor] = {"x5": x5}
-            srgb = self.forward_pixels(x5, params, place, seen if intermediates else None)
+            srgb = self.forward_pixels(x5, params, coordinates, seen if intermediates else None)
         return ISPResult(srgb.clamp(0.0, 1.0), params, seen if intermediates else {})
 
     # -- as numbers -------------------------------------------------------------------------------------------------
 
     def typical_setting(self, white_balance: Sequence[float] | None = None) -> ISPParams:
-        """The setting of one picture that the constants choose; of as-shot multipliers R, G, B if these are given."""
+        """The setting of one picture that the constants choose, under as-shot multipliers R, G, B if there are any."""
         encoders = self.reverse_encoders
         weights = [encoder.prior.softmax(0)[None] for encoder in (encoders.colour, encoders.gain)]
         given = None if white_balance is None else tuple(white_balance)
@@ -176,24 +202,25 @@ class DictionaryISP(StagedISP):
 
     @torch.no_grad()
     def reverse_table(self, setting: ISPParams, nodes: int = 33) -> Tensor:
-        """The reverse pass up to the mosaic, at the centre of the shading, of ``nodes`` sRGB values an axis.
+        """Tabulate the reverse pass up to the mosaic, at the centre of the shading, over ``nodes`` sRGB values an axis.
 
-        Returns linear camera RGB ``(nodes ** 3, 3)``, black 0 and white 1, red changing fastest.
+        Returns:
+            Linear camera RGB ``(nodes ** 3, 3)``, black 0 and white 1, red changing fastest.
         """
         cube = stages.node_colours(nodes)
         shading = self.find(stages.LensShading)
         centre = torch.zeros(2) if shading is None else shading.mask.mean
-        place = centre[None, :, None, None].expand(1, 2, *cube.shape[-2:])
-        return self.reverse_pixels(cube, setting, place)[0].flatten(1).T.contiguous()
+        coordinates = centre[None, :, None, None].expand(1, 2, *cube.shape[-2:])
+        return self.reverse_pixels(cube, setting, coordinates)[0].flatten(1).T.contiguous()
 
     @torch.no_grad()
     def tone_curve(self) -> Tensor:
-        """x2, linear, of the 256 greys of sRGB, R, G, B: ``(256, 3)``. It holds tone and gamma."""
+        """Compute linear x2 of the 256 greys of sRGB, ``(256, 3)``: tone and gamma in one curve a channel."""
         return self.linear(torch.linspace(0.0, 1.0, 256).expand(1, 3, 1, -1))[0, :, 0].T.contiguous()
 
     @torch.no_grad()
     def description(self, white_balance: Sequence[float] | None = None) -> dict[str, Any]:
-        """What the ISP is made of, as JSON; ``setting`` is :meth:`typical_setting`, ``info`` what the fit recorded."""
+        """Describe the ISP as JSON: its atoms, curves and mask, :meth:`typical_setting`, and what the fit recorded."""
         setting, shading, info = self.typical_setting(white_balance), self.find(stages.LensShading), dict(self.info)
         mask = shading and {"mean": shading.mask.mean.tolist(), "precision": shading.mask.precision.tolist()}
         return {
@@ -220,13 +247,13 @@ class DictionaryISP(StagedISP):
     # -- files ------------------------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> None:
-        """Write weights, configuration and ``info`` to one safetensors file, atomically; no disabled part is stored."""
+        """Write weights, configuration and ``info`` to one safetensors file, whole or not at all."""
         header = {"format": "rawaug", "kind": "isp", "config": to_json(asdict(self.config)), "info": to_json(self.info)}
         write_tensors(self.state_dict(), header, path)
 
     @classmethod
     def from_pretrained(cls, name: str | Path) -> DictionaryISP:
-        """Load an ISP: the name of one shipped with the package, or a path.
+        """Load an ISP by the name of one that the package ships, or from a path.
 
         Raises:
             FileNotFoundError: if there is no such file or name.
@@ -254,7 +281,11 @@ class DictionaryISP(StagedISP):
 
 @torch.no_grad()
 def restrict_to_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
-    """The ISP with the published cameras of these names for its atoms: all lights, the same tones."""
+    """Make an ISP whose atoms are the published cameras of these names; tones and lights stay those of ``isp``.
+
+    Raises:
+        ValueError: if the atoms of ``isp`` are not published cameras, or a name is unknown.
+    """
     if not isinstance(isp.colour, CameraDictionary):
         raise ValueError("a camera by name needs an ISP of published cameras, such as universal")
     listed = load_cameras()

@@ -1,14 +1,15 @@
-"""What an ISP is made of: stages, dictionaries, encoders that choose among their atoms, and what a shot's data replace.
+"""The parts of an ISP (stages, dictionaries, encoders that choose among atoms), and settings from what a file states.
 
 An encoder gives the weights of a dictionary's atoms, ``w = softmax(b + E(I))``, from the N images ``I`` that the atoms
 make of one picture (Conde et al., AAAI 2022, "Parameter Dictionaries"); ``b`` is a learned constant, which decides
 alone where there is no network ``E``.
 
-Of known data, grey ``(1, 1, 1)`` becomes ``C 1 / g``, and the file says that it is ``1 / (wb d)``; hence ``g = wb d (C
-1)``. RAW readings ``y_k`` of a channel give its gain by least squares, ``1 / g = sum w x5 y / sum w x5^2`` with ``x5``
-made under gain 1, weighted by ``w = 1 / (y + 0.01)`` for shot noise and reweighted (Cauchy) against readings that lie
-on edges. Where tone is a mixture of curves, and the camera one of cameras, readings choose these as well, in turn:
-given the gains, ``g_c y = sum_k v_k (C T_k(x))_c`` is linear in the weights v, and ``sum_n w_n (C_n T(x))_c`` in w.
+A file states the white balance wb and the digital gain d: grey ``(1, 1, 1)`` becomes ``C 1 / g`` here and ``1 / (wb
+d)`` in the file, hence ``g = wb d (C 1)``. RAW readings ``y_k`` of a channel give its gain by least squares, ``1 / g =
+sum w x5 y / sum w x5^2`` with ``x5`` made under gain 1, weighted by ``w = 1 / (y + 0.01)`` for shot noise and
+reweighted (Cauchy) against readings that lie on edges. Where tone is a mixture of curves, and the camera one of
+cameras, readings choose these as well, in turn: given the gains, ``g_c y = sum_k v_k (C T_k(x))_c`` is linear in the
+weights v, and ``sum_n w_n (C_n T(x))_c`` in w.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ S = TypeVar("S", bound=Stage)
 
 
 THUMBNAIL = 48
-"""Longest side of what an encoder looks at."""
+"""Longest side of the picture that an encoder looks at."""
 CLIPPED = 0.98
 SHADOW = 0.01
 """Added to a reading used as a variance: the share of read noise."""
 ROUNDS = 4
 PULL = 1e-4
-"""Of the typical weights, against the readings' mean square."""
+"""How strongly weights are drawn to the typical ones, as a share of the readings' mean square."""
 
 
 class Encoder(nn.Module):
@@ -52,11 +53,14 @@ class Encoder(nn.Module):
 
     @property
     def looks(self) -> bool:
-        """Whether it looks at the picture."""
+        """Whether it has layers that look at the picture."""
         return self.layers is not None
 
     def add_layers(self, widths: tuple[int, int, int]) -> None:
-        """Look at the picture from now on; changes no weight before the layers are trained."""
+        """Let it look at the picture from now on, by three convolutions; untrained, they change no weight.
+
+        ``widths`` are their features.
+        """
         atoms = len(self.prior)
         channels = (3 * atoms, *widths)
         layers: list[nn.Module] = []
@@ -68,7 +72,7 @@ class Encoder(nn.Module):
         self.layers = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), head).to(self.prior.device)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Images ``(B, N, 3, h, w)`` to weights ``(B, N)`` on the simplex."""
+        """Weigh the N images ``(B, N, 3, h, w)`` that the atoms make: ``(B, N)`` on the simplex."""
         logits = self.prior.expand(len(images), -1)
         if self.layers is not None:
             logits = logits + self.layers(images.flatten(1, 2))
@@ -76,12 +80,12 @@ class Encoder(nn.Module):
 
     @torch.no_grad()
     def set_prior(self, weights: Tensor) -> None:
-        """Make the constant ``weights`` ``(N,)`` (zeros become 1e-6)."""
+        """Set the constant so that it gives ``weights`` ``(N,)``; zeros become 1e-6."""
         self.prior.copy_(weights.clamp_min(1e-6).log())
 
 
 class Encoders(nn.Module):
-    """What chooses the weights of both dictionaries in one direction."""
+    """The encoders of one direction: one for the colour atoms, one for the gain atoms."""
 
     def __init__(self, config: ISPConfig) -> None:
         super().__init__()
@@ -90,7 +94,7 @@ class Encoders(nn.Module):
 
 
 def thumbnail(image: Tensor) -> Tensor:
-    """``(B, 3, H, W)`` averaged down to at most :data:`THUMBNAIL` a side."""
+    """Average a picture ``(B, 3, H, W)`` down to at most :data:`THUMBNAIL` pixels a side."""
     height, width = image.shape[-2:]
     scale = THUMBNAIL / max(height, width, THUMBNAIL)
     return F.adaptive_avg_pool2d(image, (max(1, round(height * scale)), max(1, round(width * scale))))
@@ -102,9 +106,9 @@ class StagedISP(nn.Module):
     def __init__(self, config: ISPConfig | None = None, seed: int = 0) -> None:
         super().__init__()
         self.info: dict[str, Any] = {}
-        """What a fit recorded."""
+        """What a fit recorded, as plain values by name."""
         self.config = config or ISPConfig()
-        """What it is made of; :meth:`configure` and :meth:`use_encoders` change it."""
+        """The parts that it is made of; :meth:`configure` and :meth:`use_encoders` change them."""
         with initialise_from(seed):
             self.colour = ColourDictionary(self.config.colour_atoms)
             if self.config.cameras:
@@ -160,35 +164,55 @@ class StagedISP(nn.Module):
         return self.tone.typical if self.tone else self.colour.matrices.new_zeros(0)
 
     def reverse_pixels(
-        self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
+        self, x: Tensor, params: ISPParams, coordinates: Tensor | None = None, seen: dict[str, Tensor] | None = None
     ) -> Tensor:
-        """x to x5 ``(B, 3, H, W)``, the reverse pass without its mosaic; fills ``seen`` with x1 ... x5."""
+        """Run the reverse pass without its mosaic.
+
+        Args:
+            x: sRGB as float ``(B, 3, H, W)``; or P pixels of it ``(B, 3, 1, P)``, as the pass is pointwise.
+            params: the settings of the pictures.
+            coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame; the picture is one by default.
+            seen: is filled with x1 ... x5 by name.
+
+        Returns:
+            Linear camera colour x5, of the shape of ``x``.
+        """
         for stage in self.ordered_stages:
-            x = stage.reverse(x, params, place)
+            x = stage.reverse(x, params, coordinates)
             if seen is not None:
                 seen[f"x{stage.makes}"] = x
         return x
 
     def forward_pixels(
-        self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
+        self, x: Tensor, params: ISPParams, coordinates: Tensor | None = None, seen: dict[str, Tensor] | None = None
     ) -> Tensor:
-        """x5 ``(B, 3, H, W)`` to x, not clipped; fills ``seen`` with x4 ... x1."""
+        """Run the forward pass after demosaicing; the result is not clipped.
+
+        Args:
+            x: linear camera colour x5 ``(B, 3, H, W)``.
+            params: the settings of the pictures.
+            coordinates: as in :meth:`reverse_pixels`.
+            seen: is filled with x4 ... x1 by name.
+
+        Returns:
+            sRGB, of the shape of ``x``.
+        """
         for stage in reversed(self.ordered_stages):
-            x = stage.forward(x, params, place)
+            x = stage.forward(x, params, coordinates)
             if seen is not None and stage.makes > 1:
                 seen[f"x{stage.makes - 1}"] = x
         return x
 
     def linear(self, x: Tensor) -> Tensor:
-        """x to x2 by the stages in their usual order, without a setting: what the reverse encoders look at."""
+        """Compute x2 from sRGB, both ``(B, 3, H, W)``, by the stages in their usual order; it needs no setting."""
         for stage in sorted(self.ordered_stages, key=lambda stage: stage.makes):
             x = stage.reverse(x, None) if stage.makes <= 2 else x
         return x
 
-    def remove_shading(self, x: Tensor, place: Tensor | None) -> Tensor:
-        """x5 to x4, what the forward encoders look at."""
+    def remove_shading(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
+        """Compute x4 from x5, both ``(B, 3, H, W)``; the forward encoders look at x4."""
         for stage in reversed(self.ordered_stages):
-            x = stage.forward(x, None, place) if stage.makes >= 5 else x
+            x = stage.forward(x, None, coordinates) if stage.makes >= 5 else x
         return x
 
 
@@ -201,7 +225,17 @@ def with_white_balance(
     white_balance: Tensor | tuple[float, ...] | None,
     digital_gain: Tensor | float | None,
 ) -> ISPParams:
-    """Put the camera's own gains, and the colour atoms of such light, in place of the chosen ones."""
+    """Replace the gains of a setting, and its colour atoms by those of such light, by what the camera states.
+
+    Args:
+        isp: whose dictionaries are used.
+        params: the settings of B pictures.
+        white_balance: as-shot multipliers of R, G, B, ``(3,)`` or ``(B, 3)``; green is made 1. None keeps the gains.
+        digital_gain: the factor on all channels, a scalar or ``(B,)``. None keeps the setting's own.
+
+    Raises:
+        ValueError: if a multiplier is not positive, or the shapes are of another number of pictures.
+    """
     batch = len(params.gains)
     if white_balance is not None:
         balance = torch.as_tensor(white_balance, dtype=params.gains.dtype, device=params.gains.device)
@@ -227,13 +261,28 @@ def _require_factor(name: str, value: Tensor) -> None:
         raise ValueError(f"{name} must be positive, got {value.flatten().tolist()}")
 
 
-def with_raw_samples(isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: Tensor, place: Tensor) -> ISPParams:
-    """Gains from RAW readings, then the colour atoms of that light, and the gains again; clipped ones do not count."""
+def with_raw_samples(
+    isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: Tensor, coordinates: Tensor
+) -> ISPParams:
+    """Solve for the gains from RAW readings, choose the colour atoms of that light, and solve for the gains again.
+
+    Clipped readings do not count.
+
+    Args:
+        isp: the camera.
+        x: sRGB as float ``(B, 3, H, W)``.
+        params: the settings to start from.
+        raw_samples: ``(B, K, 3)`` of row, column and RAW value.
+        coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame.
+
+    Raises:
+        ValueError: if a reading is NaN or lies outside the picture.
+    """
     _require_places(raw_samples, x)
     rows, columns = raw_samples[..., 0].long(), raw_samples[..., 1].long()
     batch = torch.arange(len(x), device=x.device)[:, None]
     pixels = x[batch, :, rows, columns].transpose(1, 2)[:, :, None]
-    where = place.expand(len(x), -1, -1, -1)[batch, :, rows, columns].transpose(1, 2)[:, :, None]
+    where = coordinates.expand(len(x), -1, -1, -1)[batch, :, rows, columns].transpose(1, 2)[:, :, None]
     channel = torch.tensor(isp.cfa.channels, device=x.device)[rows % 2, columns % 2]
     own = F.one_hot(channel, 3).transpose(1, 2).to(x)
     return with_readings(isp, pixels, where, own, raw_samples[..., 2], params)
@@ -242,11 +291,22 @@ def with_raw_samples(isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: 
 def with_readings(
     isp: StagedISP, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams
 ) -> ISPParams:
-    """As :func:`with_raw_samples`, for pixels that are at hand."""
+    """Do what :func:`with_raw_samples` does for pixels that were picked already.
+
+    Args:
+        isp: the camera.
+        pixels: their sRGB, ``(B, 3, 1, K)``.
+        where: their coordinates in the full frame, ``(B, 2, 1, K)``.
+        own: 1 for the colour that each site has and 0 for the others, ``(B, 3, K)``.
+        value: the readings, ``(B, K)``.
+        params: the settings to start from.
+    """
     params = _solve(isp, pixels, where, own, value, params)
     if isp.tone is not None and isinstance(isp.colour, CameraDictionary):
         for _ in range(ROUNDS):
-            params = _solve(isp, pixels, where, own, value, _mixed(isp.colour, isp.tone, pixels, own, value, params))
+            params = _solve(
+                isp, pixels, where, own, value, _fit_mixtures(isp.colour, isp.tone, pixels, own, value, params)
+            )
         return params
     light = params.gains / params.matrix.sum(2) / (params.colour_weights @ isp.colour.neutral).exp()
     weights = isp.colour.weights_for(light)
@@ -254,10 +314,10 @@ def with_readings(
     return _solve(isp, pixels, where, own, value, params)
 
 
-def _mixed(
+def _fit_mixtures(
     cameras: CameraDictionary, tones: ToneDictionary, pixels: Tensor, own: Tensor, value: Tensor, params: ISPParams
 ) -> ISPParams:
-    """The nearest mixture of curves, then of cameras, under the gains that ``params`` have."""
+    """Fit the mixture of curves, then that of cameras, under the gains that ``params`` have."""
     target = value * torch.einsum("bck,bc->bk", own, params.gains)
     weight = ((value < CLIPPED) / (value.clamp_min(0.0) + SHADOW)).sqrt()
     seen = torch.einsum("bck,bcd->bkd", own, params.matrix)
@@ -272,11 +332,12 @@ def _mixed(
 
 
 def _nearest(target: Tensor, makes: Tensor, typical: Tensor) -> Tensor:
-    """Weights ``(B, N)`` whose mixture of ``makes`` ``(B, N, K)`` is nearest ``target`` ``(B, K)``."""
+    """Find weights ``(B, N)`` whose mixture of ``makes`` ``(B, N, K)`` is nearest to ``target`` ``(B, K)``."""
     rows = []
-    for wanted, atoms in zip(target.double(), makes.double(), strict=True):
+    for row, atoms in zip(target.double(), makes.double(), strict=True):
         pull = (PULL * atoms.square().mean() * atoms.shape[1]).sqrt() * torch.eye(len(atoms)).to(atoms)
-        point = torch.cat([wanted, typical.to(atoms) @ pull])
+        # A mixture that the readings leave open falls back on the typical weights.
+        point = torch.cat([row, typical.to(atoms) @ pull])
         rows.append(nearest_in_hull(point[None], torch.cat([atoms, pull], dim=1))[0][0])
     return torch.stack(rows).to(target.dtype)
 

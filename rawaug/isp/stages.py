@@ -47,12 +47,12 @@ _HALF_LEVEL = 0.5 / 255
 
 
 def as_float(srgb: Tensor) -> Tensor:
-    """uint8 to float32 in [0, 1]; floats pass."""
+    """Convert a picture ``(..., 3, H, W)`` from uint8 to float32 in [0, 1]; floats pass as they are."""
     return srgb.float() / 255.0 if srgb.dtype == torch.uint8 else srgb
 
 
 def as_display_referred(srgb: Tensor) -> Tensor:
-    """:func:`as_float` of a picture; ValueError unless it is uint8 or float32 in [0, 1]."""
+    """Convert a picture ``(B, 3, H, W)`` to float32; ValueError unless it is uint8, or float32 in [0, 1]."""
     if srgb.layout != torch.strided:
         raise ValueError(f"a picture must be a dense tensor, got {srgb.layout}; call to_dense()")
     if srgb.dtype not in (torch.uint8, torch.float32):
@@ -62,7 +62,7 @@ def as_display_referred(srgb: Tensor) -> Tensor:
 
 
 def require_display_range(image: Tensor) -> None:
-    """Raise ValueError if floats leave [0, 1] by more than half an 8-bit level, or are NaN."""
+    """Raise ValueError if floats of an image of any shape leave [0, 1] by more than half an 8-bit level, or are NaN."""
     # Only on the CPU: elsewhere reading a value back would stall the device.
     if image.device.type != "cpu" or image.dtype == torch.uint8 or not image.numel():
         return
@@ -78,7 +78,7 @@ def require_display_range(image: Tensor) -> None:
 
 
 def _colourwise(hidden: int, outputs: int) -> nn.Sequential:
-    """``hidden`` 1 x 1 convolutions to 32 features with ReLU, then one that is zero until it is trained."""
+    """Stack ``hidden`` 1 x 1 convolutions to 32 features with ReLU, and one that is zero until it is trained."""
     last = nn.Conv2d(WIDTH, outputs, 1)
     nn.init.zeros_(last.weight)
     last.bias = nn.Parameter(torch.zeros(outputs))
@@ -88,13 +88,14 @@ def _colourwise(hidden: int, outputs: int) -> nn.Sequential:
 
 
 class ToneNetwork(nn.Module):
-    """f1: a residual 3-32-32-32-3 network of 1 x 1 convolutions with ReLU; the identity at first."""
+    """The tone curve f1 as a residual 3-32-32-32-3 network of 1 x 1 convolutions with ReLU; the identity at first."""
 
     def __init__(self) -> None:
         super().__init__()
         self.layers = _colourwise(hidden=3, outputs=3)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Map colours ``(B, 3, H, W)`` to colours of the same shape, each pixel by itself."""
         return x + self.layers(x)
 
     @torch.no_grad()
@@ -113,22 +114,22 @@ class ToneNetwork(nn.Module):
 
 
 def gamma_expand(x: Tensor, gamma: Tensor | float) -> Tensor:
-    """f2 reversed: display-referred to linear, ``max(x, eps) ** gamma``."""
+    """f2 reversed: display-referred to linear ``(B, 3, H, W)``, ``max(x, eps) ** gamma``."""
     return x.clamp_min(EPS) ** gamma
 
 
 def gamma_compress(x: Tensor, gamma: Tensor | float) -> Tensor:
-    """f2: linear to display-referred, ``max(x, eps) ** (1 / gamma)``."""
+    """f2: linear to display-referred ``(B, 3, H, W)``, ``max(x, eps) ** (1 / gamma)``."""
     return x.clamp_min(EPS) ** (1.0 / gamma)
 
 
 def correct_colour(x: Tensor, matrix: Tensor) -> Tensor:
-    """f3 in either direction: ``matrix`` ``(B, 3, 3)`` acts on colour columns."""
+    """f3 in either direction: multiply the colours of ``x`` ``(B, 3, H, W)`` by ``matrix`` ``(B, 3, 3)``."""
     return torch.einsum("bij,bjhw->bihw", matrix, x)
 
 
 def inverse_gains(x: Tensor, gains: Tensor, knee: float | None = HIGHLIGHT_KNEE) -> Tensor:
-    """f4 reversed: divide by ``gains`` ``(B, 3)``, sparing highlights; ``knee=None`` divides plainly.
+    """f4 reversed: divide ``x`` ``(B, 3, H, W)`` by ``gains`` ``(B, 3)``, sparing highlights; None divides plainly.
 
     ``m = clip((mean(x) - knee) / (1 - knee), 0)^2`` and the factor is ``max(m + (1 - m) / g, 1 / g)``.
     """
@@ -142,19 +143,28 @@ def inverse_gains(x: Tensor, gains: Tensor, knee: float | None = HIGHLIGHT_KNEE)
 
 
 def highlight_rise(floor: Tensor, knee: float | None) -> Tensor:
-    """What sparing a highlight adds to ``floor``, one over the gains, where the mask is 1."""
+    """How much brighter a spared highlight is where the mask is 1; ``floor`` ``(..., 3)`` is one over the gains."""
     return torch.zeros_like(floor) if knee is None else (1.0 - floor).clamp_min(0.0)
 
 
 def apply_gains(x: Tensor, gains: Tensor) -> Tensor:
-    """f4: multiply by ``gains`` ``(B, 3)``."""
+    """f4: multiply ``x`` ``(B, 3, H, W)`` by ``gains`` ``(B, 3)``."""
     return x * gains[:, :, None, None]
 
 
 def frame_coordinates(
     height: int, width: int, offset: tuple[int, int] = (0, 0), frame: tuple[int, int] | None = None
 ) -> Tensor:
-    """Coordinates ``(1, 2, H, W)`` (y, x) of a crop's pixels in its *full* frame: centre 0, half the diagonal 1."""
+    """Coordinates (y, x) of a crop's pixels in its *full* frame, whose centre is 0 and half of whose diagonal is 1.
+
+    Args:
+        height, width: sides of the crop.
+        offset: its top and left in the frame.
+        frame: height and width of the frame; the crop is one by default.
+
+    Returns:
+        float32 ``(1, 2, H, W)``.
+    """
     full_height, full_width = frame or (height, width)
     half_diagonal = 0.5 * (full_height**2 + full_width**2) ** 0.5
     y = (torch.arange(height, dtype=torch.float32) + (offset[0] + 0.5 - full_height / 2)) / half_diagonal
@@ -162,9 +172,9 @@ def frame_coordinates(
     return torch.stack(torch.meshgrid(y, x, indexing="ij"))[None]
 
 
-def coordinates_or_full(x: Tensor, place: Tensor | None) -> Tensor:
-    """``place``, or that of a full frame, in the dtype of the image ``x``."""
-    return (frame_coordinates(*x.shape[-2:]) if place is None else place).to(x)
+def coordinates_or_full(x: Tensor, coordinates: Tensor | None) -> Tensor:
+    """``coordinates`` ``(B, 2, H, W)``, or those of a full frame, in the type of the image ``x`` ``(B, 3, H, W)``."""
+    return (frame_coordinates(*x.shape[-2:]) if coordinates is None else coordinates).to(x)
 
 
 class GaussianMask(nn.Module):
@@ -186,14 +196,14 @@ class GaussianMask(nn.Module):
         factor = factor.index_put((rows, columns), self.factor)
         return factor @ factor.T
 
-    def forward(self, place: Tensor) -> Tensor:
-        """Mask ``(B, 1, H, W)`` in (0, 1] at coordinates ``(B, 2, H, W)``."""
-        p = place - self.mean[None, :, None, None]
+    def forward(self, coordinates: Tensor) -> Tensor:
+        """Compute the mask ``(B, 1, H, W)``, in (0, 1], at coordinates ``(B, 2, H, W)``."""
+        p = coordinates - self.mean[None, :, None, None]
         return torch.exp(-0.5 * torch.einsum("bihw,ij,bjhw->bhw", p, self.precision, p))[:, None]
 
     @torch.no_grad()
     def set(self, mean: Tensor, precision: Tensor) -> None:
-        """Start from a mean ``(2,)`` and a precision ``(2, 2)``; negative curvature is taken as none."""
+        """Set the mean ``(2,)`` and the precision ``(2, 2)``; negative curvature is taken as none."""
         values, vectors = torch.linalg.eigh(precision)
         root = vectors @ torch.diag(values.clamp_min(0.0).sqrt())
         lower = torch.linalg.qr(root.T).R.T
@@ -209,12 +219,18 @@ class AttentionMask(nn.Module):
         self.layers = _colourwise(hidden=2, outputs=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Mask ``(B, 1, H, W)`` of an image ``(B, 3, H, W)``."""
+        """Compute the mask ``(B, 1, H, W)`` of an image ``(B, 3, H, W)``."""
         return 2.0 * torch.sigmoid(self.layers(x))
 
 
 class Tables(NamedTuple):
-    """What the baked pass looks up, at the nodes of an N x N x N cube."""
+    """What the baked pass looks up, at the nodes of an N x N x N cube.
+
+    Args:
+        cube: the colours of the nodes, ``(1, 3, N, N * N)``.
+        x2: what the stages up to x2 make of them, of the same shape.
+        attention: the attention mask there, ``(1, 1, N, N * N)``, if there is one.
+    """
 
     cube: Tensor
     x2: Tensor
@@ -222,7 +238,15 @@ class Tables(NamedTuple):
 
 
 class BatchParams(NamedTuple):
-    """What the baked pass takes from the settings of a batch."""
+    """What the baked pass takes from the settings of a batch of B pictures.
+
+    Args:
+        matrix: ``(B, 3, 3)``, x2 to x3.
+        floor: ``(B, 1, 3)``, one over the gains.
+        frame: ``(B, 6)``, where the picture lies; see :class:`rawaug.kernels.reference.Camera`.
+        curves: ``(B, T)``, inverse tone curves, or ``(B, 0)`` where the tone is in the tables.
+        shading: ``(3,)``, exponents of the mask, or ``(0,)`` without one.
+    """
 
     matrix: Tensor
     floor: Tensor
@@ -247,37 +271,52 @@ class Stage(nn.Module, ABC):
         self.config = config
 
     @abstractmethod
-    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        """``x_(k-1)`` to ``x_k``."""
+    def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute ``x_k`` from ``x_(k-1)``, both ``(B, 3, H, W)``.
+
+        ``params`` are the settings of the pictures, which stages up to x2 do without, and ``coordinates``
+        ``(1 or B, 2, H, W)`` those of the pixels in the full frame.
+        """
 
     @abstractmethod
-    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        """``x_k`` to ``x_(k-1)``, arguments as in :meth:`reverse`."""
+    def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute ``x_(k-1)`` from ``x_k``, both ``(B, 3, H, W)``; arguments as in :meth:`reverse`."""
 
     def bake(self, tables: Tables) -> Tables:
-        """The tables of the reverse pass with what this stage does to every picture alike."""
+        """Put what this stage does to every picture alike into the tables of the reverse pass."""
         return tables._replace(x2=self.reverse(tables.x2, None)) if self.makes <= 2 else tables
 
     def bake_forward(self, tables: Tables) -> Tables:
-        """The tables of the forward pass, whose ``x2`` becomes sRGB, likewise."""
+        """Put what this stage does to every picture alike into the tables of the forward pass, whose x2 is sRGB."""
         return tables._replace(x2=self.forward(tables.x2, None)) if self.makes <= 2 else tables
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
-        """``batch`` with what this stage does to these pictures of ``size``; ``place`` ``(B, 4 to 6)`` or None."""
+        """Put what this stage does to these pictures into ``batch``.
+
+        Args:
+            batch: what the stages before this one have put there.
+            params: the settings of the pictures.
+            place: where each lies in its frame, ``(B, 4 to 6)``: top, left, height and width of the frame, and, if the
+                crop was turned or enlarged, its view and how many rows of the frame it has; None for full frames.
+            size: height and width of the pictures.
+        """
         return batch
 
     def describe(self) -> str:
-        """The stage's parameters in one line; empty if the settings hold them all."""
+        """Describe the stage's parameters in one line; the line is empty if the settings hold them all."""
         return ""
 
     # -- fitting ----------------------------------------------------------------------------------------------------
 
     def coarse_parameters(self) -> dict[str, Tensor]:
-        """The few numbers of :meth:`coarse`."""
+        """The few numbers, by name, that :meth:`coarse` depends on."""
         return {}
 
-    def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
-        """The reverse pass in a few numbers, from which a fit starts; the identity if each frame has its own."""
+    def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
+        """Compute the reverse pass ``(B, 3, H, W)`` in a few numbers, from which a fit starts.
+
+        A stage whose parameters each frame has for itself does nothing here.
+        """
         return x
 
     def start_coarse(self, gamma: float, toe: float) -> None:
@@ -290,20 +329,20 @@ class Stage(nn.Module, ABC):
         """Start :meth:`forward` from :meth:`reverse`."""
 
     def parameters_of(self, forward: bool) -> dict[str, Tensor]:
-        """The parameters that the forward or the reverse pass is fitted by, with the stage's name before theirs."""
+        """The parameters that a fit of the forward or of the reverse pass changes, as ``stage.name``."""
         named = self.named_parameters()
         return {f"{self.name}.{key}": p for key, p in named if key.startswith("forward_") == forward}
 
 
 def node_colours(nodes: int) -> Tensor:
-    """The colours ``(1, 3, N, N * N)`` at the nodes of a table, axes B, G, R."""
+    """The colours at the nodes of a table, float32 ``(1, 3, N, N * N)``; the axes of the cube are B, G, R."""
     axis = torch.linspace(0.0, 1.0, nodes, dtype=torch.float32)
     return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).flip(0).reshape(1, 3, nodes, nodes**2)
 
 
 @STAGES.register("tone")
 class ToneMap(Stage):
-    """f1: a tone network for each direction."""
+    """f1: one tone network for each direction."""
 
     name, makes = "tone", 1
     toe: Tensor
@@ -314,28 +353,34 @@ class ToneMap(Stage):
         self.forward_network = ToneNetwork()
         self.register_buffer("toe", torch.zeros(()), persistent=False)
 
-    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+    def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute x1 from sRGB, both ``(B, 3, H, W)``, by the reverse network."""
         return self.reverse_network(x)
 
-    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute sRGB from x1, both ``(B, 3, H, W)``, by the forward network."""
         return self.forward_network(x)
 
     def coarse_parameters(self) -> dict[str, Tensor]:
+        """The toe of the curve."""
         return {"toe": self.toe}
 
-    def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
+    def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
+        """Compute ``x + toe (1 - x)``, ``(B, 3, H, W)``: with a gamma behind it the curve of sRGB."""
         return x + self.toe * (1.0 - x)
 
     def start_coarse(self, gamma: float, toe: float) -> None:
+        """Take the toe of the curve; the stage gamma takes its power."""
         self.toe.fill_(toe)
 
     def start_fine(self) -> None:
+        """Start the reverse network as the curve with the toe."""
         self.reverse_network.start_from(float(self.toe))
 
 
 @STAGES.register("gamma")
 class Gamma(Stage):
-    """f2: a power for each direction, 2.2 at first."""
+    """f2: one power for each direction, 2.2 at first."""
 
     name, makes = "gamma", 2
 
@@ -344,59 +389,72 @@ class Gamma(Stage):
         self.reverse_gamma = nn.Parameter(torch.tensor(2.2))
         self.forward_gamma = nn.Parameter(torch.tensor(2.2))
 
-    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+    def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute x2 from x1, both ``(B, 3, H, W)``, by the reverse power."""
         return gamma_expand(x, self.reverse_gamma)
 
-    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute x1 from x2, both ``(B, 3, H, W)``, by the forward power."""
         return gamma_compress(x, self.forward_gamma)
 
     def describe(self) -> str:
+        """Describe both powers."""
         return f"gamma: {self.reverse_gamma.item():.3f} reverse, {self.forward_gamma.item():.3f} forward"
 
     def coarse_parameters(self) -> dict[str, Tensor]:
+        """The reverse power."""
         return {"gamma": self.reverse_gamma}
 
-    def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
+    def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
+        """Compute the reverse pass itself, ``(B, 3, H, W)``, which is one number already."""
         return self.reverse(x, None)
 
     @torch.no_grad()
     def start_coarse(self, gamma: float, toe: float) -> None:
+        """Take the power of the curve; the stage tone takes its toe."""
         self.reverse_gamma.fill_(gamma)
 
     @torch.no_grad()
     def start_forward(self) -> None:
+        """Start the forward power from the reverse one."""
         self.forward_gamma.copy_(self.reverse_gamma)
 
 
 @STAGES.register("colour")
 class ColorCorrection(Stage):
-    """f3: the picture's matrix."""
+    """f3: each picture's own matrix C."""
 
     name, makes = "colour", 3
 
-    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+    def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute x3 = C x2, both ``(B, 3, H, W)``."""
         return correct_colour(x, require_params(params).matrix)
 
-    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute x2 = pinv(C) x3, both ``(B, 3, H, W)``."""
         return correct_colour(x, torch.linalg.pinv(require_params(params).matrix))
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
+        """Put the matrices ``(B, 3, 3)`` of ``params`` into ``batch``; ``place`` and ``size`` do not matter."""
         return batch._replace(matrix=params.matrix.to(batch.matrix))
 
 
 @STAGES.register("gains")
 class WhiteBalance(Stage):
-    """f4: the picture's gains, with Brooks' care for highlights on the way back."""
+    """f4: each picture's own gains, with Brooks' care for highlights on the way back."""
 
     name, makes = "gains", 4
 
-    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+    def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute x4 from x3, both ``(B, 3, H, W)``, by :func:`inverse_gains`."""
         return inverse_gains(x, require_params(params).gains, self.config.knee)
 
-    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute x3 = g x4, both ``(B, 3, H, W)``."""
         return apply_gains(x, require_params(params).gains)
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
+        """Put one over the gains ``(B, 3)`` of ``params`` into ``batch``; ``place`` and ``size`` do not matter."""
         return batch._replace(floor=1.0 / params.gains.to(batch.floor)[:, None])
 
 
@@ -412,21 +470,29 @@ class LensShading(Stage):
         self.reverse_attention = AttentionMask() if config.attention else None
         self.forward_attention = AttentionMask() if config.attention else None
 
-    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        x = x * self.mask(coordinates_or_full(x, place))
+    def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute x5 = x4 G(p) A(x4 G(p)), both ``(B, 3, H, W)``."""
+        x = x * self.mask(coordinates_or_full(x, coordinates))
         return x if self.reverse_attention is None else x * self.reverse_attention(x)
 
-    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        x = x / self.mask(coordinates_or_full(x, place))
+    def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute x4 from x5, both ``(B, 3, H, W)``: divide by the mask, then apply the forward attention."""
+        x = x / self.mask(coordinates_or_full(x, coordinates))
         return x if self.forward_attention is None else x * self.forward_attention(x)
 
     def bake(self, tables: Tables) -> Tables:
+        """Put the reverse attention mask into the tables."""
         return _bake_attention(tables, self.reverse_attention)
 
     def bake_forward(self, tables: Tables) -> Tables:
+        """Put the forward attention mask into the tables."""
         return _bake_attention(tables, self.forward_attention)
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
+        """Put the mask's exponents and each picture's frame ``(B, 6)`` into ``batch``.
+
+        ``place`` and ``size`` are as in :meth:`Stage.adjust`; ``params`` do not matter.
+        """
         centre = (float(self.mask.mean[0]), float(self.mask.mean[1]))
         places = [[0, 0, *size]] * len(batch.frame) if place is None else place.tolist()
         frame = batch.frame.new_tensor([mask_frame(p, *size, centre) for p in places]).reshape(len(batch.frame), 6)
@@ -435,14 +501,17 @@ class LensShading(Stage):
         return batch._replace(frame=frame, shading=shading)
 
     def describe(self) -> str:
+        """Describe the mask by its mean and precision."""
         mean, precision = self.mask.mean.tolist(), self.mask.precision.flatten().tolist()
         return f"shading: mean {mean}, precision {[round(p, 3) for p in precision]}"
 
     def coarse_parameters(self) -> dict[str, Tensor]:
+        """The five numbers of the mask."""
         return {f"mask.{key}": p for key, p in self.mask.named_parameters()}
 
-    def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
-        return x * self.mask(coordinates_or_full(x, place))
+    def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
+        """Multiply ``x`` ``(B, 3, H, W)`` by the Gaussian mask alone."""
+        return x * self.mask(coordinates_or_full(x, coordinates))
 
 
 def _bake_attention(tables: Tables, mask: AttentionMask | None) -> Tables:
@@ -450,7 +519,7 @@ def _bake_attention(tables: Tables, mask: AttentionMask | None) -> Tables:
 
 
 def require_params(params: ISPParams | None) -> ISPParams:
-    """``params``, which every stage after x2 needs."""
+    """The settings, which every stage after x2 needs; ValueError if there are none yet."""
     if params is None:
         raise ValueError("this stage needs the pictures' parameters; choose them first")
     return params

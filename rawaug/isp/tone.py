@@ -35,22 +35,22 @@ PIECES = 51
 
 
 def srgb_to_linear(code: Tensor) -> Tensor:
-    """The sRGB transfer function: codes in [0, 1] to linear display light in [0, 1]."""
+    """The sRGB transfer function: codes in [0, 1], of any shape, to linear display light in [0, 1]."""
     return torch.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055).clamp_min(0.0) ** 2.4)
 
 
 def inverse_smoothstep(x: Tensor) -> Tensor:
-    """``1/2 - sin(asin(1 - 2x) / 3)`` on [0, 1], the inverse of ``3x^2 - 2x^3``."""
+    """Invert ``3x^2 - 2x^3`` on [0, 1] by ``1/2 - sin(asin(1 - 2x) / 3)``; tensors of any shape."""
     return 0.5 - torch.sin(torch.asin(1.0 - 2.0 * x.clamp(0.0, 1.0)) / 3.0)
 
 
 def to_linear(srgb: Tensor, tables: Tensor) -> Tensor:
-    """Pictures ``(B, C, H, W)``, uint8 or float in [0, 1], through one table ``(B, 1021)`` each; float32."""
+    """Map pictures ``(B, C, H, W)``, uint8 or float in [0, 1], each by its own table ``(B, 1021)``, to linear light."""
     return apply_curves(tables[:, ::STEPS] if srgb.dtype == torch.uint8 else tables, srgb)
 
 
 def to_code(linear: Tensor, tables: Tensor) -> Tensor:
-    """The way back: linear light ``(B, C, H, W)``, held to [0, 1], to sRGB codes in [0, 1], float32."""
+    """Invert :func:`to_linear`: linear light ``(B, C, H, W)``, held to [0, 1], to sRGB codes in [0, 1], float32."""
     light = linear.clamp(0.0, 1.0).flatten(1).to(tables)
     right = torch.searchsorted(tables, light).clamp(1, NODES - 1)
     low, high = tables.gather(1, right - 1), tables.gather(1, right)
@@ -70,14 +70,14 @@ class ToneDictionary(nn.Module):
         self.register_buffer("typical", torch.full((atoms,), 1.0 / atoms))
 
     def combine(self, weights: Tensor) -> Tensor:
-        """Weights ``(B, K)`` to tables ``(B, 1021)``, the same bits in a batch of any size."""
+        """Mix the curves by weights ``(B, K)`` into tables ``(B, 1021)``: the same bits in a batch of any size."""
         table = weights.new_zeros(len(weights), self.curves.shape[1])
         for weight, curve in self._weighed(weights):
             table += weight[:, None] * curve
         return table
 
     def _weighed(self, weights: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Weights ``(B,)`` with a curve ``(1021,)``, or a curve for each ``(B, 1021)``, in the order of the atoms."""
+        """Pair weights ``(B,)`` with one curve ``(1021,)`` or one for each picture ``(B, 1021)``, in order of atoms."""
         # Weights of 0 are skipped on a CPU, unless they are being fitted; on a GPU looking for them would stall it, and
         # an exported pass has no values to look at.
         if weights.is_cuda or weights.requires_grad or torch.compiler.is_compiling():
@@ -92,7 +92,7 @@ class ToneDictionary(nn.Module):
 
 @STAGES.register("curve")
 class ToneCurve(Stage):
-    """f1 and f2 in one: the picture's inverse tone curve, or the typical one where the setting is not chosen yet."""
+    """f1 and f2 in one: each picture's inverse tone curve, or the typical one while no setting is chosen."""
 
     name, makes = "curve", 2
 
@@ -103,28 +103,35 @@ class ToneCurve(Stage):
         self.dictionary = ToneDictionary(config.tone_atoms)
         self.slopes: Tensor | None = None  # (K, PIECES), l, during a fit
 
-    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+    def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute x2 from sRGB, both ``(B, 3, H, W)``, by each picture's curve."""
         return to_linear(x, self._curves(len(x), params))
 
-    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute sRGB from x2, both ``(B, 3, H, W)``, by the inverse of each picture's curve."""
         return to_code(x, self._curves(len(x), params))
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
+        """Put the curves ``(B, 1021)`` of ``params`` into ``batch``; ``place`` and ``size`` do not matter."""
         return batch._replace(curves=self.dictionary.combine(params.tone_weights.to(batch.matrix)))
 
     def describe(self) -> str:
+        """Say how many curves there are, and their light at code 128."""
         return f"tone curves: {self.config.tone_atoms}, at code 128 " + " ".join(
             f"{value:.3f}" for value in self.dictionary.curves[:, 128 * STEPS].tolist()
         )
 
     def coarse_parameters(self) -> dict[str, Tensor]:
+        """The logarithms of the slopes on each piece, during a fit."""
         return {} if self.slopes is None else {"slopes": self.slopes}
 
-    def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
+    def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
+        """Compute the reverse pass itself, ``(B, 3, H, W)``, under the slopes of the fit."""
         return self.reverse(x, None)
 
     @torch.no_grad()
     def start_coarse(self, gamma: float, toe: float) -> None:
+        """Start all curves as ``(x + toe (1 - x))^gamma``, less its value at black, and all slopes as 1."""
         code = torch.linspace(0.0, 1.0, NODES, dtype=torch.float64)
         curve = (code + toe * (1.0 - code)) ** gamma
         self.dictionary.curves.copy_((curve - curve[0]) / (1.0 - curve[0]))
@@ -132,15 +139,16 @@ class ToneCurve(Stage):
 
     @torch.no_grad()
     def start_forward(self) -> None:
-        """The curves are those of the reverse pass from now on."""
-        self.dictionary.curves.copy_(self._bent())
+        """Keep the fitted curves for both directions."""
+        self.dictionary.curves.copy_(self._bend())
         self.slopes = None
 
     def parameters_of(self, forward: bool) -> dict[str, Tensor]:
+        """The slopes for a fit of the reverse pass, nothing for one of the forward pass."""
         return {} if forward or self.slopes is None else {f"{self.name}.slopes": self.slopes}
 
-    def _bent(self) -> Tensor:
-        """The curves under the slopes of a fit."""
+    def _bend(self) -> Tensor:
+        """Bend the curves by the slopes of a fit, ``(K, 1021)``."""
         if self.slopes is None:
             return self.dictionary.curves
         rises = self.dictionary.curves.diff(dim=1) * self.slopes.exp().repeat_interleave((NODES - 1) // PIECES, dim=1)
@@ -153,4 +161,4 @@ class ToneCurve(Stage):
         if params is not None and params.tone_weights.shape[1]:
             weights = params.tone_weights.to(weights)
         weights = weights.expand(batch, -1)
-        return self.dictionary.combine(weights) if self.slopes is None else weights @ self._bent()
+        return self.dictionary.combine(weights) if self.slopes is None else weights @ self._bend()

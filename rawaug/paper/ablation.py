@@ -147,7 +147,7 @@ def _comparable(pair: Pair) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """sRGB, RAW of three colours, places and the mask of unclipped pixels, all ``(1, C, h, w)``."""
     if not pair.registered:
         blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
-        return blocks.srgb[None], blocks.raw[None], blocks.place, (~blocks.clipped)[None, None]
+        return blocks.srgb[None], blocks.raw[None], blocks.coordinates, (~blocks.clipped)[None, None]
     picked = (..., slice(None, None, STRIDE), slice(None, None, STRIDE))
     raw = bayer.demosaic(pair.raw[None], pair.cfa)[picked]
     place = frame_coordinates(*pair.raw.shape[-2:])[picked]

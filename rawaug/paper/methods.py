@@ -140,7 +140,7 @@ def _makers(model: Method, pair: Pair) -> dict[str, Callable[[Tensor, Tensor], T
 
     def maker(given: Any) -> Callable[[Tensor, Tensor], Tensor]:
         if isinstance(model, DictionaryISP):
-            return lambda patch, place: model.reverse(patch, given, place=place).raw
+            return lambda patch, place: model.reverse(patch, given, coordinates=place).raw
         return lambda patch, place: model.reverse(patch, given)
 
     return {row: maker(given) for row, given in settings(model, pair).items()}
@@ -253,14 +253,14 @@ def oracle(isp: DictionaryISP, pair: Pair, others: Sequence[ISPParams]) -> ISPPa
     start = None
     if isp.config.cameras:
         own, value = pixels.site[:, :, 0], pixels.target.sum(dim=(1, 2))
-        start = staged.with_readings(isp, pixels.srgb, pixels.place, own, value, others[0])
+        start = staged.with_readings(isp, pixels.srgb, pixels.coordinates, own, value, others[0])
     found = [*others, _descended(isp, pixels, start)]
     return min(found, key=lambda setting: squared_error(isp, pixels, setting).item())
 
 
 def squared_error(isp: DictionaryISP, pixels: PixelSamples, setting: ISPParams) -> Tensor:
     """Mean over the readings that are not clipped: a few that are would outweigh all others. Held to [0, 1]."""
-    made = isp.reverse_pixels(pixels.srgb, setting, pixels.place).clamp(0.0, 1.0)
+    made = isp.reverse_pixels(pixels.srgb, setting, pixels.coordinates).clamp(0.0, 1.0)
     return ((made - pixels.target) ** 2 * pixels.known).sum() / pixels.known.sum()
 
 

@@ -408,7 +408,7 @@ class Mean(Denoiser):
     """The mean over 3 x 3 pixels: what is wider than these it leaves."""
 
     def __init__(self, channels: int, pyramid: int) -> None:
-        super().__init__(channels, False, False, 1, {}, pyramid=pyramid)
+        super().__init__({}, pyramid=pyramid, channels=channels, variance_map=False)
 
     def residual(self, features: Tensor) -> Tensor:
         padded = F.pad(features, (1, 1, 1, 1), mode="reflect")
@@ -437,7 +437,7 @@ def test_a_pyramid_is_told_the_variance_that_is_left_at_every_scale(channels: in
 
     class Told(Denoiser):
         def __init__(self) -> None:
-            super().__init__(channels, True, False, 1, {}, pyramid=2)
+            super().__init__({}, pyramid=2, channels=channels, deviation=False)
 
         def residual(self, features: Tensor) -> Tensor:
             picture, variance = (x[..., 4:-4, 4:-4] for x in features.split(channels, dim=1))

@@ -30,7 +30,7 @@ from rawaug.seeding import keyed_generator
 
 
 def reading_error(predicted: Tensor, part: PixelSamples) -> Tensor:
-    """Mean over frames of the weighted squared error on unclipped readings."""
+    """Average the weighted squared error of RAW ``(F, 3, 1, P)`` on unclipped readings, first within frames."""
     weight = part.known / (4.0 * (predicted.detach().clamp_min(0.0) + 0.01))
     error = (predicted - part.target) ** 2 * weight
     return (error.sum((1, 2, 3)) / part.known.sum((1, 2, 3)).clamp_min(1.0)).mean()
@@ -39,35 +39,45 @@ def reading_error(predicted: Tensor, part: PixelSamples) -> Tensor:
 def cycle_error(
     isp: DictionaryISP, part: PixelSamples, params: ISPParams, back: Mapping[str, Tensor], config: FitConfig
 ) -> Tensor:
-    """l2 on the sRGB of the forward pass, and on every intermediate image against ``back``, the reverse pass's.
+    """Compute the squared error of the forward pass on sRGB and on every image between the stages.
 
-    From noisy readings the pass would learn to mend noise, so that it starts where the reverse pass ended.
+    From noisy readings the pass would learn to denoise, so there it starts where the reverse pass ended.
+
+    Args:
+        isp: the ISP being fitted.
+        part: the pixels, F frames of P.
+        params: the settings of the F frames.
+        back: the images ``(F, 3, 1, P)`` of the reverse pass, x1 ... x5 and ``raw``.
+        config: gives the weight of the images between the stages, and whether readings are noisy.
+
+    Returns:
+        A scalar.
     """
     ahead: dict[str, Tensor] = {}
     start = back["raw"].detach() if config.noisy else part.cell_raw
-    error = (isp.forward_pixels(start, params, part.place, ahead) - part.cell_srgb) ** 2
+    error = (isp.forward_pixels(start, params, part.coordinates, ahead) - part.cell_srgb) ** 2
     for name in ahead:
         error = error + config.intermediate * (ahead[name] - back[name]) ** 2 if name in back else error
     return (error * part.cell_weight).sum() / (3.0 * part.cell_weight.sum()).clamp_min(1.0)
 
 
 def mean_square(isp: DictionaryISP, part: PixelSamples, params: ISPParams) -> Tensor:
-    """Error of every frame ``(F,)`` on its unclipped pixels."""
+    """Compute the mean squared error of every frame ``(F,)`` on its unclipped pixels."""
     count = len(part.srgb)
     params = ISPParams(*(value.expand(count, *value.shape[1:]) for value in params))
-    error = (isp.reverse_pixels(part.srgb, params, part.place) - part.target) ** 2 * part.known
+    error = (isp.reverse_pixels(part.srgb, params, part.coordinates) - part.target) ** 2 * part.known
     return error.sum((1, 2, 3)) / part.known.sum((1, 2, 3)).clamp_min(1.0)
 
 
 def weight_distance(ours: ISPParams, theirs: ISPParams) -> Tensor:
-    """``|w_r - w_f|^2`` of both dictionaries."""
+    """Compute ``|w_r - w_f|^2``, the sum over both dictionaries, a scalar."""
     colour = (ours.colour_weights - theirs.colour_weights).square().sum()
     return colour + (ours.gain_weights - theirs.gain_weights).square().sum()
 
 
 @torch.no_grad()
 def mean_psnr(isp: DictionaryISP, frames: FitFrames, as_shot: bool = False) -> float:
-    """Mean PSNR of the frames, each in the setting that the ISP chooses for its thumbnail, or with as-shot gains."""
+    """Average the PSNR of the frames, each in the setting that the ISP chooses for it, or under as-shot gains."""
     values = []
     for k, shot in enumerate(frames.shots):
         given = shot.white_balance if as_shot else None
@@ -83,7 +93,15 @@ def adam(
     spent: Callable[[int], float],
     clip_norm: float | None = None,
 ) -> Iterator[Tensor]:
-    """Adam on ``loss(step)`` until ``spent(step)`` is 1, under a cosine; yields the loss of each step."""
+    """Descend on a loss by Adam under a cosine, and yield the loss of each step, a scalar.
+
+    Args:
+        tensors: what is changed, in place, tensors of any shape.
+        learning_rate: at the start; it falls to 0.
+        loss: ``loss(step)`` gives the scalar to minimise.
+        spent: ``spent(step)`` says which share of the budget is used up; the descent ends at 1.
+        clip_norm: gradients are scaled down to this norm.
+    """
     optimiser = torch.optim.Adam(tensors, lr=learning_rate)
     step = 0
     while (share := spent(step)) < 1.0:
@@ -99,7 +117,7 @@ def adam(
 
 
 class BestScore(NamedTuple):
-    """Score of a watched stage at its start, and the best one with its step."""
+    """The score of a watched stage at its start, and the best one with the step at which it was reached."""
 
     start: float
     step: int
@@ -107,7 +125,14 @@ class BestScore(NamedTuple):
 
 
 class Descent:
-    """Runs the stages of a fit, and writes what each came to, so that a stopped fit goes on with the next one."""
+    """Runs the stages of a fit, and writes the end of each, so that a stopped fit goes on with the next one.
+
+    Args:
+        path: file of the state; None keeps none.
+        key: what the state belongs to; a file of another fit is ignored.
+        seed: keys the draws of every step.
+        progress: whether to show progress bars.
+    """
 
     report_steps: ClassVar[int] = 50
 
@@ -131,7 +156,17 @@ class Descent:
         report: Callable[[], str] | None = None,
         watch: Callable[[], float] | None = None,
     ) -> None:
-        """Minimise ``loss`` over ``tensors`` in place; a watched stage ends with its best ones."""
+        """Minimise a loss by Adam; a stage that ran already takes its end from the state.
+
+        Args:
+            stage: name of the stage.
+            loss: ``loss(generator)`` draws a batch and gives a scalar.
+            tensors: what is changed in place, tensors of any shape by name.
+            steps: number of steps.
+            learning_rate: at the start.
+            report: gives a text for the progress bar, every :attr:`report_steps` steps.
+            watch: gives a score of frames held out; the stage then ends with the tensors that scored best.
+        """
 
         def scores(step: int) -> str:
             reported = report() if report is not None and step else ""
@@ -162,7 +197,7 @@ class Descent:
             tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
 
     def finish(self) -> None:
-        """Remove the state: the fit is done."""
+        """Remove the state, as the fit is done."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 

@@ -26,7 +26,7 @@ ENCODER_PIXELS, ENCODER_RATE = 1024, 1e-3
 FEWEST_FRAMES, FOLDS = 12, 4
 """From so many frames on "auto" trains encoders; and parts that are left out in turn to judge them."""
 MANY_FRAMES, STEPS, LEARNING_RATE, CONSISTENCY = 50, 1000, 2e-4, 0.01
-"""Of end-to-end training."""
+"""End-to-end training: frames from which on it is the default, its steps, its rate, and the weight of consistency."""
 
 Refit = Callable[[FitFrames, str, FitConfig], DictionaryISP]
 """Fits an ISP without encoders to some frames alone; the text tells its stages from those of other fits."""
@@ -43,7 +43,15 @@ def gain_left_out(frames: FitFrames, folds: int, gain: Callable[[FitFrames, FitF
 
 
 def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent, refit: Refit) -> None:
-    """Train and keep the encoders, or leave the constants, as ``config.encoders`` says."""
+    """Train the encoders, or keep the constants, as ``config.encoders`` says.
+
+    Args:
+        isp: the ISP, fitted up to its atoms.
+        frames: all frames of the fit.
+        config: the settings of the fit.
+        descent: runs the training.
+        refit: fits an ISP without encoders to some of the frames, to judge encoders on the others.
+    """
 
     def better(out: FitFrames, kept: FitFrames, part: str) -> float:
         """dB by which encoders beat constants on frames that no stage of the fit has seen."""
@@ -68,16 +76,16 @@ def _train(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: De
     tensors = {name: p for name, p in isp.named_parameters() if "_encoders." in name and ".layers." in name}
 
     def loss(generator: torch.Generator) -> Tensor:
-        drawn = _drawn(frames, FRAMES_A_STEP, ENCODER_PIXELS, generator)
+        drawn = _draw_frames(frames, FRAMES_A_STEP, ENCODER_PIXELS, generator)
         return torch.stack([_frame_loss(isp, part, shot, config, generator) for part, shot in drawn]).mean()
 
     descent.run(stage, loss, tensors, config.encoder_steps, ENCODER_RATE)
 
 
-def _drawn(
+def _draw_frames(
     frames: FitFrames, count: int, pixels: int, generator: torch.Generator
 ) -> list[tuple[PixelSamples, FrameSummary]]:
-    """``count`` of the frames, with replacement, each with the same random pixels."""
+    """Draw ``count`` of the frames, with replacement, each with the same random pixels."""
     chosen = torch.randint(len(frames.shots), (count,), generator=generator).tolist()
     index = torch.randint(frames.pixels.srgb.shape[-1], (pixels,), generator=generator)
     return [(frames.pixels.pick(index, torch.tensor([k])), frames.shots[k]) for k in chosen]
@@ -93,7 +101,7 @@ def _frame_loss(
 
 
 def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """The same random piece of both thumbnails, flipped or not, so that the encoders cannot memorise the frames."""
+    """Cut the same random piece from both thumbnails, flipped or not, so that the encoders cannot learn the frames."""
     share = 0.5 + 0.5 * torch.rand(2, generator=generator)
     start = torch.rand(2, generator=generator) * (1.0 - share)
     flip = bool(torch.rand((), generator=generator) < 0.5)
@@ -108,14 +116,21 @@ def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[
 
 
 def joint_steps(config: FitConfig, frames: int) -> int:
-    """Steps of end-to-end training on this number of frames."""
+    """The steps of end-to-end training on this number of frames."""
     if config.joint_steps is not None:
         return config.joint_steps
     return STEPS if frames >= MANY_FRAMES else 0
 
 
 def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent) -> None:
-    """Refine everything at once, if ``config.joint_steps`` says so; the gain goes to ``isp.info``."""
+    """Refine everything at once, if ``config.joint_steps`` says so; the gain goes to ``isp.info``.
+
+    Args:
+        isp: the fitted ISP.
+        frames: all frames of the fit, of which a tenth is held out.
+        config: the settings of the fit.
+        descent: runs the training.
+    """
     count = len(frames.shots)
     steps = joint_steps(config, count)
     if steps == 0:
@@ -126,7 +141,7 @@ def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, desc
     watched, trained = frames.some(held_out), frames.some([k for k in range(count) if k not in held_out])
 
     def loss(generator: torch.Generator) -> Tensor:
-        drawn = _drawn(trained, FRAMES_A_STEP, config.batch, generator)
+        drawn = _draw_frames(trained, FRAMES_A_STEP, config.batch, generator)
         return torch.stack([_joint_frame_loss(isp, part, shot, config) for part, shot in drawn]).mean()
 
     tensors = dict(isp.named_parameters())
@@ -138,6 +153,6 @@ def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, desc
 def _joint_frame_loss(isp: DictionaryISP, part: PixelSamples, shot: FrameSummary, config: FitConfig) -> Tensor:
     ours, theirs = isp.choose(shot.srgb), isp.choose_forward(isp.remove_shading(shot.raw, None))
     back: dict[str, Tensor] = {}
-    back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.place, back)
+    back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.coordinates, back)
     cycle = cycle_error(isp, part, theirs, back, config)
     return mean_square(isp, part, ours)[0] + cycle + CONSISTENCY * config.consistency * weight_distance(ours, theirs)

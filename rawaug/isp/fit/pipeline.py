@@ -49,7 +49,7 @@ from rawaug.seeding import derive_seed
 
 
 def with_better_tone(frames: FitFrames, config: FitConfig, refit: Refit) -> tuple[FitConfig, float | None]:
-    """The settings with ``tone`` decided, and the curve's gain in dB if it was compared."""
+    """Decide the setting ``tone``; the gain of the curve in dB comes with it if both were compared."""
     if config.tone != "auto":
         return config, None
     if len(frames.shots) < 2:
@@ -70,7 +70,7 @@ CURVE_STEPS = 150
 CURVE_RATE = 2e-2
 DIMMEST = 0.01
 SHADING_PAYS = 0.5
-"""A mask stays that takes away half of the squared error: what the frames' content feigns takes a few percent."""
+"""A mask is kept if it halves the squared error; one that the frames' content feigns takes away a few percent."""
 FRAMES_A_STEP = 16
 
 
@@ -117,14 +117,14 @@ def fit_isp(
 
 
 def _key(config: FitConfig, frames: FitFrames) -> str:
-    """What a kept state belongs to."""
+    """Hash the settings and pixels that a kept state belongs to."""
     known = [(shot.name, shot.camera, shot.white_balance) for shot in frames.shots]
     settings = repr((__version__, config, known)).encode()
     return digest(settings, frames.pixels.srgb.numpy().tobytes(), frames.pixels.target.numpy().tobytes())
 
 
 def new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
-    """An ISP of the size that these frames need, drawn from the seed."""
+    """Make an ISP of the size that these frames need, drawn from the seed."""
     patterns = {shot.cfa for shot in shots}
     count = min(config.most_atoms, len(shots))
     more = REACH_ATOMS if config.reach > 1.0 else 0
@@ -160,7 +160,7 @@ class _Fit:
         tried = []
         for curve in STANDARD_CURVES:
             self._start_coarse(*curve)
-            self.colour = FrameColour.from_product(least_squares(self._curved(self.samples), self.samples))
+            self.colour = FrameColour.from_product(least_squares(self._apply_curve(self.samples), self.samples))
             tried.append((self._error(), curve, self.colour))
         _, curve, colour = min(tried, key=lambda one: one[0])
         self._start_coarse(*curve)
@@ -171,7 +171,7 @@ class _Fit:
             stage.start_coarse(gamma, toe)
 
     def fit_reverse(self, report: Callable[[DictionaryISP], str] | None = None) -> DictionaryISP:
-        """Stages 1 to 3: the reverse pass, without encoders."""
+        """Run stages 1 to 3, which fit the reverse pass, without encoders."""
         self.curve()
         self.tone(report)
         self.atoms(self.isp)
@@ -180,7 +180,7 @@ class _Fit:
     # -- stage 1 ----------------------------------------------------------------------------------------------------
 
     def curve(self) -> None:
-        """Stage 1: without the mask and, where the readings fall off towards the corners, with it as well."""
+        """Run stage 1 without the mask and, where the readings fall off towards the corners, with it as well."""
         shading = self.isp.find(LensShading)
         wanted = self.config.shading if shading else "off"
         if wanted != "on":
@@ -188,7 +188,7 @@ class _Fit:
         if shading is None or wanted == "off":
             self._remove(shading)
             return
-        mean, precision = fit_fall_off(self._curved(self.samples), self.samples, self.colour.product())
+        mean, precision = fit_fall_off(self._apply_curve(self.samples), self.samples, self.colour.product())
         if wanted == "auto" and not darkens_corners(mean, precision):
             self._remove(shading)
             return
@@ -207,14 +207,14 @@ class _Fit:
 
     @torch.no_grad()
     def _error(self) -> float:
-        predicted = stages.correct_colour(self._curved(self.samples), self.colour.product())
+        predicted = stages.correct_colour(self._apply_curve(self.samples), self.colour.product())
         return float(reading_error(predicted, self.samples))
 
-    def _curved(self, part: PixelSamples) -> Tensor:
-        """x2 of the curve, times the mask: what a matrix takes to RAW."""
+    def _apply_curve(self, part: PixelSamples) -> Tensor:
+        """Compute x2 by the curve, times the mask: a frame's matrix takes it to RAW."""
         x = part.srgb
         for stage in self.isp.ordered_stages:
-            x = stage.coarse(x, part.place)
+            x = stage.coarse(x, part.coordinates)
         return x
 
     def _descend_on_curve(self, stage: str, without: Stage | None = None) -> None:
@@ -222,7 +222,7 @@ class _Fit:
 
         def loss(generator: torch.Generator) -> Tensor:
             frames, part = self._draw(generator)
-            predicted = stages.correct_colour(self._curved(part), self.colour.pick(frames).product())
+            predicted = stages.correct_colour(self._apply_curve(part), self.colour.pick(frames).product())
             return reading_error(predicted, part) + self.tie(self.colour)
 
         steps = CURVE_STEPS if self.config.curve_steps is None else self.config.curve_steps
@@ -231,7 +231,7 @@ class _Fit:
     # -- stage 2 ----------------------------------------------------------------------------------------------------
 
     def tone(self, report: Callable[[DictionaryISP], str] | None) -> None:
-        """Stage 2."""
+        """Run stage 2, the tone and each frame's colour; ``report`` is called with the ISP as it would be."""
         tensors: dict[str, Tensor] = self._colours()
         for stage in self.isp.ordered_stages:
             stage.start_fine()
@@ -239,7 +239,7 @@ class _Fit:
 
         def loss(generator: torch.Generator) -> Tensor:
             frames, part = self._draw(generator)
-            predicted = self.isp.reverse_pixels(part.srgb, self.colour.pick(frames).params(), part.place)
+            predicted = self.isp.reverse_pixels(part.srgb, self.colour.pick(frames).params(), part.coordinates)
             return reading_error(predicted, part) + self.tie(self.colour)
 
         def status() -> str:
@@ -261,7 +261,7 @@ class _Fit:
         return {"log_scale": self.colour.log_scale, "matrix": self.colour.matrix}
 
     def _draw(self, generator: torch.Generator) -> tuple[Tensor | slice, PixelSamples]:
-        """Random frames (all, if few) and pixels of a step."""
+        """Draw the frames of a step (all, if they are few) and their pixels."""
         count, pixels = self.samples.srgb.shape[0], self.samples.srgb.shape[-1]
         frames: Tensor | slice = slice(None)
         if count > FRAMES_A_STEP:
@@ -272,7 +272,7 @@ class _Fit:
     # -- stage 3 ----------------------------------------------------------------------------------------------------
 
     def atoms(self, isp: DictionaryISP) -> None:
-        """Stage 3."""
+        """Run stage 3: make the frames' colours the atoms of ``isp``."""
         set_knee(isp, self.colour, self.samples)
         set_atoms(isp, self.colour, self.shots, self.config)
         set_priors(isp, self.samples, self.config)
@@ -280,7 +280,7 @@ class _Fit:
     # -- stage 5 ----------------------------------------------------------------------------------------------------
 
     def forward(self) -> None:
-        """Stage 5."""
+        """Run stage 5: fit the forward networks to the reverse pass."""
         isp, tensors = self.isp, dict[str, Tensor]()
         for stage in isp.ordered_stages:
             stage.start_forward()
@@ -290,7 +290,7 @@ class _Fit:
             frames, part = self._draw(generator)
             params, back = self.colour.pick(frames).params(), dict[str, Tensor]()
             with torch.no_grad():
-                back["raw"] = isp.reverse_pixels(part.cell_srgb, params, part.place, back)
+                back["raw"] = isp.reverse_pixels(part.cell_srgb, params, part.coordinates, back)
             return cycle_error(isp, part, params, back, self.config)
 
         if tensors:
@@ -298,7 +298,7 @@ class _Fit:
 
 
 def darkens_corners(mean: Tensor, precision: Tensor) -> bool:
-    """Whether a mask takes more than :data:`DIMMEST` of the light at a corner, 1 from the centre."""
+    """Whether a mask of mean ``(2,)`` and precision ``(2, 2)`` takes more than :data:`DIMMEST` of a corner's light."""
     corners = torch.tensor([[0.6, 0.8], [0.6, -0.8], [-0.6, 0.8], [-0.6, -0.8]]) - mean
     exponent = 0.5 * torch.einsum("ki,ij,kj->k", corners, precision, corners)
     return bool((exponent > DIMMEST).any())

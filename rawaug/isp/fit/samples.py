@@ -31,30 +31,57 @@ BLOCK = 16
 
 
 class FramePair(Protocol):
-    """What the fit needs of a pair; :class:`rawaug.data.Pair` is one."""
+    """A frame that a fit takes; :class:`rawaug.data.Pair` is one."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """The name of the frame, which keys the pixels that are drawn."""
+
     @property
-    def srgb(self) -> Tensor: ...  # (3, H, W) uint8 or float
+    def srgb(self) -> Tensor:
+        """The developed picture ``(3, H, W)``, uint8 or float in [0, 1]."""
+
     @property
-    def raw(self) -> Tensor: ...  # (1, H, W)
+    def raw(self) -> Tensor:
+        """The clean mosaic ``(1, H, W)``."""
+
     @property
-    def noisy(self) -> Tensor | None: ...  # (1, H, W)
+    def noisy(self) -> Tensor | None:
+        """The captured noisy mosaic ``(1, H, W)``, if there is one."""
+
     @property
-    def cfa(self) -> CFA: ...
+    def cfa(self) -> CFA:
+        """The pattern of the mosaics."""
+
     @property
-    def white_balance(self) -> tuple[float, float, float]: ...
+    def white_balance(self) -> tuple[float, float, float]:
+        """The as-shot multipliers of R, G and B."""
+
     @property
-    def camera(self) -> str: ...
+    def camera(self) -> str:
+        """Maker and model."""
+
     @property
-    def registered(self) -> bool: ...
+    def registered(self) -> bool:
+        """Whether picture and mosaic agree pixel by pixel."""
+
     @property
-    def color_known(self) -> bool: ...
+    def color_known(self) -> bool:
+        """Whether the white balance and the colour matrix are the camera's own."""
 
 
 class FrameSummary(NamedTuple):
-    """What is kept of a frame besides its pixels."""
+    """What is kept of a frame besides its pixels.
+
+    Args:
+        name: of the frame.
+        camera: maker and model.
+        cfa: pattern of its mosaic.
+        white_balance: as-shot multipliers of R, G and B.
+        srgb: thumbnail of the picture, ``(1, 3, h, w)``.
+        raw: thumbnail of the mosaic's colours, ``(1, 3, h', w')``.
+        registered: whether picture and mosaic agree pixel by pixel.
+    """
 
     name: str
     camera: str
@@ -66,19 +93,30 @@ class FrameSummary(NamedTuple):
 
 
 class PixelSamples(NamedTuple):
-    """F frames of P pixels each."""
+    """P pixels of each of F frames, as images of one row.
+
+    Args:
+        srgb: the picture, ``(F, 3, 1, P)``.
+        target: the reading in the channel of the site, 0 in the others, ``(F, 3, 1, P)``.
+        site: 1 in the channel of the site, ``(F, 3, 1, P)``.
+        known: the same, but 0 where the reading or the picture is clipped.
+        coordinates: of the pixels in the full frame, ``(F, 2, 1, P)``.
+        cell_srgb: the picture averaged over the 2 x 2 cell, ``(F, 3, 1, P)``.
+        cell_raw: the three colours of the cell, ``(F, 3, 1, P)``.
+        cell_weight: how much the cell counts, less on edges and 0 where it is clipped, ``(F, 1, 1, P)``.
+    """
 
     srgb: Tensor
     target: Tensor
     site: Tensor
     known: Tensor
-    place: Tensor
+    coordinates: Tensor
     cell_srgb: Tensor
     cell_raw: Tensor
     cell_weight: Tensor
 
     def pick(self, index: Tensor, frames: Tensor | slice = slice(None)) -> PixelSamples:
-        """The pixels ``index`` of every frame, or of some."""
+        """Pick the pixels of an index ``(p,)`` from every frame, or from those of an index ``(f,)``."""
         return PixelSamples(*(value[frames].index_select(-1, index) for value in self))
 
 
@@ -89,13 +127,23 @@ class FitFrames(NamedTuple):
     shots: list[FrameSummary]
 
     def some(self, frames: Sequence[int]) -> FitFrames:
-        """Some of the frames."""
+        """Take some of the frames by their numbers."""
         index = torch.tensor(frames)
         return FitFrames(PixelSamples(*(value[index] for value in self.pixels)), [self.shots[k] for k in frames])
 
 
 def sample_pixels(pairs: Iterable[FramePair], pixels: int, seed: int, noisy: bool = False) -> FitFrames:
-    """Draw ``pixels`` from each frame with replacement, keyed by ``seed`` and its name; the frames are read once."""
+    """Draw random pixels from every frame, with replacement; the frames are read once.
+
+    Args:
+        pairs: the frames.
+        pixels: how many are drawn from each.
+        seed: keys the draws, with the name of the frame.
+        noisy: take the captured noisy RAW in place of the clean one.
+
+    Raises:
+        ValueError: if there is no frame, or one lacks its colours or its noisy RAW.
+    """
     drawn = [_sample_frame(pair, pixels, seed, noisy) for pair in pairs]
     if not drawn:
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")
@@ -126,7 +174,7 @@ def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple
 
 
 def _sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:
-    """Mosaic sites with the one colour they have, and the cells around them."""
+    """Draw mosaic sites with the one colour that they have, and the cells around them."""
     height, width = raw.shape[-2:]
     row = torch.randint(height, (pixels,), generator=generator)
     column = torch.randint(width, (pixels,), generator=generator)
@@ -143,12 +191,12 @@ def _sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Ge
     spread = (corners.amax(0) - corners.amin(0)).amax(0)
     unclipped = (corners.amax((0, 1)) < CLIPPED_SRGB) & (cell_raw.amax(0) < CLIPPED_RAW)
     weight = unclipped / (1.0 + (spread * 32.0) ** 2)
-    place = frame_coordinates(height, width)[0, :, row, column]
-    return _samples(pixel, reading * own, own, own * inside, place, corners.mean(0), cell_raw, weight)
+    coordinates = frame_coordinates(height, width)[0, :, row, column]
+    return _samples(pixel, reading * own, own, own * inside, coordinates, corners.mean(0), cell_raw, weight)
 
 
 def _blocks(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:
-    """Averages over blocks, linear light: tolerant to a shift of a few pixels."""
+    """Draw averages over blocks in linear light, which tolerate a shift of a few pixels."""
     blocks = block_averages(srgb, raw, cfa)
     greens = torch.stack([blocks.srgb[1], blocks.raw[1].clamp_min(0.0).sqrt()])[:, ~blocks.clipped]
     likeness = float(torch.corrcoef(greens)[0, 1])
@@ -157,18 +205,25 @@ def _blocks(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.G
     index = torch.randint(blocks.clipped.numel(), (pixels,), generator=generator)
     pixel, reading = blocks.srgb.flatten(1)[:, index], blocks.raw.flatten(1)[:, index]
     inside = ~blocks.clipped.flatten()[index] & (pixel.amax(0) < CLIPPED_SRGB)
-    place = blocks.place[0].flatten(1)[:, index]
+    coordinates = blocks.coordinates[0].flatten(1)[:, index]
     known = inside.expand(3, -1).float()
-    return _samples(pixel, reading, torch.ones_like(known), known, place, pixel, reading, inside.float())
+    return _samples(pixel, reading, torch.ones_like(known), known, coordinates, pixel, reading, inside.float())
 
 
 class Blocks(NamedTuple):
-    """An unregistered pair, averaged over blocks."""
+    """An unregistered pair, averaged over blocks.
 
-    srgb: Tensor  # (3, h, w), averaged in linear light
-    raw: Tensor  # (3, h, w)
-    clipped: Tensor  # (h, w), whether any site of the block is
-    place: Tensor  # (1, 2, h, w), in the full frame
+    Args:
+        srgb: ``(3, h, w)``, averaged in linear light.
+        raw: ``(3, h, w)``.
+        clipped: ``(h, w)``, whether any site of the block is.
+        coordinates: ``(1, 2, h, w)``, in the full frame.
+    """
+
+    srgb: Tensor
+    raw: Tensor
+    clipped: Tensor
+    coordinates: Tensor
 
 
 def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA) -> Blocks:
@@ -182,12 +237,12 @@ def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA) -> Blocks:
     low_srgb = F.avg_pool2d(x[None] ** 2.2, BLOCK)[0] ** (1 / 2.2)
     low_raw = F.avg_pool2d(_colours(window, cfa)[None], BLOCK // 2)[0]
     clipped = F.max_pool2d((window >= CLIPPED_RAW).float()[None], BLOCK)[0, 0] > 0
-    place = frame_coordinates(rows, columns, (top, left), (height, width))
-    return Blocks(low_srgb, low_raw, clipped, F.avg_pool2d(place, BLOCK))
+    coordinates = frame_coordinates(rows, columns, (top, left), (height, width))
+    return Blocks(low_srgb, low_raw, clipped, F.avg_pool2d(coordinates, BLOCK))
 
 
 def find_shift(srgb: Tensor, raw: Tensor, cfa: CFA) -> tuple[int, int]:
-    """How far, in pixels down and right, the sRGB of an unregistered pair is shifted against its RAW."""
+    """Find how many pixels down and right a picture ``(3, H, W)`` lies against its mosaic ``(1, H, W)``."""
     with extra("raw"):
         from skimage.registration import phase_cross_correlation
 
@@ -199,11 +254,11 @@ def find_shift(srgb: Tensor, raw: Tensor, cfa: CFA) -> tuple[int, int]:
 
 
 def _colours(raw: Tensor, cfa: CFA) -> Tensor:
-    """Mosaic ``(1, H, W)`` to its cells' colours ``(3, H/2, W/2)``."""
+    """Average a mosaic ``(1, H, W)`` to the colours of its cells ``(3, H/2, W/2)``."""
     planes = bayer.pack(raw, cfa)
     return torch.stack([planes[0], (planes[1] + planes[2]) / 2, planes[3]])
 
 
 def _samples(*values: Tensor) -> PixelSamples:
-    """Rows ``(C, P)`` or ``(P,)`` as images ``(C, 1, P)``."""
+    """Shape rows ``(C, P)`` or ``(P,)`` as images ``(C, 1, P)``."""
     return PixelSamples(*(v.reshape(-1, 1, v.shape[-1]) for v in values))

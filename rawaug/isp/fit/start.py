@@ -36,10 +36,15 @@ FEWEST_PIXELS = 32
 
 @dataclass
 class FrameColour:
-    """Per-frame colour, refined together with the global parameters."""
+    """The colour of each of F frames, refined together with the global parameters.
 
-    log_scale: Tensor  # (F, 3), log of 1 / gains
-    matrix: Tensor  # (F, 3, 3), rows l1-normalised on use
+    Args:
+        log_scale: ``(F, 3)``, logarithm of one over the gains.
+        matrix: ``(F, 3, 3)``, whose rows are l1-normalised on use.
+    """
+
+    log_scale: Tensor
+    matrix: Tensor
 
     @classmethod
     def from_product(cls, product: Tensor) -> FrameColour:
@@ -51,12 +56,12 @@ class FrameColour:
         return self.log_scale.exp()[:, :, None] * l1_normalise(self.matrix)
 
     def params(self) -> ISPParams:
-        """As the ISP takes them (without weights)."""
+        """The settings of the frames as the ISP takes them, without weights."""
         none = self.log_scale.new_empty(len(self.log_scale), 0)
         return ISPParams(none, none, l1_normalise(self.matrix), torch.exp(-self.log_scale), none)
 
     def pick(self, frames: Tensor | slice) -> FrameColour:
-        """The colours of some frames."""
+        """Take the colours of some frames, by an index ``(f,)`` or a slice."""
         return FrameColour(self.log_scale[frames], self.matrix[frames])
 
     def neutral(self, balance: Tensor) -> tuple[Tensor, Tensor]:
@@ -67,7 +72,7 @@ class FrameColour:
 
 
 class Tie:
-    """What draws the frames of one camera together."""
+    """A penalty that draws the frames of one camera together."""
 
     def __init__(self, shots: Sequence[FrameSummary]) -> None:
         cameras = [shot.camera for shot in shots]
@@ -87,7 +92,7 @@ class Tie:
 
 @torch.no_grad()
 def least_squares(linear: Tensor, samples: PixelSamples) -> Tensor:
-    """``M_f`` ``(F, 3, 3)`` that takes ``linear`` ``(F, 3, 1, P)`` to the readings, from the normal equations."""
+    """Solve for ``M_f`` ``(F, 3, 3)``, which takes ``linear`` ``(F, 3, 1, P)`` to the readings, by least squares."""
     x = linear[:, :, 0].double()
     y, known = samples.target[:, :, 0].double(), samples.known[:, :, 0].double()
     if (known.sum(2) < FEWEST_PIXELS).any():
@@ -101,12 +106,15 @@ def least_squares(linear: Tensor, samples: PixelSamples) -> Tensor:
 
 @torch.no_grad()
 def fit_fall_off(linear: Tensor, samples: PixelSamples, product: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean ``(2,)`` and precision ``(2, 2)`` of the Gaussian that best explains log(reading / prediction)."""
-    # A quadratic in the place; an offset for each frame and channel takes up what the mask does to the matrices.
+    """Fit the mean ``(2,)`` and precision ``(2, 2)`` of a Gaussian to log(reading / prediction).
+
+    ``product`` ``(F, 3, 3)`` takes ``linear`` ``(F, 3, 1, P)`` to the prediction.
+    """
+    # A quadratic in the coordinates; an offset for each frame and channel takes up what the mask does to the matrices.
     predicted = stages.correct_colour(linear, product)
     bright = (samples.known * (samples.target > 0.02) * (predicted > 0.02))[:, :, 0].double()
     ratio = (samples.target.clamp_min(1e-3) / predicted.clamp_min(1e-3)).log()[:, :, 0].double()
-    y, x = samples.place[:, :, 0].double().unbind(1)
+    y, x = samples.coordinates[:, :, 0].double().unbind(1)
     terms = torch.stack([y, x, y * y, y * x, x * x], dim=1)  # (F, 5, P)
     count = bright.sum(2, keepdim=True).clamp_min(1.0)
     ratio = ratio - (ratio * bright).sum(2, keepdim=True) / count
@@ -128,7 +136,14 @@ REACH_ATOMS = 8
 
 @torch.no_grad()
 def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSummary], config: FitConfig) -> None:
-    """The frames' matrices and gains become the atoms; clusters of them where there are more frames than atoms."""
+    """Make the frames' matrices and gains the atoms, or clusters of them where there are more frames than atoms.
+
+    Args:
+        isp: whose dictionaries are set.
+        colour: the colour of each frame.
+        shots: their summaries.
+        config: gives the reach of further gain atoms, and the seed of the clusters.
+    """
     balance = torch.tensor([shot.white_balance for shot in shots])
     params = colour.params()
     light, neutral = log_light(balance), -colour.neutral(balance)[1]
@@ -145,7 +160,10 @@ def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSumm
 
 
 def reach_atoms(count: int, reach: float) -> Tensor:
-    """``(count, 3)`` log offsets (digital, red, blue) from the frames' mean: corners of a box, tetrahedron first."""
+    """Make gain atoms that no frame had, as log offsets (digital, red, blue) from the frames' mean, ``(count, 3)``.
+
+    They are the corners of a box, those of a tetrahedron first.
+    """
     corners = sorted(product((-1.0, 1.0), repeat=3), key=lambda corner: corner[0] * corner[1] * corner[2])
     size = torch.tensor([0.25, 1.0, 1.0]) * torch.tensor(reach).log()
     return torch.tensor(corners[:count]).reshape(-1, 3) * size
@@ -167,7 +185,7 @@ def _groups(points: Tensor, count: int, seed: int) -> Tensor:
 
 
 def _spread(colour: FrameColour, balance: Tensor) -> float:
-    """The kernel width that best predicts each frame's colour from the others' in similar light."""
+    """Find the kernel width that best predicts each frame's colour from those of the others in similar light."""
     if len(balance) < 3:
         return torch.inf
     matrix, neutral = colour.neutral(balance)
@@ -184,23 +202,23 @@ def _spread(colour: FrameColour, balance: Tensor) -> float:
 
 @torch.no_grad()
 def set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) -> None:
-    """Where highlights begin to be spared: the knee under which all pixels, clipped ones too, come out best."""
+    """Set where highlights begin to be spared: the knee under which all pixels, clipped ones too, come out best."""
     errors: dict[float, float] = {}
     for knee in KNEES:
         isp.configure(knee=knee)
-        predicted = isp.reverse_pixels(samples.srgb, colour.params(), samples.place).clamp(0.0, 1.0)
+        predicted = isp.reverse_pixels(samples.srgb, colour.params(), samples.coordinates).clamp(0.0, 1.0)
         square = (predicted - samples.target) ** 2 * samples.site
         errors[knee] = float((square.sum((1, 2, 3)) / samples.site.sum((1, 2, 3)) + 1e-6).log().sum())
     isp.configure(knee=min(errors, key=lambda knee: errors[knee]))
 
 
 def set_priors(isp: DictionaryISP, samples: PixelSamples, config: FitConfig) -> None:
-    """The constant weights: all colour atoms alike, and the gains that serve the frames best."""
+    """Set the constant weights: all colour atoms alike, and the gain atoms as serves the frames best."""
     colour_weights = torch.full((isp.config.colour_atoms,), 1.0 / isp.config.colour_atoms)
     with torch.no_grad():
         plain = isp.params_from_weights(colour_weights[None], torch.ones(1, isp.config.gain_atoms))
         plain = plain._replace(gains=torch.ones(1, 3))
-        x = isp.reverse_pixels(samples.srgb, plain, samples.place)
+        x = isp.reverse_pixels(samples.srgb, plain, samples.coordinates)
         a, b = ((samples.known * m).mean((2, 3)) for m in (x * x, x * samples.target))
     inverse = 1.0 / isp.gain.channel_gains().detach()
     weights = best_constants(a, b, inverse, config.prior_steps, config.mse_floor)
@@ -210,7 +228,17 @@ def set_priors(isp: DictionaryISP, samples: PixelSamples, config: FitConfig) -> 
 
 
 def best_constants(a: Tensor, b: Tensor, inverse_atoms: Tensor, steps: int = 400, mse_floor: float = 1e-5) -> Tensor:
-    """Weights ``(M,)`` of atoms of inverse gains ``(M, 3)`` for frames with moments ``a, b`` ``(F, 3)``."""
+    """Descend on the weights of the gain atoms that serve the frames best; see the module.
+
+    Args:
+        a, b: second moments of the frames, ``(F, 3)``.
+        inverse_atoms: one over the gains of the atoms, ``(M, 3)``.
+        steps: of the descent.
+        mse_floor: added to a frame's squared error under the logarithm.
+
+    Returns:
+        Weights ``(M,)`` on the simplex.
+    """
     logits = torch.zeros(len(inverse_atoms), requires_grad=True)
     optimiser = torch.optim.Adam([logits], lr=0.05)
     for _ in range(steps):

@@ -58,8 +58,8 @@ def test_white_balance_is_taken_as_given(srgb: torch.Tensor) -> None:
 def test_shading_depends_on_the_place_in_the_frame(srgb: torch.Tensor) -> None:
     isp = DictionaryISP()
     cast(Any, isp.stages["shading"]).mask.set(torch.zeros(2), torch.eye(2))
-    centre = isp.reverse(srgb, place=frame_coordinates(32, 48, (1000, 1500), (2032, 3048))).raw
-    corner = isp.reverse(srgb, place=frame_coordinates(32, 48, (0, 0), (2032, 3048))).raw
+    centre = isp.reverse(srgb, coordinates=frame_coordinates(32, 48, (1000, 1500), (2032, 3048))).raw
+    corner = isp.reverse(srgb, coordinates=frame_coordinates(32, 48, (0, 0), (2032, 3048))).raw
     assert 0.55 < (corner.mean() / centre.mean()).item() < 0.65  # exp(-1/2) at the corner
 
 

@@ -68,10 +68,10 @@ def test_gaussian_mask_takes_mean_and_precision() -> None:
     mean, precision = torch.tensor([0.1, -0.2]), torch.tensor([[0.8, 0.1], [0.1, 0.5]])
     mask.set(mean, precision)
     torch.testing.assert_close(mask.precision, precision)
-    place = stages.frame_coordinates(40, 60)
-    p = place[0] - mean[:, None, None]
+    coordinates = stages.frame_coordinates(40, 60)
+    p = coordinates[0] - mean[:, None, None]
     expected = torch.exp(-0.5 * (0.8 * p[0] ** 2 + 0.2 * p[0] * p[1] + 0.5 * p[1] ** 2))
-    torch.testing.assert_close(mask(place)[0, 0], expected)
+    torch.testing.assert_close(mask(coordinates)[0, 0], expected)
 
 
 class Squeeze(Stage):
@@ -83,10 +83,10 @@ class Squeeze(Stage):
         super().__init__(config)
         self.strength = nn.Parameter(torch.tensor(0.3))
 
-    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+    def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         return x - self.strength * x * (1.0 - x)
 
-    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         b = 1.0 - self.strength
         return ((b * b + 4.0 * self.strength * x).sqrt() - b) / (2.0 * self.strength)
 

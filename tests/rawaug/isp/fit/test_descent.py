@@ -129,9 +129,9 @@ def both_passes(isp: DictionaryISP, part: PixelSamples) -> tuple[dict[str, Tenso
     """Intermediate images of the two passes under the reverse weights, and the sRGB of the forward one."""
     params = isp.choose(part.srgb)
     back: dict[str, Tensor] = {}
-    back["raw"] = isp.reverse_pixels(part.cell_srgb, params, part.place, back)
+    back["raw"] = isp.reverse_pixels(part.cell_srgb, params, part.coordinates, back)
     ahead: dict[str, Tensor] = {}
-    srgb = isp.forward_pixels(part.cell_raw, params, part.place, ahead)
+    srgb = isp.forward_pixels(part.cell_raw, params, part.coordinates, ahead)
     return back, ahead, srgb
 
 

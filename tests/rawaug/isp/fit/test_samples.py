@@ -32,8 +32,10 @@ def test_readings_stand_at_their_sites_in_their_channel(exact_pairs: list[Pair])
     assert samples.srgb.shape == samples.target.shape == (3, 3, 1, 500)
     assert torch.equal(samples.site.sum(1), torch.ones(3, 1, 500))
     assert ((samples.target > 0) == (samples.site > 0)).all()
-    pair, place = exact_pairs[1], samples.place[1, :, 0]
-    where = (frame_coordinates(*pair.raw.shape[-2:])[0].flatten(1).T[None] - place.T[:, None]).abs().sum(2).argmin(1)
+    pair, coordinates = exact_pairs[1], samples.coordinates[1, :, 0]
+    where = (
+        (frame_coordinates(*pair.raw.shape[-2:])[0].flatten(1).T[None] - coordinates.T[:, None]).abs().sum(2).argmin(1)
+    )
     assert torch.equal(pair.raw.flatten()[where], samples.target[1].sum(0)[0])
     assert torch.equal(pair.srgb.flatten(1)[:, where] / 255.0, samples.srgb[1, :, 0])
     assert [shot.name for shot in shots] == ["shot0", "shot1", "shot2"] and shots[1].white_balance == (2.0, 1.0, 1.2)
@@ -89,8 +91,8 @@ def test_blocks_show_the_same_and_know_their_place(
     window = (slice(top, top + BLOCK), slice(left, left + BLOCK))
     reds = pair.raw[0][window][0::2, 1::2]
     torch.testing.assert_close(blocks.raw[0, 0, 0], reds.mean())
-    place = frame_coordinates(*pair.raw.shape[-2:])[0, :, window[0], window[1]].mean((1, 2))
-    torch.testing.assert_close(blocks.place[0, :, 0, 0], place)
+    coordinates = frame_coordinates(*pair.raw.shape[-2:])[0, :, window[0], window[1]].mean((1, 2))
+    torch.testing.assert_close(blocks.coordinates[0, :, 0, 0], coordinates)
 
 
 def test_a_picture_of_another_shot_is_refused(exact_pair: Callable[..., Pair]) -> None:
