@@ -29,9 +29,9 @@ from rawaug.io.raw import develop
 from rawaug.metrics import psnr
 from rawaug.noise import noise_model
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import enlarged
+from rawaug.plugin.dataset import enlarge
 from rawaug.plugin.draw import Draw
-from rawaug.plugin.pictures import even_sided
+from rawaug.plugin.pictures import trim_to_even
 from rawaug.plugin.targets import Srgb
 
 LEVELS = (2e-3, 1e-5)
@@ -122,8 +122,8 @@ def differences(pictures: Sequence[Tensor], method: str) -> list[float]:
     augment = RawAugment.from_pretrained("universal", target=Srgb(demosaicing=method), draw=Draw(exposure=(-0.5, 0.0)))
     rows = []
     for number, picture in enumerate(pictures):
-        pair = augment(even_sided(picture), torch.Generator().manual_seed(number))
-        truth = even_sided(picture)[None] / 255.0
+        pair = augment(trim_to_even(picture), torch.Generator().manual_seed(number))
+        truth = trim_to_even(picture)[None] / 255.0
         rows.append([psnr(pair.clean[None], truth).item(), psnr(pair.noisy[None], pair.clean[None]).item()])
     return torch.tensor(rows).mean(0).tolist()
 
@@ -138,7 +138,7 @@ def main() -> None:
         by_lag = torch.stack([correlation(*one) for one in seen]).mean(0)
         print(f"{name:20}", *(f"{value:6.2f}" for value in by_lag.tolist()))
     sharp = list(demo_photographs("test").values())
-    large = [enlarged(p, (2 * p.shape[-2], 2 * p.shape[-1])) for p in sharp]
+    large = [enlarge(p, (2 * p.shape[-2], 2 * p.shape[-1])) for p in sharp]
     for method in bayer.METHODS:
         for name, pictures in (("as they are", sharp), ("enlarged", large)):
             demosaicing, noise = differences(pictures, method)

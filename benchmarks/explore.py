@@ -20,7 +20,7 @@ from benchmarks.measure import arguments, finish, show, start
 from rawaug.data.demo import demo_files
 from rawaug.explore.page import as_html
 from rawaug.explore.view_state import Look
-from rawaug.explore.views import VIEWS, denoised
+from rawaug.explore.views import VIEWS, denoise
 from rawaug.io import read_picture, write_picture
 from rawaug.plugin.config import AugmentConfig
 
@@ -37,7 +37,7 @@ def picture(folder: Path, height: int, width: int) -> Path:
 
 def moves(file: Path, tab: str, repeats: int) -> dict[str, float]:
     """Milliseconds of the moves by kind and clock; the first move of a kind compiles, and is left out."""
-    view = {**VIEWS, "Denoise": denoised}[tab]
+    view = {**VIEWS, "Denoise": denoise}[tab]
     look = Look(str(file), AugmentConfig())
     cameras = [CAMERAS[k % len(CAMERAS)] for k in range(repeats + 1)]
     kinds = {

@@ -25,8 +25,8 @@ from rawaug.data import open_pictures
 from rawaug.data.pairs import centre
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import RawPairs, enlarged
-from rawaug.plugin.pictures import even_sided
+from rawaug.plugin.dataset import RawPairs, enlarge
+from rawaug.plugin.pictures import trim_to_even
 from rawaug.plugin.targets import Srgb
 
 SIDE, LAGS = 256, 4
@@ -91,8 +91,8 @@ def drawn(pictures: Sequence[Tensor], finish: bool, noise: Sequence[str], seed: 
     """Pairs of ``target="srgb"`` of the strengths of :data:`STRENGTHS`."""
     augment = RawAugment.from_pretrained("universal", noise=noise, target=Srgb(finish=finish))
     scales = [ENLARGED[0] + (ENLARGED[1] - ENLARGED[0]) * (k % 10) / 9 for k in range(len(pictures))]
-    larger = [enlarged(p, [round(s * side) for side in p.shape[1:]]) for p, s in zip(pictures, scales, strict=True)]  # type: ignore[arg-type]
-    pairs = RawPairs([even_sided(picture) for picture in larger], augment, SIDE, seed=seed)
+    larger = [enlarge(p, [round(s * side) for side in p.shape[1:]]) for p, s in zip(pictures, scales, strict=True)]  # type: ignore[arg-type]
+    pairs = RawPairs([trim_to_even(picture) for picture in larger], augment, SIDE, seed=seed)
     for epoch in range(1000):
         pairs.set_epoch(epoch)
         for index in range(len(pairs)):

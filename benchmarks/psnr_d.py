@@ -38,7 +38,7 @@ from rawaug.paper.downstream import DownstreamConfig, DownstreamScore, MadeCrops
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.draw import Draw
-from rawaug.plugin.pictures import even_sided
+from rawaug.plugin.pictures import trim_to_even
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.stream import PictureCrops, RealCrops, Source
 
@@ -129,7 +129,7 @@ def main() -> None:
     config = replace(config, bin=options.bin)
     crop = config.train.crop
     folders = [open_pictures(folder, min_side=crop) for folder in options.pictures]
-    pictures = [even_sided(folder[k]) for folder in folders for k in range(len(folder))]
+    pictures = [trim_to_even(folder[k]) for folder in folders for k in range(len(folder))]
     tests, known = named(options.test), options.out / "scores.json"
     rows: Rows = json.loads(known.read_text(encoding="utf-8")) if known.is_file() else {}
     for seed in options.seeds:

@@ -131,7 +131,7 @@ def test_100_megapixels_are_cropped_without_a_copy() -> None:
     pairs = RawPairs([picture], AUGMENT, crop=32)
     pairs.set_epoch(0)
     pair = pairs[0]
-    assert pair.noisy.shape == (4, 16, 16) and pair.params.place[2:4].tolist() == [10_000, 10_000]
+    assert pair.noisy.shape == (4, 16, 16) and pair.params.crop[2:4].tolist() == [10_000, 10_000]
     assert torch.equal(pairs.replay(0, pair.params).noisy, pair.noisy)
 
 

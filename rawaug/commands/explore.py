@@ -8,7 +8,7 @@ from pathlib import Path
 from rawaug.data.demo import demo_files
 from rawaug.data.folders import PICTURE_EXTENSIONS
 from rawaug.errors import extra
-from rawaug.explore.page import address, build, listening, server_of
+from rawaug.explore.page import build, make_server, open_socket, socket_url
 from rawaug.files import files_in
 
 
@@ -23,9 +23,9 @@ def run(pictures: str | None = None, /, *, host: str = "127.0.0.1", port: int = 
     with extra("explore"):  # one line that names all that the page needs, before the pictures ask for theirs
         import gradio  # noqa: F401
     page = build(*choices(pictures))
-    with listening(host, port) as open_, suppress(KeyboardInterrupt):
-        print(f"{address(open_)} (Ctrl-C stops it)", flush=True)
-        server_of(page).run(sockets=[open_])
+    with open_socket(host, port) as open_, suppress(KeyboardInterrupt):
+        print(f"{socket_url(open_)} (Ctrl-C stops it)", flush=True)
+        make_server(page).run(sockets=[open_])
 
 
 def choices(pictures: str | None) -> tuple[list[Path], list[str]]:

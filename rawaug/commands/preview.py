@@ -24,7 +24,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading, frame_coordinates
 from rawaug.isp.tone import STEPS
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.pictures import even_sided
+from rawaug.plugin.pictures import trim_to_even
 from rawaug.seeding import keyed_generator
 
 _MAXIMUM = 768
@@ -58,7 +58,7 @@ def run(
     stages = Path(out) if Path(out).suffix else Path(f"{out}.png")
     require_writable(stages)
     augment = RawAugment.from_pretrained(isp, cfa=cfa)
-    whole = even_sided(read_picture(picture, max_pixels))
+    whole = trim_to_even(read_picture(picture, max_pixels))
     stages.parent.mkdir(parents=True, exist_ok=True)
     atoms = stages.with_name(f"{stages.stem}-atoms{stages.suffix}")
     _draw_stages(augment, whole, count, seed).savefig(stages, dpi=130)

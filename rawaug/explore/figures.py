@@ -11,7 +11,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.errors import extra
-from rawaug.explore.view_state import Drawn
+from rawaug.explore.view_state import Example
 from rawaug.io import encode_srgb
 from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
@@ -24,7 +24,7 @@ _MOST = 2**16  # values of a colour
 _FEWEST = 50  # values in a bin of the signal, for its variance to mean something
 
 
-def histograms(drawn: Drawn) -> np.ndarray:
+def histograms(drawn: Example) -> np.ndarray:
     """How often RAW has each value, by colour: clean as a line, noisy as an area."""
     figure, axis = _figure()
     clean, noisy = (_by_colour(drawn, raw) for raw in (drawn.pair.clean, drawn.pair.noisy))
@@ -41,7 +41,7 @@ def histograms(drawn: Drawn) -> np.ndarray:
     return _pixels(figure)
 
 
-def tone_curve(drawn: Drawn) -> np.ndarray:
+def tone_curve(drawn: Example) -> np.ndarray:
     figure, tone = _figure()
     isp, setting = drawn.augment.isp, drawn.pair.params.isp
     code = np.arange(256)
@@ -53,7 +53,7 @@ def tone_curve(drawn: Drawn) -> np.ndarray:
     return _pixels(figure)
 
 
-def colours(drawn: Drawn) -> np.ndarray:
+def colours(drawn: Example) -> np.ndarray:
     """What the drawn matrix makes of colours, over the colour atoms."""
     figure, colour = _figure()
     isp, setting = drawn.augment.isp, drawn.pair.params.isp
@@ -70,7 +70,7 @@ def colours(drawn: Drawn) -> np.ndarray:
     return _pixels(figure)
 
 
-def noise(drawn: Drawn) -> list[np.ndarray]:
+def noise(drawn: Example) -> list[np.ndarray]:
     """Variance of noisy minus clean against the clean signal, by colour, and its law; linear and logarithmic."""
     pair = drawn.pair
     ramp = torch.logspace(-4, 0, 100)
@@ -113,7 +113,7 @@ def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[
     return mean, variance
 
 
-def _by_colour(drawn: Drawn, raw: Tensor) -> list[Tensor]:
+def _by_colour(drawn: Example, raw: Tensor) -> list[Tensor]:
     """Values of red, green and blue sites, each ``(N,)``; of many, evenly spaced ones."""
     mosaic = raw if len(raw) == 1 else drawn.augment.mosaic(raw)
     values = [mosaic[0][plane > 0] for plane in bayer.pattern(drawn.augment.cfa).planes(*mosaic.shape[-2:])]

@@ -20,8 +20,17 @@ from markupsafe import Markup
 
 from rawaug.bayer import PATTERNS
 from rawaug.errors import MissingExtra, escape, extra
-from rawaug.explore.view_state import Look, command, iso_range, loaded, noises_of, possible, python, tones_of
-from rawaug.explore.views import VIEWS, Panel, denoised, seen_in
+from rawaug.explore.view_state import (
+    Look,
+    command,
+    drop_inapplicable,
+    iso_range,
+    load_isp,
+    noise_choices,
+    python,
+    tone_names,
+)
+from rawaug.explore.views import VIEWS, Panel, denoise, with_tab
 from rawaug.files import WEIGHTS
 from rawaug.isp.cameras import LAMPS, load_cameras
 from rawaug.plugin.config import AugmentConfig
@@ -84,7 +93,7 @@ FIRST_SEED = 2
 """Its first draw for the first built-in picture is ordinary noise; that of seed 0 is nearly the strongest."""
 
 
-def look_of(values: Mapping[str, Any]) -> Look:
+def parse_look(values: Mapping[str, Any]) -> Look:
     """The look that the controls' values mean."""
     picture = values["picture"]
     if not picture:
@@ -102,19 +111,19 @@ def look_of(values: Mapping[str, Any]) -> Look:
         ),
         cfa=None if values["cfa"] == OWN else values["cfa"],
     )
-    return Look(str(picture), possible(config), int(values["seed"] or 0))
+    return Look(str(picture), drop_inapplicable(config), int(values["seed"] or 0))
 
 
 def _given(choice: str) -> str | None:
     return None if choice == ANY else choice
 
 
-def shown(tab: str, values: Mapping[str, Any]) -> dict[str, Any]:
+def show(tab: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """What changes on the page: ``message``, ``python``, ``command``, and the content of the open tab by its name."""
     try:
-        look = seen_in(tab, look_of(values))
+        look = with_tab(tab, parse_look(values))
         if tab == DENOISE:
-            before, after = denoised(look)
+            before, after = denoise(look)
             images = (before.image, after.image)
             return {"message": "", tab: images, "compared": f"{before.title} | {after.title}", **_code(look)}
         return {"message": "", tab: as_html(VIEWS[tab](look)), **_code(look)}
@@ -163,11 +172,11 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
         made["isp"] = gr.Dropdown(isps, value=usual.isp, label="ISP")
         made["camera"] = gr.Dropdown([ANY, *cameras], value=ANY, label="Camera", **whole)
         made["light"] = gr.Dropdown([ANY, *(f"{k} K" for k in KELVINS), *LAMPS], value=ANY, label="Light", **whole)
-        made["tone"] = gr.Dropdown([ANY, *tones_of(usual.isp)], value=ANY, label="Tone curve", **whole)
+        made["tone"] = gr.Dropdown([ANY, *tone_names(usual.isp)], value=ANY, label="Tone curve", **whole)
         made["draw_exposure"] = gr.Checkbox(True, label="Draw the exposure at random")
         made["exposure"] = gr.Slider(-4, 1, value=0, step=0.25, label="Exposure (stops)", interactive=False)
     with gr.Group():
-        made["noise"] = gr.Dropdown(noises_of(usual.isp), value=usual.noise, label="Noise", **whole)
+        made["noise"] = gr.Dropdown(noise_choices(usual.isp), value=usual.noise, label="Noise", **whole)
         made["iso"] = gr.Number(0, label="ISO", info=_about_iso(str(usual.noise)), interactive=False)
         made["cfa"] = gr.Dropdown([OWN, *PATTERNS], value=OWN, label="CFA")
         made["seed"] = gr.Number(FIRST_SEED, label="Seed", precision=0, minimum=0)
@@ -184,7 +193,7 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
 
 
 def _tab(gr: Any, name: str, outputs: dict[str, Any]) -> Any:
-    view = VIEWS.get(name, denoised)
+    view = VIEWS.get(name, denoise)
     with gr.Tab(name) as tab:
         gr.Markdown(str(view.__doc__).partition("\n")[0])  # what it shows
         if name == DENOISE:
@@ -199,7 +208,7 @@ def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, An
     opened = gr.State(next(iter(VIEWS)))
 
     def redraw(tab: str, *values: Any) -> list[Any]:
-        changes = shown(tab, dict(zip(controls, values, strict=True)))
+        changes = show(tab, dict(zip(controls, values, strict=True)))
         return [changes.get(name, gr.skip()) for name in outputs]
 
     def select(tab: str, *values: Any) -> list[Any]:
@@ -213,7 +222,7 @@ def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, An
         tab.select(partial(select, name), inputs, [opened, *results], **quiet)
     isp, noise, drawn = (controls[name] for name in ("isp", "noise", "draw_exposure"))
     fitting = [controls[name] for name in ("camera", "light", "tone", "noise")]
-    isp.change(partial(_fitting, gr), [isp, controls["tone"], noise], fitting, **quiet)
+    isp.change(partial(_update_choices, gr), [isp, controls["tone"], noise], fitting, **quiet)
     noise.change(
         lambda name: gr.update(interactive=iso_range(name) is not None, info=_about_iso(name)),
         noise,
@@ -223,9 +232,9 @@ def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, An
     drawn.change(lambda on: gr.update(interactive=not on), drawn, controls["exposure"], **quiet)
 
 
-def _fitting(gr: Any, isp: str, tone: str, noise: str) -> list[Any]:
+def _update_choices(gr: Any, isp: str, tone: str, noise: str) -> list[Any]:
     """Cameras, lights and tones are those of published cameras; the noise of the ISP's own goes with it."""
-    published, tones, noises = bool(loaded(isp).config.cameras), [ANY, *tones_of(isp)], noises_of(isp)
+    published, tones, noises = bool(load_isp(isp).config.cameras), [ANY, *tone_names(isp)], noise_choices(isp)
     toned = gr.update(interactive=published, choices=tones, **({} if tone in tones else {"value": ANY}))
     usual = AugmentConfig().noise
     noised = gr.update(choices=noises, **({} if noise in noises else {"value": usual}))
@@ -237,7 +246,7 @@ def _about_iso(noise: str) -> str:
     return f"0: drawn from {measured[0]:g} to {measured[1]:g}" if measured else "this noise model has no ISO"
 
 
-def server_of(page: Any) -> Any:
+def make_server(page: Any) -> Any:
     """A server of uvicorn for the page; ``server.run(sockets=[...])`` runs it until it is interrupted."""
     with extra("explore"):
         import fastapi
@@ -249,14 +258,14 @@ def server_of(page: Any) -> Any:
     return uvicorn.Server(uvicorn.Config(app, log_level="error"))
 
 
-def listening(host: str, port: int) -> socket.socket:
-    """A socket for :func:`server_of`; port 0 takes any that is free."""
+def open_socket(host: str, port: int) -> socket.socket:
+    """A socket for :func:`make_server`; port 0 takes any that is free."""
     try:
         return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:
         raise OSError(f"port {port} of {host} cannot be used ({error.strerror}); choose another --port") from None
 
 
-def address(open_: socket.socket) -> str:
+def socket_url(open_: socket.socket) -> str:
     host, port = open_.getsockname()[:2]
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

@@ -19,7 +19,7 @@ from rawaug.plugin.augment import RawAugment, with_iso
 from rawaug.plugin.config import AugmentConfig, pair_generator
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.params import RawPair
-from rawaug.plugin.pictures import even_sided
+from rawaug.plugin.pictures import trim_to_even
 from rawaug.registry import NOISE
 
 
@@ -32,7 +32,7 @@ class Look:
     seed: int = 0
 
 
-class Drawn(NamedTuple):
+class Example(NamedTuple):
     """The picture uint8 ``(3, H, W)``, the augmentation, and one pair without the leading B."""
 
     srgb: Tensor
@@ -40,24 +40,24 @@ class Drawn(NamedTuple):
     pair: RawPair
 
 
-def drawn(look: Look, number: int = 0) -> Drawn:
+def make_example(look: Look, number: int = 0) -> Example:
     """The pair of this number, as ``rawaug synth`` makes it of the picture."""
-    return _drawn(look, number, Path(look.picture).stat().st_mtime_ns)
+    return _make_example(look, number, Path(look.picture).stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=16)
-def _drawn(look: Look, number: int, changed: int) -> Drawn:
-    srgb, augment = opened(look.picture, changed), augmentation(look.config)
-    return Drawn(srgb, augment, augment(srgb, pair_generator(look.seed, Path(look.picture).name, number)))
+def _make_example(look: Look, number: int, changed: int) -> Example:
+    srgb, augment = _read_even(look.picture, changed), make_augment(look.config)
+    return Example(srgb, augment, augment(srgb, pair_generator(look.seed, Path(look.picture).name, number)))
 
 
 @lru_cache(maxsize=2)
-def opened(picture: str, changed: int) -> Tensor:
+def _read_even(picture: str, changed: int) -> Tensor:
     """The picture as it is augmented; ``changed`` says which state of the file."""
-    return even_sided(read_picture(picture))
+    return trim_to_even(read_picture(picture))
 
 
-def augmentation(config: AugmentConfig) -> RawAugment:
+def make_augment(config: AugmentConfig) -> RawAugment:
     """What :meth:`AugmentConfig.make` makes, from an ISP that is baked once."""
     baked = _baked(AugmentConfig(config.isp, config.camera, target=config.target, burst=config.burst, cfa=config.cfa))
     return baked.with_draws(with_iso(config.noise, config.iso), config.draw)
@@ -67,18 +67,18 @@ _baked = lru_cache(maxsize=4)(AugmentConfig.make)
 
 
 @lru_cache(maxsize=4)
-def loaded(isp: str) -> DictionaryISP:
+def load_isp(isp: str) -> DictionaryISP:
     return DictionaryISP.from_pretrained(isp)
 
 
-def tones_of(isp: str) -> list[str]:
+def tone_names(isp: str) -> list[str]:
     """The tone curves of an ISP; none where its tone is learned."""
-    return list(loaded(isp).info.get("tones", []))
+    return list(load_isp(isp).info.get("tones", []))
 
 
-def noises_of(isp: str) -> list[str]:
+def noise_choices(isp: str) -> list[str]:
     """Noise by name: presets, measured cameras, and the ISP's own where it was measured."""
-    own = ["camera"] if "noise" in loaded(isp).info else []
+    own = ["camera"] if "noise" in load_isp(isp).info else []
     return [*own, *(name for name in noise_names() if name not in NOISE)]
 
 
@@ -93,14 +93,14 @@ def iso_range(noise: str) -> tuple[float, float] | None:
     return limits
 
 
-def possible(config: AugmentConfig) -> AugmentConfig:
+def drop_inapplicable(config: AugmentConfig) -> AugmentConfig:
     """The settings without those that do not apply to their ISP and noise.
 
     A fitted ISP has no light, tone and camera to choose, and noise that is not a measured camera's has no ISO.
     """
-    if not loaded(config.isp).config.cameras:
+    if not load_isp(config.isp).config.cameras:
         config = replace(config, camera=None, draw=replace(config.draw, light=None, tone=None))
-    elif config.draw.tone not in tones_of(config.isp):
+    elif config.draw.tone not in tone_names(config.isp):
         config = replace(config, draw=replace(config.draw, tone=None))
     if not isinstance(config.noise, str) or iso_range(config.noise) is None:
         config = replace(config, iso=None)

@@ -24,14 +24,14 @@ from denoisers.network import PACKED
 from rawaug.bayer import CFA, pattern
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.explore import figures
-from rawaug.explore.view_state import Drawn, Look, drawn
+from rawaug.explore.view_state import Example, Look, make_example
 from rawaug.io import encode_srgb
 from rawaug.isp.config import ISPParams
 from rawaug.isp.stages import frame_coordinates
 from rawaug.metrics import psnr
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.config import pair_generator
-from rawaug.plugin.pictures import even_sided
+from rawaug.plugin.pictures import trim_to_even
 
 DRAWS = 8
 HEIGHT, WIDTH = 512, 768
@@ -51,20 +51,20 @@ class Panel(NamedTuple):
 
 def pair(look: Look) -> list[Panel]:
     """The noisy and the clean RAW made from the picture, developed; PSNR is that of the RAW."""
-    made = drawn(look)
+    made = make_example(look)
     noisy, clean = (_crop(raw) for raw in (made.pair.noisy, made.pair.clean))
     quality = psnr(noisy[None], clean[None]).item()
-    shown = [_developed(made, raw) for raw in (noisy, clean)]
+    shown = [_develop(made, raw) for raw in (noisy, clean)]
     return [Panel(f"noisy: {_levels(made)}; {quality:.1f} dB", shown[0]), Panel(f"clean: {_setting(made)}", shown[1])]
 
 
 @torch.no_grad()
 def stages(look: Look) -> list[Panel]:
     """The picture between the stages of the ISP, small; linear images through the sRGB curve."""
-    made = drawn(look)
+    made = make_example(look)
     factor = max(1, max(made.srgb.shape[-2:]) // _THUMBNAIL)
-    small = even_sided(F.avg_pool2d(made.srgb[None].float(), factor)[0].round().to(torch.uint8))
-    shown = stage_pictures(made.augment, small, _batched(made.pair.params.isp))
+    small = trim_to_even(F.avg_pool2d(made.srgb[None].float(), factor)[0].round().to(torch.uint8))
+    shown = stage_pictures(made.augment, small, _as_batch(made.pair.params.isp))
     return [Panel(title, _to_uint8(image)) for title, image in shown.items()]
 
 
@@ -86,7 +86,7 @@ def stage_pictures(
 
 def raw(look: Look) -> list[Panel]:
     """The mosaic magnified, histograms of clean and noisy RAW, and the packed planes."""
-    made = drawn(look)
+    made = make_example(look)
     mosaic = made.augment.mosaic(made.pair.noisy)
     sensor = pattern(made.augment.cfa)
     near = _crop(mosaic, _ZOOM)
@@ -108,7 +108,7 @@ def raw(look: Look) -> list[Panel]:
 
 def camera(look: Look) -> list[Panel]:
     """The drawn tone curve and colours, over the atoms of the ISP that they are mixed from."""
-    made = drawn(look)
+    made = make_example(look)
     return [
         Panel(_setting(made), figures.tone_curve(made)),
         Panel("large: red, green, blue, skin and sky by the drawn matrix; small: by the atoms", figures.colours(made)),
@@ -117,7 +117,7 @@ def camera(look: Look) -> list[Panel]:
 
 def noise(look: Look) -> list[Panel]:
     """Measured variance of the noise against the law that it was drawn from."""
-    made = drawn(look)
+    made = make_example(look)
     titles = f"noise of the pair and its law: {_levels(made)}", "the same on logarithmic axes"
     return [Panel(title, image) for title, image in zip(titles, figures.noise(made), strict=True)]
 
@@ -125,33 +125,33 @@ def noise(look: Look) -> list[Panel]:
 @torch.no_grad()
 def draws(look: Look) -> list[Panel]:
     """Eight draws of camera, light, exposure and noise for the central part, at half size."""
-    first = drawn(look)
+    first = make_example(look)
     augment, part, panels = first.augment, _crop(first.srgb), []
     top, left, *_ = _centre(first.srgb)
     place = torch.tensor([[top, left, *first.srgb.shape[-2:], 0]])
     for number in range(DRAWS):
         params = augment.sample(part[None], pair_generator(look.seed, Path(look.picture).name, number), place)
-        made = Drawn(part, augment, augment.apply(part[None], params).map(lambda tensor: tensor[0]))
-        panels.append(Panel(f"draw {number}: {_setting(made)}; {_levels(made)}", _developed(first, _half(made), 2)))
+        made = Example(part, augment, augment.apply(part[None], params).map(lambda tensor: tensor[0]))
+        panels.append(Panel(f"draw {number}: {_setting(made)}; {_levels(made)}", _develop(first, _half(made), 2)))
     return panels
 
 
-def denoised(look: Look) -> list[Panel]:
+def denoise(look: Look) -> list[Panel]:
     """Noisy on the left, denoised by the shipped network on the right, both developed."""
-    made = drawn(look)
+    made = make_example(look)
     if made.augment.pattern is not None:
         raise ValueError(f"{DEFAULT} denoises Bayer RAW, not {made.augment.cfa}; choose a Bayer CFA")
     cfa = CFA(made.augment.cfa)
     noisy, clean, variance = (_crop(x)[None] for x in (made.pair.noisy, made.pair.clean, made.pair.variance))
     result = _network()(Noisy(noisy, variance, cfa=cfa)).clamp(max=1.0)
     before, after = (psnr(x, clean).item() for x in (noisy, result))
-    shown = [_developed(made, x[0]) for x in (noisy, result)]
+    shown = [_develop(made, x[0]) for x in (noisy, result)]
     return [Panel(f"noisy, {before:.1f} dB", shown[0]), Panel(f"denoised by {DEFAULT}, {after:.1f} dB", shown[1])]
 
 
-def developed(look: Look) -> list[Panel]:
+def srgb(look: Look) -> list[Panel]:
     """Noisy and clean as sRGB: noise in RAW, demosaiced and developed by the camera that made the RAW."""
-    made = drawn(look)
+    made = make_example(look)
     noisy, clean = (_crop(image) for image in (made.pair.noisy, made.pair.clean))
     quality = psnr(noisy[None], clean[None]).item()
     assert made.augment.srgb is not None
@@ -162,11 +162,11 @@ def developed(look: Look) -> list[Panel]:
 
 def burst(look: Look) -> list[Panel]:
     """Noisy frames of the scene from a hand that moves, each with noise of its own."""
-    made = drawn(look)
+    made = make_example(look)
     panels = []
     for k, (down, right, angle) in enumerate(made.pair.params.extras["motion"].tolist()):
         moved = f"{down:+.1f} pixels down, {right:+.1f} to the right, turned by {math.degrees(angle):+.2f} degrees"
-        panels.append(Panel(f"frame {k}: {moved}", _developed(made, _crop(made.pair.noisy[k]))))
+        panels.append(Panel(f"frame {k}: {moved}", _develop(made, _crop(made.pair.noisy[k]))))
     return panels
 
 
@@ -177,7 +177,7 @@ VIEWS: dict[str, Callable[[Look], list[Panel]]] = {
     "Camera": camera,
     "Noise": noise,
     "Eight draws": draws,
-    "sRGB": developed,
+    "sRGB": srgb,
     "Burst": burst,
 }
 """The tabs; beside them there is the one that compares the noisy picture with the denoised one."""
@@ -185,7 +185,7 @@ FORMS: dict[str, dict[str, Any]] = {"sRGB": {"target": "srgb"}, "Burst": {"burst
 """Target and burst of the pairs that a tab shows, if not those of the others."""
 
 
-def seen_in(tab: str, look: Look) -> Look:
+def with_tab(tab: str, look: Look) -> Look:
     return replace(look, config=replace(look.config, **FORMS.get(tab, {})))
 
 
@@ -194,7 +194,7 @@ def _network() -> RawDenoiser:
     return RawDenoiser.of(DEFAULT)
 
 
-def _half(made: Drawn) -> Tensor:
+def _half(made: Example) -> Tensor:
     """Noisy RAW in three colours at half the size, ``(3, H/2, W/2)``: of Bayer patterns a pixel a cell."""
     noisy = made.pair.noisy
     if made.augment.pattern is None:
@@ -202,13 +202,13 @@ def _half(made: Drawn) -> Tensor:
     return F.avg_pool2d(made.augment.pattern.demosaic(noisy[None]), 2)[0]
 
 
-def _setting(made: Drawn) -> str:
+def _setting(made: Example) -> str:
     """Gains of the draw: white balance and exposure."""
     red, green, blue = (made.pair.params.isp.gains / made.pair.params.isp.gains[1]).tolist()
     return f"white balance {red:.2f}, {green:.0f}, {blue:.2f}; mean {made.pair.clean.mean().item():.3f}"
 
 
-def _levels(made: Drawn) -> str:
+def _levels(made: Example) -> str:
     levels = made.pair.params.noise
     if not {"shot_var", "read_var"} <= levels.keys():
         return "noise without levels"
@@ -216,15 +216,15 @@ def _levels(made: Drawn) -> str:
 
 
 @torch.no_grad()
-def _developed(made: Drawn, part: Tensor, scale: int = 1) -> np.ndarray:
+def _develop(made: Example, part: Tensor, scale: int = 1) -> np.ndarray:
     """The central part of RAW, or of linear RGB at 1 / ``scale`` of the size, developed by a draw's own setting."""
     rgb = part if scale > 1 else pattern(made.augment.cfa).demosaic(made.augment.mosaic(part)[None])[0]
     top, left, height, width = (place // scale for place in (*_centre(made.srgb)[:2], *made.srgb.shape[-2:]))
     place = frame_coordinates(rgb.shape[-2], rgb.shape[-1], (top, left), (height, width))
-    return _to_uint8(made.augment.isp.forward_pixels(rgb[None], _batched(made.pair.params.isp), place)[0])
+    return _to_uint8(made.augment.isp.forward_pixels(rgb[None], _as_batch(made.pair.params.isp), place)[0])
 
 
-def _batched(setting: ISPParams) -> ISPParams:
+def _as_batch(setting: ISPParams) -> ISPParams:
     return ISPParams(*(value[None] for value in setting))
 
 

@@ -47,7 +47,7 @@ from rawaug.paper.methods import (
     resumed,
     score_rows,
 )
-from rawaug.plugin.pictures import even_sided
+from rawaug.plugin.pictures import trim_to_even
 from rawaug.progress import progress
 from rawaug.registry import EXPERIMENTS
 from rawaug.training.config import weights_key
@@ -208,7 +208,7 @@ class Table:
         self._fitted: dict[str, Fitted] = {}
         side = settings.downstream.train.crop if settings.downstream else 2
         pictures = open_pictures(settings.pictures, min_side=side)
-        self.pictures = [even_sided(pictures[k]) for k in range(len(pictures))]
+        self.pictures = [trim_to_even(pictures[k]) for k in range(len(pictures))]
 
     def filled(self) -> dict[str, dict[str, Any]]:
         """All rows; printed, and written with every single figure."""

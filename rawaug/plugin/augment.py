@@ -30,7 +30,7 @@ from rawaug.kernels.runtime import eager
 from rawaug.noise import Iso, NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
 from rawaug.plugin.draw import Draw, SettingSampler
 from rawaug.plugin.params import AugmentParams, RawPair
-from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
+from rawaug.plugin.pictures import find_picture, get_picture, is_picture, replace_picture, to_rgb_batch, trim_to_even
 from rawaug.plugin.targets import Burst, Srgb, Target, keep_white
 from rawaug.seeding import keyed_generator, rank_key
 
@@ -156,26 +156,26 @@ class RawAugment(nn.Module):
 
     @eager
     @torch.no_grad()
-    def sample(self, srgb: Any, generator: torch.Generator | None = None, place: Tensor | None = None) -> AugmentParams:
+    def sample(self, srgb: Any, generator: torch.Generator | None = None, crop: Tensor | None = None) -> AugmentParams:
         """Draw parameters for a batch; for a single picture without the leading B.
 
         Args:
             srgb: the pictures; only ``perturb`` and ``chosen`` look at them, ``convex`` counts them.
             generator: on the CPU; the module's own by default.
-            place: ``(B, 5)`` top, left, height, width of the full frames, view; untouched full frames by default.
+            crop: ``(B, 5)`` top, left, height, width of the full frames, view; untouched full frames by default.
         """
-        params = self._sample(self._batch(srgb), generator or self._own_generator(), place)
+        params = self._sample(self._batch(srgb), generator or self._own_generator(), crop)
         return params.map(lambda t: t[0]) if is_picture(srgb) else params
 
-    def _sample(self, srgb: Tensor, generator: torch.Generator, place: Tensor | None) -> AugmentParams:
-        if place is None:
-            place = torch.tensor([0, 0, *srgb.shape[-2:], 0]).repeat(len(srgb), 1)
+    def _sample(self, srgb: Tensor, generator: torch.Generator, crop: Tensor | None) -> AugmentParams:
+        if crop is None:
+            crop = torch.tensor([0, 0, *srgb.shape[-2:], 0]).repeat(len(srgb), 1)
         with _float32(srgb):
             setting = self.settings.sample(srgb, generator)
             noise, extras = self.noise.sample(len(srgb), generator), dict[str, Tensor]()
             for part in (self.srgb, self.burst):
                 extras |= {} if part is None else part.sample(len(srgb), generator)
-            return AugmentParams(setting, noise, place, extras)
+            return AugmentParams(setting, noise, crop, extras)
 
     @eager
     @torch.no_grad()
@@ -196,20 +196,20 @@ class RawAugment(nn.Module):
 
     @eager
     @torch.no_grad()
-    def make(self, srgb: Tensor, generator: torch.Generator, place: Tensor | None = None) -> RawPair:
+    def make_pair(self, srgb: Tensor, generator: torch.Generator, crop: Tensor | None = None) -> RawPair:
         """Sample, then apply, of ``(B, 3, H, W)`` that :mod:`rawaug.plugin.pictures` has converted already."""
         self._require_here(srgb)
-        return self._pair(srgb, self._sample(srgb, generator, place))
+        return self._pair(srgb, self._sample(srgb, generator, crop))
 
     def _pair(self, srgb: Tensor, params: AugmentParams) -> RawPair:
-        if len(params.place) != len(srgb):
-            raise ValueError(f"the parameters are for {len(params.place)} pictures, but the batch has {len(srgb)}")
+        if len(params.crop) != len(srgb):
+            raise ValueError(f"the parameters are for {len(params.crop)} pictures, but the batch has {len(srgb)}")
         with _float32(srgb):
             if self.burst is not None:
                 return self._burst(srgb, params, self.burst)
             noisy, clean, variance = self._noisy(self._clean(srgb, params), params)
             if self.target == "rgb":
-                clean = self.baked.colours(srgb, params.isp, params.place, white=1.0)
+                clean = self.baked.colours(srgb, params.isp, params.crop, white=1.0)
             return RawPair(noisy, clean, variance, params)
 
     @eager
@@ -241,12 +241,12 @@ class RawAugment(nn.Module):
                 f"develop takes packed RAW of a Bayer pattern, (B, 4, h, w) or (4, h, w) from 2 x 2 on, "
                 f"got {tuple(raw.shape)} of {self.cfa}"
             )
-        if len(params.place) != len(raw):
-            raise ValueError(f"the parameters are for {len(params.place)} pictures, but the batch has {len(raw)}")
+        if len(params.crop) != len(raw):
+            raise ValueError(f"the parameters are for {len(params.crop)} pictures, but the batch has {len(raw)}")
         bayer.require_method(demosaicing)
         mosaic, methods = bayer.unpack(raw.float(), self.isp.cfa), [demosaicing] * len(raw)
         with _float32(raw):
-            return self._forward().develop([mosaic], methods, keep_white(params.isp), params.place)[0]
+            return self._forward().develop([mosaic], methods, keep_white(params.isp), params.crop)[0]
 
     def _forward(self) -> FastForward:
         if self.display is None:  # tables that only developing needs
@@ -264,8 +264,8 @@ class RawAugment(nn.Module):
 
     def _clean(self, srgb: Tensor, params: AugmentParams) -> Tensor:
         if self.pattern is None:
-            return self.baked(srgb, params.isp, params.place, white=1.0)
-        return self._planes(self.baked.colours(srgb, params.isp, params.place, white=1.0))
+            return self.baked(srgb, params.isp, params.crop, white=1.0)
+        return self._planes(self.baked.colours(srgb, params.isp, params.crop, white=1.0))
 
     def _planes(self, rgb: Tensor) -> Tensor:
         """RAW as four planes: packed, or, of other patterns, the sites of every 2 x 2 square as they come."""
@@ -289,13 +289,13 @@ class RawAugment(nn.Module):
         return noisy, planes, variance
 
     def _burst(self, srgb: Tensor, params: AugmentParams, burst: Burst) -> RawPair:
-        scene = self.baked.colours(srgb, params.isp, params.place, shaded=False)
+        scene = self.baked.colours(srgb, params.isp, params.crop, shaded=False)
         repeated = params.map(lambda t: t.repeat_interleave(burst.frames, 0))
         if "seed" in repeated.noise:
             seeds = {"sensor_seed": repeated.noise["seed"], "seed": params.extras["frame_seed"].flatten()}
             repeated.noise.update(seeds)
         moving = burst.move(scene, params.extras["motion"])
-        frames = burst.expose(self.baked.shade(moving, repeated.isp, repeated.place))
+        frames = burst.expose(self.baked.shade(moving, repeated.isp, repeated.crop))
         noisy, clean, variance = (
             x.unflatten(0, (len(srgb), burst.frames)) for x in self._noisy(self._planes(frames), repeated)
         )
@@ -325,10 +325,10 @@ class RawAugment(nn.Module):
             ValueError: if there is no picture.
         """
         where = find_picture(batch, key, batched=True)
-        pictures = picked(batch, where)
+        pictures = get_picture(batch, where)
         srgb = self._batch(pictures)
-        pair = self.make(srgb, generator or self._own_generator())
-        return replaced(batch, where, pair.map(lambda t: t[0]) if is_picture(pictures) else pair)
+        pair = self.make_pair(srgb, generator or self._own_generator())
+        return replace_picture(batch, where, pair.map(lambda t: t[0]) if is_picture(pictures) else pair)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RawAugment:
         """Move with the surrounding network, but stay float32."""
@@ -353,7 +353,7 @@ class RawAugment(nn.Module):
 
     def _batch(self, pictures: Any) -> Tensor:
         """``(B, 3, H, W)`` with even sides; other input is moved to the module's device."""
-        srgb = even_sided(to_rgb_batch(pictures))
+        srgb = trim_to_even(to_rgb_batch(pictures))
         if not isinstance(pictures, Tensor):
             return srgb.to(self.device)
         self._require_here(srgb)

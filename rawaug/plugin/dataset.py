@@ -26,31 +26,34 @@ from rawaug.kernels.runtime import one_thread
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.epochs import Passes, Visits
 from rawaug.plugin.params import AugmentParams, RawPair, require_keys
-from rawaug.plugin.pictures import even_sided, find_picture, picked, replaced, to_rgb_tensor
+from rawaug.plugin.pictures import find_picture, get_picture, replace_picture, to_rgb_tensor, trim_to_even
 from rawaug.seeding import keyed_generator
 
 
 class _Pairs(Dataset[Any]):
     """What a Dataset of pairs and a stream of them share: the settings, the epochs, and how a sample becomes a pair."""
 
-    _epochs: Visits | Passes
-
     def __init__(
         self,
         dataset: Any,
         augment: RawAugment | DictionaryISP | str | Path,
-        crop: int | tuple[int, int] | None,
-        seed: int,
-        key: str | int | None,
-        turns: bool,
-        keys: Sequence[str] | None,
-        zoom: float,
+        crop: int | tuple[int, int] | None = 256,
+        *,
+        seed: int = 0,
+        key: str | int | None = None,
+        turns: bool = True,
+        keys: Sequence[str] | None = None,
+        zoom: float = 1.0,
     ) -> None:
         if not zoom >= 1.0 or (zoom > 1.0 and crop is None):
             raise ValueError(f"zoom must be at least 1, and 1 without a crop; got {zoom} with crop={crop}")
-        self.dataset, self.augment = dataset, augmentation(augment)
+        self._epochs = self._make_epochs(dataset)
+        self.dataset, self.augment = dataset, as_augment(augment)
         self.crop, self.seed, self.turns, self.zoom = crop_size(crop), seed, turns, zoom
         self.key, self.keys = key, require_keys(keys)
+
+    def _make_epochs(self, dataset: Any) -> Visits | Passes:
+        raise NotImplementedError
 
     def set_epoch(self, epoch: int) -> None:
         """Pin the epoch: from now on an index is the same pair whenever it is asked for, until the next call.
@@ -90,15 +93,15 @@ class _Pairs(Dataset[Any]):
     def _generator(self, epoch: int, *names: int | str) -> torch.Generator:
         return keyed_generator(self.seed, "pairs", epoch, *names)
 
-    def _paired(self, sample: Any, name: int | str, generator: torch.Generator) -> Any:
+    def _make_pair(self, sample: Any, name: int | str, generator: torch.Generator) -> Any:
         where = find_picture(sample, self.key)
         try:
-            patch, place = random_patch(picked(sample, where), self.crop, self.turns, generator, self.zoom)
-            batch = self.augment.make(patch[None], generator, place[None])
+            patch, crop = draw_patch(get_picture(sample, where), self.crop, self.turns, generator, self.zoom)
+            batch = self.augment.make_pair(patch[None], generator, crop[None])
         except ValueError as error:
             raise ValueError(f"picture {name}: {error}") from error
         pair = batch.map(lambda t: t[0])
-        return replaced(sample, where, pair if self.keys is None else pair.under(self.keys))
+        return replace_picture(sample, where, pair if self.keys is None else pair.as_dict(self.keys))
 
 
 class RawPairs(_Pairs):
@@ -137,51 +140,49 @@ class RawPairs(_Pairs):
 
     _epochs: Visits
 
-    def __init__(
-        self,
-        dataset: Any,
-        augment: RawAugment | DictionaryISP | str | Path,
-        crop: int | tuple[int, int] | None = 256,
-        *,
-        seed: int = 0,
-        key: str | int | None = None,
-        turns: bool = True,
-        keys: Sequence[str] | None = None,
-        zoom: float = 1.0,
-    ) -> None:
+    def _make_epochs(self, dataset: Any) -> Visits:
         if isinstance(dataset, IterableDataset) or not hasattr(dataset, "__getitem__"):
             raise TypeError(
                 f"{type(dataset).__name__} has no index; use RawPairStream(dataset, augment) for an iterable"
             )
-        super().__init__(dataset, augment, crop, seed, key, turns, keys, zoom)
-        self._epochs = Visits(len(dataset) if isinstance(dataset, Sized) else 0)
+        return Visits(len(dataset) if isinstance(dataset, Sized) else 0)
 
     def __getitem__(self, index: int) -> Any:
         index = range(len(self))[operator.index(index)]  # an IndexError ends iteration
         return self.draw(index, self._generator(*self._epochs.key(index)))
 
     def draw(self, index: int, generator: torch.Generator) -> Any:
-        """The pair of picture ``index``, drawn from ``generator``; counts no epoch."""
-        return self._paired(self.dataset[index], index, generator)
+        """Draw the pair of picture ``index`` from a generator on the CPU; no epoch is counted.
+
+        Returns:
+            The sample of the dataset with the pair, without B, in place of the picture.
+        """
+        return self._make_pair(self.dataset[index], index, generator)
 
     def draw_batch(self, indices: Sequence[int], generators: Sequence[torch.Generator]) -> RawPair:
-        """The pairs of :meth:`draw`, bit for bit, made at once as a batch: of small crops most of the time is calls.
+        """Draw the pairs of :meth:`draw`, bit for bit, as one batch, which is faster for small crops.
 
-        The dataset's samples are pictures alone, and ``crop`` is set.
+        Args:
+            indices: B indices of a dataset whose samples are pictures alone; ``crop`` must be set.
+            generators: one for each.
         """
         drawn, patches = [], []
         for index, generator in zip(indices, generators, strict=True):
-            patch, place = random_patch(self.dataset[index], self.crop, self.turns, generator, self.zoom)
+            patch, crop = draw_patch(self.dataset[index], self.crop, self.turns, generator, self.zoom)
             patches.append(patch[None])
-            drawn.append(self.augment.sample(patches[-1], generator, place[None]))
-        pair: RawPair = self.augment.apply(torch.cat(patches), AugmentParams.joined(drawn))
+            drawn.append(self.augment.sample(patches[-1], generator, crop[None]))
+        pair: RawPair = self.augment.apply(torch.cat(patches), AugmentParams.concatenate(drawn))
         return pair
 
     def replay(self, index: int, params: AugmentParams) -> RawPair:
-        """The pair that ``params`` (those of one pair, without B) make of picture ``index``, whatever the seed is."""
+        """Make the pair of picture ``index`` again from the parameters of one pair, without B, whatever the seed is.
+
+        Raises:
+            ValueError: if the picture is of another size than the one that they were drawn for.
+        """
         sample = self.dataset[index]
-        picture = even_sided(to_rgb_tensor(picked(sample, find_picture(sample, self.key))))
-        pair: RawPair = self.augment.apply(placed(picture, params.place, self.crop), params)
+        picture = trim_to_even(to_rgb_tensor(get_picture(sample, find_picture(sample, self.key))))
+        pair: RawPair = self.augment.apply(cut_patch(picture, params.crop, self.crop), params)
         return pair
 
 
@@ -223,8 +224,11 @@ class RawPairStream(_Pairs, IterableDataset[Any]):
         identity: str | int | None = None,
         divide: bool = False,
     ) -> None:
-        super().__init__(dataset, augment, crop, seed, key, turns, keys, zoom)
-        self._epochs, self.identity, self.divide = Passes(), identity, divide
+        super().__init__(dataset, augment, crop, seed=seed, key=key, turns=turns, keys=keys, zoom=zoom)
+        self.identity, self.divide = identity, divide
+
+    def _make_epochs(self, dataset: Any) -> Passes:
+        return Passes()
 
     def __iter__(self) -> Iterator[Any]:
         info = get_worker_info()
@@ -236,13 +240,13 @@ class RawPairStream(_Pairs, IterableDataset[Any]):
             number = n if self.divide else n * workers + worker
             if number < start or (self.divide and n % workers != worker):
                 continue
-            name = (number, *self._epochs.rank()) if self.identity is None else (self._identity(sample),)
-            pair = self._paired(sample, name[0], self._generator(epoch, *name))
+            name = (number, *self._epochs.rank()) if self.identity is None else (self._read_identity(sample),)
+            pair = self._make_pair(sample, name[0], self._generator(epoch, *name))
             self._epochs.at(number + 1)
             yield pair
         self._epochs.end()
 
-    def _identity(self, sample: Any) -> int | str:
+    def _read_identity(self, sample: Any) -> int | str:
         try:
             value = sample[self.identity]
         except (KeyError, IndexError, TypeError) as error:
@@ -250,8 +254,12 @@ class RawPairStream(_Pairs, IterableDataset[Any]):
         return value if isinstance(value, int) else str(value)
 
 
-def augmentation(augment: RawAugment | DictionaryISP | str | Path) -> RawAugment:
-    """The augmentation, or one of an ISP, its name or its path; TypeError for anything else."""
+def as_augment(augment: RawAugment | DictionaryISP | str | Path) -> RawAugment:
+    """An augmentation as it is, or one of an ISP, its name or its path, with the default settings.
+
+    Raises:
+        TypeError: if it is something else.
+    """
     if isinstance(augment, RawAugment):
         return augment
     if isinstance(augment, (DictionaryISP, str, Path)):
@@ -260,7 +268,11 @@ def augmentation(augment: RawAugment | DictionaryISP | str | Path) -> RawAugment
 
 
 def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
-    """Height and width of a crop given as a side or as both; None for whole pictures. ValueError if odd."""
+    """Height and width of a crop that is given as a side or as both; None means whole pictures.
+
+    Raises:
+        ValueError: if a side is odd, or it is neither.
+    """
     if crop is None:
         return None
     sides = (crop, crop) if isinstance(crop, SupportsIndex) else tuple(crop) if isinstance(crop, Sequence) else ()
@@ -270,49 +282,73 @@ def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
     return bayer.RandomCrop((height, width)).size
 
 
-def random_place(
-    picture: Tensor, crop: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
+def draw_crop(
+    picture: Tensor, size: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
 ) -> Tensor:
-    """Place of a crop of ``(3, H, W)``: ``(5,)`` top, left, H, W, view; with a zoom also the rows that are enlarged."""
+    """Draw where a picture is cropped and how the crop is turned, as :class:`AugmentParams` keeps it.
+
+    Args:
+        picture: ``(3, H, W)`` with even sides.
+        size: height and width of the crop; None for the whole picture.
+        turns: whether flips are drawn, and, of a square, quarter turns.
+        generator: on the CPU.
+        zoom: half of the crops are enlarged by up to this factor.
+
+    Returns:
+        ``(5,)`` top, left, H, W, view; with a zoom ``(6,)``, where the last is the number of rows that are enlarged.
+    """
     height, width = picture.shape[-2:]
-    size = crop or (height, width)
-    if crop and zoom > 1.0:
+    region = size or (height, width)
+    if size and zoom > 1.0:
         share, drawn = torch.rand(2, generator=generator).tolist()
-        rows = crop[0] if share < 0.5 else math.ceil(crop[0] / 2 * zoom**-drawn) * 2
-        return torch.cat([random_place(picture, _region(crop, rows), turns, generator), torch.tensor([rows])])
-    corner = bayer.RandomCrop(size).sample(height, width, generator)
-    turn = bayer.RandomTurn(bayer.CFA.RGGB, quarter=size[0] == size[1])
+        rows = size[0] if share < 0.5 else math.ceil(size[0] / 2 * zoom**-drawn) * 2
+        return torch.cat([draw_crop(picture, _region(size, rows), turns, generator), torch.tensor([rows])])
+    corner = bayer.RandomCrop(region).sample(height, width, generator)
+    turn = bayer.RandomTurn(bayer.CFA.RGGB, quarter=region[0] == region[1])
     view = turn.sample(generator) if turns else torch.tensor(0)
     return torch.cat([corner, torch.tensor([height, width]), view[None]])
 
 
-def random_patch(
-    picture: Any, crop: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
+def draw_patch(
+    picture: Any, size: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """A crop of a picture in any form, ``(3, H, W)``, and its place."""
-    whole = even_sided(to_rgb_tensor(picture))
-    place = random_place(whole, crop, turns, generator, zoom)
-    return placed(whole, place, crop), place
+    """Draw a crop of a picture in any form, and cut it out.
+
+    Args:
+        picture: in any form that :mod:`rawaug.plugin.pictures` lists.
+        size: height and width of the crop; None for the whole picture.
+        turns, generator, zoom: as for :func:`draw_crop`.
+
+    Returns:
+        The patch ``(3, *size)``, uint8 or float32, and its crop ``(5,)`` or ``(6,)``.
+    """
+    whole = trim_to_even(to_rgb_tensor(picture))
+    crop = draw_crop(whole, size, turns, generator, zoom)
+    return cut_patch(whole, crop, size), crop
 
 
-def placed(picture: Tensor, place: Tensor, crop: tuple[int, int] | None) -> Tensor:
-    """The patch of a whole picture ``(3, H, W)`` at ``place``; ValueError if the place is of another size."""
-    top, left, height, width, view, rows = (*place.tolist(), 0)[:6]
+def cut_patch(picture: Tensor, crop: Tensor, size: tuple[int, int] | None) -> Tensor:
+    """Cut the patch ``(3, *size)`` that a drawn crop ``(5,)`` or ``(6,)`` means out of a whole picture ``(3, H, W)``.
+
+    Raises:
+        ValueError: if the crop was drawn for a picture of another size.
+    """
+    top, left, height, width, view, rows = (*crop.tolist(), 0)[:6]
     if picture.shape[-2:] != (height, width):
         raise ValueError(f"the parameters belong to a picture of {height} x {width}, got {tuple(picture.shape[-2:])}")
-    patch = bayer.crop(picture, top, left, *(_region(crop, rows) if crop else (height, width)))
-    if crop and patch.shape[-2:] != crop:
-        patch = enlarged(patch, crop)
+    patch = bayer.crop(picture, top, left, *(_region(size, rows) if size else (height, width)))
+    if size and patch.shape[-2:] != size:
+        patch = enlarge(patch, size)
     return bayer.turn(patch, view).contiguous()
 
 
-def _region(crop: tuple[int, int], rows: int) -> tuple[int, int]:
+def _region(size: tuple[int, int], rows: int) -> tuple[int, int]:
     """Even height and width of the ``rows`` that are enlarged to the crop; 0 rows for the crop itself."""
-    return (rows, math.ceil(crop[1] * rows / crop[0] / 2) * 2) if rows else crop
+    return (rows, math.ceil(size[1] * rows / size[0] / 2) * 2) if rows else size
 
 
-def enlarged(patch: Tensor, size: tuple[int, int]) -> Tensor:
-    """``(3, h, w)`` to ``(3, *size)`` of the same type, bicubic."""
+def enlarge(patch: Tensor, size: tuple[int, int]) -> Tensor:
+    """Enlarge a patch ``(3, h, w)`` to ``(3, *size)`` by bicubic interpolation; it keeps its type, uint8 or float."""
     with one_thread():  # the same bits everywhere
         larger = F.interpolate(patch[None].float(), size=size, mode="bicubic", align_corners=False)[0]
     if patch.dtype == torch.uint8:

@@ -35,7 +35,7 @@ def own_share(loader: Any, seed: int) -> Any:
 
     Lightning and Fabric divide only a DataLoader, which a wrapped one is not.
     """
-    if world_size() == 1 or not isinstance(loader, DataLoader) or not _chose_its_order(loader):
+    if world_size() == 1 or not isinstance(loader, DataLoader) or not _has_own_order(loader):
         return loader
     shuffle = isinstance(loader.sampler, RandomSampler)
     dataset: Any = loader.dataset
@@ -49,7 +49,7 @@ def own_share(loader: Any, seed: int) -> Any:
     return share
 
 
-def _chose_its_order(loader: DataLoader[Any]) -> bool:
+def _has_own_order(loader: DataLoader[Any]) -> bool:
     """Whether the sampler is the one that the loader made from ``shuffle``."""
     sampler, batches = loader.sampler, loader.batch_sampler
     if batches is not None and not (type(batches) is BatchSampler and batches.sampler is sampler):
@@ -63,7 +63,7 @@ _COUNTED = -1  # in place of a pinned epoch
 MAX_WORKERS = 512
 
 
-def checked_epoch(epoch: SupportsIndex) -> int:
+def require_epoch(epoch: SupportsIndex) -> int:
     """The epoch (or batch number) as an int of 63 bits, which is what a shared counter holds."""
     if not isinstance(epoch, SupportsIndex) or not 0 <= index(epoch) < 2**63:
         raise ValueError(f"an epoch is an integer from 0 to 2^63 - 1, got {epoch!r}")
@@ -85,7 +85,7 @@ class _Epochs:
         return None if epoch == _COUNTED else epoch
 
     def pin(self, epoch: int) -> None:
-        self._pinned[0] = checked_epoch(epoch)
+        self._pinned[0] = require_epoch(epoch)
 
     def rank(self) -> tuple[int, ...]:
         """:func:`rawaug.seeding.rank_key`; in a spawned worker, which is no part of the process group, the parent's."""
@@ -101,7 +101,7 @@ class _Epochs:
                 value.share_memory_()  # an unpickled copy is not shared with its own workers; in a worker it is already
 
     def _resume(self, epoch: int | None) -> None:
-        self._pinned[0] = _COUNTED if epoch is None else checked_epoch(epoch)
+        self._pinned[0] = _COUNTED if epoch is None else require_epoch(epoch)
 
 
 class Visits(_Epochs):

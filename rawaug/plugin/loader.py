@@ -20,10 +20,18 @@ from torch.utils.data import IterableDataset
 from rawaug.isp.model import DictionaryISP
 from rawaug.kernels.runtime import find_device
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import augmentation, crop_size, random_patch
-from rawaug.plugin.epochs import checked_epoch, own_share, world_size
+from rawaug.plugin.dataset import as_augment, crop_size, draw_patch
+from rawaug.plugin.epochs import own_share, require_epoch, world_size
 from rawaug.plugin.params import RawPair, require_keys
-from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, stacked, to_rgb_batch
+from rawaug.plugin.pictures import (
+    find_picture,
+    get_picture,
+    is_picture,
+    replace_picture,
+    stack_pictures,
+    to_rgb_batch,
+    trim_to_even,
+)
 from rawaug.seeding import keyed_generator, rank_key
 
 
@@ -72,7 +80,7 @@ class WrappedLoader:
         data, to repeat the same noise, and with ``start`` where the wrapped loader itself resumes in the middle of
         an epoch.
         """
-        self._next = self._at = Position(checked_epoch(epoch), checked_epoch(start))
+        self._next = self._at = Position(require_epoch(epoch), require_epoch(start))
         if hasattr(self.loader, "set_epoch"):
             self.loader.set_epoch(epoch)
 
@@ -117,11 +125,11 @@ class WrappedLoader:
                 continue
             where = find_picture(batch, self.key, batched=True)
             generator = keyed_generator(self.augment.seed, "wrap", epoch, number, *rank_key())
-            pair = self._pair(self._pictures(picked(batch, where)), generator)
+            pair = self._make_pair(self._with_channel(get_picture(batch, where)), generator)
             last = number - first + 1 == length  # where training loops stop, before the end of the iterator
-            self._reached(Position(epoch + 1, 0) if last else Position(epoch, number + 1))
-            yield replaced(batch, where, pair if self.keys is None else pair.under(self.keys))
-        self._reached(Position(epoch + 1, 0))
+            self._advance(Position(epoch + 1, 0) if last else Position(epoch, number + 1))
+            yield replace_picture(batch, where, pair if self.keys is None else pair.as_dict(self.keys))
+        self._advance(Position(epoch + 1, 0))
 
     def _length(self) -> int | None:
         """Batches of a pass, where they can be counted on."""
@@ -129,26 +137,26 @@ class WrappedLoader:
             return None
         return len(self) if isinstance(self.loader, Sized) else None
 
-    def _reached(self, position: Position) -> None:
+    def _advance(self, position: Position) -> None:
         self._at = position
         if not position.batch:
             self._order = None
 
-    def _pictures(self, batch: Any) -> Any:
+    def _with_channel(self, batch: Any) -> Any:
         """Batches of grey pictures ``(B, H, W)``, which a DataLoader collates, with an axis for their one channel."""
         grey = isinstance(batch, (Tensor, np.ndarray)) and batch.ndim == 3
         return batch[:, None] if grey and getattr(self.loader, "batch_size", None) is not None else batch
 
-    def _pair(self, pictures: Any, generator: torch.Generator) -> RawPair:
-        whole = even_sided(to_rgb_batch(pictures)) if self.crop is None else None
-        srgb, place = (whole, None) if whole is not None else self._crops(pictures, generator)
-        return self.augment.make(srgb.to(self.device, non_blocking=True), generator, place)
+    def _make_pair(self, pictures: Any, generator: torch.Generator) -> RawPair:
+        whole = trim_to_even(to_rgb_batch(pictures)) if self.crop is None else None
+        srgb, crop = (whole, None) if whole is not None else self._draw_crops(pictures, generator)
+        return self.augment.make_pair(srgb.to(self.device, non_blocking=True), generator, crop)
 
-    def _crops(self, pictures: Any, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def _draw_crops(self, pictures: Any, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """One crop of each picture ``(B, 3, crop, crop)``, and their places ``(B, 5)``."""
         listed = [pictures] if is_picture(pictures) else pictures
-        drawn = [random_patch(picture, self.crop, False, generator) for picture in listed]
-        return stacked([patch for patch, _ in drawn]), torch.stack([place for _, place in drawn])
+        drawn = [draw_patch(picture, self.crop, False, generator) for picture in listed]
+        return stack_pictures([patch for patch, _ in drawn]), torch.stack([crop for _, crop in drawn])
 
     def __getattr__(self, name: str) -> Any:
         if "_share" not in self.__dict__:  # asked for before anything is set, by copy and pickle
@@ -191,4 +199,4 @@ def wrap(
         >>> [(pair.noisy.shape, labels) for pair, labels in loader]
         [(torch.Size([2, 4, 32, 32]), ['cat', 'dog'])]
     """
-    return WrappedLoader(loader, augmentation(augment), crop_size(crop), key, require_keys(keys), device)
+    return WrappedLoader(loader, as_augment(augment), crop_size(crop), key, require_keys(keys), device)

@@ -21,7 +21,7 @@ class AugmentParams(NamedTuple):
     Args:
         isp: camera settings.
         noise: levels and seeds of the noise.
-        place: ``(B, 5)`` top, left, height, width, view: position of the picture in its full frame, and how it was
+        crop: ``(B, 5)`` top, left, height, width, view: position of the picture in its full frame, and how it was
             turned after the crop (see :func:`rawaug.bayer.turn`); ``(B, 6)`` with the number of rows that were
             enlarged to the crop.
         extras: of target ``"srgb"`` ``demosaicing`` (its number) and, with JPEG, ``quality``, each ``(B,)``; of bursts
@@ -30,29 +30,29 @@ class AugmentParams(NamedTuple):
 
     isp: ISPParams
     noise: dict[str, Tensor]
-    place: Tensor
+    crop: Tensor
     extras: dict[str, Tensor]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> AugmentParams:
         """The same function applied to every tensor: ``params.map(lambda t: t[0])`` are those of the first picture."""
         noise, extras = ({name: change(value) for name, value in drawn.items()} for drawn in (self.noise, self.extras))
-        return AugmentParams(ISPParams(*map(change, self.isp)), noise, change(self.place), extras)
+        return AugmentParams(ISPParams(*map(change, self.isp)), noise, change(self.crop), extras)
 
     def tensors(self) -> dict[str, Tensor]:
         """As a flat dict, to store with a batch; :meth:`from_tensors` is the inverse."""
         groups = {"isp": self.isp._asdict(), "noise": self.noise, "extras": self.extras}
         flat = {f"{group}.{name}": value for group, drawn in groups.items() for name, value in drawn.items()}
-        return flat | {"place": self.place}
+        return flat | {"crop": self.crop}
 
     @classmethod
-    def joined(cls, parts: Sequence[AugmentParams]) -> AugmentParams:
+    def concatenate(cls, parts: Sequence[AugmentParams]) -> AugmentParams:
         flat = [params.tensors() for params in parts]
         return cls.from_tensors({name: torch.cat([tensors[name] for tensors in flat]) for name in flat[0]})
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> AugmentParams:
         """The inverse of :meth:`tensors`; ValueError if one is missing."""
-        missing = {"place", *(f"isp.{name}" for name in ISPParams._fields)} - set(tensors)
+        missing = {"crop", *(f"isp.{name}" for name in ISPParams._fields)} - set(tensors)
         if missing:
             raise ValueError(f"not the parameters of an augmentation: {', '.join(sorted(missing))} missing")
         isp = ISPParams(*(tensors[f"isp.{name}"] for name in ISPParams._fields))
@@ -60,7 +60,7 @@ class AugmentParams(NamedTuple):
             {name.removeprefix(group): value for name, value in tensors.items() if name.startswith(group)}
             for group in ("noise.", "extras.")
         )
-        return cls(isp, noise, tensors["place"], extras)
+        return cls(isp, noise, tensors["crop"], extras)
 
 
 class RawPair(NamedTuple):
@@ -85,13 +85,13 @@ class RawPair(NamedTuple):
         """The same function applied to every tensor: ``pair.map(lambda t: t[0])`` is the first pair of a batch."""
         return RawPair(change(self.noisy), change(self.clean), change(self.variance), self.params.map(change))
 
-    def under(self, keys: Sequence[str]) -> dict[str, Any]:
+    def as_dict(self, keys: Sequence[str]) -> dict[str, Any]:
         """Noisy, clean, variance and params, as many as there are keys, as a dict with these: ``("lq", "gt")``."""
         return dict(zip(keys, self, strict=False))
 
 
 def require_keys(keys: Sequence[str] | None) -> tuple[str, ...] | None:
-    """The keys of :meth:`RawPair.under`; ValueError if they are not 1 to 4 different names."""
+    """The keys of :meth:`RawPair.as_dict`; ValueError if they are not 1 to 4 different names."""
     if keys is None:
         return None
     named = () if isinstance(keys, str) else tuple(keys)

@@ -54,14 +54,14 @@ def to_rgb_batch(pictures: Any) -> Tensor:
     if is_picture(pictures):
         return to_rgb_tensor(pictures)[None]
     if isinstance(pictures, Sequence):
-        return stacked([to_rgb_tensor(picture) for picture in pictures])
+        return stack_pictures([to_rgb_tensor(picture) for picture in pictures])
     image = _as_tensor(pictures)
     if image.ndim != 4:
         raise ValueError(f"a batch must be (B, 3, H, W), (B, H, W, 3) or a list, got {_described(pictures)}")
     return _rgb(image, pictures)
 
 
-def stacked(images: Sequence[Tensor]) -> Tensor:
+def stack_pictures(images: Sequence[Tensor]) -> Tensor:
     """Pictures ``(3, H, W)`` of one size to ``(B, 3, H, W)``; where only some are 8 bits, all become float32."""
     sizes = sorted({tuple(image.shape[-2:]) for image in images})
     if len(sizes) != 1:
@@ -72,7 +72,7 @@ def stacked(images: Sequence[Tensor]) -> Tensor:
     return torch.stack(list(images))
 
 
-def even_sided(image: Tensor) -> Tensor:
+def trim_to_even(image: Tensor) -> Tensor:
     """``(..., H, W)`` without its last row or column where a side is odd: a Bayer cell is 2 x 2."""
     height, width = image.shape[-2:]
     if min(image.shape[0], height // 2, width // 2) < 1:
@@ -125,11 +125,11 @@ def _likely_pair(first: Any, second: Any) -> bool:
     return images and first.mode == second.mode == "RGB" and first.size == second.size
 
 
-def picked(sample: Any, where: Where) -> Any:
+def get_picture(sample: Any, where: Where) -> Any:
     return sample if where is None else sample[where]
 
 
-def replaced(sample: Any, where: Where, value: Any) -> Any:
+def replace_picture(sample: Any, where: Where, value: Any) -> Any:
     """The sample with ``value`` there, all else as it was; mappings become dicts.
 
     A dict in place of the picture of a mapping is merged with it; ValueError if that would overwrite another field.

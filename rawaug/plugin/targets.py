@@ -99,7 +99,7 @@ class Srgb:
         if min(noisy.shape[-2:]) < 4:
             raise ValueError(f"target 'srgb' demosaics pictures of at least 4 x 4, got {tuple(noisy.shape[-2:])}")
         methods = [self.methods[number] for number in params.extras["demosaicing"].tolist()]
-        noisy, clean = forward.develop((noisy, clean), methods, keep_white(params.isp), params.place)
+        noisy, clean = forward.develop((noisy, clean), methods, keep_white(params.isp), params.crop)
         if (finishing := self.finishing) is not None:
             noisy, clean = finishing.apply(noisy, clean, params.extras["finish"])
         if "quality" in params.extras:

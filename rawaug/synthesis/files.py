@@ -27,7 +27,7 @@ from rawaug.io.pictures import encode_png
 from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, frame_coordinates
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import RawPair, load_params
-from rawaug.synthesis.maker import Format, Origin, PairMaker, noise_levels, replay_pair
+from rawaug.synthesis.maker import Format, Origin, PairMaker, pair_levels, replay_pair
 
 LONGEST_STEM = 200
 """Bytes of a picture's name in those of its pairs, which have at most 255."""
@@ -100,14 +100,14 @@ def _write_dngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
 
 
 def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> None:
-    write_npz(Path(f"{stem}.npz"), pair.clean, pair.noisy, _stated(pair, augment))
+    write_npz(Path(f"{stem}.npz"), pair.clean, pair.noisy, _metadata(pair, augment))
 
 
 def _write_tiffs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
     for end, image in _images(pair, augment).items():
         if augment.target == "srgb":  # which viewers take integers for
             image = (image * 65535.0).round().to(torch.uint16)
-        write_tiff(Path(f"{stem}{end}.tif"), image, _stated(pair, augment))
+        write_tiff(Path(f"{stem}{end}.tif"), image, _metadata(pair, augment))
 
 
 def _write_pngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
@@ -137,11 +137,11 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
     return replay_pair(drawn, Origin(**json.loads(header["origin"])), params, picture, isp)
 
 
-def _stated(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
+def _metadata(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
     """Metadata of the mosaics; colour that cannot be inverted is not stored."""
     if augment.target == "srgb":
-        return noise_levels(pair)
-    stated: dict[str, Any] = {"cfa": augment.cfa, **noise_levels(pair)}
+        return pair_levels(pair)
+    stated: dict[str, Any] = {"cfa": augment.cfa, **pair_levels(pair)}
     try:
         white_balance, matrix, _ = _color(pair, augment)
     except (ValueError, RuntimeError):
@@ -162,7 +162,7 @@ def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[dict[str, RawFram
         "camera": "rawaug dictionary ISP",
         "gain_maps": _shading_maps(augment, pair),
     }
-    levels = noise_levels(pair)
+    levels = pair_levels(pair)
     profile = (levels["shot_var"], levels["read_var"]) if len(levels) == 2 else None
     frames = {
         end: RawFrame(mosaic=mosaic, noise_profile=None if end == "_clean" else profile, **metadata)

@@ -96,7 +96,7 @@ def synth(
     fixed = _settings(format, per_image, seed, AugmentConfig(**settings))
     if workers is not None and workers < 0:
         raise ValueError(f"workers must be at least 0, got {workers}")
-    part, parts = part_of(shard)
+    part, parts = parse_shard(shard)
     PairMaker(fixed, max_pixels)  # raises for a wrong name here, not in a worker
     stored, tasks = fixed.to_json(), list[Task]()
     with locked(out / (LOCK if parts == 1 else f"rawaug-{part}-of-{parts}.lock")):
@@ -107,9 +107,9 @@ def synth(
         else:
             tasks += picture_tasks(pictures, source, out, per_image)
         require_same_settings(out / "synth.json", stored)
-        result = _worked_off(out, tasks[part - 1 :: parts], fixed, max_pixels, workers)
+        result = _run(out, tasks[part - 1 :: parts], fixed, max_pixels, workers)
         if format == "webdataset":
-            shards.finish(out, len(tasks), fixed)
+            shards.write_index(out, len(tasks), fixed)
     result.seconds = time.perf_counter() - start
     if result.pictures and len(result.broken) == result.pictures:
         count, reason = result.pictures, min(result.broken.values())
@@ -117,7 +117,7 @@ def synth(
     return result
 
 
-def part_of(shard: str) -> tuple[int, int]:
+def parse_shard(shard: str) -> tuple[int, int]:
     first, _, second = shard.partition("/")
     if not (first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second)):
         raise ValueError(f"shard must be K/N with K from 1 to N, as 3/32, got {shard!r}")
@@ -136,14 +136,12 @@ def _settings(format: Format, per_image: int, seed: int, config: AugmentConfig) 
     return Settings(format, config, sha256(find_weights(isp)), seed)
 
 
-def _worked_off(
-    out: Path, tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None
-) -> Synthesis:
+def _run(out: Path, tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Synthesis:
     result = Synthesis(out, sum(task.pictures for task in tasks), existing=sum(task.existing for task in tasks))
     for task in tasks:
         result.broken |= task.broken
     todo = [task for task in tasks if task.todo]
-    outcomes = _done(todo, settings, max_pixels, workers)
+    outcomes = _run_tasks(todo, settings, max_pixels, workers)
     for made, broken in progress(outcomes, label="synth", unit="file", total=len(todo), leave=True):
         result.made += made
         result.broken |= broken
@@ -156,7 +154,7 @@ def _worked_off(
 _maker: PairMaker
 
 
-def _done(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[Outcome]:
+def _run_tasks(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[Outcome]:
     workers = min(len(tasks), os.cpu_count() or 1 if workers is None else workers)
     if workers < 1:
         _prepare(settings, max_pixels)

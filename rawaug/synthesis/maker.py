@@ -16,7 +16,7 @@ from rawaug.io import read_picture
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.config import AugmentConfig, pair_generator
 from rawaug.plugin.params import AugmentParams, RawPair
-from rawaug.plugin.pictures import even_sided
+from rawaug.plugin.pictures import trim_to_even
 from rawaug.plugin.targets import Target
 
 Format = Literal["dng", "npz", "tiff", "png", "webdataset"]
@@ -58,7 +58,7 @@ class PairMaker:
     def pairs(self, picture: Path, key: str, numbers: Iterable[int]) -> tuple[Origin, Iterator[tuple[int, RawPair]]]:
         """The origin of a picture's pairs, and an iterator over (number, pair)."""
         before, content = picture.stat(), sha256(picture)
-        srgb = even_sided(read_picture(picture, self.max_pixels)).contiguous()
+        srgb = trim_to_even(read_picture(picture, self.max_pixels)).contiguous()
         after = picture.stat()
         if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
             raise ValueError(f"{picture}: changed while it was read; run the same command again")
@@ -71,7 +71,7 @@ class PairMaker:
         return Origin(str(picture), content, self.settings.isp_sha256, self.settings.config.to_json()), made()
 
 
-def noise_levels(pair: RawPair) -> dict[str, float]:
+def pair_levels(pair: RawPair) -> dict[str, float]:
     noise = pair.params.noise
     return {key: noise[key].item() for key in ("shot_var", "read_var") if key in noise}
 
@@ -95,7 +95,7 @@ def replay_pair(
     config = replace(config, isp=str(isp or config.isp))
     if sha256(find_weights(config.isp)) != origin.isp_sha256:
         raise ValueError(f"{label}: the ISP {config.isp} is not the one this pair was made with")
-    srgb = even_sided(read_picture(found))
+    srgb = trim_to_even(read_picture(found))
     if sha256(found) != origin.picture_sha256:
         raise ValueError(f"{label}: the picture {found} has changed since this pair was made")
     pair: RawPair = config.make().apply(srgb, params)

@@ -29,7 +29,7 @@ from rawaug.files import digest, parse_object, replacing, write_json
 from rawaug.plugin.config import AugmentConfig
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.targets import Burst
-from rawaug.synthesis.maker import Origin, PairMaker, Settings, noise_levels, replay_pair
+from rawaug.synthesis.maker import Origin, PairMaker, Settings, pair_levels, replay_pair
 
 PER_SHARD = 500
 """Pictures in a shard: of half a megapixel each, two gigabytes."""
@@ -42,7 +42,7 @@ class ShardTask:
 
     def __init__(self, path: Path, first: int, source: Path, names: Sequence[str], per_image: int) -> None:
         self.path, self.first, self.source, self.names, self.per_image = path, first, source, names, per_image
-        known = _known(path)
+        known = _read_record(path)
         self.pictures, self.existing = len(names), int(known.get("nsamples", 0))
         self.broken, self.todo = dict(known.get("broken", {})), not known
 
@@ -58,25 +58,25 @@ class ShardTask:
                     broken[name] = str(error).replace(str(picture), name)
                     continue
                 for number, pair in pairs:
-                    _add_sample(tar, f"{index:08d}_{number}", pair, _described(pair, maker, origin, name, number))
+                    _add_sample(tar, f"{index:08d}_{number}", pair, _describe(pair, maker, origin, name, number))
                     made += 1
         size = self.path.stat().st_size
         record = {"url": self.path.name, "nsamples": made, "filesize": size, "broken": broken}
-        write_json(record, _record(self.path))
+        write_json(record, _record_path(self.path))
         return made, broken
 
 
-def _path(out: Path, number: int) -> Path:
+def _shard_path(out: Path, number: int) -> Path:
     return out / f"shard-{number:06d}.tar"
 
 
-def _record(shard: Path) -> Path:
+def _record_path(shard: Path) -> Path:
     return shard.parent / ".shards" / f"{shard.stem}.json"
 
 
-def _known(shard: Path) -> dict[str, Any]:
+def _read_record(shard: Path) -> dict[str, Any]:
     """The record that marks a shard as complete; empty if there is none."""
-    record = _record(shard)
+    record = _record_path(shard)
     if not record.is_file():
         return {}
     try:
@@ -92,7 +92,7 @@ def shard_tasks(
         raise ValueError(f"per_shard must be at least 1, got {per_shard}")
     names = _names(pictures, source)
     return [
-        ShardTask(_path(out, k), start, source, names[start : start + per_shard], per_image)
+        ShardTask(_shard_path(out, k), start, source, names[start : start + per_shard], per_image)
         for k, start in enumerate(range(0, len(names), per_shard))
     ]
 
@@ -114,13 +114,13 @@ def _names(pictures: Sequence[Path], source: Path) -> tuple[str, ...]:
     return tuple(picture.relative_to(source).as_posix() for picture in pictures)
 
 
-def _described(pair: RawPair, maker: PairMaker, origin: Origin, name: str, number: int) -> dict[str, Any]:
+def _describe(pair: RawPair, maker: PairMaker, origin: Origin, name: str, number: int) -> dict[str, Any]:
     """The JSON of a sample; paths are relative, so that machines with other folders write the same bytes."""
     own = asdict(origin) | {"picture": name, "number": number, "cfa": maker.augment.cfa}
     own["settings"]["isp"] = Path(own["settings"]["isp"]).name
     height, width = (pair.clean if len(pair.clean) == 3 else maker.augment.mosaic(pair.clean)).shape[-2:]
     params = {key: value.tolist() for key, value in pair.params.tensors().items()}
-    return own | noise_levels(pair) | {"height": height, "width": width, "params": params}
+    return own | pair_levels(pair) | {"height": height, "width": width, "params": params}
 
 
 def _add_sample(tar: tarfile.TarFile, key: str, pair: RawPair, described: Mapping[str, Any]) -> None:
@@ -151,16 +151,16 @@ def replay_sample(described: Mapping[str, Any], pictures: str | Path, isp: str |
     return replay_pair(AugmentParams.from_tensors(tensors), origin, described["picture"], picture, isp)
 
 
-def finish(out: Path, count: int, settings: Settings) -> None:
+def write_index(out: Path, count: int, settings: Settings) -> None:
     """Write the index and the dataset card once all shards exist."""
-    records = [_known(_path(out, number)) for number in range(count)]
+    records = [_read_record(_shard_path(out, number)) for number in range(count)]
     if not all(records):
         return
     shards = [{key: record[key] for key in ("url", "nsamples", "filesize")} for record in records]
     index = {"__kind__": "wids-shard-index-v1", "wids_version": 1, "name": "rawaug pairs", "shardlist": shards}
     write_json(index, out / "index.json")
     with replacing(out / "README.md") as partial:
-        partial.write_text(card(shards, settings), encoding="utf-8")
+        partial.write_text(dataset_card(shards, settings), encoding="utf-8")
 
 
 def _form(config: AugmentConfig) -> str:
@@ -177,7 +177,7 @@ def _form(config: AugmentConfig) -> str:
     return form if frames is None else f"{form}; noisy has an axis of {frames} frames before these"
 
 
-def card(shards: Sequence[Mapping[str, Any]], settings: Settings) -> str:
+def dataset_card(shards: Sequence[Mapping[str, Any]], settings: Settings) -> str:
     """The dataset card, with the header that Hugging Face reads."""
     pairs, size = (sum(shard[key] for shard in shards) for key in ("nsamples", "filesize"))
     config = settings.config

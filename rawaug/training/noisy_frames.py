@@ -30,7 +30,7 @@ from rawaug.data.development import develop_packed
 from rawaug.data.pairs import Lazy, Pair, Sample
 from rawaug.noise import ShotReadModel, anscombe, camera_law
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.pictures import even_sided, to_rgb_tensor
+from rawaug.plugin.pictures import to_rgb_tensor, trim_to_even
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
 from rawaug.training.estimators import R2R, NoisyCrop, SelfSupervised
@@ -135,7 +135,7 @@ class FrozenPictures(Lazy[NoisyFrame]):
         return frame
 
     def _made(self, index: int) -> NoisyFrame:
-        srgb = even_sided(to_rgb_tensor(self.pictures[index]))[None]
+        srgb = trim_to_even(to_rgb_tensor(self.pictures[index]))[None]
         params = self.augment.sample(srgb, keyed_generator(self.seed, "frozen", index))
         shots = []
         for shot in range(self.shots):

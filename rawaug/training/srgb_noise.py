@@ -21,7 +21,7 @@ from rawaug.data.pairs import Sample
 from rawaug.isp.stages import as_float
 from rawaug.noise.levels import uniform
 from rawaug.noise.models import Params, draw_normals, draw_seeds, per_picture, poisson
-from rawaug.plugin.dataset import crop_size, random_patch
+from rawaug.plugin.dataset import crop_size, draw_patch
 from rawaug.plugin.targets import compress_jpeg
 from rawaug.registry import SRGB_NOISE, require_between
 from rawaug.seeding import keyed_generator
@@ -128,6 +128,6 @@ class NoisyPictures:
 
     def draw(self, generator: torch.Generator) -> Sample:
         drawn = self.pictures[int(torch.randint(len(self.pictures), (), generator=generator))]
-        clean = as_float(random_patch(drawn, self.crop, True, generator, self.zoom)[0])[None]
+        clean = as_float(draw_patch(drawn, self.crop, True, generator, self.zoom)[0])[None]
         noisy = self.noise.apply(clean, self.noise.sample(1, generator))
         return Sample(noisy[0], clean[0], torch.zeros_like(clean[0]))

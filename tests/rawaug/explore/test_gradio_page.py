@@ -21,7 +21,7 @@ from PIL import Image
 from rawaug.commands.explore import choices
 from rawaug.data import demo_pictures
 from rawaug.explore import view_state as looks
-from rawaug.explore.page import FIRST_SEED, listening
+from rawaug.explore.page import FIRST_SEED, open_socket
 from rawaug.explore.views import pair as view
 from rawaug.io import write_picture
 
@@ -156,7 +156,7 @@ def test_the_first_view_is_the_pair_that_the_code_makes(browser: Any, pictures: 
     open_tab(browser, "Code")
     made: dict[str, Any] = {}
     exec(code(browser, "python"), made)
-    assert torch.equal(made["pair"].noisy, looks.drawn(look).pair.noisy)
+    assert torch.equal(made["pair"].noisy, looks.make_example(look).pair.noisy)
     open_tab(browser, "Pair")
 
 
@@ -240,10 +240,10 @@ def test_nothing_is_asked_of_another_machine(browser: Any, served: str) -> None:
 
 
 def test_a_port_in_use_is_one_line() -> None:
-    with listening("127.0.0.1", 0) as taken:
+    with open_socket("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(OSError, match=rf"port {port} of 127\.0\.0\.1 cannot be used .*; choose another --port"):
-            listening("127.0.0.1", port)
+            open_socket("127.0.0.1", port)
 
 
 def test_what_can_be_chosen(pictures: Path) -> None:

@@ -16,7 +16,7 @@ from rawaug.data import demo_pictures
 from rawaug.explore import views
 from rawaug.explore.figures import variance_by_signal
 from rawaug.explore.page import as_html, message
-from rawaug.explore.view_state import Look, command, drawn, iso_range, noises_of, possible, python
+from rawaug.explore.view_state import Look, command, drop_inapplicable, iso_range, make_example, noise_choices, python
 from rawaug.io import read_picture, write_picture
 from rawaug.plugin.config import AugmentConfig
 from rawaug.plugin.draw import Draw
@@ -50,7 +50,7 @@ def picture(tmp_path_factory: pytest.TempPathFactory) -> str:
 )
 def test_command_and_python_make_the_pair_bit_for_bit(picture: str, config: AugmentConfig, tmp_path: Path) -> None:
     look = Look(picture, config, seed=5)
-    pair = drawn(look).pair
+    pair = make_example(look).pair
     words = shlex.split(command(look, str(tmp_path)))
     assert words[0] == "rawaug" and main([*words[1:], "--workers", "0"]) == 0
     with np.load(tmp_path / "cat's_0.npz") as file:
@@ -73,7 +73,7 @@ def test_developed_without_noise_it_is_the_picture_again(picture: str) -> None:
 
 def test_every_view_has_titled_pictures_and_the_draws_differ(picture: str) -> None:
     look = Look(picture, AugmentConfig(noise=LEVELS))
-    panels = {name: view(views.seen_in(name, look)) for name, view in views.VIEWS.items()}
+    panels = {name: view(views.with_tab(name, look)) for name, view in views.VIEWS.items()}
     assert {name: len(found) for name, found in panels.items()} == {
         "Pair": 2, "Stages": 5, "RAW": 6, "Camera": 2, "Noise": 2, "Eight draws": 8, "sRGB": 2, "Burst": 4
     }  # fmt: skip
@@ -93,12 +93,12 @@ def test_other_patterns_have_no_packed_planes_and_no_network(picture: str) -> No
     assert [panel.title.partition(":")[0] for panel in views.raw(look)] == ["XTRANS", "histograms"]
     assert views.pair(look)[0].image.shape == (96, 144, 3)
     with pytest.raises(ValueError, match="denoises Bayer RAW, not"):
-        views.denoised(look)
+        views.denoise(look)
 
 
 def test_the_shipped_network_removes_noise(picture: str) -> None:
     look = Look(picture, AugmentConfig(noise=(5e-3, 1e-4), draw=Draw(exposure=0.0, light=5500.0), cfa="BGGR"))
-    noisy, denoised = views.denoised(look)
+    noisy, denoised = views.denoise(look)
     before, after = (float(panel.title.split()[-2]) for panel in (noisy, denoised))
     assert after > before + 3
     clean = views.pair(look)[1].image.astype(float)
@@ -108,10 +108,10 @@ def test_the_shipped_network_removes_noise(picture: str) -> None:
 def test_large_pictures_are_shown_in_part(tmp_path: Path) -> None:
     write_picture(tmp_path / "large.png", demo_pictures(1)[0].repeat(1, 2, 2))
     look = Look(str(tmp_path / "large.png"), AugmentConfig())
-    assert drawn(look).srgb.shape == (3, 1024, 1024)
+    assert make_example(look).srgb.shape == (3, 1024, 1024)
     assert [panel.image.shape for panel in views.pair(look)] == [(512, 768, 3)] * 2
     assert {max(panel.image.shape) for panel in views.stages(look)} == {512}
-    whole, part = drawn(look).pair.clean, views._crop(drawn(look).pair.clean)
+    whole, part = make_example(look).pair.clean, views._crop(make_example(look).pair.clean)
     assert part.shape == (4, 256, 384) and torch.equal(part, whole[:, 126:382, 60:444])
 
 
@@ -127,12 +127,12 @@ def test_measured_variance_follows_the_law() -> None:
 
 def test_what_does_not_apply_is_left_out() -> None:
     fitted = AugmentConfig("gopro-hero", "Nikon D750", draw=Draw(light=5500.0, tone="linear"))
-    assert possible(fitted) == AugmentConfig("gopro-hero")
+    assert drop_inapplicable(fitted) == AugmentConfig("gopro-hero")
     preset = AugmentConfig("universal-small", noise="upi", iso=800.0, draw=Draw(tone="nokia like"))
-    assert possible(preset) == AugmentConfig("universal-small", noise="upi")
+    assert drop_inapplicable(preset) == AugmentConfig("universal-small", noise="upi")
     kept = AugmentConfig(noise="Nikon D750", iso=800.0, draw=Draw(tone="linear"))
-    assert possible(kept) == kept
-    assert "camera" in noises_of("gopro-hero") and "camera" not in noises_of("universal")
+    assert drop_inapplicable(kept) == kept
+    assert "camera" in noise_choices("gopro-hero") and "camera" not in noise_choices("universal")
     assert iso_range("any camera") is not None and iso_range("camera") is None
 
 
@@ -141,7 +141,7 @@ def test_a_changed_file_is_read_again(tmp_path: Path) -> None:
     means = []
     for value in (50, 200):
         write_picture(look.picture, torch.full((3, 16, 16), value, dtype=torch.uint8))
-        means.append(drawn(look).pair.clean.mean())
+        means.append(make_example(look).pair.clean.mean())
     assert means[0] < means[1]
 
 

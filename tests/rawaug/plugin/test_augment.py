@@ -168,9 +168,9 @@ def test_fields_pass_and_keys_name_the_pictures(augment: RawAugment, srgb: Tenso
 def test_a_single_picture_makes_a_single_pair_that_replays(augment: RawAugment) -> None:
     picture = Image.fromarray(np.random.default_rng(0).integers(256, size=(17, 21, 3), dtype=np.uint8))
     pair = augment(picture)
-    assert pair.noisy.shape == (4, 8, 10) and pair.params.place.tolist() == [0, 0, 16, 20, 0]
+    assert pair.noisy.shape == (4, 8, 10) and pair.params.crop.tolist() == [0, 0, 16, 20, 0]
     assert_same(augment.apply(picture, pair.params), pair)
-    assert augment.sample(picture).place.shape == (5,)
+    assert augment.sample(picture).crop.shape == (5,)
 
 
 def test_raw_stays_float32_in_mixed_precision(isp: DictionaryISP, srgb: Tensor) -> None:
@@ -288,11 +288,11 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     save_file({"a": torch.zeros(1)}, tmp_path / "other.safetensors")
     with pytest.raises(ValueError, match=r"other.*no rawaug parameters"):
         load_params(tmp_path / "other.safetensors")
-    save_file({"place": torch.zeros(5)}, tmp_path / "part.safetensors", {"kind": "augment_params"})
+    save_file({"crop": torch.zeros(5)}, tmp_path / "part.safetensors", {"kind": "augment_params"})
     with pytest.raises(ValueError, match=r"part\.safetensors: .* missing"):
         load_params(tmp_path / "part.safetensors")
     (tmp_path / "text.safetensors").write_text("not this")
     with pytest.raises(ValueError, match=r"text.*not a readable"):
         load_params(tmp_path / "text.safetensors")
-    with pytest.raises(ValueError, match="place missing"):
+    with pytest.raises(ValueError, match="crop missing"):
         AugmentParams.from_tensors({f"isp.{name}": torch.zeros(1) for name in ISPParams._fields})

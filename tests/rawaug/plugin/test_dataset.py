@@ -23,7 +23,7 @@ from rawaug import bayer
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import RawPairs, RawPairStream, random_place
+from rawaug.plugin.dataset import RawPairs, RawPairStream, draw_crop
 from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
 
@@ -75,14 +75,14 @@ def test_patches_are_cropped_then_turned_as_the_parameters_say(augment: RawAugme
     pairs.set_epoch(0)
     views = set()
     for i in range(COUNT):
-        top, left, height, width, view = pairs[i].params.place.tolist()
+        top, left, height, width, view = pairs[i].params.crop.tolist()
         assert (height, width) == tuple(side // 2 * 2 for side in pictures[i].shape[1:])
         patch = bayer.turn(pictures[i][:, top : top + 16, left : left + 16], view)
         assert torch.equal(augment.apply(patch, pairs[i].params).noisy, pairs[i].noisy)
         views.add(view)
     assert len(views) > 3
     upright = RawPairs(pictures, augment, crop=16, turns=False)
-    assert {int(upright[i].params.place[4]) for i in range(COUNT)} == {0}
+    assert {int(upright[i].params.crop[4]) for i in range(COUNT)} == {0}
 
 
 def test_another_epoch_or_seed_is_another_draw(augment: RawAugment, pictures: list[Tensor]) -> None:
@@ -141,7 +141,7 @@ def test_small_pictures_and_odd_crops_are_refused(augment: RawAugment, pictures:
 def test_oblong_crops_are_flipped_only(augment: RawAugment, pictures: list[Tensor]) -> None:
     pairs = RawPairs(pictures, augment, crop=(12, 20))
     assert pairs[0].noisy.shape == (4, 6, 10)
-    assert {int(pairs[i].params.place[4]) for i in range(COUNT)} <= {0, 1, 2, 3}
+    assert {int(pairs[i].params.crop[4]) for i in range(COUNT)} <= {0, 1, 2, 3}
     pair = pairs[2]
     assert torch.equal(pairs.replay(2, pair.params).noisy, pair.noisy)
     for wrong in ((12, 21), (12,), "12", 12.0):
@@ -296,9 +296,9 @@ def test_half_of_the_crops_are_enlarged_and_replayed(augment: RawAugment, pictur
     rows = []
     for i in range(len(pairs)):
         pair = pairs[i]
-        assert pair.noisy.shape == (4, 8, 8) and len(pair.params.place) == 6
+        assert pair.noisy.shape == (4, 8, 8) and len(pair.params.crop) == 6
         assert torch.equal(pairs.replay(i, pair.params).noisy, pair.noisy)
-        rows.append(int(pair.params.place[5]))
+        rows.append(int(pair.params.crop[5]))
     assert 8 <= min(rows) < 12 and max(rows) == 16
     for wrong in ({"zoom": 0.5}, {"zoom": 2.0, "crop": None}):
         with pytest.raises(ValueError, match="zoom must be at least 1"):
@@ -307,7 +307,7 @@ def test_half_of_the_crops_are_enlarged_and_replayed(augment: RawAugment, pictur
 
 def test_half_of_the_crops_are_enlarged() -> None:
     picture, generator = torch.zeros(3, 64, 64), torch.Generator().manual_seed(0)
-    rows = [int(random_place(picture, (32, 32), True, generator, zoom=2.0)[5]) for _ in range(1000)]
+    rows = [int(draw_crop(picture, (32, 32), True, generator, zoom=2.0)[5]) for _ in range(1000)]
     assert 0.4 < sum(side < 32 for side in rows) / len(rows) < 0.6
 
 

@@ -76,14 +76,14 @@ def test_pictures_of_different_sizes_with_a_crop(augment: RawAugment, form: str)
     else:
         pair = batch
     assert isinstance(pair, RawPair) and pair.noisy.shape == (4, 4, 8, 8)
-    assert pair.params.place[:, 2:4].tolist() == [[16, 30], [18, 28], [18, 28], [20, 26]]
+    assert pair.params.crop[:, 2:4].tolist() == [[16, 30], [18, 28], [18, 28], [20, 26]]
 
 
 def test_crops_are_where_the_parameters_say(augment: RawAugment) -> None:
     ramp = torch.arange(40 * 50).reshape(1, 40, 50).expand(3, -1, -1) % 256
     picture = ramp.to(torch.uint8)
     (pair,) = wrap([[picture, picture]], augment, crop=16)
-    places = pair.params.place.tolist()
+    places = pair.params.crop.tolist()
     assert places[0] != places[1]
     patches = torch.stack([picture[:, t : t + 16, left : left + 16] for t, left, *_ in places])
     assert torch.equal(augment.apply(patches, pair.params).noisy, pair.noisy)

@@ -11,12 +11,12 @@ import torch
 from PIL import Image
 
 from rawaug.plugin.pictures import (
-    even_sided,
     find_picture,
-    picked,
-    replaced,
+    get_picture,
+    replace_picture,
     to_rgb_batch,
     to_rgb_tensor,
+    trim_to_even,
     warn_of_pairs,
 )
 
@@ -120,7 +120,7 @@ def test_pictures_that_make_no_batch_are_refused() -> None:
 @pytest.mark.parametrize("shape", [(3, 1, 8), (3, 8, 0), (0, 3, 8, 8)])
 def test_what_holds_no_bayer_cell_is_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="at least 2 x 2"):
-        even_sided(torch.zeros(shape))
+        trim_to_even(torch.zeros(shape))
 
 
 Named = namedtuple("Named", ["image", "label"])
@@ -139,8 +139,8 @@ Named = namedtuple("Named", ["image", "label"])
 )
 def test_the_picture_is_found_and_replaced(sample: Any, key: Any, expected: Any) -> None:
     where = find_picture(sample, key)
-    assert picked(sample, where) is RGB
-    out = replaced(sample, where, "new")
+    assert get_picture(sample, where) is RGB
+    out = replace_picture(sample, where, "new")
     assert out == expected and type(out) is type(expected)
 
 

@@ -16,7 +16,7 @@ from rawaug.files import replacing
 from rawaug.io import write_picture
 from rawaug.plugin.targets import Srgb
 from rawaug.synthesis import shards as pair_shards
-from rawaug.synthesis.folder import Synthesis, part_of, synth
+from rawaug.synthesis.folder import Synthesis, parse_shard, synth
 from rawaug.synthesis.shards import replay_sample
 
 FIXED = (2e-3, 1e-4)
@@ -157,7 +157,7 @@ def test_what_cannot_go_on_is_refused(pictures: Path, whole: Path, tmp_path: Pat
         pair_shards.shard_tasks([pictures / "a.png"], pictures, tmp_path, 1, 0)
     for shard in ("0/4", "5/4", "3", "1/0", "a/b", "-1/2", "1/2/3"):
         with pytest.raises(ValueError, match="shard must be K/N with K from 1 to N"):
-            part_of(shard)
+            parse_shard(shard)
     (tmp_path / ".shards").mkdir()
     (tmp_path / ".shards/shard-000000.json").write_text("{")
     with pytest.raises(ValueError, match=r"shard-000000\.json: not JSON.*; delete it to make the shard again"):
