@@ -37,7 +37,7 @@ _LINES = (
 
 @lru_cache(maxsize=8192)
 def camera_key(name: str) -> str:
-    """What names of one camera have in common.
+    """Reduce a name to a key that all names of one camera share.
 
     Example:
         >>> camera_key("Sony A7 III") == camera_key("Sony ILCE-7M3"), camera_key("Canon EOS 5D Mark II")
@@ -64,7 +64,7 @@ def _elsewhere() -> dict[str, str]:
 
 
 def similar_cameras(part: str, known: Iterable[str]) -> list[str]:
-    """The cameras of ``known`` that have ``part`` in their names, or all of its words.
+    """List the known cameras that have ``part`` in their names, or all of its words.
 
     Example:
         >>> similar_cameras("a7 iii", ["Sony ILCE-7M3", "Sony SLT-A77"])
@@ -77,7 +77,7 @@ def similar_cameras(part: str, known: Iterable[str]) -> list[str]:
 
 
 def find_camera(name: str, known: Iterable[str]) -> str:
-    """The camera of ``known``, maker and model, that goes by ``name``; of several the first.
+    """Find the known camera, maker and model, that goes by ``name``; of several it is the first.
 
     Raises:
         ValueError: if there is no such name; similar ones are suggested.

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 
 def escape(text: object) -> str:
-    r"""The text with line breaks, terminal codes, bidirectional marks and bytes that are not UTF-8 as escapes.
+    r"""Write line breaks, terminal codes, bidirectional marks and bytes that are not UTF-8 as escapes.
 
     Example:
         >>> escape("a\nb\x1b[2Jc ü 写真")
@@ -57,11 +57,11 @@ _WAYS_OUT = (
     (r"dataloader worker.*(killed|exited)", "a worker process was killed, perhaps for its memory; use fewer workers"),
     (r"no space left on device|pytorchstreamwriter", "the disk is full; free some space"),
 )
-"""By what the error says, in lower case, first match."""
+"""Patterns of an error's text in lower case, the first of which counts, and the advice."""
 
 
 def resource_error(error: BaseException) -> str | None:
-    """What is short and what to do about it, in one line; None for any other error.
+    """Say in one line what the machine is short of and what to do; None for any other error.
 
     Example:
         >>> resource_error(RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. "))
@@ -75,7 +75,7 @@ def resource_error(error: BaseException) -> str | None:
 
 
 def strip_traceback(text: str) -> str:
-    """The last line of an error that a DataLoader's worker raised, in place of its traceback.
+    """Keep the last line of an error that a DataLoader's worker raised, without its traceback.
 
     Example:
         >>> strip_traceback("Caught ValueError in a worker.\\nOriginal Traceback ...\\nValueError: a")

@@ -19,7 +19,7 @@ PATCH = 256
 """Side of the mosaic patches over which an ISP's PSNR_r is averaged."""
 
 
-def _compared(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+def _as_floats(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """Both in float32, or in float64 where one is: half precision would lose squares below 6e-8, from 72 dB on."""
     if a.shape != b.shape:
         raise ValueError(f"images differ in shape: {tuple(a.shape)} and {tuple(b.shape)}")
@@ -32,25 +32,25 @@ def _compared(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def psnr(a: Tensor, b: Tensor) -> Tensor:
-    """PSNR in dB of each picture of a batch: ``(B, ...)`` to ``(B,)``; infinite where the two are equal."""
-    a, b = _compared(a, b)
+    """Compute the PSNR in dB of each picture of a batch, ``(B, ...)`` to ``(B,)``; equal ones have infinity."""
+    a, b = _as_floats(a, b)
     return -10.0 * ((a - b) ** 2).flatten(1).mean(1).log10()
 
 
 def patch_psnr(a: Tensor, b: Tensor, patch: int = PATCH) -> Tensor:
-    """PSNR_r: the mean over whole ``patch`` x ``patch`` pieces of ``(B, 1, H, W)`` from the top left, ``(B,)``.
+    """Compute PSNR_r ``(B,)``, the mean PSNR over whole ``patch`` x ``patch`` pieces of ``(B, 1, H, W)``.
 
-    A side shorter than a patch is the patch's side.
+    The pieces start at the top left. A picture shorter than a patch is one patch.
     """
-    a, b = _compared(a, b)
+    a, b = _as_floats(a, b)
     size = (min(patch, a.shape[-2]), min(patch, a.shape[-1]))
     error = F.avg_pool2d((a - b) ** 2, size)
     return (-10.0 * error.log10()).flatten(1).mean(1)
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """SSIM of each picture of a batch: ``(B, C, H, W)``, no side shorter than the window, to ``(B,)``."""
-    a, b = _compared(a, b)
+    """Compute the SSIM ``(B,)`` of pictures ``(B, C, H, W)``, no side of which may be shorter than the window."""
+    a, b = _as_floats(a, b)
     if a.ndim != 4 or min(a.shape[-2:]) < WINDOW:
         raise ValueError(f"SSIM needs (B, C, H, W) with sides of at least {WINDOW}, got {tuple(a.shape)}")
     from kornia.metrics import ssim as ssim_map
@@ -59,7 +59,7 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
 
 
 def worst_and_best_quarter(values: list[float]) -> tuple[float, float]:
-    """Means of the lowest and of the highest 25% (at least one value each)."""
+    """Average the lowest and the highest 25 % of the values, at least one value each."""
     ordered = sorted(values)
     count = max(1, round(len(ordered) / 4))
     return sum(ordered[:count]) / count, sum(ordered[-count:]) / count

@@ -43,10 +43,17 @@ def progress(
     shown: bool = True,
     stream: TextIO | None = None,
 ) -> Any:
-    """``items``, counted as they are iterated over; ``set_postfix_str(text, refresh=False)`` adds to what is shown.
+    """Count items as they are iterated over; ``set_postfix_str(text, refresh=False)`` of the result adds a text.
 
-    ``unit`` is singular; ``total`` is for items without a length, ``initial`` for what was done before. A finished bar
-    stays in the terminal if ``leave``; nothing is printed unless ``shown``.
+    Args:
+        items: what is iterated over.
+        label: stands before the bar.
+        unit: what one item is called, in the singular.
+        total: the number of items, if they have no length.
+        initial: how many were done before.
+        leave: whether a finished bar stays in the terminal.
+        shown: whether anything is printed.
+        stream: where to, stderr by default.
     """
     stream = stream or sys.stderr
     settings: dict[str, Any] = {"desc": label, "unit": unit, "total": total, "initial": initial}
@@ -71,7 +78,7 @@ class _Lines(terminal_tqdm):
 
 
 def time_stage(stage: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Adds the seconds of a method to ``self.seconds[stage]``."""
+    """Decorator: add the seconds that a method takes to ``self.seconds[stage]``."""
 
     def decorated(method: Callable[..., T]) -> Callable[..., T]:
         @wraps(method)

@@ -35,7 +35,7 @@ Spec = str | Mapping[str, Any]
 
 
 def split_spec(spec: Spec) -> tuple[str, dict[str, Any]]:
-    """Both parts of a spec; a bare name has no settings.
+    """Split a spec into its name and its settings; a bare name has none.
 
     Raises:
         ValueError: if it has no name, or another key.
@@ -58,7 +58,7 @@ def split_spec(spec: Spec) -> tuple[str, dict[str, Any]]:
 
 
 def spec_label(spec: Spec) -> str:
-    """A spec in a line, for tables: its name and settings."""
+    """Write a spec in one line, for tables: its name and settings."""
     name, settings = split_spec(spec)
     return " ".join([name, *(f"{key}={value}" for key, value in settings.items())])
 
@@ -66,7 +66,13 @@ def spec_label(spec: Spec) -> str:
 def check_settings(
     label: str, function: Callable[..., Any], settings: Mapping[str, Any], given: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Keyword arguments for a function or class, lists as tuples; the caller passes those that are ``given`` besides.
+    """Check settings against the signature that takes them, and return them as keyword arguments, lists as tuples.
+
+    Args:
+        label: opens the messages.
+        function: a function or class.
+        settings: values by name.
+        given: names that the caller passes besides, so that they may be missing here.
 
     Raises:
         ValueError: if one is unknown, missing, or not of the plain type that the signature names.
@@ -82,7 +88,15 @@ def check_settings(
 
 
 def require_between(key: str, value: object, least: float, most: float) -> None:
-    """Refuse a number out of bounds before anything is built with it; it must be whole where both bounds are.
+    """Refuse a number out of bounds before anything is built with it.
+
+    Args:
+        key: its name in the message.
+        value: the number; it must be whole if both bounds are.
+        least, most: the bounds, both allowed.
+
+    Raises:
+        ValueError: if it is out of bounds or no such number.
 
     Example:
         >>> require_between("width", 10**9, 1, 4096)
@@ -96,7 +110,7 @@ def require_between(key: str, value: object, least: float, most: float) -> None:
 
 
 def suggest(name: object, known: Iterable[str]) -> str:
-    """``" (nearest: UNet)"`` for a name that is nearly known, else nothing."""
+    """Suggest the known name that is nearest, as ``" (nearest: UNet)"``; nothing if none is near."""
     by_key = {candidate.casefold(): candidate for candidate in known}
     near = difflib.get_close_matches(str(name).casefold(), by_key, n=1)
     return f" (nearest: {by_key[near[0]]})" if near else ""
@@ -129,7 +143,7 @@ class Registry(Mapping[str, Any]):
         self._unimported = list(packages)
 
     def register(self, name: str) -> Callable[[T], T]:
-        """Decorator: the class or function is found by ``name``, which no other thing may have, from now on."""
+        """Decorator: let the class or function be found by ``name``, which no other thing may have."""
 
         def add(thing: T) -> T:
             known = self._things.get(name, thing)
@@ -164,10 +178,11 @@ class Registry(Mapping[str, Any]):
         return len(list(iter(self)))
 
     def name_of(self, thing: Any) -> str | None:
+        """Find the name that a thing is registered under; None if it is not."""
         return next((name for name in (*self._things, *self) if self[name] is thing), None)
 
     def make(self, spec: Spec, **defaults: Any) -> Any:
-        """A new one, with its settings as keyword arguments; ``defaults`` stand where these say nothing."""
+        """Make a thing with the settings of its spec; ``defaults`` fill in what these leave out."""
         name, settings = split_spec(spec)
         return self[name](**{**defaults, **check_settings(f"{self.kind} {name}", self[name], settings, defaults)})
 
@@ -203,7 +218,7 @@ def _path(thing: Any) -> str:
 
 
 def _of_type(value: Any, parameter: inspect.Parameter, label: str) -> Any:
-    """The value if it is of the parameter's type; only plain types are checked here."""
+    """Return the value if it is of the parameter's type; only plain types are checked here."""
     hint, default = parameter.annotation, parameter.default
     expected = _PLAIN.get(hint if isinstance(hint, str) else getattr(hint, "__name__", ""))
     value = tuple(value) if isinstance(value, list) else value

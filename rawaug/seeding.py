@@ -14,13 +14,13 @@ import torch
 
 
 def derive_seed(*keys: int | str) -> int:
-    """A 63-bit seed from a sequence of integers and strings, the same on every machine."""
+    """Derive a 63-bit seed from integers and strings, the same on every machine."""
     digest = hashlib.blake2b(repr(keys).encode(), digest_size=8).digest()
     return int.from_bytes(digest, "little") >> 1
 
 
 def keyed_generator(*keys: int | str, device: torch.device | str = "cpu") -> torch.Generator:
-    """A ``torch.Generator`` on ``device``, seeded with :func:`derive_seed`."""
+    """Make a ``torch.Generator`` on ``device`` that is seeded by :func:`derive_seed`."""
     return torch.Generator(device).manual_seed(derive_seed(*keys))
 
 
@@ -33,7 +33,7 @@ def rank_key() -> tuple[int, ...]:
 
 @contextmanager
 def initialise_from(seed: int) -> Iterator[None]:
-    """Layers made inside are float32 and draw their weights from ``seed``; PyTorch's global state is then restored."""
+    """Let layers that are made inside be float32 and draw their weights from ``seed``; the global state is restored."""
     default = torch.get_default_dtype()
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)

@@ -16,17 +16,17 @@ from rawaug.bayer.cfa import CFA
 from rawaug.bayer.patterns import PATTERNS, pattern
 
 _WHOLE = 48
-"""Sides of several whole cells of every pattern, whole at half and at a quarter, too."""
+"""A side that is a multiple of four cells of every pattern."""
 
 
 class Halving:
-    """A mosaic of any pattern, sides multiples of 4, at half its sides as packed RGGB, and back.
+    """Brings mosaics of one pattern, sides multiples of 4, to half their sides as packed RGGB, and back.
 
-    A new site is the mean of its colour's pixels around its place, weighed as by :func:`rawaug.bayer.bin_mosaic`, but
+    A new site is the mean of its colour's pixels around its place, weighed as by :func:`rawaug.bayer.bin_mosaic`, only
     that both greens are one colour.
 
     Args:
-        planes: ``(B, 3, H, W)`` of the pattern.
+        planes: ``(B, 3, H, W)``, 1 at the sites of a colour and 0 elsewhere.
     """
 
     def __init__(self, planes: Tensor) -> None:
@@ -38,15 +38,15 @@ class Halving:
         self.weights = self._sums(self.planes, self.kernels).clamp_min(1e-6)
 
     def __call__(self, mosaic: Tensor) -> Tensor:
-        """``(B, 1, H, W)`` to ``(B, 4, H/4, W/4)``."""
+        """Halve a mosaic ``(B, 1, H, W)``: packed ``(B, 4, H/4, W/4)``."""
         return self._sums(mosaic * self.planes, self.kernels) / self.weights
 
     def variance(self, map_of_it: Tensor) -> Tensor:
-        """Of independent noise whose variance is ``(B, 1, H, W)``, or the same everywhere: that of the new sites."""
+        """Compute the variance of the new sites from that of the pixels, ``(B, 1, H, W)`` or the same everywhere."""
         return self._sums(map_of_it * self.planes, self.kernels.square()) / self.weights.square()
 
     def back(self, packed: Tensor) -> Tensor:
-        """``(B, 4, h, w)`` to full colour ``(B, 3, 4h, 4w)``, linear between the places of a colour."""
+        """Enlarge packed ``(B, 4, h, w)`` to full colour ``(B, 3, 4h, 4w)``, linear between the sites of a colour."""
         height, width = (4 * side for side in packed.shape[-2:])
         up = F.interpolate(F.pad(packed, (1, 1, 1, 1), mode="replicate"), scale_factor=4, mode="bilinear")
         starts = [(5 - 2 * i, 5 - 2 * j) for i, j in CFA.RGGB.sites]
@@ -61,10 +61,10 @@ class Halving:
 
 
 def to_bayer(mosaic: Tensor, cfa: str) -> Tensor:
-    """A mosaic ``(1, H, W)`` of any pattern as one of RGGB at half the sides, ``(1, h, w)``, h and w even.
+    """Convert a mosaic ``(1, H, W)`` of any pattern to RGGB at half the sides, ``(1, h, w)``, h and w even.
 
-    Lines at the end that fill no cell are left out, and of Quad-Bayer a first line that halves the squares of a colour.
-    :func:`to_bayer_variance` says what of the noise is left.
+    Lines at the end that fill no cell are left out, and in Quad-Bayer a first line that would halve the squares of a
+    colour. :func:`to_bayer_variance` gives the share of the noise's variance that is left.
     """
     known, places = pattern(cfa), ((0, 0), (0, 1), (1, 0), (1, 1))
     top, left = next((place for place in places if known.shift(*place).name in PATTERNS), (0, 0))
@@ -76,6 +76,6 @@ def to_bayer(mosaic: Tensor, cfa: str) -> Tensor:
 
 
 def to_bayer_variance(cfa: str) -> float:
-    """Of independent noise of variance 1, what :func:`to_bayer` leaves, the mean over the colours' sites."""
+    """The variance that :func:`to_bayer` leaves of independent noise of variance 1, the mean over all sites."""
     halving = Halving(pattern(cfa).planes(_WHOLE, _WHOLE)[None])
     return float(halving.variance(torch.ones(1, 1, 1, 1))[..., 2:-2, 2:-2].mean())

@@ -61,11 +61,12 @@ class CFA(StrEnum):
 
 
 def noise_variance(raw: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Tensor:
-    """The variance of shot and read noise, ``shot_var max(raw, 0) + read_var``, white = 1; the levels broadcast."""
+    """Compute ``shot_var max(raw, 0) + read_var`` of RAW of any shape, white = 1; the levels broadcast."""
     return raw.clamp_min(0.0) * shot_var + read_var
 
 
 def require_even(height: int, width: int) -> None:
+    """Raise ValueError unless both sides of a Bayer mosaic are even and at least 2."""
     if height % 2 or width % 2:
         raise ValueError(f"a Bayer mosaic must have even sides, got {height} x {width}; crop the last row or column")
     if min(height, width) < 2:
@@ -73,12 +74,13 @@ def require_even(height: int, width: int) -> None:
 
 
 def require_channels(image: Tensor, channels: int, what: str) -> None:
+    """Raise ValueError, naming ``what`` it is, unless an image is ``(..., channels, H, W)``."""
     if image.ndim < 3 or image.shape[-3] != channels:
         raise ValueError(f"{what} must have shape (..., {channels}, H, W), got {tuple(image.shape)}")
 
 
 def pack(mosaic: Tensor, cfa: CFA | str) -> Tensor:
-    """Mosaic ``(..., 1, H, W)`` to packed planes R, Gr, Gb, B ``(..., 4, H/2, W/2)``; ValueError if a side is odd."""
+    """Pack a mosaic ``(..., 1, H, W)`` into planes R, Gr, Gb, B ``(..., 4, H/2, W/2)``; ValueError if a side is odd."""
     require_channels(mosaic, 1, "a mosaic")
     require_even(*mosaic.shape[-2:])
     plane = mosaic[..., 0, :, :]
@@ -86,7 +88,7 @@ def pack(mosaic: Tensor, cfa: CFA | str) -> Tensor:
 
 
 def unpack(packed: Tensor, cfa: CFA | str) -> Tensor:
-    """Packed planes ``(..., 4, H/2, W/2)`` to the mosaic ``(..., 1, H, W)``; the inverse of :func:`pack`."""
+    """Unpack planes ``(..., 4, H/2, W/2)`` to the mosaic ``(..., 1, H, W)``, the inverse of :func:`pack`."""
     require_channels(packed, 4, "packed RAW")
     *lead, _, height, width = packed.shape
     require_even(2 * height, 2 * width)
@@ -97,7 +99,7 @@ def unpack(packed: Tensor, cfa: CFA | str) -> Tensor:
 
 
 def pack_rgb(rgb: Tensor, cfa: CFA | str) -> Tensor:
-    """Full-colour linear ``(..., 3, H, W)`` to packed ``(..., 4, H/2, W/2)``: each site keeps its own colour alone."""
+    """Pack full colour ``(..., 3, H, W)`` into planes ``(..., 4, H/2, W/2)``: each site keeps its own colour alone."""
     require_channels(rgb, 3, "an RGB image")
     require_even(*rgb.shape[-2:])
     sites = zip((0, 1, 1, 2), CFA(cfa).sites, strict=True)
@@ -105,12 +107,12 @@ def pack_rgb(rgb: Tensor, cfa: CFA | str) -> Tensor:
 
 
 def mosaic(rgb: Tensor, cfa: CFA | str) -> Tensor:
-    """Full-colour linear ``(..., 3, H, W)`` to the mosaic ``(..., 1, H, W)``: stage f6, reversed."""
+    """Mosaic full colour ``(..., 3, H, W)`` to ``(..., 1, H, W)``, stage f6 reversed: a site keeps its own colour."""
     return unpack(pack_rgb(rgb, cfa), cfa)
 
 
 def turn(image: Tensor, view: int) -> Tensor:
-    """One of the eight flips and quarter turns of ``(..., H, W)``; a mosaic's pattern moves along.
+    """Flip or turn an image ``(..., H, W)`` in one of eight ways; a mosaic's pattern moves along.
 
     ``view`` is in [0, 8): bit 2 transposes first, bit 1 then flips the rows, bit 0 the columns. View 0 is the identity,
     3 the half turn, 5 and 6 are the quarter turns to the right and to the left.
@@ -124,7 +126,7 @@ def turn(image: Tensor, view: int) -> Tensor:
 
 
 def turn_back(image: Tensor, view: int) -> Tensor:
-    """The inverse of :func:`turn` with the same ``view``."""
+    """Undo :func:`turn` of the same ``view`` on an image ``(..., H, W)``."""
     flips = turn(image, view & 3)
     return flips.transpose(-2, -1) if view & 4 else flips
 
@@ -139,13 +141,23 @@ def turn_keeping_cfa(raw: Tensor, cfa: CFA | str, view: int) -> Tensor:
 
 
 def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
-    """Crop ``(..., H, W)``; ValueError if the offset or size is odd, which moves the pattern, or beyond the mosaic."""
+    """Crop a Bayer mosaic ``(..., H, W)`` and keep its pattern.
+
+    Args:
+        raw: the mosaic.
+        top, left: the first row and column, even.
+        height, width: the size of the crop, even.
+
+    Raises:
+        ValueError: if a number is odd, which would move the pattern, or the crop extends beyond the mosaic.
+    """
     if any(value % 2 for value in (top, left, height, width)):
         raise ValueError(f"offset ({top}, {left}) and size {height} x {width} must be even to keep the CFA")
     return crop_window(raw, top, left, height, width)
 
 
 def crop_window(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
+    """Crop ``raw`` ``(..., H, W)`` at ``top``, ``left`` to ``height`` x ``width``; ValueError if that is not inside."""
     sides = tuple(raw.shape[-2:])
     if min(top, left) < 0 or min(height, width) < 1 or top + height > sides[0] or left + width > sides[1]:
         raise ValueError(f"crop {height} x {width} at ({top}, {left}) extends beyond the mosaic {sides}")
@@ -153,15 +165,25 @@ def crop_window(raw: Tensor, top: int, left: int, height: int, width: int) -> Te
 
 
 def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False) -> Tensor:
-    """A mosaic ``(..., 1, H, W)`` at 1 / ``factor`` of its sides, each site the mean of its colour around its place.
+    """Bin a mosaic: each new site is the mean of its colour around its place.
 
     The mean is over 2 ``factor`` pixels of the old mosaic either way, ``factor`` sites of a colour, about the centre of
     the new site; with an even factor a site at the window's end counts by the part of it that is inside. So the sites
     of the new mosaic are as far apart as a sensor's, and demosaicing finds edges where they are. The pattern stays;
-    independent noise has :func:`bin_mosaic_variance` of its variance. Beyond the border its last sites are repeated.
-    With ``together`` the four sites of a new cell are means around its one centre, as a pixel of full colour needs
-    them, so that the colours of its truth are in register.
-    ValueError if the CFA is not Bayer's, or a side is not a multiple of 2 ``factor``.
+    independent noise keeps :func:`bin_mosaic_variance` of its variance. Beyond the border the last sites are repeated.
+
+    Args:
+        raw: ``(..., 1, H, W)``, sides multiples of 2 ``factor``.
+        cfa: its pattern, one of Bayer's.
+        factor: by which the sides shrink.
+        together: take the means of a new cell's four sites around its one centre, as a pixel of full colour needs
+            them, so that the colours of its truth are in register.
+
+    Returns:
+        ``(..., 1, H / factor, W / factor)``.
+
+    Raises:
+        ValueError: if the CFA is not Bayer's, or a side is not such a multiple.
 
     Example:
         >>> bin_mosaic(torch.rand(1, 16, 24), "GRBG", 4).shape
@@ -177,13 +199,13 @@ def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False)
 
 
 def bin_mosaic_variance(factor: int, together: bool = False) -> float:
-    """Of independent noise of variance 1 after :func:`bin_mosaic`: about ``1 / factor^2``, 0.051 for 4."""
+    """The variance that :func:`bin_mosaic` leaves of independent noise of variance 1: about ``1 / factor^2``."""
     part = (-1 if together else factor - 1) / 4 % 1
     return ((factor - 1 + part**2 + (1 - part) ** 2) / factor**2) ** 2
 
 
 def _window_means(plane: Tensor, axis: int, factor: int, move: float) -> Tensor:
-    """Means over ``factor`` sites of one colour, of windows moved by so many of its sites."""
+    """Average windows of ``factor`` sites of one colour, moved by ``move`` of its sites."""
     first, part = math.floor(move), move % 1
     size = plane.shape[axis]  # not len(), which an exported network would keep
     sites = torch.arange(size, device=plane.device)
@@ -195,7 +217,7 @@ def _window_means(plane: Tensor, axis: int, factor: int, move: float) -> Tensor:
 
 
 def crop_to_cfa(mosaic: Tensor, cfa: CFA, target: CFA) -> Tensor:
-    """``(..., H, W)`` from the first site where ``cfa`` reads as ``target``; sides stay even."""
+    """Crop a mosaic ``(..., H, W)`` so that its pattern ``cfa`` reads as ``target``; sides stay even."""
     rows, columns = cfa.shift_to(target)
     height, width = mosaic.shape[-2:]
     return mosaic[..., rows : height - rows, columns : width - columns]

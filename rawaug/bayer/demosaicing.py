@@ -36,12 +36,12 @@ STENCILS: dict[str, tuple[Tensor, Tensor, Tensor]] = {
 
 
 def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:
-    """Mosaic ``(B, 1, H, W)``, sides even, to ``(B, 3, H, W)``: stage f6; each site keeps the colour that it measured.
+    """Demosaic ``(B, 1, H, W)``, sides even, to ``(B, 3, H, W)``, stage f6: each site keeps the colour it measured.
 
-    ``method`` is ``bilinear``; ``malvar``: the missing colour follows its neighbours, corrected by the Laplacian of the
-    known one (H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing of Bayer-patterned
-    color images", ICASSP 2004); ``adams`` or ``ahd``: see the module; they expect white balance. All but the first take
-    sides of at least 4.
+    The methods are ``bilinear``; ``malvar``, where a missing colour follows its neighbours, corrected by the Laplacian
+    of the known one (H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing of
+    Bayer-patterned color images", ICASSP 2004); ``adams`` and ``ahd``, which the module explains and which expect white
+    balance. All but the first take sides of at least 4.
     """
     require_channels(raw, 1, "a mosaic")
     require_even(*raw.shape[-2:])
@@ -62,7 +62,10 @@ def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:
 
 @lru_cache
 def demosaicing_stencils(cfa: CFA | str, method: str) -> tuple[Tensor, list[list[list[int]]]]:
-    """Four stencils ``(4, K, K)``, and which makes a colour at a site: ``kinds[colour][row][column]``, 0 for none."""
+    """Make the four stencils ``(4, K, K)``, and say which gives a colour at a site of the cell.
+
+    ``kinds[colour][row][column]`` is 0 where the site has the colour itself, else the number of its stencil from 1.
+    """
     cross, along_row, diagonal = STENCILS[method]
     own = CFA(cfa).channels
 
@@ -78,15 +81,15 @@ def demosaicing_stencils(cfa: CFA | str, method: str) -> tuple[Tensor, list[list
 
 
 def _along(raw: Tensor, axis: int) -> tuple[Tensor, Tensor]:
-    """The other colour of a row, or column, at every site, and how much the two change there."""
+    """Estimate the other colour of a row, or column, at every site, and how much both change there."""
     padded = F.pad(raw, (2, 2, 0, 0) if axis == -1 else (0, 0, 2, 2), mode="reflect")
     far, near, own, after, last = (padded.narrow(axis, k, raw.shape[axis]) for k in range(5))
     bend = 2 * own - far - last
     return (near + after) / 2 + bend / 4, (near - after).abs() + bend.abs()
 
 
-def _coloured(raw: Tensor, other: Tensor, cfa: CFA) -> Tensor:
-    """Full colour of a mosaic and the green at its red and blue sites: the colours less green go on linearly."""
+def _fill_colours(raw: Tensor, other: Tensor, cfa: CFA) -> Tensor:
+    """Fill in the colours, given the green at red and blue sites: the differences to green are interpolated."""
     red, first, second, blue = cfa.sites
     green = other.clone()
     for i, j in (first, second):
@@ -108,11 +111,11 @@ def _coloured(raw: Tensor, other: Tensor, cfa: CFA) -> Tensor:
 def _adams(raw: Tensor, cfa: CFA) -> Tensor:
     (row, change), (column, change_down) = _along(raw, -1), _along(raw, -2)
     share = (change < change_down).to(raw) + 0.5 * (change == change_down)
-    return _coloured(raw, torch.lerp(column, row, share), cfa)
+    return _fill_colours(raw, torch.lerp(column, row, share), cfa)
 
 
 def _ahd(raw: Tensor, cfa: CFA) -> Tensor:
-    pictures = [_coloured(raw, _along(raw, axis)[0], cfa) for axis in (-1, -2)]
+    pictures = [_fill_colours(raw, _along(raw, axis)[0], cfa) for axis in (-1, -2)]
     steps = [_steps(picture) for picture in pictures]
     # Of the picture along rows the steps along rows, and of the other those along columns, say what is alike here.
     alike = [torch.minimum(steps[0][k][:, :2].amax(1), steps[1][k][:, 2:].amax(1))[:, None] for k in (0, 1)]
@@ -123,7 +126,7 @@ def _ahd(raw: Tensor, cfa: CFA) -> Tensor:
 
 
 def _steps(rgb: Tensor) -> tuple[Tensor, Tensor]:
-    """How far light and colour ``(B, 4, H, W)`` are from those of the neighbours left, right, above and below."""
+    """Square the steps of light and of colour, ``(B, 4, H, W)``, to the neighbours left, right, above and below."""
     found = []
     for image in (rgb[:, 1:2], rgb[:, ::2] - rgb[:, 1:2]):
         across, down = (image.diff(dim=axis).square().sum(1) for axis in (-1, -2))
@@ -134,10 +137,10 @@ def _steps(rgb: Tensor) -> tuple[Tensor, Tensor]:
 
 DIRECTIONAL = {"adams": _adams, "ahd": _ahd}
 METHODS = (*STENCILS, *DIRECTIONAL)
-"""Names of all."""
+"""The names of all demosaicings."""
 
 
 def require_method(name: str) -> None:
-    """ValueError if there is no such demosaicing."""
+    """Raise ValueError unless there is such a demosaicing."""
     if name not in METHODS:
         raise ValueError(f"demosaicing {name!r} is unknown; use one of {', '.join(METHODS)}")

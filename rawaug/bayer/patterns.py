@@ -39,7 +39,7 @@ class Pattern:
 
     @property
     def period(self) -> int:
-        """Side of the cell."""
+        """The side of the cell in pixels."""
         return len(self.rows)
 
     def shift(self, rows: int, columns: int) -> Pattern:
@@ -62,17 +62,17 @@ class Pattern:
         return cell.repeat(*times)[:height, :width]
 
     def planes(self, height: int, width: int) -> Tensor:
-        """One plane a colour that is 1 at its sites and 0 elsewhere, float32 ``(3, H, W)``: an input of networks."""
+        """Make one plane for each colour, 1 at its sites and 0 elsewhere, float32 ``(3, H, W)``, as networks take."""
         return (self.channels(height, width) == torch.arange(3)[:, None, None]).float()
 
     def mosaic(self, rgb: Tensor) -> Tensor:
-        """Full-colour ``(..., 3, H, W)`` to the mosaic ``(..., 1, H, W)``."""
+        """Mosaic full colour ``(..., 3, H, W)``: ``(..., 1, H, W)``."""
         require_channels(rgb, 3, "an RGB image")
         index = self.channels(*rgb.shape[-2:]).to(rgb.device)
         return rgb.gather(-3, index.expand(*rgb.shape[:-3], 1, *index.shape))
 
     def demosaic(self, raw: Tensor) -> Tensor:
-        """Mosaic ``(B, 1, H, W)`` to ``(B, 3, H, W)``, for the eye: what a site measured stays, the rest are means.
+        """Demosaic ``(B, 1, H, W)`` to ``(B, 3, H, W)`` for the eye: each site keeps its colour and gets two means.
 
         The mean is that of the sites of the colour nearby, with the weights of a tent as wide as the cell (normalised
         convolution: Knutsson and Westin, CVPR 1993); of Bayer's patterns it is bilinear interpolation.
@@ -81,13 +81,22 @@ class Pattern:
         return torch.where(planes > 0, raw, _tent(raw * planes, self.period) * inverse)
 
     def crop(self, raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
-        """Crop ``(..., H, W)`` at whole cells, so that the pattern begins at its corner again; any size."""
+        """Crop a mosaic ``(..., H, W)`` at whole cells, so that the pattern begins at the corner again.
+
+        Args:
+            raw: the mosaic.
+            top, left: the first row and column, multiples of the period.
+            height, width: any size.
+
+        Raises:
+            ValueError: if an offset is no such multiple, or the crop extends beyond the mosaic.
+        """
         if top % self.period or left % self.period:
             raise ValueError(f"offset ({top}, {left}) must be a multiple of {self.period} to keep {self.name}")
         return crop_window(raw, top, left, height, width)
 
     def shift_after(self, view: int) -> tuple[int, int]:
-        """Rows and columns, less than the period, from which a turned mosaic of whole cells reads the pattern again."""
+        """Find the row and column, less than the period, from which a turned mosaic reads the pattern again."""
         cell = self.channels(self.period, self.period)
         turned = turn(cell, view)
         sites = [(i, j) for i in range(self.period) for j in range(self.period)]
@@ -113,7 +122,7 @@ class Pattern:
 
 
 def _tent(image: Tensor, period: int) -> Tensor:
-    """``(B, C, H, W)`` through a separable tent that reaches half a cell to each side; 0 beyond the edges."""
+    """Filter ``(B, C, H, W)`` by a separable tent that reaches half a cell to each side; beyond the edges is 0."""
     reach = period // 2
     for axis in (-2, -1):
         side = image.shape[axis]
@@ -127,7 +136,7 @@ def _tent(image: Tensor, period: int) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _sites(name: str, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """The planes of a pattern, and one over the sum of the tent's weights on them, each ``(1, 3, H, W)``."""
+    """Make the planes of a pattern, and one over the sum of the tent's weights on them, each ``(1, 3, H, W)``."""
     known = pattern(name)
     planes = known.planes(height, width)[None]
     return planes, 1.0 / _tent(planes, known.period)
@@ -149,7 +158,7 @@ PATTERNS: dict[str, Pattern] = {
 
 
 def _phases() -> Iterator[Pattern]:
-    """Every known pattern and, of those of larger cells, what it is from other origins: ``XTRANS+1+2`` and the like."""
+    """Yield every known pattern and what it reads from other origins, such as ``XTRANS+1+2``."""
     yield from PATTERNS.values()
     for known in PATTERNS.values():
         for i, j in product(range(known.period), repeat=2):
@@ -163,7 +172,7 @@ _BY_NAME = {phase.name: _BY_ROWS.setdefault(phase.rows, phase) for phase in _pha
 
 
 def pattern_name(rows: Sequence[str]) -> str | None:
-    """The name of the pattern whose cell is read as ``rows`` from its top left, or None if it is unknown.
+    """Name the pattern whose cell reads as ``rows`` from its top left; None if it is unknown.
 
     Example:
         >>> pattern_name(["GRBGBR", "BGGRGG", "RGGBGG", "GBRGRB", "RGGBGG", "BGGRGG"])
@@ -174,13 +183,13 @@ def pattern_name(rows: Sequence[str]) -> str | None:
 
 
 def canonical_cfa(cfa: str) -> str:
-    """The :class:`CFA` of a Bayer pattern's name, the name of another; ValueError if there is no such pattern."""
+    """Give the :class:`CFA` of a Bayer pattern, the name of any other; ValueError if there is no such pattern."""
     name = pattern(cfa).name
     return CFA(name) if name in CFA.__members__ else name
 
 
 def plane_indices(cfa: str) -> Tensor:
-    """Which of R, Gr, Gb, B (0 to 3) each site of a pattern's cell is, int64 ``(n, n)``; if not Bayer's, greens are 1.
+    """Say which of R, Gr, Gb, B (0 to 3) each site of a cell is, int64 ``(n, n)``; greens are 1 unless it is Bayer's.
 
     Example:
         >>> plane_indices("GRBG").tolist(), plane_indices("XTRANS").shape
@@ -196,7 +205,7 @@ def plane_indices(cfa: str) -> Tensor:
 
 
 def pattern(name: str) -> Pattern:
-    """The pattern of this name: a Bayer one, the same with ``QUAD-`` before it, or ``XTRANS``.
+    """Find a pattern by name: a Bayer one, the same with ``QUAD-`` before it, or ``XTRANS``.
 
     Those of larger cells may begin at another origin: ``XTRANS+1+2`` begins a row lower and two columns to the right.
 

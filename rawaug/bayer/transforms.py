@@ -13,9 +13,9 @@ from rawaug.bayer.cfa import CFA, N_VIEWS, crop, pack, turn, turn_keeping_cfa
 
 
 class _Transform(nn.Module, ABC):
-    """A module with an ``apply(raw, params)`` of its own; with a function alone it is still ``nn.Module.apply``.
+    """A module whose ``apply(raw, params)`` transforms; with a function alone it is still ``nn.Module.apply``.
 
-    Without a generator, as in ``nn.Sequential``, it draws by ``seed``, the worker that it is in and the call's number.
+    Without a generator, as in ``nn.Sequential``, it draws from ``seed``, the number of its worker and that of the call.
     """
 
     def __init__(self, seed: int) -> None:
@@ -39,9 +39,9 @@ class _Transform(nn.Module, ABC):
 
 
 class RandomCrop(_Transform):
-    """A crop ``(..., size, size)`` of mosaics ``(..., H, W)`` at a random even offset: the pattern stays.
+    """Crops mosaics ``(..., H, W)`` to ``(..., size, size)`` at a random even offset, so that the pattern stays.
 
-    One draw serves all that is in the tensor: noisy and clean, stacked, are cropped alike.
+    One draw serves the whole tensor, so that noisy and clean mosaics, stacked, are cropped alike.
 
     Args:
         size: even side, or (height, width), in mosaic pixels, at most those of the mosaics.
@@ -62,7 +62,7 @@ class RandomCrop(_Transform):
             raise ValueError(f"crop must be even and at least 2, got {size}")
 
     def sample(self, height: int, width: int, generator: torch.Generator) -> Tensor:
-        """``(2,)``: top and left of a crop of a mosaic of ``height`` x ``width``."""
+        """Draw top and left of a crop of a mosaic of ``height`` x ``width``, ``(2,)``."""
         rows, columns = self.size
         if height < rows or width < columns:
             raise ValueError(f"{height} x {width} is smaller than the crop {rows} x {columns}; choose a smaller crop")
@@ -74,11 +74,12 @@ class RandomCrop(_Transform):
         return crop(raw, top, left, *self.size)
 
     def forward(self, raw: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Crop ``(..., H, W)`` at an offset drawn from ``generator``."""
         return self._apply_params(raw, self.sample(raw.shape[-2], raw.shape[-1], self._own(generator)))
 
 
 class RandomTurn(_Transform):
-    """One of the eight flips and quarter turns of mosaics ``(..., H, W)``, the same for all that is in the tensor.
+    """Flips or turns mosaics ``(..., H, W)`` in one of eight ways, the same for the whole tensor.
 
     Args:
         cfa: pattern of the mosaics.
@@ -97,7 +98,7 @@ class RandomTurn(_Transform):
         self.cfa, self.keep_cfa, self.views = CFA(cfa), keep_cfa, N_VIEWS if quarter else N_VIEWS // 2
 
     def sample(self, generator: torch.Generator) -> Tensor:
-        """The view, ``()``."""
+        """Draw the view, a scalar."""
         return torch.randint(self.views, (), generator=generator)
 
     def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor:
@@ -105,6 +106,7 @@ class RandomTurn(_Transform):
         return turn_keeping_cfa(raw, self.cfa, view) if self.keep_cfa else turn(raw, view)
 
     def forward(self, raw: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Turn ``(..., H, W)`` by a view drawn from ``generator``."""
         return self._apply_params(raw, self.sample(self._own(generator)))
 
 
@@ -116,4 +118,5 @@ class Pack(nn.Module):
         self.cfa = CFA(cfa)
 
     def forward(self, mosaic: Tensor) -> Tensor:
+        """Pack ``(..., 1, H, W)`` to ``(..., 4, H/2, W/2)``."""
         return pack(mosaic, self.cfa)

@@ -27,12 +27,19 @@ _failed: list[str] = []
 
 
 def can_use_triton(image: Tensor) -> bool:
-    """Whether to try a Triton kernel on ``image``."""
+    """Whether to try a Triton kernel on an image of any shape."""
     return image.device.type == "cuda" and not _failed and find_spec("triton") is not None
 
 
 def fastest(name: str, image: Tensor, *args: Any, otherwise: Callable[[], R]) -> R:
-    """``name(image, *args)`` by the kernel for the image's device, or ``otherwise()`` where there is none."""
+    """Run a pass by the kernel for the device of an image.
+
+    Args:
+        name: of the pass, a function of :mod:`rawaug.kernels.cpu` or :mod:`rawaug.kernels.gpu`.
+        image: of any shape.
+        args: what the pass takes besides.
+        otherwise: the same pass in PyTorch, for devices without a kernel.
+    """
     if name in _ON_GPU and can_use_triton(image):
         return try_kernel(lambda: getattr(import_module("rawaug.kernels.gpu"), name)(image, *args), otherwise)
     if image.device.type == "cpu" and runtime.has_numba():
@@ -42,7 +49,7 @@ def fastest(name: str, image: Tensor, *args: Any, otherwise: Callable[[], R]) ->
 
 
 def try_kernel(kernel: Callable[[], R], otherwise: Callable[[], R]) -> R:
-    """The result of ``kernel``, or of ``otherwise`` after a warning if it fails."""
+    """Run a kernel; if it fails, warn and run ``otherwise``."""
     try:
         return kernel()
     except torch.OutOfMemoryError:  # says nothing about the kernel

@@ -1,8 +1,8 @@
 """The passes of :mod:`rawaug.kernels.reference` as loops for the CPU, compiled by Numba.
 
-A row is worked on in pieces that fit the fastest cache, each step a loop of its own, which the compiler turns into
+A row is worked on in tiles that fit the fastest cache, each step a loop of its own, which the compiler turns into
 vector instructions. It does not find those for the table's look-up, so :func:`_interpolate` spells them out: four
-colours of two neighbouring nodes at a time. Exponential, logarithm and sine are polynomials of least greatest error.
+colours of two neighbouring nodes at a time. Exponential, logarithm and sine are minimax polynomials.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from rawaug.kernels.directions import demosaic_directional as demosaic_direction
 from rawaug.kernels.reference import INCREMENTS, MULTIPLIERS, ROUNDS, Camera, Display
 from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
 
-_TILE = 256  # cells of RAW that are worked on at a time
-_NOISE_TILE = 512  # and of noise
+_TILE = 256  # cells of RAW in a tile
+_NOISE_TILE = 512  # cells of noise in a tile
 
 _ZERO, _ONE, _FAR = np.float32(0), np.float32(1), np.float32(np.inf)
-_LEAST = np.float32(-125)  # exponent at which a mask counts as 0
+_LEAST = np.float32(-125)  # the exponent at which a mask counts as 0; below it floats would become denormal
 
 _M0, _M1 = (np.uint64(m) for m in MULTIPLIERS)
 _K0, _K1 = (np.uint32(k) for k in INCREMENTS)
@@ -48,7 +48,7 @@ _SINE = tuple(np.float32(c) for c in (1.5167854e-4, -4.6741581e-3, 0.079689927, 
 
 
 def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
-    """sRGB ``(B, 3, H, W)``, uint8 or float32 on the CPU, to packed RAW ``(B, 4, H/2, W/2)``, at most ``white``."""
+    """Convert sRGB ``(B, 3, H, W)``, uint8 or float32 on the CPU, to RAW ``(B, 4, H/2, W/2)`` up to ``white``."""
     batch, _, height, width = srgb.shape
     raw = torch.empty(batch, 4, height // 2, width // 2, dtype=torch.float32)
     if not raw.numel():
@@ -70,12 +70,22 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
 
 
 def render(linear: Tensor, display: Display) -> Tensor:
-    """Camera colour x5 ``(B, 3, H, W)``, float32 on the CPU, to sRGB in [0, 1]."""
+    """Develop camera colour x5 ``(B, 3, H, W)``, float32 on the CPU, to sRGB in [0, 1]."""
     return _render_rows(linear.detach().contiguous(), None, np.empty(0, np.int64), linear.shape, display)
 
 
 def develop(raw: Tensor, display: Display, cfa: CFA | str, methods: Sequence[str]) -> Tensor:
-    """Mosaics ``(B, 1, H, W)``, float32 on the CPU, each demosaiced by its own method, to sRGB in [0, 1]."""
+    """Develop mosaics to sRGB.
+
+    Args:
+        raw: ``(B, 1, H, W)``, float32 on the CPU.
+        display: the way from camera colour to sRGB.
+        cfa: pattern of the mosaics.
+        methods: the demosaicing of each, one of :data:`rawaug.bayer.STENCILS`.
+
+    Returns:
+        sRGB ``(B, 3, H, W)`` in [0, 1].
+    """
     used = sorted(set(methods))
     weights = np.stack([_site_weights(CFA(cfa), method) for method in used])
     padded = F.pad(raw.detach(), (2, 2, 2, 2), mode="reflect")  # about the border sites: the pattern stays
@@ -101,7 +111,7 @@ def _render_rows(
 
 @lru_cache
 def _site_weights(cfa: CFA, method: str) -> np.ndarray:
-    """``(2, 3, 6, _TILE)``: by row and colour, the weights of the six sums of :func:`_demosaic` at each site."""
+    """Lay out the weights of :func:`_demosaic`'s six sums by row of the cell, colour and site, (2, 3, 6, _TILE)."""
     stencils, kinds = demosaicing_stencils(cfa, method)
     edge = 2 - stencils.shape[-1] // 2
     around = F.pad(stencils, (edge, edge, edge, edge))
@@ -122,7 +132,7 @@ def _interpolate(context, table, node, row, layer, u, v, w, out, at, plane):  # 
 
 
 def _interpolation(context, build, signature: Signature, values):  # type: ignore[no-untyped-def]
-    """Machine code of :func:`_interpolate`: two nodes along u are one vector of 8, mixed along w, then v, then u."""
+    """Emit the code of :func:`_interpolate`: two nodes along u are one vector of 8, mixed along w, v, then u."""
     table, node, row, layer, u, v, w, out, at, plane = values
     number, index = ir.FloatType(), ir.IntType(32)
     wide, narrow = ir.VectorType(number, 8), ir.VectorType(number, 4)
@@ -156,7 +166,8 @@ def _interpolation(context, build, signature: Signature, values):  # type: ignor
 
 @compile_part
 def _cell_of(value, scale, last):  # type: ignore[no-untyped-def]
-    """The node below a value, at most ``last``, and the share of the way to the next; values are clamped."""
+    """Find the node below a value, at most ``last``, and the share of the way to the next; values are clamped."""
+    # Comparisons in this order send NaN to node 0: an index must never be out of bounds.
     x = np.float32(value) * scale
     x = x if x > _ZERO else _ZERO
     top = np.float32(last + 1)
@@ -168,7 +179,7 @@ def _cell_of(value, scale, last):  # type: ignore[no-untyped-def]
 
 @compile_part
 def _look_up(red, green, blue, scale, table, nodes, shares, halves, out):  # type: ignore[no-untyped-def]
-    """Values of the table ``(N, N, N, 4)`` at colours ``(n,)``, to ``out`` ``(2, 3, _TILE)``.
+    """Look up the table ``(N, N, N, 4)`` at colours ``(n,)``, and write to ``out`` ``(2, 3, _TILE)``.
 
     With ``halves`` = 1 even and odd sites go apart, to the two halves of ``out``; with 0 all go to its first half.
     """
@@ -190,7 +201,7 @@ def _look_up(red, green, blue, scale, table, nodes, shares, halves, out):  # typ
 
 @compile_part
 def _through_curve(plane, scale, curve, nodes, shares, out):  # type: ignore[no-untyped-def]
-    """Values of a curve ``(T,)`` at one channel of a row: even sites to ``out`` ``(2, n)`` [0], odd ones to [1]."""
+    """Look up a curve ``(T,)`` at one channel of a row: even sites go to ``out[0]``, odd ones to ``out[1]``."""
     last, share = np.int32(len(curve) - 2), shares[0]
     for j in range(len(plane)):
         nodes[j], share[j] = _cell_of(plane[j], scale, last)
@@ -203,7 +214,7 @@ def _through_curve(plane, scale, curve, nodes, shares, out):  # type: ignore[no-
 
 @compile_part
 def _of_codes(plane, curve, out):  # type: ignore[no-untyped-def]
-    """:func:`_through_curve` of bytes, for which the curve has an entry each."""
+    """Look up a curve that has an entry for each byte, as :func:`_through_curve` does."""
     even, odd = out[0], out[1]
     for j in range(len(plane) // 2):
         even[j], odd[j] = curve[plane[2 * j]], curve[plane[2 * j + 1]]
@@ -211,10 +222,8 @@ def _of_codes(plane, curve, out):  # type: ignore[no-untyped-def]
 
 @compile_part
 def _fall_off(frame, row, first, shading, out):  # type: ignore[no-untyped-def]
-    """The mask at every second pixel of a row from ``first`` on.
-
-    2^f is a polynomial, the whole exponent goes to a float's bits.
-    """
+    """Compute the mask at every second pixel of a row from ``first`` on."""
+    # 2^exponent is a polynomial for the fraction, and the bits of a float for the whole part.
     y = frame[0] + np.float32(row) * frame[2] + np.float32(first) * frame[4]
     x = frame[1] + np.float32(row) * frame[3] + np.float32(first) * frame[5]
     dy, dx = np.float32(2) * frame[4], np.float32(2) * frame[5]
@@ -233,7 +242,7 @@ def _fall_off(frame, row, first, shading, out):  # type: ignore[no-untyped-def]
 
 @compile_part
 def _develop(x2, colour, channel, knee, mask, white, out):  # type: ignore[no-untyped-def]
-    """One channel of x4 times the mask, of x2 ``(3, n)``."""
+    """Compute one channel of x4 times the mask from x2 ``(3, n)``."""
     c0, c1, c2 = colour[channel, 0], colour[channel, 1], colour[channel, 2]
     m0, m1, m2 = colour[3, 0], colour[3, 1], colour[3, 2]
     floor, rise = colour[4, channel], colour[5, channel]
@@ -250,7 +259,7 @@ def _develop(x2, colour, channel, knee, mask, white, out):  # type: ignore[no-un
 
 @compile_part
 def _attend(x4, channel, table, nodes, shares, found, white, out):  # type: ignore[no-untyped-def]
-    """One channel of x4 ``(3, n)`` times the attention that all three call for."""
+    """Multiply one channel of x4 ``(3, n)`` by the attention, which depends on all three."""
     count, scale = len(out), np.float32(len(table) - 1)
     _look_up(x4[0, :count], x4[1, :count], x4[2, :count], scale, table, nodes, shares, 0, found)
     for j in range(count):
@@ -262,7 +271,7 @@ def _attend(x4, channel, table, nodes, shares, found, white, out):  # type: igno
 def _raw_rows(  # type: ignore[no-untyped-def]
     srgb, scale, table, codes, curves, attention, colour, knee, frame, shading, sites, white, raw, start, stop,
 ):  # fmt: skip
-    """Rows ``start`` to ``stop`` of the batch's rows of pixels, one picture's after the other's."""
+    """Convert rows ``start`` to ``stop`` of all pictures' rows of pixels, counted through the batch."""
     height, width = srgb.shape[2], raw.shape[3]
     nodes, shares = np.empty(2 * _TILE, np.int32), np.empty((3, 2 * _TILE), np.float32)
     x2, attended = np.empty((2, 3, _TILE), np.float32), np.empty((2, 3, _TILE), np.float32)
@@ -303,7 +312,7 @@ def _pairs(one, other, out):  # type: ignore[no-untyped-def]
 
 @compile_part
 def _demosaic(mosaic, row, first, weights, sums, out):  # type: ignore[no-untyped-def]
-    """Colours ``(3, n)`` of a row from ``first`` on, of a mosaic with margins of 2.
+    """Demosaic a row from ``first`` on to colours ``(3, n)``; the mosaic has margins of 2.
 
     Stencils are symmetric: a colour is a sum, by the weights of its site, of the site's own value and those of its
     neighbours along the row, the column and the diagonals, and of those two sites away along row and column.
@@ -331,7 +340,7 @@ def _weighted(a, x, b, y, more, out):  # type: ignore[no-untyped-def]
 
 @compile_part
 def _root(x, c0, c1, c2, out):  # type: ignore[no-untyped-def]
-    """The root of one channel of x2, held to [0, 1], of x3 ``(3, n)``."""
+    """Compute the root of one channel of x2, held to [0, 1], from x3 ``(3, n)``."""
     for j in range(len(out)):
         y = c0 * x[0, j] + c1 * x[1, j] + c2 * x[2, j]
         y = y if y > _ZERO else _ZERO
@@ -341,7 +350,7 @@ def _root(x, c0, c1, c2, out):  # type: ignore[no-untyped-def]
 
 @compile_part
 def _at_curve(root, curve, nodes, shares, out):  # type: ignore[no-untyped-def]
-    """Values of a curve ``(T,)`` at one channel, in [0, 1], of a row."""
+    """Look up a curve ``(T,)`` at one channel of a row, which is in [0, 1]."""
     last = np.int32(len(curve) - 2)
     scale = np.float32(len(curve) - 1)
     for j in range(len(out)):
@@ -355,7 +364,7 @@ def _at_curve(root, curve, nodes, shares, out):  # type: ignore[no-untyped-def]
 def _srgb_rows(  # type: ignore[no-untyped-def]
     source, weights, methods, table, curves, attention, matrix, gains, frame, shading, srgb, start, stop,
 ):  # fmt: skip
-    """Rows ``start`` to ``stop`` of the batch's rows of pixels, of camera colour or, with weights, of mosaics."""
+    """Develop rows ``start`` to ``stop`` of all pictures' rows, of camera colour or, with weights, of mosaics."""
     height, width = srgb.shape[2], srgb.shape[3]
     nodes, shares = np.empty(_TILE, np.int32), np.empty((3, _TILE), np.float32)
     x, root, mask = np.empty((3, _TILE), np.float32), np.empty((3, _TILE), np.float32), np.ones(_TILE, np.float32)
@@ -409,9 +418,17 @@ def _srgb_rows(  # type: ignore[no-untyped-def]
 def shot_read(
     clean: Tensor, levels: Tensor, keys: list[int], white: float, with_variance: bool
 ) -> tuple[Tensor, Tensor]:
-    """Noisy RAW, clipped at ``white``, and its variance map (without it: empty), float32 ``(B, 4, h, w)`` on the CPU.
+    """Add shot and read noise to clean RAW.
 
-    ``levels`` is ``(B, 2)``, shot_var and read_var; ``keys`` has one number below 2^64 a picture.
+    Args:
+        clean: packed ``(B, 4, h, w)``, float32 on the CPU.
+        levels: ``(B, 2)``, shot_var and read_var of each picture.
+        keys: one number below 2^64 for each picture.
+        white: the value to clip at.
+        with_variance: whether to compute the variance map of the noisy signal.
+
+    Returns:
+        Noisy RAW and its variance map, both ``(B, 4, h, w)``; the map is empty if it was not asked for.
     """
     noisy = torch.empty_like(clean, memory_format=torch.contiguous_format)
     variance = torch.empty_like(noisy if with_variance else noisy[:, :, :0])
@@ -442,7 +459,7 @@ def _words(key, first, count, words):  # type: ignore[no-untyped-def]
 
 @compile_part
 def _log(x):  # type: ignore[no-untyped-def]
-    """Natural logarithm of a positive, normal float32: exponent, and a polynomial in the mantissa about 1."""
+    """Compute the natural logarithm of a positive, normal float32 by its exponent and a polynomial in its mantissa."""
     bits = np.float32(x).view(np.int32)
     exponent = (bits - np.int32(0x3F3504F3)) >> np.int32(23)  # mantissa in [1 / sqrt(2), sqrt(2))
     m = np.int32(bits - (exponent << np.int32(23))).view(np.float32) - _ONE
@@ -454,7 +471,8 @@ def _log(x):  # type: ignore[no-untyped-def]
 
 @compile_part
 def _sine(turn):  # type: ignore[no-untyped-def]
-    """Sine of an angle in units of 2^-32 turns: folded to a quarter turn about 0, then an odd polynomial."""
+    """Compute the sine of an angle in units of 2^-32 turns: fold it to a quarter turn about 0, then a polynomial."""
+    # The overflow of int32 is the full turn, so no remainder has to be taken.
     folded = turn
     if turn > _QUARTER_TURN or turn < -_QUARTER_TURN:
         folded = np.int32(np.int32(-(2**31)) - turn)
@@ -496,7 +514,7 @@ def _law(noisy, shot, read, variance):  # type: ignore[no-untyped-def]
 
 @compile_loop
 def _noise_rows(clean, levels, keys, white, noisy, variance, start, stop):  # type: ignore[no-untyped-def]
-    """Rows ``start`` to ``stop`` of the batch's rows of cells, one picture's after the other's."""
+    """Add noise to rows ``start`` to ``stop`` of all pictures' rows of cells, counted through the batch."""
     height, width = clean.shape[2], clean.shape[3]
     words, normals = np.empty((4, _NOISE_TILE), np.uint32), np.empty((4, _NOISE_TILE), np.float32)
     for row in range(start, stop):

@@ -10,12 +10,12 @@ from rawaug.bayer import CFA
 from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
 
 _MARGIN = 6
-"""Green looks 2 sites around, colour 1, steps of colour 1, their count 1; even, so that the pattern stays."""
+"""Green looks 2 sites around, colour 1, steps of colour 1 and their count 1; 6 is even, so that the pattern stays."""
 _HALF, _QUARTER, _TWO = np.float32(0.5), np.float32(0.25), np.float32(2)
 
 
 def demosaic_directional(raw: Tensor, cfa: CFA, method: str) -> Tensor:
-    """Mosaics ``(B, 1, H, W)``, float32 on the CPU, to ``(B, 3, H, W)`` by ``adams`` or ``ahd``."""
+    """Demosaic ``(B, 1, H, W)``, float32 on the CPU, to ``(B, 3, H, W)`` by ``adams`` or ``ahd``."""
     batch, _, height, width = raw.shape
     rgb = torch.empty(batch, 3, height, width)
     ends = ((_MARGIN, _MARGIN), (_MARGIN, _MARGIN))
@@ -28,7 +28,7 @@ def demosaic_directional(raw: Tensor, cfa: CFA, method: str) -> Tensor:
 
 @compile_loop
 def _rows(mosaic, red_row, red_column, homogeneous, rgb, start, stop):  # type: ignore[no-untyped-def]
-    """Rows ``start`` to ``stop`` of a picture whose mosaic has margins."""
+    """Demosaic rows ``start`` to ``stop`` of a picture whose mosaic has margins."""
     own = mosaic[start : stop + 2 * _MARGIN]
     rows, width = own.shape
     first = (start + red_row) % 2  # of the rows with red
@@ -58,7 +58,7 @@ def _rows(mosaic, red_row, red_column, homogeneous, rgb, start, stop):  # type: 
 
 @compile_part
 def _green(own, i, j, known, homogeneous, pictures):  # type: ignore[no-untyped-def]
-    """Green of a site in both pictures; without ``homogeneous`` that of the lesser change in the first."""
+    """Fill in the green of a site in both pictures; without ``homogeneous`` the first has that of the lesser change."""
     here = own[i, j]
     if known:
         pictures[0, 1, i, j] = pictures[1, 1, i, j] = here
@@ -78,7 +78,7 @@ def _green(own, i, j, known, homogeneous, pictures):  # type: ignore[no-untyped-
 
 @compile_part
 def _colours(own, i, with_red, red_column, picture):  # type: ignore[no-untyped-def]
-    """Red and blue of a row: green plus the mean of what the sites of the colour nearby are above green."""
+    """Fill in red and blue of a row: green plus the mean difference to green of the colour's sites nearby."""
     green, near, far = picture[1], 0 if with_red else 2, 2 if with_red else 0
     for j in range(3, own.shape[1] - 3):
         across = (own[i, j - 1] - green[i, j - 1]) + (own[i, j + 1] - green[i, j + 1])
@@ -93,7 +93,7 @@ def _colours(own, i, with_red, red_column, picture):  # type: ignore[no-untyped-
 
 @compile_part
 def _leads(pictures, lead):  # type: ignore[no-untyped-def]
-    """How many more of a site's four neighbours are like it in the first picture than in the second."""
+    """Count how many more of a site's four neighbours are like it in the first picture than in the second."""
     rows, width = lead.shape
     steps = np.zeros((2, 2, 2, rows, width), np.float32)  # picture; to the right, below; of light, of colour
     for d in range(2):

@@ -19,7 +19,7 @@ _NOISE_BLOCK = 512
 
 
 def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
-    """sRGB ``(B, 3, H, W)``, uint8 or float32 in [0, 1], to packed RAW ``(B, 4, H/2, W/2)``, at most ``white``."""
+    """Convert sRGB ``(B, 3, H, W)``, uint8 or float32 in [0, 1], to packed RAW ``(B, 4, H/2, W/2)`` up to ``white``."""
     batch, _, height, width = srgb.shape
     h, w = height // 2, width // 2
     raw = torch.empty(batch, 4, h, w, device=srgb.device, dtype=torch.float32)
@@ -39,7 +39,7 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
 
 @triton.jit
 def _axis(x, NODES: tl.constexpr):  # type: ignore[no-untyped-def]
-    """The node below a position on the table's axis, and the share of the next."""
+    """Find the node below a position on the table's axis, and the share of the next."""
     x = tl.minimum(tl.maximum(x, 0.0), NODES - 1.0)
     node = tl.minimum(x.to(tl.int32), NODES - 2)
     return node, x - node.to(tl.float32)
@@ -47,7 +47,7 @@ def _axis(x, NODES: tl.constexpr):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _plane(table, at, u, v, NODES: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Bilinear in two axes, ``at`` the nearer corner."""
+    """Interpolate along two axes; ``at`` is the nearer corner."""
     low = tl.load(table + at) * (1.0 - u) + tl.load(table + at + 4) * u
     high = tl.load(table + at + 4 * NODES) * (1.0 - u) + tl.load(table + at + 4 * NODES + 4) * u
     return low * (1.0 - v) + high * v
@@ -55,14 +55,14 @@ def _plane(table, at, u, v, NODES: tl.constexpr):  # type: ignore[no-untyped-def
 
 @triton.jit
 def _read(table, at, u, v, t, NODES: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Trilinear."""
+    """Interpolate along all three axes."""
     near = _plane(table, at, u, v, NODES)
     return near * (1.0 - t) + _plane(table, at + 4 * NODES * NODES, u, v, NODES) * t
 
 
 @triton.jit
 def _curve(curve, x, ENTRIES: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Linear interpolation of a picture's curve."""
+    """Interpolate a picture's curve."""
     node, share = _axis(x, ENTRIES)
     low = tl.load(curve + node)
     return low + (tl.load(curve + node + 1) - low) * share
@@ -70,13 +70,13 @@ def _curve(curve, x, ENTRIES: tl.constexpr):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _row(colour, k, r, g, b):  # type: ignore[no-untyped-def]
-    """Row ``k`` of the matrix (3: the mean of its rows) times a colour."""
+    """Multiply row ``k`` of the matrix (3: the mean of its rows) by a colour."""
     return tl.load(colour + 3 * k) * r + tl.load(colour + 3 * k + 1) * g + tl.load(colour + 3 * k + 2) * b
 
 
 @triton.jit
 def _channel(colour, k, r, g, b, m, shade):  # type: ignore[no-untyped-def]
-    """Channel ``k`` of x4 times the mask; ``m`` is 1 in the highlights that the gains spare."""
+    """Compute channel ``k`` of x4 times the mask; ``m`` is 1 in the highlights that the gains spare."""
     return _row(colour, k, r, g, b) * (tl.load(colour + 12 + k) + m * tl.load(colour + 15 + k)) * shade
 
 
@@ -85,7 +85,7 @@ def _site(  # type: ignore[no-untyped-def]
     srgb, table, curve, attention, colour, frame, shading, raw, cell, h, w, scale, knee, white,
     SITE: tl.constexpr, NODES: tl.constexpr, ENTRIES: tl.constexpr, ATTENDS: tl.constexpr, SHADES: tl.constexpr,
 ):  # fmt: skip
-    """One plane of the cells: SITE is row + 2 column + 4 colour of its sites."""
+    """Convert one plane of the cells; SITE is row + 2 column + 4 colour of its sites."""
     size = h.to(tl.int64) * w
     inside = cell < h * w
     row, column = cell // w * 2 + SITE % 2, cell % w * 2 + SITE // 2 % 2
@@ -146,7 +146,15 @@ def _raw_cells(  # type: ignore[no-untyped-def]
 def shot_read(
     clean: Tensor, levels: Tensor, keys: list[int], white: float, with_variance: bool
 ) -> tuple[Tensor, Tensor]:
-    """Noisy RAW and its variance map, ``(B, 4, h, w)``; arguments of :func:`rawaug.kernels.cpu.shot_read`."""
+    """Add shot and read noise to clean RAW, as :func:`rawaug.kernels.cpu.shot_read` does, on a GPU.
+
+    Args:
+        clean: packed ``(B, 4, h, w)``, float32.
+        levels: ``(B, 2)``, shot_var and read_var of each picture.
+        keys: one number below 2^64 for each picture.
+        white: the value to clip at.
+        with_variance: whether to compute the variance map; it is empty otherwise.
+    """
     clean = clean.detach().contiguous()
     batch, _, height, width = clean.shape
     noisy = torch.empty_like(clean)
@@ -164,7 +172,7 @@ def shot_read(
 
 @triton.jit
 def _sine(turn):  # type: ignore[no-untyped-def]
-    """As on the CPU: folded to a quarter turn about 0, then an odd polynomial."""
+    """Compute the sine as on the CPU: fold the angle to a quarter turn about 0, then an odd polynomial."""
     folded = tl.where(turn > 1073741824, 2147483647 - turn + 1, turn)
     folded = tl.where(turn < -1073741824, -2147483647 - turn - 1, folded)
     x = folded.to(tl.float32) * 9.313225746154785e-10
@@ -174,7 +182,7 @@ def _sine(turn):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _pair(u, turn):  # type: ignore[no-untyped-def]
-    """Two normals of two words (Box and Muller)."""
+    """Turn two words into two normals (Box and Muller)."""
     radius = tl.sqrt(-2.0 * tl.log((u.to(tl.float32) + 0.5) * 2.3283064365386963e-10))
     turn = turn.to(tl.int32, bitcast=True)
     return radius * _sine(turn + 1073741824), radius * _sine(turn)

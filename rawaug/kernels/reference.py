@@ -32,18 +32,18 @@ ROUNDS = 10
 _LOW = 0xFFFFFFFF
 
 BAND = 2**19
-"""Pixels that a CPU works on at a time, to bound its memory."""
+"""Pixels that a CPU works on at a time, which bounds its memory."""
 
 
 class Camera(NamedTuple):
-    """What the pass needs to know, float32 on the device of the pictures.
+    """The settings of the reverse pass, float32 on the device of the pictures; an absent part is an empty tensor.
 
     Args:
         table: ``(N, N, N, 4)`` x2 over the sRGB cube, axes B, G, R; the last of the four is not used. Empty if the
             pictures have curves.
         curves: ``(B, T)`` x2 over the sRGB code, one curve a picture for all of its channels; T is 256 for uint8, where
             it is not interpolated. Empty if there is a table.
-        attention: of the same form, A in the first of the four over the cube of x4; or empty, for none.
+        attention: ``(N, N, N, 4)``, A in the first of the four over the cube of x4; or empty.
         colour: ``(B, 6, 3)``: the rows of the matrix, their mean, floor, rise.
         knee: mean of x3 where the gains start to spare highlights.
         frame: ``(B, 6)`` y and x about the mask's centre of the first pixel, of a step down, and of one to the right.
@@ -62,10 +62,13 @@ class Camera(NamedTuple):
 
 
 def mask_frame(place: list[int], height: int, width: int, centre: tuple[float, float]) -> list[float]:
-    """One row of :attr:`Camera.frame`, for a picture of ``height`` x ``width`` with the mask's centre at (y, x).
+    """Compute one row of :attr:`Camera.frame`.
 
-    ``place`` is top, left, height and width of the full frame, and, if the crop was turned or enlarged, its view and
-    how many rows became ``height``.
+    Args:
+        place: top, left, height and width of the full frame, and, if the crop was turned or enlarged, its view and how
+            many rows of the frame became ``height``.
+        height, width: sides of the picture.
+        centre: (y, x) of the mask.
     """
     top, left, frame_height, frame_width, view, rows = (*place, 0, 0)[:6]
     step = rows / height if rows else 1.0
@@ -82,7 +85,17 @@ def mask_frame(place: list[int], height: int, width: int, centre: tuple[float, f
 
 
 def unprocess(srgb: Tensor, camera: Camera, white: float, band: int = BAND) -> Tensor:
-    """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to packed RAW ``(B, 4, H/2, W/2)``, at most ``white``."""
+    """Convert sRGB to packed RAW.
+
+    Args:
+        srgb: ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides.
+        camera: the settings of the pass.
+        white: the value to clip at.
+        band: pixels that a CPU works on at a time.
+
+    Returns:
+        float32 ``(B, 4, H/2, W/2)``.
+    """
     batch, _, height, width = srgb.shape
     raw = torch.empty(batch, 4, height // 2, width // 2, device=srgb.device, dtype=torch.float32)
     pictures, rows = batch, height
@@ -97,7 +110,7 @@ def unprocess(srgb: Tensor, camera: Camera, white: float, band: int = BAND) -> T
 
 
 def look_up(table: Tensor, x: Tensor) -> Tensor:
-    """Trilinear interpolation of ``table`` ``(N, N, N, 4)`` at ``x`` ``(B, 3, H, W)``: ``(B, 4, H, W)``."""
+    """Interpolate ``table`` ``(N, N, N, 4)`` trilinearly at colours ``x`` ``(B, 3, H, W)``: ``(B, 4, H, W)``."""
     batch, _, height, width = x.shape
     half = 127.5 if x.dtype == torch.uint8 else 0.5
     points = (x / half - 1.0).permute(0, 2, 3, 1).reshape(1, batch, height, width, 3)
@@ -106,9 +119,9 @@ def look_up(table: Tensor, x: Tensor) -> Tensor:
 
 
 def apply_curves(curves: Tensor, x: Tensor) -> Tensor:
-    """Each picture of ``x`` ``(B, C, H, W)`` through its own curve, ``curves`` ``(B, T)``, by linear interpolation.
+    """Map each picture of ``x`` ``(B, C, H, W)`` by its own curve of ``curves`` ``(B, T)``, interpolated linearly.
 
-    Of 256 entries each is a code of uint8, and nothing is interpolated; floats are held to [0, 1].
+    Curves of 256 entries have one for each code of uint8, where nothing is interpolated. Floats are held to [0, 1].
     """
     if x.dtype == torch.uint8 and curves.shape[1] == 256:
         return _take(curves, x.int())
@@ -124,7 +137,7 @@ def _take(curves: Tensor, index: Tensor) -> Tensor:
 
 
 class Display(NamedTuple):
-    """What the way from camera colour to sRGB needs to know, float32 on the device of the pictures.
+    """The settings of the way from camera colour to sRGB, float32 on the device of the pictures.
 
     Args:
         table: ``(N, N, N, 4)`` sRGB over the cube of roots of x2, axes B, G, R; empty if the pictures have curves.
@@ -145,7 +158,7 @@ class Display(NamedTuple):
 
 
 def render(linear: Tensor, display: Display) -> Tensor:
-    """Camera colour x5 ``(B, 3, H, W)``, float32, to sRGB in [0, 1]; differentiable."""
+    """Develop camera colour x5 ``(B, 3, H, W)``, float32, to sRGB in [0, 1]; the pass is differentiable."""
     mask = fall_off(display, 0, *linear.shape[-2:])
     x = linear if mask is None else linear / mask
     if display.attention.numel():
@@ -162,7 +175,7 @@ def render(linear: Tensor, display: Display) -> Tensor:
 
 
 def _develop(srgb: Tensor, camera: Camera, top: int, raw: Tensor) -> None:
-    """Rows of pictures from ``top`` on, to ``raw``."""
+    """Convert rows of pictures from ``top`` on, and write them to ``raw``."""
     x2 = apply_curves(camera.curves, srgb) if camera.curves.numel() else look_up(camera.table, srgb)[:, :3]
     mask = fall_off(camera, top, *srgb.shape[-2:])
     for plane, (i, j, channel) in enumerate(camera.sites.tolist()):
@@ -176,7 +189,7 @@ def _develop(srgb: Tensor, camera: Camera, top: int, raw: Tensor) -> None:
 
 
 def _channels(x2: Tensor, camera: Camera, channels: slice, mask: Tensor | None) -> Tensor:
-    """``channels`` of x4 times the mask."""
+    """Compute some channels of x4 times the mask."""
     rows, mean, floor, rise = camera.colour[:, :3], camera.colour[:, 3:4], camera.colour[:, 4], camera.colour[:, 5]
     m = torch.einsum("bck,bkhw->bchw", mean, x2).sub_(camera.knee).div_(1.0 - camera.knee).clamp_(0.0, 1.0).square_()
     factor = torch.addcmul(floor[:, channels, None, None], m, rise[:, channels, None, None])
@@ -185,7 +198,10 @@ def _channels(x2: Tensor, camera: Camera, channels: slice, mask: Tensor | None) 
 
 
 def fall_off(camera: Camera | Display, top: int, height: int, width: int) -> Tensor | None:
-    """The mask ``(B, 1, H, W)`` of the rows from ``top`` on."""
+    """Compute the mask ``(B, 1, H, W)`` of ``height`` rows of ``width`` pixels from ``top`` on; None without shading.
+
+    ``camera`` holds the frames of the pictures and the exponents.
+    """
     if not camera.shading.numel():
         return None
     i = torch.arange(top, top + height, device=camera.frame.device)[:, None]
@@ -199,7 +215,7 @@ def fall_off(camera: Camera | Display, top: int, height: int, width: int) -> Ten
 
 
 def philox(key: int, counters: Tensor) -> Tensor:
-    """Philox4x32-10 of int64 ``counters`` ``(n,)`` below 2^32, under a key below 2^64: int64 ``(4, n)`` below 2^32."""
+    """Run Philox4x32-10 on counters ``(n,)`` below 2^32 under a key below 2^64: words ``(4, n)`` below 2^32, int64."""
     zero = torch.zeros_like(counters)
     a, b, c, d = counters, zero, zero, zero
     low, high = key & _LOW, key >> 32
@@ -211,7 +227,7 @@ def philox(key: int, counters: Tensor) -> Tensor:
 
 
 def normals(key: int, height: int, width: int) -> Tensor:
-    """Standard normal float32 ``(4, height, width)``: the four planes of a packed picture, cells counted row by row."""
+    """Draw standard normals for the planes of a packed picture, float32 ``(4, H, W)``; cells are counted row by row."""
     w = philox(key, torch.arange(height * width))
     radius = (w[0::2].float() + 0.5).mul_(2.0**-32).log_().mul_(-2.0).sqrt_()
     turn = torch.where(w[1::2] < 2**31, w[1::2], w[1::2] - 2**32).double().mul_(2.0 * math.pi / 2**32)
@@ -220,7 +236,7 @@ def normals(key: int, height: int, width: int) -> Tensor:
 
 
 def _product(x: Tensor, factor: int) -> tuple[Tensor, Tensor]:
-    """High and low 32 bits of a product of 32-bit numbers: int64 has room for the halves' products alone."""
+    """Compute the high and low 32 bits of a product, by halves, as int64 has no room for all of its 64 bits."""
     upper, lower = (x >> 16) * factor, (x & 0xFFFF) * factor
     high = (upper + (lower >> 16)) >> 16
     return high, ((upper << 16) + lower) & _LOW

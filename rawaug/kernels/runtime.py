@@ -28,7 +28,7 @@ KINDS = ("auto", "cpu", "cuda", "gpu", "mps")
 
 
 def find_device(name: str, key: str = "device", count: int = 1) -> torch.device:
-    """The device called ``name``, one of :data:`KINDS` or a numbered one such as ``cuda:1``; ``key`` opens messages.
+    """Find a device by name, one of :data:`KINDS` or a numbered one such as ``cuda:1``; ``key`` opens messages.
 
     Raises:
         ValueError: if the name is unknown, or this machine does not have ``count`` such devices.
@@ -55,7 +55,7 @@ def has_fast_bfloat16(device: torch.device) -> bool:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """PyTorch's CPU loops use one thread within this block, or within the decorated function."""
+    """Let PyTorch's CPU loops use one thread within this block, or within the decorated function."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -79,8 +79,8 @@ def eager(function: Callable[P, R]) -> Callable[P, R]:
     return run
 
 
-_GRAIN = 2**15  # numbers below which waking a thread costs more than it saves
-_PIECES = 4  # for each thread, so that a late one does not hold up the others
+_GRAIN = 2**15  # with fewer numbers waking a thread costs more than it saves
+_PIECES = 4  # pieces of work for each thread, so that a late one does not hold up the others
 _OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 """Fused multiply-adds are allowed: they do not depend on the order of pixels or threads."""
 
@@ -106,14 +106,14 @@ def compile_loop(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def compile_part(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator: for functions that only :func:`compile_loop` ones of the same module call."""
+    """Decorator: machine code for functions that only those of :func:`compile_loop` in the same module call."""
     from numba import njit
 
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
 
 
 _pools: dict[int, ThreadPoolExecutor] = {}
-"""By number of threads."""
+"""The pools by their number of threads."""
 
 
 def _after_fork() -> None:

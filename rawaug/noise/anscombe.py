@@ -22,7 +22,9 @@ TABLE_COUNTS = 60.0
 
 
 def forward(y: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Tensor:
-    """Noisy RAW ``(B, ...)`` to noise of variance 1. Variances are numbers, or one a picture ``(B,)``.
+    """Transform noisy RAW ``(B, ...)`` so that its noise has variance 1.
+
+    ``shot_var`` and ``read_var`` are numbers, or tensors ``(B,)`` with one for each picture, white = 1.
 
     Raises:
         ValueError: if a ``shot_var`` is not positive (its noise is white already), or a ``read_var`` is negative.
@@ -37,7 +39,11 @@ def forward(y: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Te
 
 
 def inverse(z: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Tensor:
-    """The clean RAW whose noisy RAW has the mean ``z`` after :func:`forward`; never below black. Arguments as there."""
+    """Invert :func:`forward` without bias.
+
+    The result is the clean RAW whose transformed noisy RAW has the mean ``z`` ``(B, ...)``. It is never below
+    black; the levels are those of :func:`forward`.
+    """
     shot, read = _levels(z, shot_var, read_var)
     pictures = zip(z, shot.flatten().tolist(), read.flatten().tolist(), strict=True)
     return torch.stack([s * _counts(picture, math.sqrt(r) / s) for picture, s, r in pictures])
@@ -52,7 +58,7 @@ def _levels(like: Tensor, shot_var: float | Tensor, read_var: float | Tensor) ->
 
 
 def _counts(z: Tensor, sigma: float) -> Tensor:
-    """Expected photons for the mean z, with read noise of ``sigma`` photons."""
+    """Look up the expected photons for the mean z, with read noise of ``sigma`` photons."""
     counts, means = (t.to(z) for t in _table(sigma))
     right = torch.searchsorted(means, z.contiguous()).clamp_(1, len(means) - 1)
     step = (means[right] - means[right - 1]).clamp_min(torch.finfo(z.dtype).tiny)  # the first ones at a high sigma: 0
@@ -62,7 +68,7 @@ def _counts(z: Tensor, sigma: float) -> Tensor:
 
 
 def _table(sigma: float) -> tuple[Tensor, Tensor]:
-    """(expected counts, E[z]) up to TABLE_COUNTS: the Poisson sum over k of E[2 sqrt(k + sigma n + 3/8 + sigma^2)]."""
+    """Tabulate expected counts and E[z], the Poisson sum over k of E[2 sqrt(k + sigma n + 3/8 + sigma^2)]."""
     counts = torch.linspace(0, math.sqrt(TABLE_COUNTS), 512, dtype=torch.float64).square()
     k = torch.arange(0.0, 3 * TABLE_COUNTS, dtype=torch.float64)
     n = torch.linspace(-8, 8, 801, dtype=torch.float64)

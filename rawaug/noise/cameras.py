@@ -73,7 +73,7 @@ ANY_CAMERA = "any camera"
 SHOT_ON_MOSAIC = 8.6
 READ_ON_MOSAIC = 6.2
 SPREAD = ((7.2 / SHOT_ON_MOSAIC, 11.4 / SHOT_ON_MOSAIC), (2.2 / READ_ON_MOSAIC, 16.0 / READ_ON_MOSAIC))
-"""Of the levels of a profile, shot_var and read_var: the least and the greatest part that a camera may really have."""
+"""Factors between which a camera's shot_var, and its read_var, may really lie, relative to its profile's."""
 _ROUNDING = 1e-9  # of logarithms that are the same ISO
 _LEAST = 1e-12  # stands for a variance of 0 in the logarithms
 
@@ -89,14 +89,14 @@ class Profiles(NamedTuple):
     rows: Tensor
 
     def limits(self) -> Tensor:
-        """Logarithms of the lowest and highest ISO of each camera, ``(N, 2)``."""
+        """The logarithms of the lowest and highest ISO of each camera, ``(N, 2)``."""
         iso = self.table[0]
         return torch.stack([iso[:, 0], iso.gather(1, self.rows[:, None] - 1)[:, 0]], dim=1)
 
 
 @cache
 def load_profiles() -> Profiles:
-    """The package's ``profiles.tsv``; the geometric mean where a camera has an ISO twice."""
+    """Load the package's ``profiles.tsv``; where a camera has an ISO twice, the geometric mean counts."""
     cameras: dict[str, dict[float, list[list[float]]]] = defaultdict(lambda: defaultdict(list))
     text = resources.files("rawaug.noise").joinpath("profiles.tsv").read_text("utf-8")
     for line in text.splitlines()[2:]:
@@ -116,9 +116,17 @@ def load_profiles() -> Profiles:
 
 
 class ProfileLevels:
-    """Levels of one camera's profile, or of any, each alike, within its share of the limits of the ISO.
+    """The levels of one camera's profile, or of all profiles alike.
 
-    Of any camera they are drawn within :data:`SPREAD`; of one camera they are the middle of it.
+    Each picture draws an ISO, log-uniformly within the limits that its camera's profile has. The levels of any camera
+    are drawn within :data:`SPREAD` as well; those of one camera are the middle of it.
+
+    Args:
+        camera: maker and model, or ``any camera``.
+        iso: one ISO, the limits of the draw, or None for all that was measured.
+
+    Raises:
+        ValueError: if the camera has no profile, or none reaches the ISO.
     """
 
     def __init__(self, camera: str = ANY_CAMERA, iso: Iso = None) -> None:
@@ -129,8 +137,8 @@ class ProfileLevels:
         chosen = torch.tensor([profiles.names.index(name) for name in names])
         limits = profiles.limits()[chosen]
         measured = (round(math.exp(limits.min())), round(math.exp(limits.max())))
-        wanted = iso_limits(names[0] if len(names) == 1 else ANY_CAMERA, iso, measured)
-        low, high = torch.tensor(wanted, dtype=torch.float64).log()
+        asked = iso_limits(names[0] if len(names) == 1 else ANY_CAMERA, iso, measured)
+        low, high = torch.tensor(asked, dtype=torch.float64).log()
         limits = torch.stack([limits[:, 0].clamp_min(low), limits[:, 1].clamp_max(high)], dim=1)
         within = limits[:, 0] <= limits[:, 1] + _ROUNDING
         if not within.any():
@@ -139,6 +147,7 @@ class ProfileLevels:
         self.spread = camera.casefold() == ANY_CAMERA
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw a camera and an ISO for each picture, and interpolate its levels, ``(batch,)``."""
         device = generator.device
         drawn = torch.randint(len(self.cameras), (batch,), generator=generator, device=device)
         low, high = self.limits.to(device)[drawn].unbind(1)
@@ -154,7 +163,7 @@ class ProfileLevels:
 
 
 class LevelEnds(NamedTuple):
-    """The least and the greatest level that one camera is likely to have at an ISO, white = 1."""
+    """The least and the greatest levels that one camera is likely to have at an ISO, white = 1."""
 
     iso: float
     shot_var: tuple[float, float]
@@ -162,7 +171,7 @@ class LevelEnds(NamedTuple):
 
 
 def profile_ends(camera: str) -> list[LevelEnds]:
-    """How far the levels of a camera's profile are known, at its lowest ISO and that doubled up to its highest.
+    """Say how far the levels of a camera's profile are known, at its lowest ISO and at each doubling of it.
 
     Raises:
         ValueError: if the camera has no profile.
@@ -183,7 +192,7 @@ def profile_ends(camera: str) -> list[LevelEnds]:
 
 
 class IsoLevel(NamedTuple):
-    """What was measured at one ISO.
+    """The noise levels that were measured at one ISO.
 
     Args:
         iso: None if the files have none.
@@ -226,12 +235,12 @@ class MeasuredLevels:
 
     @property
     def limits(self) -> tuple[float, float] | None:
-        """Lowest and highest ISO that was measured; None where the files have no ISO."""
+        """The lowest and the highest ISO that was measured; None where the files have no ISO."""
         low, high = self.levels[0].iso, self.levels[-1].iso
         return None if low is None or high is None else (low, high)
 
     def at(self, iso: float | None) -> tuple[float, float]:
-        """(shot_var, read_var) at an ISO, None where one level was measured; ValueError outside the range."""
+        """Give (shot_var, read_var) at an ISO, or the one measured level for None; ValueError outside the range."""
         if self.limits is None or (iso is None and len(self.levels) == 1):
             return self.levels[0].shot_var, self.levels[0].read_var
         if iso is None:
@@ -244,20 +253,20 @@ class MeasuredLevels:
         return float(shot_var), float(read_var)
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Levels at ISO values that are log-uniform over the measured range."""
+        """Draw an ISO for each picture, log-uniformly over the measured range, and its levels, ``(batch,)``."""
         device = generator.device
         if self.limits is None or len(self.levels) == 1:
             return FixedLevels(*self.at(None)).sample(batch, generator)
         return interpolate_levels(self.table.to(device), log_uniform(self.limits, batch, generator))
 
     def spec(self) -> dict[str, Any]:
-        """The noise by name: what files of weights hold, and :func:`rawaug.noise.noise_model` reads."""
+        """Write the law as a name with settings, which files of weights hold and :func:`noise_model` reads."""
         rows = [{key: value for key, value in level._asdict().items() if value is not None} for level in self.levels]
         return {"name": "MeasuredNoise", "settings": {"camera": self.camera, "levels": rows}}
 
 
 def camera_law(stored: Mapping[str, Any]) -> MeasuredLevels:
-    """The law in the entry ``noise`` of an ISP's file."""
+    """Read the law in the entry ``noise`` of an ISP's file; ValueError if it is no law of a camera."""
     if "shot_var" in stored:  # a single level, as in the shipped canon-powershot
         return MeasuredLevels([IsoLevel(None, stored["shot_var"], stored["read_var"], stored.get("r2"))])
     if stored.get("name") != "MeasuredNoise":
@@ -294,22 +303,26 @@ def _by_iso() -> dict[str, Callable[[Iso], SiddLevels | PmridLevels | EldLevels]
 
 
 def camera_names() -> list[str]:
-    """The cameras that were measured one by one."""
+    """List the cameras that were measured one by one."""
     return list(_by_iso())
 
 
 def measured_ranges() -> dict[str, tuple[float, float]]:
-    """Lowest and highest ISO of the cameras that were measured one by one."""
+    """Give the lowest and highest ISO of each camera that was measured one by one."""
     return {name: levels(None).iso for name, levels in _by_iso().items()}
 
 
 def noise_names() -> list[str]:
-    """Every name that :func:`noise_model` knows."""
+    """List every name that :func:`noise_model` knows."""
     return [*NOISE, *load_presets()["presets"], *camera_names(), ANY_CAMERA, *load_profiles().names]
 
 
 def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None) -> NoiseLevels:
-    """The levels of a name, of a mixture of names, or the fixed levels (shot_var, read_var).
+    """Make the levels of a name, of a mixture of names, or fixed ones of (shot_var, read_var).
+
+    Args:
+        spec: a preset or camera, several of which each picture draws one, or two variances, white = 1.
+        iso: of a camera: one ISO, limits, or None for its whole measured range.
 
     Raises:
         ValueError: if the name is unknown, has no law by ISO, or the ISO is outside the measured range.
@@ -336,7 +349,7 @@ def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None
 
 @cache
 def warn_of_swapped_levels(shot_var: float, read_var: float) -> None:
-    """Once for each pair of levels: no sensor has more read noise than shot noise at white."""
+    """Warn, once for each pair of levels, of more read noise than shot noise at white, which no sensor has."""
     said = f"noise ({shot_var:g}, {read_var:g}): read_var is above shot_var, as in no sensor"
     warnings.warn(f"{said}; the order is (shot_var, read_var)", stacklevel=3)
 
@@ -355,7 +368,7 @@ def _of_profile(spec: str, iso: Iso) -> ProfileLevels:
 
 
 def noise_model(spec: NoiseSpec | NoiseModel, *, iso: Iso = None, poisson: bool = False) -> NoiseModel:
-    """The noise model of a name or of (shot_var, read_var); a model is returned as it is.
+    """Make the noise model of a name or of (shot_var, read_var); a model is returned as it is.
 
     Args:
         spec: one of :func:`noise_names`, with settings as ``{"name": ..., "settings": {...}}``, a list of names (each
@@ -408,12 +421,13 @@ TYPICAL_SIGNAL = 0.06
 
 
 class ScaledLevels:
-    """The levels of a law, both variances times a factor."""
+    """The levels of a law, with both variances multiplied by a factor."""
 
     def __init__(self, law: NoiseLevels, factor: float) -> None:
         self.law, self.factor = law, factor
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw levels from the law and multiply them, ``(batch,)``."""
         shot_var, read_var = self.law.sample(batch, generator)
         return shot_var * self.factor, read_var * self.factor
 

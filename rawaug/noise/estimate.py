@@ -51,7 +51,7 @@ _RELATIVE_SD = math.sqrt(2 / _DOF)  # of one block's variance
 _FLAT = 1.2  # low over expected energy: passes 70 % of the blocks that hold noise alone
 _WHITE = 0.15  # how far the bands' energies may differ
 _CLIP_MARGIN = 4.0  # in standard deviations of a pixel
-_MIN_BLOCKS = 30  # a level's
+_MIN_BLOCKS = 30  # of one level
 _MIN_POINTS = 6
 _ROUNDS = 10
 
@@ -61,8 +61,15 @@ _PILED_UP = 0.25  # share of pixels at the lowest value, above which nothing can
 
 @dataclass(frozen=True)
 class NoisePoints:
-    """Measured levels: tensors ``(N,)``. ``channel`` is 0 to 3 for R, Gr, Gb, B; ``blocks`` counts the flat ones;
-    ``used`` is False where the level was left out of the line (too few blocks, not white, or far from the others)."""
+    """The N measured points of a camera, tensors ``(N,)``.
+
+    Args:
+        signal: mean signal, white = 1.
+        variance: of the noise at this signal.
+        channel: 0 to 3 for R, Gr, Gb, B.
+        blocks: how many flat blocks were measured.
+        used: False where the point was left out of the line: of too few blocks, not white, or far from the others.
+    """
 
     signal: Tensor
     variance: Tensor
@@ -73,7 +80,14 @@ class NoisePoints:
 
 @dataclass(frozen=True)
 class NoiseEstimate:
-    """The fitted line, R^2 over the used points, and all points; ``read_var`` 0 if unmeasurable."""
+    """The line that was fitted to a camera's points.
+
+    Args:
+        shot_var: its slope.
+        read_var: its intercept, 0 if it cannot be measured.
+        r2: R^2 over the used points.
+        points: all points.
+    """
 
     shot_var: float
     read_var: float
@@ -82,7 +96,7 @@ class NoiseEstimate:
 
 
 class _Blocks(NamedTuple):
-    """What is known of each block, tensors ``(N,)``: mean, mean energies of the DCT bands, and the room to clipping."""
+    """Measures of each of N blocks, ``(N,)``: mean, mean energies of the DCT bands, and the room to clipping."""
 
     channel: Tensor
     signal: Tensor
@@ -94,21 +108,21 @@ class _Blocks(NamedTuple):
     to_white: Tensor
 
     def take(self, index: Tensor) -> _Blocks:
-        """Some of the blocks."""
+        """Take some of the blocks by an index ``(n,)``."""
         return _Blocks(*(values[index] for values in self))
 
 
 def estimate_noise(
     mosaics: Tensor | Sequence[Tensor], cfa: CFA | str, *, read_var: float | None = None
 ) -> NoiseEstimate:
-    """The levels of one camera at one ISO, from the flat regions of its RAW files.
+    """Estimate the levels of one camera at one ISO from the flat regions of its RAW files.
 
     Args:
         mosaics: one or several ``(1, H, W)`` or ``(1, 1, H, W)``, black-subtracted, white = 1. Signals near white are
             left out, and those near another level of clipping, where the file's lowest or highest value piles up.
         cfa: the pattern, of all of them: Bayer's, or X-Trans or Quad-Bayer, of which each site of the cell is a plane
             of its own, so that flat regions must be three or two times as wide.
-        read_var: known from dark frames (:func:`estimate_dark_noise`); fitted too if omitted.
+        read_var: if it is known from dark frames (:func:`estimate_dark_noise`); by default it is fitted, too.
 
     Raises:
         ValueError: if there are too few flat regions, or they do not span a range of signals.
@@ -138,7 +152,7 @@ def estimate_noise(
 
 
 def _rounding(frame: Tensor) -> float:
-    """Twice the variance of rounding to the steps that a frame's values have."""
+    """Compute twice the variance of rounding to the steps that a frame's values have."""
     steps = frame.flatten()[:: max(1, frame.numel() // 2**18)].double().unique().diff()
     return 2.0 * float(steps.min()) ** 2 / 12.0 if len(steps) else math.inf
 
@@ -164,7 +178,7 @@ def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
 
 
 def _planes(mosaic: Tensor, cfa: CFA | str) -> tuple[Tensor, Tensor]:
-    """A mosaic ``(1, H, W)`` as planes of a site of the cell each, ``(n, h, w)``, and their R, Gr, Gb or B."""
+    """Split a mosaic ``(1, H, W)`` into planes of one site of the cell each, ``(n, h, w)``, and say which they are."""
     if cfa in CFA.__members__:
         return pack(mosaic, cfa), torch.arange(4)
     size = pattern(cfa).period
@@ -183,7 +197,7 @@ def _piles_up(frame: Tensor) -> bool:
 
 
 def _split_levels(blocks: _Blocks) -> list[_Blocks]:
-    """The blocks by colour and by signal, as many in each level of a colour."""
+    """Split the blocks by colour and by signal into levels, with as many blocks in each level of a colour."""
     levels = []
     for channel in range(4):
         index = torch.nonzero(blocks.channel == channel).flatten()
@@ -196,13 +210,13 @@ def _split_levels(blocks: _Blocks) -> list[_Blocks]:
 
 
 def _start(levels: list[_Blocks]) -> NoisePoints:
-    """The first guess: in each level the twentieth of the blocks that vary least in the low frequencies."""
+    """Guess first from the twentieth of each level's blocks that varies least in the low frequencies."""
     flattest = [b.take(b.low.argsort()[: max(_MIN_BLOCKS, len(b.low) // 20)]) for b in levels]
     return _gather([(b, b.high.median() / _MEDIAN) for b in flattest])
 
 
 def _points(levels: list[_Blocks], shot_var: float, read_var: float) -> NoisePoints:
-    """Each level's signal and variance over the blocks that the line says are flat and clear of clipping."""
+    """Measure each level's signal and variance over the blocks that the line says are flat and clear of clipping."""
     chosen = []
     for b in levels:
         expected = (shot_var * b.signal.clamp(min=0) + read_var).clamp(min=1e-12)
@@ -212,7 +226,7 @@ def _points(levels: list[_Blocks], shot_var: float, read_var: float) -> NoisePoi
         if len(keep) == 0:
             continue
         flat, expected = b.take(keep), expected[keep]
-        # the ratio to the line, so that a wide level is not skewed by its spread of signals
+        # The median is taken of the ratio to the line, so that a wide level is not skewed by its spread of signals.
         chosen.append((flat, (flat.high / expected).median() / _MEDIAN * expected.mean()))
     if not chosen:
         raise ValueError(
@@ -234,7 +248,7 @@ def _gather(levels: list[tuple[_Blocks, Tensor]]) -> NoisePoints:
 
 
 def _fit(points: NoisePoints, known_read_var: float | None) -> tuple[float, float, NoisePoints]:
-    """Robust weighted least squares: shot, read, and the points with outliers unused."""
+    """Fit shot and read by robust weighted least squares, and mark outliers among the points as unused."""
     used = points.used
     x, y, n = points.signal, points.variance, points.blocks.double()
     if int(used.sum()) < _MIN_POINTS or x[used].max() < 1.5 * x[used].min().clamp(min=1e-6):
@@ -253,7 +267,7 @@ def _fit(points: NoisePoints, known_read_var: float | None) -> tuple[float, floa
 
 
 def _line(x: Tensor, y: Tensor, weight: Tensor, known_read_var: float | None) -> tuple[float, float]:
-    """Weighted least squares: slope, and intercept unless it is known; an intercept below 0 is 0."""
+    """Fit the slope, and the intercept unless it is known, by weighted least squares; the intercept is at least 0."""
     w, wx, wxx = (float((weight * t).sum()) for t in (torch.ones_like(x), x, x * x))
     wy, wxy = float((weight * y).sum()), float((weight * x * y).sum())
     determinant = w * wxx - wx * wx
@@ -282,15 +296,23 @@ def own_noise(raw: Tensor, cfa: CFA | str) -> tuple[float, float] | None:
 
 
 def own_noise_share(levels: tuple[float, float], reference: Tensor, squared_error: float) -> float:
-    """The part of a mean squared error that the own noise of the reference, of these levels, makes up; at best 1."""
+    """Compute which share of a mean squared error is the reference's own noise; a perfect denoiser reaches 1.
+
+    ``levels`` are (shot_var, read_var) of the reference ``(..., H, W)``, white = 1.
+    """
     shot_var, read_var = levels
     return (shot_var * float(reference.mean()) + read_var) / squared_error
 
 
 @dataclass(frozen=True)
 class DarkNoise:
-    """``read_var`` of pixels, ``row_var`` of banding (0 if not measurable), and the black level's error in
-    R, Gr, Gb, B. Fixed pattern noise is part of ``read_var``."""
+    """The noise of a camera without light, white = 1.
+
+    Args:
+        read_var: variance of the pixels; fixed pattern noise is part of it.
+        row_var: variance of banding along rows, 0 if it cannot be measured.
+        black_offset: the black level's error in R, Gr, Gb, B.
+    """
 
     read_var: float
     row_var: float
@@ -298,7 +320,7 @@ class DarkNoise:
 
 
 def estimate_dark_noise(frames: Sequence[Tensor], cfa: CFA | str) -> DarkNoise:
-    """The noise without light, the mean over the frames ``(1, H, W)`` of one camera at one ISO.
+    """Estimate the noise without light from dark frames ``(1, H, W)`` of one camera at one ISO; it is their mean.
 
     Raises:
         ValueError: if there is no frame, or one is clipped at black.
@@ -317,7 +339,7 @@ def estimate_dark_noise(frames: Sequence[Tensor], cfa: CFA | str) -> DarkNoise:
 
 
 def _measure_dark(planes: Tensor) -> Tensor:
-    """(read_var, row_var, offsets of R, Gr, Gb, B) of packed ``(4, h, w)``."""
+    """Measure read_var, row_var and the offsets of R, Gr, Gb, B of packed ``(4, h, w)``: ``(6,)``."""
     lowest = planes == planes.min()
     if float(lowest.double().mean()) > _PILED_UP:
         raise ValueError("a dark frame is clipped at black, so its noise cannot be measured")
@@ -338,7 +360,7 @@ _CHANNELS = (("R", "tab:red"), ("Gr", "tab:olive"), ("Gb", "tab:green"), ("B", "
 
 
 def plot_noise(estimate: NoiseEstimate, path: str | Path | None = None, *, title: str = "") -> Figure:
-    """Variance against signal, on linear and logarithmic axes; saved to ``path`` (``.png``, ``.pdf``, ``.svg``)."""
+    """Plot variance against signal on linear and logarithmic axes, and save it to ``path`` (.png, .pdf or .svg)."""
     with extra("train"):
         from matplotlib.figure import Figure
 

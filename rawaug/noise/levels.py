@@ -29,38 +29,38 @@ from torch import Tensor
 
 
 class NoiseLevels(Protocol):
-    """Anything that samples noise levels."""
+    """A law of noise levels, from which every picture draws its own."""
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """(shot_var, read_var), each ``(batch,)`` float32 on the generator's device."""
+        """Draw (shot_var, read_var), each ``(batch,)`` float32 on the generator's device, white = 1."""
         ...
 
 
 @cache
 def load_presets() -> dict[str, Any]:
-    """The package's ``presets.json``: published levels, each with its source."""
+    """Load the package's ``presets.json``: published levels, each with its source."""
     data: dict[str, Any] = json.loads(resources.files("rawaug.noise").joinpath("presets.json").read_text("utf-8"))
     return data
 
 
-def _known(what: str, name: str, table: dict[str, Any]) -> Any:
+def _entry(what: str, name: str, table: dict[str, Any]) -> Any:
     if name not in table:
         raise ValueError(f"{what} {name!r} is unknown; use one of {', '.join(table)}")
     return table[name]
 
 
 def uniform(generator: torch.Generator, *shape: int) -> Tensor:
-    """Draws from [0, 1), float32 on the generator's device."""
+    """Draw from [0, 1): float32 of ``shape`` on the generator's device."""
     return torch.rand(shape, generator=generator, device=generator.device, dtype=torch.float32)
 
 
 def normal(generator: torch.Generator, *shape: int) -> Tensor:
-    """Standard normals, float32 on the generator's device."""
+    """Draw standard normals: float32 of ``shape`` on the generator's device."""
     return torch.randn(shape, generator=generator, device=generator.device, dtype=torch.float32)
 
 
 def log_uniform(limits: tuple[float, float], batch: int, generator: torch.Generator) -> Tensor:
-    """``(batch,)`` numbers whose logarithms are uniform between those of ``limits``."""
+    """Draw ``(batch,)`` numbers whose logarithms are uniform between those of ``limits``."""
     low, high = (math.log(limit) for limit in limits)
     return torch.exp(low + (high - low) * uniform(generator, batch))
 
@@ -76,15 +76,13 @@ class FixedLevels:
         self.shot_var, self.read_var = float(shot_var), float(read_var)
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        shot_var, read_var = (
-            torch.full((batch,), level, device=generator.device, dtype=torch.float32)
-            for level in (self.shot_var, self.read_var)
-        )
-        return shot_var, read_var
+        """Repeat both levels for each picture, ``(batch,)``."""
+        levels = torch.tensor([self.shot_var, self.read_var], device=generator.device, dtype=torch.float32)
+        return levels[0].repeat(batch), levels[1].repeat(batch)
 
 
 class MixedLevels:
-    """Levels of a random one of several laws, each picture's own."""
+    """The levels of several laws, of which each picture draws one, all alike."""
 
     def __init__(self, laws: Sequence[NoiseLevels]) -> None:
         if not laws:
@@ -92,6 +90,7 @@ class MixedLevels:
         self.laws = laws
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw a law for each picture and its levels from that law, ``(batch,)``."""
         which = torch.randint(len(self.laws), (batch,), generator=generator, device=generator.device)
         drawn = torch.stack([torch.stack(law.sample(batch, generator)) for law in self.laws])
         shot_var, read_var = drawn[which, :, torch.arange(batch, device=which.device)].unbind(1)
@@ -102,13 +101,14 @@ class Preset:
     """A published preset: ``upi``, ``cycleisp_dnd``, ``cycleisp_sidd`` or ``rawir``."""
 
     def __init__(self, name: str) -> None:
-        law = _known("noise preset", name, load_presets()["presets"])
+        law = _entry("noise preset", name, load_presets()["presets"])
         self.name = name
         self.shot_range: tuple[float, float] = tuple(law["shot"])
         self.line: dict[str, float] = law["read_line"]
         self.base = {"natural": math.e, "base 10": 10.0}[law["log"]]
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw shot_var log-uniformly and read_var around its line, ``(batch,)``."""
         shot_var = log_uniform(self.shot_range, batch, generator)
         scatter = self.line["sigma"] * normal(generator, batch)
         # The slope is the same in any base; intercept and scatter are exponents of the preset's own.
@@ -121,7 +121,7 @@ Iso = float | tuple[float, float] | None
 
 
 def iso_limits(camera: str, iso: Iso, measured: tuple[float, float]) -> tuple[float, float]:
-    """The limits of the draw that ``iso`` asks for."""
+    """The limits of the draw that ``iso`` asks for; ValueError if they are outside the measured range."""
     if iso is None:
         return measured
     low, high = (iso, iso) if isinstance(iso, (int, float)) else (iso[0], iso[1])
@@ -131,9 +131,9 @@ def iso_limits(camera: str, iso: Iso, measured: tuple[float, float]) -> tuple[fl
 
 
 def interpolate_levels(table: Tensor, iso: Tensor) -> tuple[Tensor, Tensor]:
-    """(shot_var, read_var), each ``(B,)``, at ISO values ``(B,)``, linear in the logarithms.
+    """Interpolate (shot_var, read_var), each ``(B,)``, at ISO values ``(B,)``, linearly in the logarithms.
 
-    ``table`` ``(3, N >= 2)`` float64 has those of ISO, ascending, shot_var and read_var.
+    ``table``, float64 ``(3, N)`` with N at least 2, holds the logarithms of ISO, ascending, shot_var and read_var.
     """
     x, shot, read = table
     at = iso.log().double()
@@ -152,58 +152,61 @@ class SiddLevels:
     """
 
     def __init__(self, phone: str, iso: Iso = None) -> None:
-        levels = _known("SIDD phone", phone, load_presets()["sidd_noise_level_function"]["cameras"])
+        levels = _entry("SIDD phone", phone, load_presets()["sidd_noise_level_function"]["cameras"])
         rows = sorted((float(iso), *pair) for iso, pair in levels.items())
         self.table = torch.tensor(rows, dtype=torch.float64).log().T.contiguous()
         self.iso = iso_limits(phone, iso, (rows[0][0], rows[-1][0]))
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw an ISO for each picture, log-uniformly, and interpolate its levels, ``(batch,)``."""
         return interpolate_levels(self.table.to(generator.device), log_uniform(self.iso, batch, generator))
 
 
 class PmridLevels:
-    """The OPPO Reno 10x of PMRID: gain linear, read variance quadratic in the ISO, one or limits within 100 to 6400."""
+    """The OPPO Reno 10x of PMRID, whose gain is linear and whose read variance is quadratic in the ISO, 100 to 6400."""
 
     def __init__(self, iso: Iso = None) -> None:
         self.law: dict[str, Any] = load_presets()["pmrid"]
         self.iso = iso_limits("pmrid", iso, tuple(self.law["iso"]))
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw an ISO for each picture, log-uniformly, and compute its levels, ``(batch,)``."""
         iso, white = log_uniform(self.iso, batch, generator), self.law["white_dn"]
         (k1, k0), (s2, s1, s0) = self.law["K"], self.law["sigma2"]
         return (k1 * iso + k0) / white, ((s2 * iso + s1) * iso + s0) / white**2
 
 
 class EldLevels:
-    """One of ELD's cameras: every scale s is log-linear in the gain, log s = slope log K + bias + N(0, sigma^2).
+    """One of ELD's cameras, where every scale s is log-linear in the gain: log s = slope log K + bias + N(0, sigma^2).
 
     As levels they give the Gaussian law of read noise; :class:`rawaug.noise.EldNoise` is the full model.
     """
 
     def __init__(self, camera: str, iso: Iso = None) -> None:
         law = load_presets()["eld"]
-        self.camera: dict[str, Any] = _known("ELD camera", camera, law["cameras"])
+        self.camera: dict[str, Any] = _entry("ELD camera", camera, law["cameras"])
         self.white_dn = float(law["white_dn"])
         self.lowest_iso = float(law["iso"][0])
         self.iso = iso_limits(camera, iso, tuple(law["iso"]))
 
     def sample_gain(self, batch: int, generator: torch.Generator) -> Tensor:
-        """K in DN an electron, ``(batch,)``."""
+        """Draw the gain K in DN an electron, ``(batch,)``."""
         return log_uniform(self.iso, batch, generator) * (self.camera["Kmin"] / self.lowest_iso)
 
     def sample_scale(self, law: str, gain: Tensor, generator: torch.Generator) -> Tensor:
-        """The scale of ``row``, ``gaussian`` or ``tukey_lambda`` noise at these gains, ``(B,)``, white = 1."""
+        """Draw the scale of ``row``, ``gaussian`` or ``tukey_lambda`` noise at gains ``(B,)``: ``(B,)``, white = 1."""
         line = self.camera[law]
         scatter = line["sigma"] * normal(generator, *gain.shape)
         return torch.exp(line["slope"] * gain.log() + line["bias"] + scatter - math.log(self.white_dn))
 
     def typical(self) -> tuple[float, float]:
-        """(shot_var, read_var) without the scatter, at the middle of the limits in the logarithm."""
+        """Compute (shot_var, read_var) without the scatter, at the geometric mean of the limits."""
         gain = math.sqrt(self.iso[0] * self.iso[1]) * (self.camera["Kmin"] / self.lowest_iso)
         line = self.camera["gaussian"]
         read_sd = math.exp(line["slope"] * math.log(gain) + line["bias"]) / self.white_dn
         return gain / self.white_dn, read_sd**2
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw a gain for each picture, and its levels, ``(batch,)``."""
         gain = self.sample_gain(batch, generator)
         return gain / self.white_dn, self.sample_scale("gaussian", gain, generator).square()

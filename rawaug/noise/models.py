@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -30,45 +31,50 @@ from rawaug.noise.levels import NoiseLevels
 from rawaug.seeding import derive_seed, keyed_generator
 
 Params = dict[str, Tensor]
-"""By name, tensors whose first dimension is the batch."""
+"""Parameters of a batch by name: tensors whose first dimension is B."""
 
 _NO_SHOT = 1e-30
 """Replaces a shot_var of 0 to avoid division by zero; too small to affect the picture."""
 _GROUP = 2**18
-"""Values whose photons are counted together: many small pictures, or one large."""
+"""Values whose photons are counted at a time: many small pictures, or one large one."""
 INVERSION_LIMIT = 10.0
-"""Rates below it are drawn by summing; from it on the expansion's distribution function is right to 5e-5."""
+"""Rates below it are drawn by a sum; from it on the expansion is used, whose distribution function errs by 5e-5."""
 _CACHED = 2**15  # counts that are drawn together on a CPU, to stay in its cache
 
 
 class NoiseModel(ABC):
-    """Base: ``noisy = model.apply(clean, model.sample(B, generator))``, packed RAW ``(B, 4, h, w)``, black 0, white 1.
+    """Base of noise on packed RAW ``(B, 4, h, w)``, black 0 and white 1.
+
+    It is used as ``noisy = model.apply(clean, model.sample(B, generator))``.
 
     Models composed on one picture draw from its one seed without correlation, each from its own ``stream``.
     """
 
     stream: ClassVar[str]
     by_plane = False
-    """Whether the four planes differ in more than their signal: such noise knows packed Bayer RAW alone."""
+    """Whether the four planes differ in more than their signal; such noise is for packed Bayer RAW alone."""
 
     @abstractmethod
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        """Parameters of ``batch`` pictures: tensors with leading dimension ``batch``, on the generator's device."""
+        """Draw the parameters of ``batch`` pictures: tensors of that leading dimension on the generator's device."""
 
     @abstractmethod
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
-        """The noisy RAW ``(B, 4, h, w)`` before the clip at white, in ``out``, which may be ``clean``, or anew."""
+        """Add the noise to ``clean`` ``(B, 4, h, w)`` without the clip at white.
+
+        The result is written to ``out``, which may be ``clean`` itself, or to new memory.
+        """
 
     @abstractmethod
     def variance(self, clean: Tensor, params: Params) -> Tensor:
-        """The variance map ``(B, 4, h, w)`` of the noise on a signal, before the clip at white."""
+        """Compute the variance map ``(B, 4, h, w)`` of the noise on a signal, before the clip at white."""
 
     @eager
     @torch.no_grad()
     def apply(self, clean: Tensor, params: Params) -> Tensor:
-        """Noisy RAW ``(B, 4, h, w)`` of clean packed RAW ``(B, 4, h, w)``: clipped at white, not at black. Pure.
+        """Make noisy RAW from clean packed RAW, both ``(B, 4, h, w)``; it is clipped at white and not at black.
 
-        The parameters may lie on another device than the picture. No gradient passes.
+        The same parameters give the same bits. They may lie on another device than the picture. No gradient passes.
 
         Raises:
             ValueError: if ``clean`` is not packed RAW in float32 or float64, or ``params`` are for another batch size.
@@ -77,12 +83,12 @@ class NoiseModel(ABC):
         return self.disturb(clean, params).clamp_(max=1.0)
 
     def apply_with_variance(self, clean: Tensor, params: Params) -> tuple[Tensor, Tensor]:
-        """Noisy RAW as in :meth:`apply` and its variance map computed from the noisy signal, in one pass."""
+        """Make noisy RAW as :meth:`apply` does and its variance map from the noisy signal, both ``(B, 4, h, w)``."""
         noisy = self.apply(clean, params)
         return noisy, self.variance(noisy, params)
 
     def generators(self, params: Params, device: torch.device) -> Iterator[torch.Generator]:
-        """One generator a picture on ``device``, from the picture's seed and the model's stream."""
+        """Yield one generator for each picture on ``device``, keyed by the picture's seed and the model's stream."""
         for seed in params["seed"].tolist():
             yield keyed_generator(seed, self.stream, device=device)
 
@@ -99,17 +105,17 @@ def require_batch(clean: Tensor, params: Params) -> None:
 
 
 def draw_seeds(batch: int, generator: torch.Generator) -> Tensor:
-    """One int64 seed a picture, ``(batch,)``."""
+    """Draw one int64 seed for each picture, ``(batch,)``."""
     return torch.randint(2**63 - 1, (batch,), generator=generator, device=generator.device)
 
 
 def per_picture(value: Tensor, like: Tensor) -> Tensor:
-    """Parameters ``(B,)`` as ``(B, 1, 1, 1)`` on the device and in the type of ``like``."""
+    """Shape parameters ``(B,)`` as ``(B, 1, 1, 1)``, on the device and in the type of ``like``."""
     return value.to(like).reshape(-1, 1, 1, 1)
 
 
 def draw_normals(like: Tensor, generators: Iterable[torch.Generator]) -> Tensor:
-    """Standard normals in the shape and type of ``like``, one generator a picture."""
+    """Draw standard normals in the shape ``(B, ...)`` and type of ``like`` from one generator for each picture."""
     drawn = torch.empty_like(like, memory_format=torch.contiguous_format)
     for picture, generator in zip(drawn, generators, strict=True):
         picture.normal_(generator=generator)
@@ -117,7 +123,7 @@ def draw_normals(like: Tensor, generators: Iterable[torch.Generator]) -> Tensor:
 
 
 class ShotReadModel(NoiseModel):
-    """The family of var = shot_var y + read_var, of levels such as ``Preset("upi")`` or ``FixedLevels(1e-3, 1e-5)``."""
+    """Base of noise with var = shot_var y + read_var, whose levels are such as ``Preset("upi")``."""
 
     stream = "shot_read"
 
@@ -125,11 +131,12 @@ class ShotReadModel(NoiseModel):
         self.levels = levels
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        """``shot_var``, ``read_var`` and ``seed``, each ``(batch,)``."""
+        """Draw ``shot_var``, ``read_var`` and ``seed``, each ``(batch,)``."""
         shot_var, read_var = self.levels.sample(batch, generator)
         return {"shot_var": shot_var, "read_var": read_var, "seed": draw_seeds(batch, generator)}
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
+        """Compute ``shot_var max(clean, 0) + read_var``, ``(B, 4, h, w)``."""
         return noise_variance(clean, *(per_picture(params[name], clean) for name in ("shot_var", "read_var")))
 
 
@@ -147,30 +154,31 @@ class ShotReadNoise(ShotReadModel):
     @eager
     @torch.no_grad()
     def apply(self, clean: Tensor, params: Params) -> Tensor:
+        """Make noisy RAW ``(B, 4, h, w)`` in one pass over the pixels; see :meth:`NoiseModel.apply`."""
         require_batch(clean, params)
-        return self._disturbed(clean, params, white=1.0)[0]
+        return self._add_noise(clean, params, white=1.0)[0]
 
     @eager
     @torch.no_grad()
     def apply_with_variance(self, clean: Tensor, params: Params) -> tuple[Tensor, Tensor]:
+        """Make noisy RAW and its variance map, both ``(B, 4, h, w)``, in one pass over the pixels."""
         require_batch(clean, params)
-        return self._disturbed(clean, params, white=1.0, with_variance=True)
+        return self._add_noise(clean, params, white=1.0, with_variance=True)
 
     @torch.no_grad()
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
-        noisy, _ = self._disturbed(clean, params, white=math.inf)
+        """Add the noise to ``clean`` ``(B, 4, h, w)`` without the clip at white."""
+        noisy, _ = self._add_noise(clean, params, white=math.inf)
         return noisy if out is None else out.copy_(noisy)
 
-    def _disturbed(
+    def _add_noise(
         self, clean: Tensor, params: Params, white: float, with_variance: bool = False
     ) -> tuple[Tensor, Tensor]:
+        in_pytorch = partial(self._in_pytorch, clean, params, white, with_variance)
         if clean.dtype != torch.float32:
-            return self._in_pytorch(clean, params, white, with_variance)
+            return in_pytorch()
         levels = torch.stack([params["shot_var"], params["read_var"]], dim=1)
-        settings = (levels, self._keys(params), white, with_variance)
-        return fastest(
-            "shot_read", clean, *settings, otherwise=lambda: self._in_pytorch(clean, params, white, with_variance)
-        )
+        return fastest("shot_read", clean, levels, self._keys(params), white, with_variance, otherwise=in_pytorch)
 
     def _in_pytorch(self, clean: Tensor, params: Params, white: float, with_variance: bool) -> tuple[Tensor, Tensor]:
         deviation = self.variance(clean, params).sqrt_()
@@ -191,6 +199,7 @@ class PoissonGaussianNoise(ShotReadModel):
 
     @torch.no_grad()
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        """Add photon and read noise to ``clean`` ``(B, 4, h, w)`` without the clip at white."""
         noisy = torch.empty_like(clean, memory_format=torch.contiguous_format) if out is None else out
         generators = list(self.generators(params, clean.device))
         together = max(1, _GROUP // max(1, clean[:1].numel()))
@@ -200,7 +209,7 @@ class PoissonGaussianNoise(ShotReadModel):
         return noisy
 
     def _noise(self, clean: Tensor, params: Params, group: slice, generators: Sequence[torch.Generator]) -> Tensor:
-        """The noise of a group of pictures; of each, photons are drawn first, then read noise."""
+        """Draw the noise of a group of pictures, for each first the photons, then the read noise."""
         shot_var = per_picture(params["shot_var"][group], clean)
         light = clean.clamp(min=0)
         photons = poisson(light / shot_var.clamp(min=_NO_SHOT), draw_normals(clean, generators)).mul_(shot_var)
@@ -208,12 +217,14 @@ class PoissonGaussianNoise(ShotReadModel):
         return noise.add_(self.read_noise(clean, {name: value[group] for name, value in params.items()}, generators))
 
     def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
-        """Read noise of the shape ``(b, 4, h, w)`` of ``like``, from one generator a picture."""
+        """Draw read noise in the shape ``(B, 4, h, w)`` of ``like``, from one generator for each picture."""
         return draw_normals(like, generators).mul_(per_picture(params["read_var"], like).sqrt())
 
 
 def poisson(rate: Tensor, normals: Tensor) -> Tensor:
-    """Poisson counts for expected counts ``rate``, written over ``normals``, contiguous standard normal draws.
+    """Turn standard normal draws into Poisson counts for the expected counts ``rate``; both are of any shape.
+
+    ``normals`` must be contiguous; the counts are written over them.
 
     A count is the quantile of its draw: ``torch.poisson`` has poor streams on CUDA and fails at high rates. Below
     :data:`INVERSION_LIMIT` the distribution function is summed; from there on its inverse is Giles' expansion in
@@ -229,7 +240,7 @@ def poisson(rate: Tensor, normals: Tensor) -> Tensor:
 
 
 def _invert_expansion(rate: Tensor, w: Tensor) -> Tensor:
-    """Giles' expansion to the order 1 / rate, rounded down."""
+    """Invert the distribution function by Giles' expansion to the order 1 / rate, rounded down."""
     root = rate.clamp(min=INVERSION_LIMIT).sqrt()
     w2 = w * w
     tail = (-8 / 405 + w2 * (7 / 810 + w2 / 270)) / root - w * (1 / 36 + w2 / 72)
@@ -237,7 +248,7 @@ def _invert_expansion(rate: Tensor, w: Tensor) -> Tensor:
 
 
 def _invert_sum(rate: Tensor, w: Tensor) -> Tensor:
-    """The number of k with F(k) < Phi(w), in double precision: in single, the sum would stop short of the far tail."""
+    """Count the k with F(k) < Phi(w), in double precision: in single, the sum would stop short of the far tail."""
     rate, u = rate.double(), torch.special.ndtr(w.double()).clamp_(max=1 - 1e-13)  # which the sum does reach
     term = torch.exp(-rate)
     total, count, k = term.clone(), torch.zeros_like(rate), 0

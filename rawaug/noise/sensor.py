@@ -52,7 +52,7 @@ def _require_not_negative(**values: Range) -> None:
 
 
 def draw_between(value: Range, batch: int, generator: torch.Generator) -> Tensor:
-    """``(batch,)``: the value, or log-uniform draws between its limits."""
+    """Repeat one value ``(batch,)`` times, or draw log-uniformly between two limits."""
     if isinstance(value, tuple):
         return log_uniform(value, batch, generator)
     return torch.full((batch,), float(value), device=generator.device, dtype=torch.float32)
@@ -60,7 +60,7 @@ def draw_between(value: Range, batch: int, generator: torch.Generator) -> Tensor
 
 @cache
 def tukey_lambda_variance(shape: float) -> float:
-    """The variance of the Tukey lambda distribution of scale 1, infinite for shapes up to -1/2, which are refused."""
+    """The variance of the Tukey lambda distribution of scale 1; up to a shape of -1/2 it is infinite: ValueError."""
     from scipy.stats import tukeylambda
 
     if shape <= -0.5:
@@ -69,7 +69,7 @@ def tukey_lambda_variance(shape: float) -> float:
 
 
 class TukeyLambdaNoise(PoissonGaussianNoise):
-    """Photon noise with Tukey-lambda read noise: heavier tails, of ``shape`` above -0.5 or uniform in a range."""
+    """Photon noise with Tukey-lambda read noise; its ``shape``, above -0.5, is one value or uniform in a range."""
 
     def __init__(self, levels: NoiseLevels, shape: float | tuple[float, float]) -> None:
         super().__init__(levels)
@@ -77,11 +77,13 @@ class TukeyLambdaNoise(PoissonGaussianNoise):
         tukey_lambda_variance(min(self.shape))
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
+        """Draw levels, seeds and the shape ``tukey_lambda`` of the tails, each ``(batch,)``."""
         low, high = self.shape
         shape = low + (high - low) * uniform(generator, batch)
         return super().sample(batch, generator) | {"tukey_lambda": shape}
 
     def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
+        """Draw heavy-tailed read noise of the stated variance, ``(B, 4, h, w)``."""
         noise = torch.empty_like(like, memory_format=torch.contiguous_format)
         shapes, variances = params["tukey_lambda"].tolist(), params["read_var"].tolist()
         for picture, shape, read_var, generator in zip(noise, shapes, variances, generators, strict=True):
@@ -91,7 +93,7 @@ class TukeyLambdaNoise(PoissonGaussianNoise):
 
 
 def _tukey_lambda(u: Tensor, shape: float) -> Tensor:
-    """The quantile function Q(u)."""
+    """Compute the quantile function Q(u)."""
     log_u, log_v = u.clamp(min=2**-25).log_(), (1 - u).log_()  # rand is a multiple of 2^-24, and may be 0
     if shape == 0:
         return log_u.sub_(log_v)
@@ -99,28 +101,31 @@ def _tukey_lambda(u: Tensor, shape: float) -> Tensor:
 
 
 class _Banding(NoiseModel):
-    """A Gaussian offset of each line of the sensor, of the variance that the parameter ``key`` says."""
+    """A Gaussian offset of each line of the sensor, whose variance is the parameter ``key``."""
 
     key: ClassVar[str]
     across: ClassVar[int]
     line_of_plane: ClassVar[list[int]]
-    """Of the two lines of a cell, that which R, Gr, Gb and B lie in."""
+    """Which of the two lines of a cell the planes R, Gr, Gb and B lie in."""
 
     def __init__(self, line_var: Range) -> None:
         _require_not_negative(**{self.key: line_var})
         self.line_var = line_var
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
+        """Draw the variance of the lines and the seeds, each ``(batch,)``."""
         return {self.key: draw_between(self.line_var, batch, generator), "seed": draw_seeds(batch, generator)}
 
     @torch.no_grad()
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        """Add the offsets of the lines to ``clean`` ``(B, 4, h, w)``."""
         one = clean[:, :2].narrow(self.across, 0, min(1, clean.shape[self.across]))
         lines = draw_normals(one, self.generators(params, clean.device))
         lines *= per_picture(params[self.key], clean).sqrt()
         return torch.add(clean, lines[:, self.line_of_plane], out=out)
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
+        """The variance of the lines, the same at every site of a picture, ``(B, 4, h, w)``."""
         return per_picture(params[self.key], clean).expand_as(clean).clone()
 
 
@@ -142,6 +147,7 @@ class _FixedPattern(NoiseModel):
     """An error that is the same all over a picture: it moves the mean and adds no variance from pixel to pixel."""
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
+        """No variance, ``(B, 4, h, w)``."""
         return torch.zeros_like(clean)
 
 
@@ -150,16 +156,18 @@ class BlackOffset(_FixedPattern):
 
     stream = "black_offset"
     colours: ClassVar[tuple[int, ...]] = ()
-    """Shape of a picture's offsets."""
+    """Shape of the offsets of one picture."""
 
     def __init__(self, sd: float) -> None:
         _require_not_negative(sd=sd)
         self.sd = sd
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
+        """Draw the offsets, ``(batch,)`` or one for each plane ``(batch, 4)``."""
         return {self.stream: self.sd * normal(generator, batch, *self.colours)}
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        """Add the offsets to ``clean`` ``(B, 4, h, w)``."""
         offsets = params[self.stream].to(clean).reshape(len(clean), math.prod(self.colours), 1, 1)
         return torch.add(clean, offsets, out=out)
 
@@ -188,12 +196,13 @@ class GreenImbalance(BlackOffset):
     by_plane = True
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        """Multiply the planes Gr and Gb of ``clean`` ``(B, 4, h, w)`` by their gains."""
         halves = clean.new_tensor([0.0, 0.5, -0.5, 0.0]).reshape(4, 1, 1)
         return torch.mul(clean, 1.0 + halves * per_picture(params[self.stream], clean), out=out)
 
 
 class DefectPixels(_FixedPattern):
-    """Dead pixels read black; hot ones add a dark current of U(0, 1). ``variance`` leaves them out.
+    """Dead pixels, which read black, and hot ones, which add a dark current of U(0, 1); ``variance`` leaves them out.
 
     Args:
         dead, hot: the share of pixels, typically 1e-5 to 1e-3, or a range of it.
@@ -210,6 +219,7 @@ class DefectPixels(_FixedPattern):
         self.dead, self.hot, self.clusters = dead, hot, clusters
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
+        """Draw the shares of dead and hot pixels and the seeds, each ``(batch,)``."""
         shares = {
             "dead_share": draw_between(self.dead, batch, generator),
             "hot_share": draw_between(self.hot, batch, generator),
@@ -217,10 +227,11 @@ class DefectPixels(_FixedPattern):
         return shares | {"seed": draw_seeds(batch, generator)}
 
     def generators(self, params: Params, device: torch.device) -> Iterator[torch.Generator]:
-        """Frames of a burst, each with a seed of its own, have the defects of one sensor."""
+        """Yield one generator for each picture; frames of a burst have the defects of one sensor."""
         return super().generators({**params, "seed": params.get("sensor_seed", params["seed"])}, device)
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        """Put the defects into ``clean`` ``(B, 4, h, w)``."""
         noisy = clean.clone() if out is None else out.copy_(clean)
         for i, generator in enumerate(self.generators(params, clean.device)):
             dead, hot = float(params["dead_share"][i]), float(params["hot_share"][i])
@@ -250,21 +261,24 @@ class Quantisation(NoiseModel):
         self.quanta = [1 / (2**depth - 1 - black_level) for depth in depths]
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
+        """Draw the step of the grid for each picture, ``(batch,)``, white = 1."""
         if len(self.quanta) == 1:
             return {"quantum": draw_between(self.quanta[0], batch, generator)}
         chosen = torch.randint(len(self.quanta), (batch,), generator=generator, device=generator.device)
         return {"quantum": torch.tensor(self.quanta, device=generator.device)[chosen]}
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        """Round ``clean`` ``(B, 4, h, w)`` to the grid."""
         quantum = per_picture(params["quantum"], clean).clamp_min(_NO_STEP)
         return torch.div(clean, quantum, out=out).round_().mul_(quantum)
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
+        """A twelfth of the squared step, ``(B, 4, h, w)``."""
         return (per_picture(params["quantum"], clean).square() / 12).expand_as(clean).clone()
 
 
 class Compose(NoiseModel):
-    """Several models of different streams, applied in order.
+    """Several models of different streams, which are applied in order.
 
     Example:
         >>> model = Compose([ShotReadNoise(FixedLevels(1e-3, 1e-5)), RowNoise(1e-6), Quantisation(bits=12)])
@@ -280,18 +294,21 @@ class Compose(NoiseModel):
         self.by_plane = any(model.by_plane for model in models)
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
+        """Draw the parameters of all models into one dictionary; the last seed serves them all."""
         params: Params = {}
         for model in self.models:
             params |= model.sample(batch, generator)
         return params
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        """Apply the models to ``clean`` ``(B, 4, h, w)`` one after the other."""
         noisy = self.models[0].disturb(clean, params, out)
         for model in self.models[1:]:
             model.disturb(noisy, params, out=noisy)
         return noisy
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
+        """Add up the variances ``(B, 4, h, w)`` of all models."""
         return torch.stack([model.variance(clean, params) for model in self.models]).sum(0)
 
 
@@ -299,15 +316,15 @@ _ABSENT = {
     "row_var": 0.0, "column_var": 0.0, "black_offset": 0.0, "colour_bias": 0.0, "dead_share": 0.0, "hot_share": 0.0,
     "quantum": 0.0, "told": 1.0, "tukey_lambda": 0.14, "green_imbalance": 0.0,
 }  # fmt: skip
-"""What the parameters of :class:`SensorNoise` are where the effect is absent; 0.14 is near the normal."""
+"""The parameters of :class:`SensorNoise` where an effect is absent; a shape of 0.14 is near the normal."""
 
 
 @NOISE.register("SensorNoise")
 class SensorNoise(Compose):
-    """Shot and read noise with a switch for everything else that a sensor does; what is 0 or None is off.
+    """Shot and read noise with a switch for everything else that a sensor does; effects set to 0 or None are off.
 
     Args:
-        levels: what samples (shot_var, read_var), or a name or pair that :func:`noise_levels` knows.
+        levels: a law of (shot_var, read_var), or a name or pair that :func:`noise_levels` knows.
         poisson: exact photon statistics instead of the Gaussian.
         tukey_lambda: shape of heavy-tailed read noise instead of Gaussian, or a range of it. Implies ``poisson``.
         row_var, column_var: variance of banding along rows and columns, white = 1, or a range of it.
@@ -367,6 +384,7 @@ class SensorNoise(Compose):
         super().__init__(models)
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
+        """Draw the parameters of all effects; those that a picture lacks have their value of absence."""
         params = super().sample(batch, generator)
         if self.told != (1.0, 1.0):
             params["told"] = log_uniform(self.told, batch, generator)
@@ -376,6 +394,7 @@ class SensorNoise(Compose):
         return params
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
+        """Add up the variances ``(B, 4, h, w)``, wrong by the factor ``told`` as a file's tag may be."""
         variance = super().variance(clean, params)
         return variance.mul_(per_picture(params["told"], clean)) if "told" in params else variance
 
@@ -413,12 +432,14 @@ class DarkFrames(PoissonGaussianNoise):
         self.shot_var = [frame.noise_profile[0] if shot_var is None else shot_var for frame in frames]  # type: ignore[index]
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
+        """Draw a dark frame for each picture with its levels, and the seeds, each ``(batch,)``."""
         frame = torch.randint(len(self.planes), (batch,), generator=generator, device=generator.device)
         shot = torch.stack([draw_between(self.shot_var[k], 1, generator)[0] for k in frame.tolist()])
         read = self.read_var.to(generator.device)[frame]
         return {"shot_var": shot, "read_var": read, "dark_frame": frame, "seed": draw_seeds(batch, generator)}
 
     def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
+        """Cut a patch for each picture out of its dark frame, ``(B, 4, h, w)``."""
         noise = torch.empty_like(like, memory_format=torch.contiguous_format)
         for picture, index, generator in zip(noise, params["dark_frame"].tolist(), generators, strict=True):
             planes = self.planes[index].to(like)
@@ -434,7 +455,7 @@ class DarkFrames(PoissonGaussianNoise):
 class EldNoise(Compose):
     """ELD's full model of one of its five cameras: photons, Tukey-lambda read noise, banding, colour bias and rounding.
 
-    One gain K is drawn a picture, and all scales follow it; the shape of the tails is one that was measured.
+    Each picture draws one gain K, which all scales follow, and one of the measured shapes of the tails.
 
     Args:
         camera: ``CanonEOS5D4``, ``CanonEOS700D``, ``CanonEOS70D``, ``NikonD850`` or ``SonyA7S2``.
@@ -451,6 +472,7 @@ class EldNoise(Compose):
         super().__init__([tails, RowNoise(0.0), bias, rounding])
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
+        """Draw the parameters of all effects, each ``(batch,)``, at one gain a picture."""
         gain = self.law.sample_gain(batch, generator)
         chosen = torch.randint(len(self.shapes), (batch,), generator=generator, device=generator.device)
         shape = self.shapes.to(generator.device)[chosen]

@@ -181,7 +181,7 @@ def test_least_squares_finds_the_matrix_of_each_frame(exact_pairs: list[Pair], c
 
 
 def test_fall_off_is_measured(exact_pair: Callable[..., Pair]) -> None:
-    samples, _ = sample_pixels([exact_pair("shot", WB, 0, fit_fall_off=0.8)], 4096, seed=0)
+    samples, _ = sample_pixels([exact_pair("shot", WB, 0, fall_off=0.8)], 4096, seed=0)
     linear = samples.srgb**2.2
     mean, precision = fit_fall_off(linear, samples, least_squares(linear, samples))
     torch.testing.assert_close(precision, 0.8 * torch.eye(2), atol=0.1, rtol=0)
