@@ -51,7 +51,7 @@ def main(command: Sequence[str] | None = None) -> None:
             clean = middle(pack(crop_to_cfa(pair.raw, pair.cfa, CFA.RGGB)[None], CFA.RGGB), side)
             params = noise.sample(1, keyed_generator(0, "binning", pair.name))
             levels = params["shot_var"].item(), params["read_var"].item()
-            noisy = Noisy.told(noise.apply(clean, params), levels, CFA.RGGB)
+            noisy = Noisy.of(noise.apply(clean, params), levels, CFA.RGGB)
             for one in everyone:
                 found[one.name].append(psnr(one(noisy).clamp(0.0, 1.0), clean).item())
         figures[way] = {name: round(fmean(values), 2) for name, values in found.items()}

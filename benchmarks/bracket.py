@@ -37,7 +37,7 @@ from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.folders import RAW_EXTENSIONS, files_in  # type: ignore[attr-defined]
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
-from rawaug.denoise.levels import UnknownNoise, levels_of
+from rawaug.denoise.levels import UnknownNoise, find_levels
 from rawaug.evaluation.scores import Denoiser, NoisyInput
 from rawaug.evaluation.tables import print_rows
 from rawaug.files import fingerprint
@@ -99,7 +99,7 @@ def bracket(folder: Path) -> list[Shot]:
     known: dict[str, tuple[float, float, str]] = {}
     for frame in frames:
         try:
-            known[frame.name] = levels_of(frame)
+            known[frame.name] = find_levels(frame)
         except UnknownNoise:
             continue
     shot_var, read_var = (fmean(levels[k] for levels in known.values()) for k in range(2))  # type: ignore[misc]
@@ -212,7 +212,7 @@ def denoised(one: Denoiser, noisy: Shot, blocks: Sequence[Block], keep: Path | N
         if file is None or not file.is_file():
             rows, columns = (slice(at - MARGIN, at + BLOCK + MARGIN) for at in (block.top, block.left))
             packed = bayer.pack(frame.mosaic[None, :, rows, columns], frame.cfa)
-            result = one(Noisy.told(packed, noisy.levels, frame.cfa)).clamp(max=1.0)
+            result = one(Noisy.of(packed, noisy.levels, frame.cfa)).clamp(max=1.0)
             result = result[..., around:-around, around:-around].clone()
             if file is not None:
                 np.save(file, result.numpy())

@@ -23,7 +23,7 @@ from rawaug.data.demo import FRAME
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import RawDenoiser
 from rawaug.evaluation.scores import Panels, panels_of
-from rawaug.evaluation.tables import PANEL, draw
+from rawaug.evaluation.tables import PANEL, save_picture
 from rawaug.evaluation.trials import trial_of
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.seeding import keyed_generator
@@ -91,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         for iso in options.iso:
             place = int(top) // 2 * 2, int(left) // 2 * 2
             rows.append(row(pairs[name], place, noise_model(options.camera, iso=iso), options.denoisers, cfa))
-    draw(rows, options.out)
+    save_picture(rows, options.out)
 
 
 if __name__ == "__main__":

@@ -39,13 +39,12 @@ from rawaug.data import open_pairs, open_pictures
 from rawaug.data.folders import Cached
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import RawDenoiser
-from rawaug.evaluation.scores import by_denoiser, score
+from rawaug.evaluation.scores import group_rows, score
 from rawaug.evaluation.trials import trial_of
 from rawaug.noise import noise_model
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.loop import train
+from rawaug.training.loop import train, validate
 from rawaug.training.stream import PictureCrops, TrainingStream
-from rawaug.training.validation import validate
 
 SIZES: dict[str, dict[str, Any]] = {
     "UNet": {"width": 16, "scales": 4},
@@ -220,7 +219,7 @@ def references(args: argparse.Namespace) -> dict[str, dict[str, float]]:
     everyone = [RawDenoiser.of(name) for name in ("NonLocalMeans", *named)]
     trials = (trial_of(pair, noise, cfa) for pair in middles(args))
     rows = {}
-    for label, scores in by_denoiser(score(everyone, trials, "references")).items():
+    for label, scores in group_rows(score(everyone, trials, "references")).items():
         rows[label] = {key: fmean(getattr(row, key) for row in scores) for key in ("psnr", "psnr_srgb")}
     return rows
 

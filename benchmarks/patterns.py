@@ -23,11 +23,10 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pairs import Binned, Middles, Pair
 from rawaug.denoise.denoiser import RawDenoiser
-from rawaug.evaluation.scores import compared, results
+from rawaug.evaluation.scores import compare, to_domain
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial
-from rawaug.experiment.demosaicing import by_libraw
-from rawaug.experiment.mosaics import demosaiced, mosaic_of, mosaic_trial
+from rawaug.experiment.demosaicing import libraw_demosaic, mosaic_of, mosaic_trial
 from rawaug.noise import anscombe, noise_model
 from rawaug.progress import progress
 
@@ -45,13 +44,13 @@ class _Colours(NonLocalMeans):
 def without_network(trial: Trial, pair: Pair) -> Iterator[tuple[str, Callable[[], Tensor]]]:
     """Names and results, linear camera RGB ``(1, 3, H, W)``."""
     mosaic, cfa = mosaic_of(trial.noisy, trial.cfa), trial.condition
-    noisy = demosaiced(trial.noisy, pair, cfa)
+    noisy = trial.ways["demosaiced"](trial.noisy)
     yield "noisy", lambda: noisy
     if cfa in CFA.__members__:
         from rawpy import FBDDNoiseReductionMode
 
         full = FBDDNoiseReductionMode.Full
-        yield "LibRaw, FBDD", lambda: by_libraw(mosaic, pair, "AHD", cfa, fbdd_noise_reduction=full)
+        yield "LibRaw, FBDD", lambda: libraw_demosaic(mosaic, pair, "AHD", cfa, fbdd_noise_reduction=full)
     assert trial.levels is not None
     shot_var, read_var = trial.levels
     white = anscombe.forward(noisy, shot_var, read_var)
@@ -69,8 +68,8 @@ def scores_of(pair: Pair, cfa: str, noise: Any, networks: list[RawDenoiser]) -> 
     found = {name: make() for name, make in without_network(trial, pair)}
     for one in networks:
         if one.of_any is not None or cfa in CFA.__members__:
-            found[one.name] = next(image for _, image in results(one.name, one(trial.given), trial))
-    scored = {name: compared(image, trial) for name, image in found.items()}
+            found[one.name] = next(image for _, image in to_domain(one.name, one(trial.given), trial))
+    scored = {name: compare(image, trial) for name, image in found.items()}
     return {name: (rgb, srgb or 0.0) for name, (rgb, _, srgb, _) in scored.items()}
 
 

@@ -18,6 +18,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -26,7 +27,7 @@ from benchmarks.measure import parser
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.denoise.denoiser import RawDenoiser
-from rawaug.evaluation.scores import score
+from rawaug.evaluation.scores import Row, score
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.recipe import find_recipe, read_recipe
@@ -34,7 +35,7 @@ from rawaug.files import write_json
 from rawaug.isp.model import DictionaryISP, restrict_to_cameras
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.paper.baselines import UPI
-from rawaug.paper.downstream import DownstreamConfig, DownstreamScore, MadeCrops, mean_of, score_on, trained_on
+from rawaug.paper.methods import DownstreamConfig, MadeCrops, score_on, train_on
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.draw import Draw
@@ -96,11 +97,16 @@ def sources(
         yield f"real RAW, {name}", RealCrops(pairs, noise, crop, CFA.RGGB)
 
 
-def filtered(specs: Sequence[str], factor: int) -> DownstreamScore:
+def means(rows: Sequence[Row]) -> list[float]:
+    """Mean PSNR over frames; that of sRGB over those that can be developed."""
+    return [fmean(row.psnr for row in rows), fmean(row.psnr_srgb for row in rows if row.psnr_srgb is not None)]
+
+
+def filtered(specs: Sequence[str], factor: int) -> list[float]:
     """The row that needs no training."""
     noise, cfa = noise_model(CONFIG.noise), CFA.RGGB
     frames = [pair.middle(1024) for spec in specs for pair in open_pairs(spec, split="test", bin=factor)]
-    return mean_of(list(score([RawDenoiser.of("NonLocalMeans")], (trial_of(pair, noise, cfa) for pair in frames))))
+    return means(list(score([RawDenoiser.of("NonLocalMeans")], (trial_of(pair, noise, cfa) for pair in frames))))
 
 
 def named(values: Sequence[str]) -> dict[str, list[str]]:
@@ -139,12 +145,12 @@ def main() -> None:
             scores = rows.setdefault(row, {}).setdefault(str(seed), {})
             if tests.keys() <= scores.keys():
                 continue
-            net = trained_on(crops, config, options.out / row.replace(" ", "-").replace(",", ""), seed)
+            net = train_on(crops, config, options.out / row.replace(" ", "-").replace(",", ""), seed)
             scores |= {
-                test: list(score_on(net, replace(config, test=specs), CFA.RGGB)) for test, specs in tests.items()
+                test: means(score_on(net, replace(config, test=specs), CFA.RGGB)) for test, specs in tests.items()
             }
             write_json(rows, known)
-    rows["NonLocalMeans"] = {"": {test: list(filtered(specs, options.bin)) for test, specs in tests.items()}}
+    rows["NonLocalMeans"] = {"": {test: filtered(specs, options.bin) for test, specs in tests.items()}}
     heads = [f"{test}, {domain}" for test in tests for domain in ("RAW", "sRGB")]
     cells = [
         [row, *(mean_and_spread([s[test][k] for s in scores.values()], 2) for test in tests for k in (0, 1))]

@@ -53,7 +53,7 @@ def noisy_shots(
     noise = SensorNoise(levels, **sensor)
     for name, clean in shots:
         noisy = noise.apply(clean, noise.sample(1, keyed_generator(0, "sensors", name)))
-        yield clean, Noisy.told(noisy, (told * levels[0], told * levels[1]), CFA.RGGB)
+        yield clean, Noisy.of(noisy, (told * levels[0], told * levels[1]), CFA.RGGB)
 
 
 def decibels(error: Tensor) -> float:

@@ -19,7 +19,7 @@ from benchmarks.measure import parser
 from rawaug import bayer
 from rawaug.data.development import developed
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
-from rawaug.denoise.levels import levels_of
+from rawaug.denoise.levels import find_levels
 from rawaug.io import RawFrame, read_raw, write_picture
 
 SIDE, MARGIN, GAP = 384, 128, 6
@@ -50,12 +50,12 @@ def main(command: Sequence[str] | None = None) -> None:
     cli.add_argument("--out", type=Path, required=True)
     args = cli.parse_args(command)
     frame = read_raw(args.frame)
-    shot_var, read_var, source = levels_of(frame)
+    shot_var, read_var, source = find_levels(frame)
     print(f"{frame.name}: {frame.camera}, shot_var {shot_var:.3g}, read_var {read_var:.3g} ({source})")
     top, left = (at // 2 * 2 for at in args.place)
     rows, columns = (slice(at - MARGIN, at + SIDE + MARGIN) for at in (top, left))
     noisy = bayer.pack(frame.mosaic[None, :, rows, columns], frame.cfa)
-    clean = RawDenoiser.of(args.denoiser)(Noisy.told(noisy, (shot_var, read_var), frame.cfa)).clamp(max=1.0)
+    clean = RawDenoiser.of(args.denoiser)(Noisy.of(noisy, (shot_var, read_var), frame.cfa)).clamp(max=1.0)
     pieces = [picture(frame, bayer.unpack(x, frame.cfa)[0], args.stops) for x in (noisy, clean)]
     inner = [piece[:, MARGIN:-MARGIN, MARGIN:-MARGIN] for piece in pieces]
     gap = torch.ones(3, SIDE, GAP)

@@ -20,11 +20,11 @@ from rawaug.data.pairs import Binned
 from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
 from rawaug.denoise.denoiser import RawDenoiser, require_classical
 from rawaug.denoise.pictures import PictureDenoiser
-from rawaug.evaluation.page import Page, shown_on_page
+from rawaug.evaluation.page import Page, select_for_page
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, print_pictures
-from rawaug.evaluation.scores import NOISY, Row, by_denoiser, panels_of, require_numbers, score, summary
+from rawaug.evaluation.scores import NOISY, Row, group_rows, panels_of, require_numbers, score, summary
 from rawaug.evaluation.tables import print_scores
-from rawaug.evaluation.trials import Measured, Trial, own_noise_note, trial_of, trials_of
+from rawaug.evaluation.trials import Measured, Trial, make_trials, own_noise_note, trial_of
 from rawaug.files import find_weights, read_header, require_writable, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseSpec, noise_model
@@ -131,7 +131,7 @@ class _Test:
 
     def __init__(self, weights: Path, noise: NoiseSpec | None, seed: int, device: str, filters: Sequence[Spec]) -> None:
         found = RawDenoiser.of(weights, device).require_mosaic()
-        around = ESTIMATORS.make(found.info.get("estimator", "supervised")).at_test
+        around = ESTIMATORS.make(found.info.get("estimator", "supervised")).wrap_for_test
         self.denoiser = replace(found, around=around, checked=False)
         self.seed, self.noise = seed, noise or found.info.get("noise", "cycleisp_sidd")
         self.filters = [RawDenoiser.of(spec) for spec in filters]
@@ -141,13 +141,13 @@ class _Test:
         """The scores; of several views, with those of a single one as ``plain``."""
         levels, cfa = noise_model(self.noise), self.denoiser.cfa
         deque(pairs, maxlen=0)  # finds those that cannot be read
-        self.trials = trials_of(pairs.kept(), lambda pair: trial_of(pair, levels, cfa, self.seed))
-        noisy, plain = by_denoiser(self.scored([NOISY, self.denoiser], "evaluate")).values()
+        self.trials = make_trials(pairs.kept(), lambda pair: trial_of(pair, levels, cfa, self.seed))
+        noisy, plain = group_rows(self.scored([NOISY, self.denoiser], "evaluate")).values()
         result = {"self_ensemble": False, "seed": self.seed, **summary(plain, noisy)}
         if views > 1 or self.filters:
             first(result)
         ensemble = [replace(self.denoiser, name="views", views=views)] if views > 1 else []
-        others = by_denoiser(self.scored([*ensemble, *self.filters], "evaluate, the rest"))
+        others = group_rows(self.scored([*ensemble, *self.filters], "evaluate, the rest"))
         if views > 1:
             found = {"self_ensemble": True, "seed": self.seed, "views": views, "plain": summary(plain, noisy)}
             result = found | summary(others.pop("views"), noisy)
@@ -164,7 +164,7 @@ class _Test:
         runs = {"plain": result.get("plain", result)} | ({"self_ensemble": result} if "plain" in result else {})
         facts, name = {"Noise": self.noise, "Seed": str(self.seed)}, self.denoiser.name
         page = Page.of_scores(f"{name} on {data}", {name: [runs]}, result.get("classical", {}), facts)
-        for trial in shown_on_page(self.trials):
+        for trial in select_for_page(self.trials):
             page.add_frame(panels_of([*self.filters, self.denoiser], trial))
         return page
 

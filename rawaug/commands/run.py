@@ -19,7 +19,7 @@ from rich.text import Text
 
 from rawaug.commands import value_of
 from rawaug.experiment import plan
-from rawaug.experiment.plan import settings_of, with_own_pairs
+from rawaug.experiment.plan import settings_of, use_all_pairs
 from rawaug.experiment.recipe import Recipe, find_recipe, kind_of, read_recipe, recipe_list
 from rawaug.registry import EXPERIMENTS, suggest
 
@@ -60,7 +60,7 @@ def run(
         whole = _with(whole, settings_of(kind), key.split("."), value)
     settings = with_values(settings_of(kind), whole, file)
     if isinstance(settings, Recipe):
-        settings = with_own_pairs(settings, content, {key.replace("-", "_") for key, _ in given})
+        settings = use_all_pairs(settings, content, {key.replace("-", "_") for key, _ in given})
     if dry_run:
         plan.dry_run(kind, settings, overwrite)
     else:

@@ -1,4 +1,4 @@
-r"""What makes clean RAW of noisy RAW, whatever it is made of, and the one place where its name is looked up.
+r"""Denoisers of RAW, whatever they are made of, and the one place where their names are looked up.
 
     d = f(y, v),    v = shot_var max(y, 0) + read_var,    result = y + s (d - y)
 
@@ -27,7 +27,7 @@ from denoisers.mosaic import BayerAdapter, MosaicDRUNet, denoise_mosaic
 from denoisers.network import PACKED
 from rawaug import bayer
 from rawaug.bayer import CFA, crop_to_cfa, noise_variance
-from rawaug.denoise.foreign import AGAIN, STRIDE, BiasFreeDnCNN, OnnxNetwork, published_pmrid
+from rawaug.denoise.foreign import AGAIN, STRIDE, BiasFreeDnCNN, OnnxNetwork, load_published
 from rawaug.files import parse_object, read_header, read_tensors, sha256
 from rawaug.io import RawFrame
 from rawaug.kernels.runtime import find_device, has_fast_bfloat16
@@ -38,20 +38,20 @@ from rawaug.registry import DENOISERS, FILTERS, Spec, spec_label, split_spec, su
 Levels = tuple[float, float]
 """(shot_var, read_var)."""
 Model = Callable[[Tensor, Tensor | None], Tensor]
-"""``model(noisy, variance) -> denoised``, ``(B, 4, h, w)``; its ``stride`` and ``upscale``, if any, are heeded."""
+"""``model(noisy, variance) -> denoised``, each ``(B, 4, h, w)``; it may have a ``stride`` and an ``upscale``."""
 CPU = torch.device("cpu")
 FILTER_TILES = (512, 32)
-"""Side and overlap in packed pixels; the filters look 8 pixels around, and BM3D 20."""
+"""Side and overlap of a filter's tiles, in packed pixels; the filters look 8 pixels around, and BM3D 20."""
 
 
 class Noisy(NamedTuple):
-    """What a denoiser is given: an image, and what it may know of its noise.
+    """The input of a denoiser: an image, and what may be known of its noise.
 
     Attributes:
         image: packed RAW ``(1, 4, h, w)``, white at 1, not clipped at black; of other patterns than Bayer's the mosaic
             ``(1, 1, H, W)``; or developed sRGB ``(1, 3, H, W)``.
-        variance: of the noise of each value, shape of ``image``; None where it is not known.
-        levels: (shot_var, read_var) where the variance is ``shot_var max(image, 0) + read_var``.
+        variance: of the noise of each value, shape of ``image``; None if it is not known.
+        levels: (shot_var, read_var) if the variance is ``shot_var max(image, 0) + read_var``.
         cfa: the pattern of packed RAW or of the mosaic.
     """
 
@@ -61,8 +61,8 @@ class Noisy(NamedTuple):
     cfa: str = CFA.RGGB
 
     @classmethod
-    def told(cls, image: Tensor, levels: Levels, cfa: CFA | str) -> Noisy:
-        """Packed RAW ``(1, 4, h, w)``, or a mosaic, with the variance of these levels."""
+    def of(cls, image: Tensor, levels: Levels, cfa: CFA | str) -> Noisy:
+        """Packed RAW ``(1, 4, h, w)``, or a mosaic ``(1, 1, H, W)``, with the variance of these levels."""
         return cls(image, noise_variance(image, *levels), levels, bayer.canonical_cfa(cfa))
 
 
@@ -72,10 +72,10 @@ class RawDenoiser:
 
     Attributes:
         name: in tables.
-        model: what denoises a piece of packed RAW once the levels, or None, are given: ``model(levels) -> f``.
+        model: ``model(levels)`` is the function f that denoises a piece of packed RAW; levels may be None.
         cfa: the pattern that it was trained for; None if it works on any of Bayer's.
         of_any: a network that takes mosaics of every pattern, with the planes of their colours.
-        info: what its file says of it.
+        info: what its file says of its training.
         reads_levels: whether noise levels make a difference.
         upscale: 2 if it demosaics as well: the result is linear camera RGB ``(1, 3, 2h, 2w)``.
         tiles: side and overlap of the pieces, in packed pixels, None being the default of :func:`denoisers.tiled`;
@@ -84,8 +84,8 @@ class RawDenoiser:
         strength: s in [0, 1]; ``(1 - s)^2`` of the noise's variance is left.
         device: where it runs.
         mixed: whether it computes in bfloat16.
-        around: what the estimator of a training puts around the network.
-        checked: whether a result that is not finite is an error; a training that diverged is scored as such.
+        around: wraps the function that denoises whole frames, as the estimator of its training asks.
+        checked: whether a result that is not finite is an error; a training that diverged is scored as it is.
         settings: what its results depend on, as JSON.
     """
 
@@ -141,7 +141,7 @@ class RawDenoiser:
 
         Example:
             >>> denoiser = RawDenoiser.of("NonLocalMeans")
-            >>> denoiser(Noisy.told(torch.rand(1, 4, 32, 48), (1e-3, 1e-5), "RGGB")).shape
+            >>> denoiser(Noisy.of(torch.rand(1, 4, 32, 48), (1e-3, 1e-5), "RGGB")).shape
             torch.Size([1, 4, 32, 48])
         """
         found = spec if isinstance(spec, cls) else _found(spec, changes.get("name"))
@@ -167,26 +167,19 @@ class RawDenoiser:
         A mosaic ``(1, 1, H, W)`` of another pattern than Bayer's remains one. ValueError if this denoiser takes none,
         the result has another shape, or is not finite where ``checked``.
         """
-        if given.image.shape[1] == 1:
-            return self._mixed_in(given, self._of_mosaic(given))
-        cfa = CFA(given.cfa)
-        own = self.cfa or cfa
-        image = _continued(given.image, cfa, own)
-        variance = None if given.variance is None else _continued(given.variance, cfa, own)
-        run = self._around(self.model(given.levels), own)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
-            denoised = run(image.to(self.device), None if variance is None else variance.to(self.device)).cpu()
-        height, width = (self.upscale * side for side in image.shape[-2:])
-        expected = (1, PACKED if self.upscale == 1 else 3, height, width)
-        if tuple(denoised.shape) != expected or (self.checked and not denoised.isfinite().all()):
-            got = f"{tuple(denoised.shape)} for {tuple(image.shape)}"
-            raise ValueError(f"{self.name}: the result is not finite, or of another shape: {got}")
-        return self._mixed_in(given, _cropped(denoised, own, cfa))
-
-    def _mixed_in(self, given: Noisy, denoised: Tensor) -> Tensor:
+        denoised = self._of_mosaic(given) if given.image.shape[1] == 1 else self._of_packed(given)
         if self.strength == 1.0:
             return denoised.to(given.image.dtype)
         return given.image.lerp(denoised.clamp(max=1.0), self.strength)
+
+    def _of_packed(self, given: Noisy) -> Tensor:
+        cfa = CFA(given.cfa)
+        own = self.cfa or cfa
+        image = _continue(given.image, cfa, own)
+        variance = None if given.variance is None else _continue(given.variance, cfa, own)
+        height, width = (self.upscale * side for side in image.shape[-2:])
+        expected = (1, PACKED if self.upscale == 1 else 3, height, width)
+        return _crop(self._run(self._around(self.model(given.levels), own), image, variance, expected), own, cfa)
 
     def _of_mosaic(self, given: Noisy) -> Tensor:
         if self.of_any is None or self.views > 1 or self.tiles is None:
@@ -197,46 +190,48 @@ class RawDenoiser:
             )
         if given.variance is None:
             raise ValueError(f"{self.name}: needs the variance of the noise")
-        run = partial(denoisers.tiled, self.of_any, tile=2 * self.tiles[0], each=counted("tile"))
-        image, variance = (x.to(self.device) for x in (given.image, given.variance))
+        pieces = partial(denoisers.tiled, self.of_any, tile=2 * self.tiles[0], each=progress_by("tile"))
+        return self._run(partial(denoise_mosaic, pieces, cfa=given.cfa), given.image, given.variance, given.image.shape)
+
+    def _run(self, run: Model, image: Tensor, variance: Tensor | None, expected: Sequence[int]) -> Tensor:
+        """``run`` on the device and in the precision of this denoiser, its result checked."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
-            denoised = denoise_mosaic(run, image, variance, given.cfa).cpu()
-        if self.checked and not denoised.isfinite().all():
-            raise ValueError(f"{self.name}: the result is not finite")
+            denoised = run(image.to(self.device), None if variance is None else variance.to(self.device)).cpu()
+        if tuple(denoised.shape) != tuple(expected) or (self.checked and not denoised.isfinite().all()):
+            got = f"{tuple(denoised.shape)} for {tuple(image.shape)}"
+            raise ValueError(f"{self.name}: the result is not finite, or of another shape: {got}")
         return denoised
 
     def _around(self, model: Model, cfa: CFA) -> Model:
         """The model in tiles, within what its training puts around it, within the self-ensemble."""
         run = model
         if self.tiles is not None:
-            run = partial(denoisers.tiled, model, tile=self.tiles[0], overlap=self.tiles[1], each=counted("tile"))
+            run = partial(denoisers.tiled, model, tile=self.tiles[0], overlap=self.tiles[1], each=progress_by("tile"))
         if self.around is not None:
             run = self.around(run)
         if self.views > 1:
-            run = denoisers.SelfEnsemble(run, cfa, views=self.views, each=counted("view group"))
+            run = denoisers.SelfEnsemble(run, cfa, views=self.views, each=progress_by("view group"))
         return run
 
     def frame(self, frame: RawFrame, levels: Levels | None) -> Tensor:
-        """The mosaic ``(1, H, W)`` of a camera's frame denoised, at most 1; linear camera RGB ``(3, H, W)`` if it
-        demosaics. ``levels`` may be None where :attr:`reads_levels` is False.
+        """The mosaic ``(1, H, W)`` of a camera's frame denoised, at most 1.
+
+        A denoiser that demosaics gives linear camera RGB ``(3, H, W)``. ``levels`` may be None where
+        :attr:`reads_levels` is False.
         """
-        if frame.cfa not in CFA.__members__:
-            told = Noisy(frame.mosaic[None], cfa=frame.cfa)
-            told = told if levels is None else Noisy.told(frame.mosaic[None], levels, frame.cfa)
-            return self(told)[0].clamp(max=1.0)
-        packed = bayer.pack(frame.mosaic[None], frame.cfa)
-        denoised = self(Noisy(packed, cfa=frame.cfa) if levels is None else Noisy.told(packed, levels, frame.cfa))
-        image = bayer.unpack(denoised, frame.cfa) if self.upscale == 1 else denoised
-        return image[0].clamp(max=1.0)
+        packs, mosaic = frame.cfa in CFA.__members__, frame.mosaic[None]
+        image = bayer.pack(mosaic, frame.cfa) if packs else mosaic
+        denoised = self(Noisy(image, cfa=frame.cfa) if levels is None else Noisy.of(image, levels, frame.cfa))
+        return (bayer.unpack(denoised, frame.cfa) if packs and self.upscale == 1 else denoised)[0].clamp(max=1.0)
 
 
-def counted(unit: str) -> Callable[[Sequence[Any]], Iterable[Any]]:
-    """Goes through the parts of a frame, where there are several with progress: its tiles, or views of one shape."""
+def progress_by(unit: str) -> Callable[[Sequence[Any]], Iterable[Any]]:
+    """A function that iterates over the parts of a frame, such as its tiles, with progress if there are several."""
     return lambda parts: progress(parts, label="frame", unit=unit) if len(parts) > 1 else iter(parts)
 
 
-def _continued(packed: Tensor, cfa: CFA, own: CFA) -> Tensor:
-    """The same mosaic in the pattern ``own``, with a mirrored line on the sides where the patterns differ."""
+def _continue(packed: Tensor, cfa: CFA, own: CFA) -> Tensor:
+    """The mosaic in the pattern ``own``, with a mirrored line on the sides where the patterns differ."""
     if own == cfa:
         return packed
     rows, columns = cfa.shift_to(own)
@@ -244,8 +239,8 @@ def _continued(packed: Tensor, cfa: CFA, own: CFA) -> Tensor:
     return bayer.pack(mosaic, own)
 
 
-def _cropped(image: Tensor, own: CFA, cfa: CFA) -> Tensor:
-    """A result without the lines that :func:`_continued` added, packed by ``cfa`` again."""
+def _crop(image: Tensor, own: CFA, cfa: CFA) -> Tensor:
+    """A result without the lines that :func:`_continue` added, packed by ``cfa`` again."""
     if own == cfa:
         return image
     packed = image.shape[1] == PACKED
@@ -257,7 +252,7 @@ def _cropped(image: Tensor, own: CFA, cfa: CFA) -> Tensor:
 
 
 def shipped_of_mosaics() -> list[str]:
-    """The shipped networks that denoise the mosaic and leave demosaicing to others."""
+    """Names of the shipped networks that denoise the mosaic and leave demosaicing to others."""
     return [name for name in list_shipped() if _denoises_mosaics(read_header(find(name)))]
 
 
@@ -267,7 +262,7 @@ def _denoises_mosaics(header: Mapping[str, str]) -> bool:
 
 
 def require_classical(specs: Sequence[Spec]) -> None:
-    """Check names, settings and libraries of classical denoisers."""
+    """Raise ValueError if a classical denoiser, one of its settings or its library does not exist."""
     for spec in specs:
         reason = FILTERS.make(spec).missing()
         if reason is not None:
@@ -300,12 +295,12 @@ def _hashed(path: Path) -> dict[str, Any]:
 
 
 def _of_weights(path: Path) -> RawDenoiser:
-    """Of rawaug, PMRID's authors or BF-DnCNN: the tensors say which."""
+    """A denoiser of a file of rawaug's, PMRID's or BF-DnCNN's weights: the tensors say which."""
     metadata, tensors = read_tensors(path, AGAIN)
     if "conv00" in tensors:
         return replace(_of_network("BF-DnCNN", BiasFreeDnCNN(tensors), {}), cfa=None)
     if "conv0.conv.weight" in tensors and metadata.get("format") != "rawaug":
-        return _of_network("PMRID, published weights", published_pmrid(path), {})
+        return _of_network("PMRID, published weights", load_published("PMRID", path), {})
     if "conv00.weight" in tensors or str(parse_object(metadata.get("config", "{}")).get("channels", PACKED)) == "3":
         raise ValueError(f"{path}: denoises developed pictures, not RAW; give it a .jpg, .png or .tif")
     if metadata.get("format") != "rawaug":

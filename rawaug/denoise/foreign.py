@@ -21,14 +21,15 @@ from rawaug.files import parse_object, read_tensors
 from rawaug.noise import anscombe
 
 STRIDE = 32
-"""Of a network that states none."""
+"""The stride of a network that states none."""
 
 
 class OnnxNetwork(nn.Module):
     """A network in an ONNX file, which takes one picture after the other.
 
     Raises:
-        FileNotFoundError, ValueError: if there is no such file, ONNX Runtime refuses it, or it takes other inputs.
+        FileNotFoundError: if there is no such file.
+        ValueError: if ONNX Runtime refuses it, or it takes other inputs.
     """
 
     def __init__(self, path: Path) -> None:
@@ -46,7 +47,7 @@ class OnnxNetwork(nn.Module):
         self.upscale = 2 if stated.get("upscale") == "2" else 1
 
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
-        """``(B, 4, h, w)`` denoised, on the CPU; ValueError with ONNX Runtime's reason where it fails."""
+        """RAW ``(B, 4, h, w)`` denoised, on the CPU; ValueError with ONNX Runtime's reason if it fails."""
         images = (noisy,) if variance is None else (noisy, variance)
         ones = zip(*(image.split(1) for image in images), strict=True)
         try:
@@ -62,7 +63,12 @@ class OnnxNetwork(nn.Module):
 
 
 def session_of(path: Path) -> Any:
-    """ONNX Runtime on the CPU, on as many threads as PyTorch has."""
+    """ONNX Runtime with a network, on the CPU, on as many threads as PyTorch has.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no network.
+    """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     with extra("export"):
@@ -77,30 +83,29 @@ def session_of(path: Path) -> Any:
 
 
 def feeds(names: Sequence[str], images: Sequence[Tensor]) -> dict[str, Any]:
-    """The inputs of a session by name, of ``images`` as many as it takes."""
+    """The inputs of a session by name: of ``images``, each ``(1, 4, h, w)``, as many as it has ``names``."""
     return {name: image.numpy() for name, image in zip(names, images, strict=False)}
 
 
 AGAIN = "download or convert it again"
 
 
-def published_pmrid(path: str | Path) -> denoisers.PMRID:
-    """PMRID with the weights of its authors, from a ``.safetensors`` file."""
-    model = denoisers.PMRID()
+def load_published(name: str, path: str | Path) -> denoisers.Denoiser:
+    """A network with the weights of its authors, from a ``.safetensors`` file, in eval mode.
+
+    Args:
+        name: of the network: PMRID, or FFDNet for colour, whose normalisations are folded into its convolutions.
+        path: of the file.
+
+    Raises:
+        ValueError: if the file is damaged or holds other weights.
+    """
+    model = denoisers.build(name)
     try:
         model.load_state_dict(read_tensors(path, AGAIN)[1])
     except RuntimeError as error:
-        raise ValueError(f"{path} does not fit PMRID's network: {str(error).splitlines()[-1].strip()}") from None
-    return model.eval()
-
-
-def published_ffdnet(path: str | Path) -> denoisers.Denoiser:
-    """FFDNet for colour with the weights of its authors, normalisations folded in, from a ``.safetensors`` file."""
-    model = denoisers.build("FFDNet")
-    try:
-        model.load_state_dict(read_tensors(path, AGAIN)[1])
-    except RuntimeError as error:
-        raise ValueError(f"{path} does not fit FFDNet's network: {str(error).splitlines()[-1].strip()}") from None
+        reason = str(error).splitlines()[-1].strip()
+        raise ValueError(f"{path} does not fit {name}'s network: {reason}") from None
     return model.eval()
 
 
@@ -114,7 +119,7 @@ class BiasFreeDnCNN(nn.Module):
     bias-free convolutional neural networks", ICLR 2020.
 
     Args:
-        weights: of the convolutions, by names that are in order.
+        weights: of the convolutions, ``(out, in, 3, 3)``, by names whose order is theirs.
     """
 
     def __init__(self, weights: Mapping[str, Tensor]) -> None:

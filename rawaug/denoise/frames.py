@@ -25,7 +25,7 @@ from torch import Tensor
 from denoisers.files import DEFAULT
 from rawaug import bayer
 from rawaug.denoise.denoiser import Levels, RawDenoiser
-from rawaug.denoise.levels import Noise, Shots, UnknownNoise, as_json, levels_of, stored_noise
+from rawaug.denoise.levels import Noise, Shots, UnknownNoise, as_json, find_levels, load_noise
 from rawaug.files import files_in, one_at_a_time, require_same_settings, require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
 from rawaug.io.dng import LINEAR_WHITE
@@ -102,7 +102,7 @@ def denoise(
     if out is not None:
         _require_new(Path(out), overwrite)
     frame = source if isinstance(source, RawFrame) else read_raw(source)
-    denoised = _denoised(frame, made, stored_noise(noise, made))
+    denoised = _denoised(frame, made, load_noise(noise, made))
     if out is not None:
         _write(Path(out), denoised, None if isinstance(source, RawFrame) else Path(source))
     return denoised.frame
@@ -142,7 +142,7 @@ def denoise_file(
         _require_new(preview, overwrite, ".jpg", ".jpeg", ".png")
         if made.upscale > 1:
             raise ValueError(f"--preview {preview}: is of mosaics; open a linear DNG in a RAW developer")
-    done = _file_denoised(source, out, made, stored_noise(noise, made))
+    done = _file_denoised(source, out, made, load_noise(noise, made))
     if preview is not None:
         frame = read_raw(out)
         preview.parent.mkdir(parents=True, exist_ok=True)
@@ -178,7 +178,7 @@ class _Result(NamedTuple):
 def _denoised(frame: RawFrame, denoiser: RawDenoiser, noise: Noise) -> _Result:
     levels, noise_source = None, "not needed"
     if denoiser.reads_levels:
-        *told, noise_source = levels_of(frame, noise)
+        *told, noise_source = find_levels(frame, noise)
         levels = (told[0], told[1])
     image = denoiser.frame(frame, levels)
     if denoiser.upscale > 1:
@@ -239,7 +239,7 @@ def denoise_folder(
     targets = _targets(source, out)
     require_writable(out, folder=True)
     made = _made(denoiser)
-    noise = stored_noise(noise, made)
+    noise = load_noise(noise, made)
     settings = {**made.settings, "noise": as_json(noise)}
     settings |= {} if made.strength == 1.0 else {"strength": made.strength}
     require_same_settings(out / "denoise.json", settings, overwrite)

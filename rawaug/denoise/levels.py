@@ -1,6 +1,6 @@
-r"""The noise levels that a denoiser is told of a frame: (shot_var, read_var), and where they are from.
+r"""The noise levels (shot_var, read_var) that a denoiser is told of a frame.
 
-They come from the NoiseProfile tag, an estimate, a camera's law at the frame's ISO, or are given.
+They come from the NoiseProfile tag, an estimate, or a camera's law at the frame's ISO; or the user gives them.
 """
 
 from __future__ import annotations
@@ -27,25 +27,31 @@ from rawaug.seeding import keyed_generator
 Shots = Mapping[tuple[str, float | None], tuple[float, float]]
 """Levels by camera and ISO."""
 Noise = str | Sequence[float] | MeasuredLevels | Shots
-"""``"auto"``, ``"profile"``, ``"estimate"``, a measured camera's name or law (at the file's ISO), two variances, or the
-levels of other files."""
+"""``"auto"``, ``"profile"`` (the tag), ``"estimate"``, a measured camera's name or law (at the file's ISO), two
+variances, or the levels of other files."""
 
 LOOSE = 0.9
 """R^2 below which an estimate is called uncertain."""
 _GIVEN = "--noise '[shot_var, read_var]'"
 DISAGREE = 1.75
-"""Ratio of tag and estimate, in the variance at the mean signal, from which ``auto`` trusts the estimate: it is within
-1.24 on frames whose noise is known, and a denoiser that is told half the variance leaves most of the noise."""
+"""Ratio of the variances at the mean signal, by the tag and by the estimate, from which ``auto`` takes the estimate.
+
+On frames whose noise is known the estimate is right within 1.24; a denoiser that is told half the variance leaves most
+of the noise."""
 
 
 class UnknownNoise(ValueError):
-    """The noise levels of a sound frame are not known."""
+    """The noise levels of a frame that is otherwise sound are not known."""
 
 
-def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str]:
-    """(shot_var, read_var) of a frame and their source.
+def find_levels(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str]:
+    """(shot_var, read_var) of a frame, and a word on where they come from.
 
-    ``auto`` is the profile where the frame bears it out, else the estimate, else the camera's published law.
+    ``auto`` takes the tag if the frame's own noise agrees with it, else the estimate, else the camera's published law.
+
+    Raises:
+        UnknownNoise: if the levels are not known.
+        ValueError: if ``noise`` names no camera, or another one than the frame's.
     """
     if isinstance(noise, MeasuredLevels):
         return *_of_law(noise, frame), "camera"
@@ -59,9 +65,9 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
     if noise == "auto":
         return _automatic(frame)
     if noise == "estimate":
-        return _estimated(frame)
+        return _estimate(frame)
     if noise != "profile":
-        return *_published(frame, noise), noise
+        return *_published_levels(frame, noise), noise
     if frame.noise_profile is None:
         raise UnknownNoise(f"{frame.name}: has no NoiseProfile tag; pass --noise estimate or {_GIVEN}")
     return *frame.noise_profile, "profile"
@@ -69,17 +75,17 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
 
 def _automatic(frame: RawFrame) -> tuple[float, float, str]:
     if frame.noise_profile is not None:
-        return _checked_profile(frame, frame.noise_profile)
+        return _check_profile(frame, frame.noise_profile)
     try:
-        return _estimated(frame)
+        return _estimate(frame)
     except UnknownNoise:
         with suppress(ValueError):
-            return *_published(frame, frame.camera), f"published for {frame.camera}"
+            return *_published_levels(frame, frame.camera), f"published for {frame.camera}"
         raise
 
 
-def _estimated(frame: RawFrame) -> tuple[float, float, str]:
-    """The estimate; half of the camera's published read variance is its least: flat areas say little about it."""
+def _estimate(frame: RawFrame) -> tuple[float, float, str]:
+    """The estimate, read_var at least half of the camera's published one, since flat areas say little about it."""
     try:
         estimate = estimate_noise(frame.mosaic, frame.cfa)
     except ValueError as error:
@@ -89,13 +95,13 @@ def _estimated(frame: RawFrame) -> tuple[float, float, str]:
         source += ": uncertain, the points follow no line"
     least = 0.0
     with suppress(ValueError):
-        least = _published(frame, frame.camera)[1] / 2
+        least = _published_levels(frame, frame.camera)[1] / 2
     if estimate.read_var < least:
         source += "; read_var is half the camera's published one"
     return estimate.shot_var, max(estimate.read_var, least), source
 
 
-def _published(frame: RawFrame, name: str) -> tuple[float, float]:
+def _published_levels(frame: RawFrame, name: str) -> tuple[float, float]:
     if not isinstance(noise_levels(name), (EldLevels, ProfileLevels)) and name not in camera_names():
         raise ValueError(f"noise {name!r} is no camera; use auto, profile, estimate, the name of one, or {_GIVEN}")
     if frame.iso is None:
@@ -110,8 +116,8 @@ def _published(frame: RawFrame, name: str) -> tuple[float, float]:
     return float(shot_var), float(read_var)
 
 
-def _checked_profile(frame: RawFrame, profile: tuple[float, float]) -> tuple[float, float, str]:
-    """The profile, unless the frame's own noise is :data:`DISAGREE` times as strong or as weak."""
+def _check_profile(frame: RawFrame, profile: tuple[float, float]) -> tuple[float, float, str]:
+    """The tag, unless the frame's own noise is :data:`DISAGREE` times as strong or as weak."""
     try:
         estimate = estimate_noise(frame.mosaic, frame.cfa)
     except ValueError:  # too little of the frame is flat to tell
@@ -133,8 +139,12 @@ def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:
         raise UnknownNoise(f"{frame.name}: {error}; pass --noise estimate or {_GIVEN}") from None
 
 
-def stored_noise(noise: Noise, denoiser: RawDenoiser) -> Noise:
-    """``"camera"`` as the law in the denoiser's file, an ISP's file as the law in it; anything else as it is."""
+def load_noise(noise: Noise, denoiser: RawDenoiser) -> Noise:
+    """``"camera"`` as the law in the denoiser's file, an ISP's file as the law in it; anything else as it is.
+
+    Raises:
+        ValueError: if the file holds no camera's noise law.
+    """
     if not isinstance(noise, str) or not (noise == "camera" or noise.endswith(".safetensors")):
         return noise
     stored = denoiser.info if noise == "camera" else DictionaryISP.from_pretrained(noise).info
@@ -146,6 +156,7 @@ def stored_noise(noise: Noise, denoiser: RawDenoiser) -> Noise:
 
 
 def as_json(noise: Noise) -> Any:
+    """The setting as JSON has it."""
     if isinstance(noise, MeasuredLevels):
         return noise.spec()
     return noise if isinstance(noise, str) else list(noise)

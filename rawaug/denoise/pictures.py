@@ -21,8 +21,8 @@ from torch import Tensor, nn
 
 import denoisers
 from denoisers.files import find, list_shipped
-from rawaug.denoise.denoiser import CPU, Noisy, counted
-from rawaug.denoise.foreign import AGAIN, published_ffdnet
+from rawaug.denoise.denoiser import CPU, Noisy, progress_by
+from rawaug.denoise.foreign import AGAIN, load_published
 from rawaug.errors import extra
 from rawaug.files import files_in, read_tensors, require_writable
 from rawaug.io.picture_files import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
@@ -96,7 +96,7 @@ class PictureDenoiser:
 
         def run(srgb: Tensor) -> Tensor:
             if not getattr(network, "reads_variance", False):
-                return denoisers.tiled(network, srgb, each=counted("tile"))
+                return denoisers.tiled(network, srgb, each=progress_by("tile"))
             return _told(network, srgb, strength * estimated_level(network, srgb)) if strength else srgb
 
         return cls(name, run, where)
@@ -127,7 +127,7 @@ def _network(spec: str) -> tuple[str, nn.Module]:
     path = find(spec)
     metadata, tensors = read_tensors(path, AGAIN)
     if "conv00.weight" in tensors and metadata.get("format") != "rawaug":
-        return "FFDNet, published weights", published_ffdnet(path)
+        return "FFDNet, published weights", load_published("FFDNet", path)
     network = denoisers.load(path)[0]
     if network.channels != 3:
         raise ValueError(f"{spec}: denoises RAW, not pictures; use {PICTURES}")
@@ -138,7 +138,7 @@ def _network(spec: str) -> tuple[str, nn.Module]:
 def _told(network: Any, srgb: Tensor, level: float) -> Tensor:
     """The picture denoised by a network that is told the deviation of its noise, 0 for unknown."""
     variance = srgb.new_full((1, 1, 1, 1), level**2).expand_as(srgb)
-    return denoisers.tiled(network, srgb, variance, each=counted("tile"))
+    return denoisers.tiled(network, srgb, variance, each=progress_by("tile"))
 
 
 def estimated_level(network: Any, srgb: Tensor) -> float:

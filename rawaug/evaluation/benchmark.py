@@ -3,10 +3,9 @@ r"""Denoisers side by side: the same frozen noise on the same clean references, 
 .. math:: \operatorname{var}(y) = \mathrm{shot\_var}\, y + \mathrm{read\_var}
 
 Each denoiser is told the levels as they are, and once more as they are estimated from the noisy frame, which is what a
-photographer has. A second table has sensors as they are: hot pixels, banding, black levels and colours that are a
+photographer has. A third table has sensors as they are: hot pixels, banding, black levels and colours that are a
 little off, rounding to 12 bits. A reference is the middle of a frame, binned by colour site if it has noise of its own.
-The hash of all noisy inputs says whether the
-figures of two people can be compared.
+The hash of all noisy inputs says whether the figures of two people can be compared.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from rawaug import bayer
 from rawaug.data.pairs import Pair, centre
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
-from rawaug.evaluation.scores import METRICS, NOISY, Panels, by_denoiser, panels_of, score, summary
-from rawaug.evaluation.tables import both
+from rawaug.evaluation.scores import METRICS, NOISY, Panels, group_rows, panels_of, score, summary
+from rawaug.evaluation.tables import join_figures
 from rawaug.evaluation.trials import Trial, raw_trial
 from rawaug.files import digest
 from rawaug.noise import FixedLevels, NoiseLevels, SensorNoise, ShotReadNoise, estimate_noise, noise_levels
@@ -45,7 +44,7 @@ SENSOR: dict[str, Any] = {
     "bits": 12,
     "black_level": 64,
 }
-"""What sensors do besides, at the strengths of :data:`OF_SENSORS`, or at the caller's."""
+"""What sensors add to shot and read noise, at the strengths of :data:`OF_SENSORS`, or at the caller's."""
 OF_SENSORS = ("phone", "strong")
 CONDITIONS = TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensors as they are"
 
@@ -53,7 +52,11 @@ CONDITIONS = TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensors
 def strengths_of(
     noise: str | Sequence[float] | Sequence[str] | None = None, isos: Sequence[float] | None = None
 ) -> dict[str, NoiseLevels]:
-    """Noise levels by the name of their column: :data:`STRENGTHS`, or those of ``noise``, at each ISO if it has any."""
+    """Noise levels by the name of their column: :data:`STRENGTHS`, or those of ``noise``, at each of ``isos``.
+
+    Raises:
+        ValueError: if the noise is unknown, or there are ISO values but no camera.
+    """
     if noise is None:
         if isos:
             raise ValueError("iso: needs the name of a camera as noise")
@@ -68,7 +71,13 @@ def trials(
 ) -> list[Trial]:
     """The middles of all frames under every condition and strength; the same bits for the same frames and seed.
 
-    Noise is put on whole frames, from which the levels are estimated; where they cannot be there is no trial.
+    Noise is put on whole frames, from which the levels are estimated; if that fails, the condition has no trial.
+
+    Args:
+        frames: clean references.
+        crop: side of the middles in pixels of the mosaic.
+        seed: of the noise.
+        strengths: noise levels by name, see :func:`strengths_of`.
     """
     strengths = strengths or strengths_of()
     of_sensors = [name for name in strengths if name in OF_SENSORS] or strengths
@@ -80,7 +89,7 @@ def trials(
             found.append(_middle(told, middle, crop, TOLD, name))
             with suppress(ValueError):  # too little of the frame is flat
                 estimate = estimate_noise(bayer.unpack(told.image, frame.cfa)[0], frame.cfa)
-                known = Noisy.told(told.image, (estimate.shot_var, estimate.read_var), frame.cfa)
+                known = Noisy.of(told.image, (estimate.shot_var, estimate.read_var), frame.cfa)
                 found.append(_middle(known, middle, crop, ESTIMATED, name))
             if name in of_sensors:
                 real = noisy_frame(frame, name, levels, seed, real=True)
@@ -89,12 +98,21 @@ def trials(
 
 
 def noisy_frame(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real: bool = False) -> Noisy:
-    """A whole frame with noise of a strength, ``(1, 4, h, w)``; that of the caller's levels is that of ``evaluate``."""
+    """A whole frame with noise of a strength, ``(1, 4, h, w)``.
+
+    Args:
+        frame: the clean reference.
+        strength: a name; that of none of :data:`STRENGTHS` stands for the caller's levels, whose noise is the same as
+            in ``rawaug evaluate``.
+        levels: the noise levels.
+        seed: of the noise.
+        real: whether what sensors add, :data:`SENSOR`, is added.
+    """
     noise = SensorNoise(levels, **SENSOR) if real else ShotReadNoise(levels)
     key = ("benchmark", strength) if strength in STRENGTHS else ("test noise",)
     params = noise.sample(1, keyed_generator(seed, *key, frame.name))
     noisy = noise.apply(bayer.pack(frame.raw[None], frame.cfa), params)
-    return Noisy.told(noisy, (params["shot_var"].item(), params["read_var"].item()), frame.cfa)
+    return Noisy.of(noisy, (params["shot_var"].item(), params["read_var"].item()), frame.cfa)
 
 
 def _middle(given: Noisy, frame: Pair, crop: int, condition: str, strength: str) -> Trial:
@@ -106,7 +124,7 @@ def _middle(given: Noisy, frame: Pair, crop: int, condition: str, strength: str)
 
 
 def hash_of(trials: Iterable[Trial]) -> str:
-    """Eight digits of the SHA-256 of all noisy inputs, in steps of 2^-12, which processors do not round differently."""
+    """Eight digits of the SHA-256 of all noisy inputs, rounded to steps of 2^-12, on which all processors agree."""
     found = list(trials)
     strengths = list(dict.fromkeys(trial.strength for trial in found))
     found.sort(key=lambda trial: (CONDITIONS.index(trial.condition), strengths.index(trial.strength)))
@@ -121,7 +139,7 @@ def benchmark(denoisers: Sequence[RawDenoiser], found: Sequence[Trial]) -> dict[
         condition and strength, means of :data:`rawaug.evaluation.scores.METRICS`.
     """
     gmacs = {one.name: _gmac(one, found[0]) for one in denoisers}
-    scored = by_denoiser(score([NOISY, *denoisers], found, "benchmark"))
+    scored = group_rows(score([NOISY, *denoisers], found, "benchmark"))
     places = list(dict.fromkeys((condition, trial.strength) for condition in CONDITIONS for trial in found))
     rows: dict[str, dict[str, Any]] = {}
     for name, of_one in scored.items():
@@ -141,49 +159,46 @@ def benchmark(denoisers: Sequence[RawDenoiser], found: Sequence[Trial]) -> dict[
 
 
 def _gmac(denoiser: RawDenoiser, trial: Trial) -> float | None:
-    """Multiplications of what PyTorch computes, 10^9 a megapixel; it warms up, too."""
+    """Multiplications that PyTorch computes, in 10^9 a megapixel of the mosaic; None if there are none."""
     with FlopCounterMode(display=False) as counter:
         denoiser(trial.given)
     return round(counter.get_total_flops() / 2e3 / trial.noisy.numel(), 2) or None
 
 
 def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str, list[str]]]]:
-    """Title, columns and cells of each condition's table; of frames whose levels cannot be estimated there are none."""
+    """Title, columns and cells by denoiser of each condition's table; heads say how many frames could be estimated."""
     for condition in (TOLD, ESTIMATED, REAL):
         scored = {name: at["frames"] for name, at in result["rows"]["noisy input"]["scores"][condition].items()}
         count = len(result["frames"])
         head = [name if n == count else f"{name} ({n} of {count} frames)" for name, n in scored.items()]
-        shown = shown_of(scored)
+        shown = shown_strength(scored)
         head += [f"SSIM, {shown}", "GMAC", "s"] if condition == TOLD else []
         cells = {}
         for name, row in result["rows"].items():
             scores = row["scores"][condition]
-            cells[name] = [both(scores[strength], "psnr", "psnr_srgb") for strength in scored]
+            cells[name] = [join_figures(scores[strength], "psnr", "psnr_srgb") for strength in scored]
             if condition == TOLD:
                 costs = ["" if row[key] is None else f"{row[key]:.2f}" for key in ("gmac", "seconds")]
-                cells[name] += [both(scores[shown], "ssim", "ssim_srgb"), *costs]
+                cells[name] += [join_figures(scores[shown], "ssim", "ssim_srgb"), *costs]
         yield f"{condition}: PSNR of RAW / sRGB in dB, {count} frame{'s' * (count != 1)}", head, cells
 
 
 def costs_of(result: Mapping[str, Any]) -> dict[str, tuple[float | None, float, float]]:
-    """GMAC a megapixel and the PSNR of RAW and sRGB of each denoiser, at the strength that is shown."""
-    shown = shown_of(result["rows"]["noisy input"]["scores"][TOLD])
-    scored = {name: (row["gmac"], row["scores"][TOLD][shown]) for name, row in result["rows"].items()}
-    return {
-        name: (gmac, scores["psnr"], scores["psnr_srgb"])
-        for name, (gmac, scores) in scored.items()
-        if name != "noisy input"
-    }
+    """By denoiser its GMAC a megapixel and its PSNR of RAW and sRGB, at the strength that is shown."""
+    shown = shown_strength(result["rows"]["noisy input"]["scores"][TOLD])
+    rows = {name: row for name, row in result["rows"].items() if name != "noisy input"}
+    scored = {name: row["scores"][TOLD][shown] for name, row in rows.items()}
+    return {name: (rows[name]["gmac"], scores["psnr"], scores["psnr_srgb"]) for name, scores in scored.items()}
 
 
-def shown_of(strengths: Collection[str]) -> str:
+def shown_strength(strengths: Collection[str]) -> str:
     """The strength whose pictures and SSIM are shown."""
     *_, last = strengths
     return "strong" if "strong" in strengths else last
 
 
 def crops(denoisers: Sequence[RawDenoiser], found: Iterable[Trial], most: int) -> Iterator[Panels]:
-    """Pictures for the page: the first frames with noise of :func:`shown_of`, levels told, by every denoiser."""
+    """Pictures for the page, by every denoiser: of the first ``most`` frames with noise of :func:`shown_strength`."""
     told = [trial for trial in found if trial.condition == TOLD]
-    shown = shown_of(dict.fromkeys(trial.strength for trial in told))
+    shown = shown_strength(dict.fromkeys(trial.strength for trial in told))
     return (panels_of(denoisers, trial) for trial in [t for t in told if t.strength == shown][:most])

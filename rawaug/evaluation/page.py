@@ -29,10 +29,10 @@ from rawaug.evaluation.tables import (
     PLAIN,
     QUARTERS,
     Runs,
-    both,
-    figures_of,
     first_runs,
+    join_figures,
     levels_note,
+    table_of,
     verdict,
 )
 from rawaug.evaluation.trials import Trial, own_noise_note
@@ -53,7 +53,14 @@ LINES = {"": "-", "_low": ":", "_middle": "--", "_high": "-."}
 
 
 class Figure(NamedTuple):
-    """A PNG file on the page; ``style`` is a class of the template: window, curve, or none for a whole frame."""
+    """A picture on the page.
+
+    Attributes:
+        png: the file.
+        alt: what stands in its place where it cannot be shown.
+        style: a class of the template: window, curve, or none for a whole frame.
+        caption: below it.
+    """
 
     png: bytes
     alt: str
@@ -63,7 +70,18 @@ class Figure(NamedTuple):
 
 @dataclass
 class Part:
-    """What stands under a heading: texts, explained terms, a table, figures; what is empty is left out."""
+    """What stands under a heading; what is empty is left out.
+
+    Attributes:
+        heading: of a chapter.
+        name: a heading below it.
+        texts: paragraphs.
+        terms: terms and their explanations.
+        head: of a table, the names of its columns.
+        rows: of the table, cells by name.
+        best: row and column of the cells in bold.
+        figures: beside each other.
+    """
 
     heading: str = ""
     name: str = ""
@@ -76,7 +94,7 @@ class Part:
 
 
 class Page:
-    """Collects the parts of the page; frames are encoded as they come and not kept."""
+    """The parts of a page, to which more are added; frames are encoded as they come and not kept."""
 
     def __init__(self, title: str, parts: Sequence[Part] = (), lead: str = "") -> None:
         self.title, self.parts, self.lead = title, list(parts), lead
@@ -86,46 +104,47 @@ class Page:
         cls,
         title: str,
         results: Runs,
-        classical: Mapping[str, Mapping[str, Any]],
+        others: Mapping[str, Mapping[str, Any]],
         facts: Mapping[str, Any] | None = None,
         arms: Mapping[str, str] | None = None,
     ) -> Page:
-        """A page with the scores of ``results``, by arm with one entry a seed, and of classical denoisers, by name.
+        """A page with scores, which opens with the verdict.
 
-        It opens with the verdict and the ``facts``, ``Noise`` as in a recipe; ``arms`` says what the methods are.
+        Args:
+            title: of the page.
+            results: by arm, one entry a seed.
+            others: summaries of other denoisers, by name.
+            facts: what else is stated, by term; ``Noise`` as a recipe has it.
+            arms: what the methods are, by name.
         """
         first = next(iter(results.values()))[0]["plain"]
-        about = {
-            "Command": command_line(),
-            **(facts or {}),
-            "Own noise": own_noise_note(first_runs(results, classical)),
-        }
+        about = {"Command": command_line(), **(facts or {}), "Own noise": own_noise_note(first_runs(results, others))}
         if noise := about.pop("Noise", None):
             named = noise if isinstance(noise, str) else json.dumps(noise)
             about["Noise"] = f"as captured with the frames, else {named}; {levels_range(first)}".rstrip("; ")
-        about = {name: text for name, text in about.items() if text}
-        page = cls(title, [Part(terms=about), Part("Methods", terms=arms or {})][: 2 if arms else 1])
-        _, page.lead = verdict(results, classical)
+        page = cls(title, [Part(terms={name: text for name, text in about.items() if text})])
+        page.parts += [Part("Methods", terms=arms)] if arms else []
+        _, page.lead = verdict(results, others)
         note = levels_note(first)
         for heading, columns in (("Scores", PLAIN), ("Self-ensemble", ENSEMBLE), ("Worst and best frames", QUARTERS)):
-            table = figures_of(results, classical, columns)
+            table = table_of(results, others, columns)
             texts = [note] if note and columns is PLAIN else []
             if table.rows:
-                page.parts.append(
-                    Part(heading, texts=texts, head=["", *table.columns], rows=table.rows, best=table.best)
-                )
-        page.parts.append(_every_image(results, classical))
+                head = ["", *table.columns]
+                page.parts.append(Part(heading, texts=texts, head=head, rows=table.rows, best=table.best))
+        page.parts.append(_every_image(first_runs(results, others)))
         return page
 
     def add_curves(self, pngs: Mapping[str, bytes], heading: str = "Training") -> None:
+        """Add pictures of curves, by title, under a heading."""
         self.parts.append(Part(heading, figures=[Figure(png, title, "curve") for title, png in pngs.items()]))
 
     def add_frame(self, row: Panels) -> None:
-        """One frame: its most detailed window in every image, and the whole of the clean one."""
+        """Add a frame: its most detailed window in every image, and the whole of the clean one."""
         first = not any(part.heading == "Pictures" for part in self.parts)
         clean = row.trial.clean
         side = WINDOW if clean.shape[1] == PACKED else 2 * WINDOW
-        top, left = most_detailed(clean, side)
+        top, left = find_detail(clean, side)
         whole, pixels = row.shown(clean), 2 * WINDOW // side
         figures = []
         for name, image in row.images.items():
@@ -139,6 +158,7 @@ class Page:
         self.parts.append(Part("Pictures" if first else "", row.trial.frame, figures=figures))
 
     def write(self, path: Path, settings: Mapping[str, Any]) -> Path:
+        """Write the page, which ends with the settings of the run; the path."""
         import yaml
         from jinja2 import Environment, PackageLoader
 
@@ -158,6 +178,7 @@ def command_line() -> str:
 
 
 def levels_range(summary: Mapping[str, Any]) -> str:
+    """The lowest and highest noise levels of the images of a summary, in words; empty if none is known."""
     said = []
     for key in ("shot_var", "read_var"):
         values = [image[key] for image in summary["images"] if key in image]
@@ -165,32 +186,32 @@ def levels_range(summary: Mapping[str, Any]) -> str:
     return ", ".join(said)
 
 
-def shown_on_page(trials: Sequence[Trial]) -> Iterator[Trial]:
-    """At most :data:`ON_PAGE` of the frames, evenly spaced."""
+def select_for_page(trials: Sequence[Trial]) -> Iterator[Trial]:
+    """At most :data:`ON_PAGE` of the trials, evenly spaced."""
     count = min(ON_PAGE, len(trials))
     return (trials[k * len(trials) // count] for k in range(count))
 
 
-def most_detailed(image: Tensor, side: int = WINDOW) -> tuple[int, int]:
-    """Top and left of the window of ``side`` with the steepest green, of packed RAW or of a picture."""
+def find_detail(image: Tensor, side: int = WINDOW) -> tuple[int, int]:
+    """Top and left of the window of ``side`` in which green is steepest, of ``(1, 4, h, w)`` or ``(1, 3, H, W)``."""
     green = image[:, 1:-1].mean(1, keepdim=True).clamp_min(0.0).sqrt()
     steep = (green[..., 1:, :-1] - green[..., :-1, :-1]).abs() + (green[..., :-1, 1:] - green[..., :-1, :-1]).abs()
     size = [min(side, length) for length in steep.shape[-2:]]
     scores = F.avg_pool2d(steep, size, stride=4)
-    place = int(scores.argmax())
-    return 4 * (place // scores.shape[-1]), 4 * (place % scores.shape[-1])
+    row, column = divmod(int(scores.argmax()), scores.shape[-1])
+    return 4 * row, 4 * column
 
 
-def draw_curves(logs: Mapping[str, Sequence[Path]]) -> dict[str, bytes]:
+def plot_curves(logs: Mapping[str, Sequence[Path]]) -> dict[str, bytes]:
     """Loss and validation PSNR over the steps as PNG files by title, from the ``log.csv`` of every seed of every arm.
 
     The loss is the mean since the row before. Thin lines are the thirds of the validation frames with least (dotted),
-    middling and most noise (dash-dotted). A curve of one point is a dot. What no log has is left out.
+    middling (dashed) and most noise (dash-dotted). A curve of one point is a dot. What no log has is left out.
     """
     rows = {(arm, k): read_log(path) for arm, paths in logs.items() for k, path in enumerate(paths)}
     colours = {arm: f"C{k % 10}" for k, arm in enumerate(logs)}
     drawn = {key: title for key, title in CURVES.items() if any(row.get(key) for log in rows.values() for row in log)}
-    return {title: _draw_curve(key, title, rows, colours) for key, title in drawn.items()}
+    return {title: _plot_curve(key, title, rows, colours) for key, title in drawn.items()}
 
 
 Log = Sequence[Mapping[str, str]]
@@ -202,7 +223,7 @@ def read_log(path: Path) -> Log:
         return list(csv.DictReader(file))
 
 
-def _draw_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colours: Mapping[str, str]) -> bytes:
+def _plot_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colours: Mapping[str, str]) -> bytes:
     with extra("train"):
         from matplotlib.figure import Figure
 
@@ -221,8 +242,11 @@ def _draw_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colou
     return _png(figure)
 
 
-def draw_costs(rows: Mapping[str, tuple[float | None, float, float]]) -> bytes:
-    """A PNG file of the two PSNR over GMAC a megapixel, by denoiser; one without GMAC, a filter, is a dashed line."""
+def plot_costs(rows: Mapping[str, tuple[float | None, float, float]]) -> bytes:
+    """A PNG file with the PSNR of RAW and sRGB over GMAC a megapixel; a filter, which has none, is a dashed line.
+
+    ``rows`` has GMAC and the two PSNR by the name of a denoiser.
+    """
     with extra("train"):
         from matplotlib.figure import Figure
 
@@ -245,12 +269,11 @@ def _png(figure: Any) -> bytes:
     return file.getvalue()
 
 
-def _every_image(results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> Part:
-    """PSNR / SSIM of every image by every method, on the mosaic; an arm's first seed."""
-    summaries = first_runs(results, classical)
+def _every_image(summaries: Mapping[str, Mapping[str, Any]]) -> Part:
+    """PSNR / SSIM of every image by every method, on the mosaic."""
     rows: dict[str, list[str]] = {}
     for summary in summaries.values():
         for image in summary["images"]:
-            cells = rows.setdefault(image["name"], [both(image, "psnr_noisy", "ssim_noisy")])
-            cells.append(both(image, "psnr", "ssim"))
+            cells = rows.setdefault(image["name"], [join_figures(image, "psnr_noisy", "ssim_noisy")])
+            cells.append(join_figures(image, "psnr", "ssim"))
     return Part("Every image", head=["image: PSNR (dB) / SSIM", "noisy input", *summaries], rows=rows)

@@ -18,9 +18,9 @@ from torch import Tensor
 
 from rawaug.data.picture_pairs import PicturePair
 from rawaug.errors import extra
-from rawaug.evaluation.scores import NOISY, Denoiser, by_denoiser, score, summary
+from rawaug.evaluation.scores import NOISY, Denoiser, group_rows, score, summary
 from rawaug.evaluation.tables import print_rows
-from rawaug.evaluation.trials import Trial, trials_of
+from rawaug.evaluation.trials import Trial, make_trials
 
 PUBLISHED, REGISTERED = "as published", "registered"
 BORDER = 4
@@ -38,7 +38,7 @@ def picture_trials(pairs: Sequence[PicturePair], registered: bool = False) -> Se
         moved = register(noisy[0], clean[0])[None]
         return Trial(noisy[inner], moved[inner], frame=pair.name, domain="srgb", condition=REGISTERED)
 
-    return trials_of(pairs, make)  # type: ignore[arg-type]
+    return make_trials(pairs, make)
 
 
 def register(noisy: Tensor, clean: Tensor) -> Tensor:
@@ -63,7 +63,7 @@ def picture_scores(denoisers: Sequence[Denoiser], pairs: Sequence[PicturePair]) 
     rows: dict[str, dict[str, Any]] = {}
     for condition in (PUBLISHED, REGISTERED):
         trials = picture_trials(pairs, registered=condition == REGISTERED)
-        found = by_denoiser(score([NOISY, *denoisers], trials, condition))
+        found = group_rows(score([NOISY, *denoisers], trials, condition))
         for name, of_one in found.items():
             rows.setdefault(name, {})[condition] = summary(of_one, found[NOISY.name])
     return {"pictures": len(pairs), "rows": rows}

@@ -22,18 +22,22 @@ from rawaug.progress import progress
 
 METRICS = ("psnr", "ssim", "psnr_srgb", "ssim_srgb")
 SHOWN_FAULTS = 5
+"""Scores without a number that an error names."""
 
 
 class Denoiser(Protocol):
-    """What can be scored: :class:`rawaug.RawDenoiser`, and whatever denoises developed pictures."""
+    """What can be scored: :class:`rawaug.RawDenoiser`, and whatever denoises developed pictures.
+
+    Attributes:
+        name: in tables.
+        takes: ``"raw"`` or ``"srgb"``, or ``""`` for any image.
+    """
 
     @property
     def name(self) -> str: ...
 
     @property
-    def takes(self) -> str:
-        """``"raw"`` or ``"srgb"``, or ``""`` for any image."""
-        ...
+    def takes(self) -> str: ...
 
     def __call__(self, given: Noisy) -> Tensor: ...
 
@@ -57,13 +61,15 @@ class Row(NamedTuple):
 
     Attributes:
         denoiser: its name, with the way that follows it if there is one.
-        frame, condition, strength, domain: of the trial.
-        psnr, ssim: in the trial's domain.
-        psnr_srgb, ssim_srgb: after development; None for what is developed already.
-        own_noise: the reference's own noise as a share of the squared error, where it is known.
-        levels: (shot_var, read_var) that it was told, if any.
+        frame: of the trial, as ``condition``, ``strength`` and ``domain`` are.
+        psnr: in dB in the trial's domain.
+        ssim: in the trial's domain.
+        psnr_srgb: in dB after development; None for what is developed already.
+        ssim_srgb: after development; None for what is developed already.
+        own_noise: the reference's own noise as a share of the squared error, if it is known.
+        levels: (shot_var, read_var) that the denoiser was told, if any.
         levels_from_clean: whether these were measured against the clean frame.
-        seconds: that it took for each megapixel of its input.
+        seconds: time that the denoiser took for each megapixel of its input.
     """
 
     denoiser: str
@@ -109,25 +115,31 @@ def _rows(denoiser: Denoiser, trial: Trial) -> Iterator[Row]:
     start = time.perf_counter()
     found = denoiser(given)
     seconds = (time.perf_counter() - start) / (given.image.numel() / 1e6)
-    for name, image in results(denoiser.name, found, trial):
-        figures = compared(image, trial)
+    for name, image in to_domain(denoiser.name, found, trial):
+        figures = compare(image, trial)
         error = 10.0 ** (-figures[0] / 10.0)
         share = None if trial.own is None or not error > 0 else trial.own / error
         row = Row(name, trial.frame, trial.condition, trial.strength, trial.domain, *figures, share, given.levels)
         yield row._replace(levels_from_clean=trial.levels_from_clean, seconds=seconds)
 
 
-def results(name: str, found: Tensor, trial: Trial) -> Iterator[tuple[str, Tensor]]:
-    """What a denoiser found, in the trial's domain, by name: RAW goes every one of the trial's ways there."""
-    if found.shape[1] == trial.clean.shape[1]:
-        yield name, found
+def to_domain(name: str, denoised: Tensor, trial: Trial) -> Iterator[tuple[str, Tensor]]:
+    """A denoiser's result in the trial's domain, by name.
+
+    RAW ``(1, 4, h, w)`` goes all of the trial's ways there, whose names follow that of the denoiser.
+    """
+    if denoised.shape[1] == trial.clean.shape[1]:
+        yield name, denoised
         return
     for way, follow in trial.ways.items():
-        yield f"{name}, {way}", follow(found)
+        yield f"{name}, {way}", follow(denoised)
 
 
-def compared(image: Tensor, trial: Trial) -> tuple[float, float, float | None, float | None]:
-    """PSNR and SSIM of an image against the clean one, in the trial's domain and after development."""
+def compare(image: Tensor, trial: Trial) -> tuple[float, float, float | None, float | None]:
+    """PSNR in dB and SSIM of an image against the clean one of the same shape, and both again after development.
+
+    ``image`` has the form of the trial's domain: ``(1, 4, h, w)`` or ``(1, 3, H, W)``.
+    """
     own = [_as_compared(x, trial) for x in (image, trial.clean)]
     first = psnr(*own).item(), ssim(*own).item()
     if trial.develop is None or trial.domain == "srgb":
@@ -144,22 +156,28 @@ def _as_compared(image: Tensor, trial: Trial) -> Tensor:
 
 @dataclass
 class Panels:
-    """One trial in pictures: images like its noisy or clean one by title, the clean one last, with captions."""
+    """One trial in pictures.
+
+    Attributes:
+        trial: of which these are.
+        images: ``(1, 4, h, w)`` or ``(1, 3, H, W)``, like the trial's noisy or clean one, by title; the clean one last.
+        captions: by title.
+    """
 
     trial: Trial
     images: dict[str, Tensor] = field(default_factory=dict)
     captions: dict[str, str] = field(default_factory=dict)
 
     def shown(self, image: Tensor) -> Tensor:
-        """An image, or a part of one, as sRGB ``(3, H, W)`` in [0, 1]."""
+        """An image, or a part of one, ``(1, C, H, W)``, as sRGB ``(3, H, W)`` in [0, 1]."""
         return image[0].clamp(0.0, 1.0) if self.trial.develop is None else self.trial.develop(image)
 
 
-def panels_of(denoisers: Sequence[Denoiser], trial: Trial) -> Panels:
-    """Noisy, denoised by each, clean; captions say the PSNR."""
+def panels_of(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOISY) -> Panels:
+    """The trial noisy, denoised by each, and clean; captions say the PSNR. ``noisy`` shows the noisy input."""
     panels = Panels(trial)
-    for title, denoiser in {"noisy": NOISY, **{one.name: one for one in denoisers}}.items():
-        for name, image in results(title, denoiser(trial.given_to(denoiser)), trial):
+    for title, denoiser in {"noisy": noisy, **{one.name: one for one in denoisers}}.items():
+        for name, image in to_domain(title, denoiser(trial.given_to(denoiser)), trial):
             panels.images[name] = image
             panels.captions[name] = f"{psnr(*(_as_compared(x, trial) for x in (image, trial.clean))).item():.2f} dB"
     panels.images["clean"] = trial.clean
@@ -167,23 +185,29 @@ def panels_of(denoisers: Sequence[Denoiser], trial: Trial) -> Panels:
     return panels
 
 
-def by_denoiser(rows: Iterable[Row]) -> dict[str, list[Row]]:
-    """Rows by the name of their denoiser, in their order."""
+def group_rows(rows: Iterable[Row], key: str = "denoiser") -> dict[str, list[Row]]:
+    """Rows by their denoiser, or by another of their attributes, in their order."""
     found: dict[str, list[Row]] = {}
     for row in rows:
-        found.setdefault(row.denoiser, []).append(row)
+        found.setdefault(getattr(row, key), []).append(row)
     return found
 
 
 def summary(rows: Iterable[Row], noisy: Iterable[Row] = ()) -> dict[str, Any]:
-    """Of one denoiser, per image, mean, worst and best 25%; what does not apply is left out.
+    """The scores of one denoiser as JSON.
 
-    ``noisy`` are the rows of the input on the same trials, in the same order. ``levels_from_clean`` counts the images
-    whose noise levels were measured against the clean frame; ``no_numbers`` says which scores are infinite or NaN, such
-    as the PSNR of two equal frames.
+    Args:
+        rows: one a trial.
+        noisy: the rows of the input on the same trials, in the same order.
+
+    Returns:
+        ``images``, the scores of each; the mean of each of :data:`METRICS`, and of its worst and best 25%; the same of
+        the noisy input; ``own_noise``; ``levels_from_clean``, the number of images whose noise levels were
+        measured against the clean frame; and ``no_numbers``, which names scores that are infinite or NaN, such as the
+        PSNR of two equal frames. What does not apply is left out.
     """
     rows, noisy = list(rows), list(noisy)
-    images = [_stated(row) for row in rows]
+    images = [_image(row) for row in rows]
     result: dict[str, Any] = {"images": images}
     if flagged := sum(row.levels_from_clean for row in rows):
         result["levels_from_clean"] = flagged
@@ -203,7 +227,7 @@ def summary(rows: Iterable[Row], noisy: Iterable[Row] = ()) -> dict[str, Any]:
     return result | _own_noise(rows, images) | ({"no_numbers": wrong} if wrong else {})
 
 
-def _stated(row: Row) -> dict[str, Any]:
+def _image(row: Row) -> dict[str, Any]:
     levels = {} if row.levels is None else dict(zip(("shot_var", "read_var"), row.levels, strict=True))
     return {"name": row.frame, **levels, **({"levels_from_clean": True} if row.levels_from_clean else {})}
 
@@ -220,7 +244,7 @@ def _own_noise(rows: Sequence[Row], images: Sequence[dict[str, Any]]) -> dict[st
 
 
 def require_numbers(summaries: Iterable[Mapping[str, Any]]) -> None:
-    """Report scores that summaries omitted, once all else is printed and written."""
+    """Raise ValueError if summaries left out scores; called once all else is printed and written."""
     faults = [fault for one in summaries for key in ("broken", "no_numbers") for fault in one.get(key, ())]
     if faults:
         more = f"; and {len(faults) - SHOWN_FAULTS} more" if len(faults) > SHOWN_FAULTS else ""

@@ -1,4 +1,4 @@
-"""The results of an experiment: a table, and a figure of noisy, denoised and clean side by side.
+"""The results of an experiment: tables of scores, and a picture of noisy, denoised and clean side by side.
 
 RAW is developed for the eye by one fixed pipeline, the same for every panel of a row: bilinear demosaic, the frame's
 white balance and colour matrix, one exposure taken from the clean frame, the sRGB curve of IEC 61966-2-1.
@@ -53,8 +53,8 @@ PRINTED: Columns = {
 }
 
 
-def draw(rows: Sequence[Panels], path: Path) -> Path:
-    """Write the figure: the panels of each row, at most :data:`ACROSS` side by side."""
+def save_picture(rows: Sequence[Panels], path: Path) -> Path:
+    """Write the panels of each row as a picture, at most :data:`ACROSS` side by side; the path."""
     with extra("train"):
         from matplotlib.figure import Figure
 
@@ -77,58 +77,60 @@ def draw(rows: Sequence[Panels], path: Path) -> Path:
 
 
 def mean_and_spread(values: Sequence[float], digits: int) -> str:
-    """``mean`` or ``mean +- standard deviation``."""
+    """``mean``, or ``mean ± standard deviation`` of several values."""
     mean = f"{statistics.fmean(values):.{digits}f}"
     return mean if len(values) < 2 else f"{mean} ± {statistics.stdev(values):.{digits}f}"
 
 
-def formatted(key: str, value: float | None) -> str:
-    """A figure as tables have it; empty where there is none."""
+def format_figure(key: str, value: float | None) -> str:
+    """The figure of a metric as tables have it; empty if there is none."""
     if value is None:
         return ""
     return f"{value:.0%}" if key == "own_noise" else f"{value:.{_digits(key)}f}"
 
 
-def both(scores: Mapping[str, Any], first: str, second: str) -> str:
-    """Two figures in a cell, a dash for what is no number."""
-    return " / ".join(formatted(key, scores.get(key)) or "-" for key in (first, second))
+def join_figures(scores: Mapping[str, Any], first: str, second: str) -> str:
+    """Two figures in a cell; a dash stands for what is no number."""
+    return " / ".join(format_figure(key, scores.get(key)) or "-" for key in (first, second))
 
 
 def _digits(key: str) -> int:
     return 2 if "psnr" in key else 4
 
 
-class Figures(NamedTuple):
-    """A table: its columns, cells by method, empty where a figure does not apply, and the best cells of columns."""
+class Table(NamedTuple):
+    """A table: its columns, cells by row, empty where a figure does not apply, and the best cells of columns."""
 
     columns: list[str]
     rows: dict[str, list[str]]
     best: set[tuple[str, int]]
 
 
-def figures_of(results: Runs, classical: Mapping[str, Mapping[str, Any]] | None, columns: Columns) -> Figures:
-    """The noisy input, classical denoisers and the arms, without columns and methods that have no figure."""
-    plain = next(iter(results.values()))[0]["plain"]
-    noisy = {key.replace("_noisy", ""): value for key, value in plain.items() if "_noisy" in key}
-    methods: dict[str, Sequence[Mapping[str, Any]]] = {"noisy input": [{"plain": noisy}]}
-    methods |= {name: [{"plain": scores}] for name, scores in (classical or {}).items()}
-    methods |= results
+def table_of(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, columns: Columns) -> Table:
+    """The noisy input, other denoisers and the arms, without columns and rows that have no figure."""
+    noisy = {
+        key.replace("_noisy", ""): x for key, x in next(iter(results.values()))[0]["plain"].items() if "_noisy" in key
+    }
+    single = {"noisy input": noisy, **(others or {})}
+    methods: Runs = {**{name: [{"plain": scores}] for name, scores in single.items()}, **results}
     values = {name: [_values(runs, *column) for column in columns.values()] for name, runs in methods.items()}
-    kept = [k for k in range(len(columns)) if any(row[k] for row in values.values())]
-    values = {name: [row[k] for k in kept] for name, row in values.items() if any(row)}
-    keys = [list(columns.values())[k][1] for k in kept]
+    values = {name: row for name, row in values.items() if any(row)}
+    shown = {head: key for k, (head, (_, key)) in enumerate(columns.items()) if any(row[k] for row in values.values())}
     best: set[tuple[str, int]] = set()
-    for k, key in enumerate(keys):
-        means = {name: round(statistics.fmean(row[k]), _digits(key)) for name, row in values.items() if row[k]}
+    rows: dict[str, list[str]] = {name: [] for name in values}
+    for k, (head, key) in enumerate(shown.items()):
+        column = {name: row[list(columns).index(head)] for name, row in values.items()}
+        means = {name: round(statistics.fmean(found), _digits(key)) for name, found in column.items() if found}
         if len(means) > 1 and key != "own_noise":
             best |= {(name, k) for name, mean in means.items() if mean == max(means.values())}
-    rows = {name: [_cell(key, found) for key, found in zip(keys, row, strict=True)] for name, row in values.items()}
-    return Figures([list(columns)[k] for k in kept], rows, best)
+        for name, found in column.items():
+            rows[name].append(_cell(key, found))
+    return Table(list(shown), rows, best)
 
 
-def first_runs(results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
-    """The summary of every method, of an arm that of its first seed."""
-    return {**classical, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
+def first_runs(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    """The summary of every method by name; of an arm that of its first seed."""
+    return {**others, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
 
 
 def _values(runs: Sequence[Mapping[str, Any]], kind: str, key: str) -> list[float]:
@@ -138,17 +140,17 @@ def _values(runs: Sequence[Mapping[str, Any]], kind: str, key: str) -> list[floa
 def _cell(key: str, values: Sequence[float]) -> str:
     if len(values) > 1 and key != "own_noise":
         return mean_and_spread(values, _digits(key))
-    return formatted(key, statistics.fmean(values) if values else None)
+    return format_figure(key, statistics.fmean(values) if values else None)
 
 
 NOISY = "the noisy input"
 
 
 def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
-    """The method to use, an arm, one of the others or :data:`NOISY`, and why in a line.
+    """The method to use, which is an arm, one of the others or :data:`NOISY`; and the reason in a line.
 
     The arm of the highest mean PSNR is compared with the best of the others, or with the noisy input. Both are empty
-    where nothing has a PSNR.
+    if nothing has a PSNR.
     """
     means = {arm: statistics.fmean(found) for arm, runs in results.items() if (found := _values(runs, "plain", "psnr"))}
     if not means:
@@ -179,7 +181,7 @@ def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> tuple[str
 
 
 def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str]]) -> None:
-    """Print a table: a name and figures in each row, a line between sections."""
+    """Print a table with a name and figures in each row, and a line between sections."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -204,21 +206,24 @@ def levels_note(summary: Mapping[str, Any]) -> str:
     return f"* noise levels of {flagged} of {images} images were measured against their clean frames"
 
 
-def print_table(results: Runs, title: str, classical: Mapping[str, Mapping[str, Any]] | None = None) -> None:
-    """Methods x (PSNR, SSIM) on the mosaic, plain and self-ensemble, and on sRGB; one entry a seed in an arm's list."""
-    table = figures_of(results, classical, PRINTED)
+def print_table(results: Runs, title: str, others: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+    """Print PSNR and SSIM of every method: in RAW plain and by self-ensemble, and developed.
+
+    ``results`` has one entry a seed in an arm's list, ``others`` a summary by name.
+    """
+    table = table_of(results, others, PRINTED)
     print_rows(title, ["arm", *table.columns], [[method, *cells] for method, cells in table.rows.items()])
     if note := levels_note(next(iter(results.values()))[0]["plain"]):
         print(note)
 
 
 def print_scores(result: Mapping[str, Any]) -> None:
-    """The table of ``rawaug evaluate``."""
+    """Print the table of ``rawaug evaluate`` from what ``--json`` writes."""
     denoiser = result["kind"] == "denoiser"
     figures = [key for key in (FIGURES if denoiser else ("psnr",)) if key != "own_noise" or key in result]
 
     def row(name: str, scores: Mapping[str, Any], form: str = "{}") -> list[str]:
-        return [name, *(formatted(key, scores.get(form.format(key))) for key in figures)]
+        return [name, *(format_figure(key, scores.get(form.format(key))) for key in figures)]
 
     images = [row(f"{one['name']}{' *' if one.get('levels_from_clean') else ''}", one) for one in result["images"]]
     shown = {"mean": "{}", "worst 25%": "{}_worst25", "best 25%": "{}_best25", "noisy": "{}_noisy"}

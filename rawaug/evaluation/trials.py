@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from statistics import fmean
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from torch import Tensor
 
@@ -32,6 +32,7 @@ Domain = Literal["raw", "rgb", "srgb"]
 """What a result is compared in: packed RAW ``(1, 4, h, w)``, linear camera RGB or developed sRGB ``(1, 3, H, W)``."""
 KEPT = 1024
 """Megabytes of trials that stay in memory; others are made again for each pass."""
+Case = TypeVar("Case")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,17 +42,17 @@ class Trial:
     Attributes:
         noisy: the input: packed RAW ``(1, 4, h, w)``, or sRGB ``(1, 3, H, W)`` in the domain ``srgb``.
         clean: the truth, in the form of ``domain``.
-        variance: of the noise of each value, at the noisy signal, shape of ``noisy``; None where it is not known.
-        frame: its name.
-        domain: what results are compared in.
+        variance: of the noise of each value, at the noisy signal, shape of ``noisy``; None if it is not known.
+        frame: name of the frame.
+        domain: the form in which results are compared with the truth.
         condition: what the denoiser is told, or what the sensor does; rows carry it.
         strength: the name of the noise's strength; rows carry it.
         levels: (shot_var, read_var) that the denoiser is told, if the noise has any.
         cfa: the pattern of packed RAW, or of a mosaic ``(1, 1, H, W)`` in its place.
         develop: makes sRGB ``(3, H, W)`` of an image like ``noisy`` or ``clean``, the same way for both.
-        raw: of developed pictures, the RAW that they were developed from, as a denoiser of RAW gets it.
-        ways: from denoised RAW to ``domain``, by name; a denoiser that gives RAW is scored once for each.
-        own: the mean variance of the noise that the reference itself has, where that is known.
+        raw: for developed pictures, the RAW that they were developed from, which a denoiser of RAW is given.
+        ways: functions from denoised RAW to ``domain``, by name; a denoiser that gives RAW is scored once for each.
+        own: the mean variance of the noise that the reference itself has, if it is known.
         levels_from_clean: whether the levels were measured against the clean frame.
     """
 
@@ -72,17 +73,17 @@ class Trial:
 
     @property
     def amount(self) -> float:
-        """How much noise there is, to put trials in order: the mean variance, or that which the levels give white."""
+        """A number that puts trials in the order of their noise: the mean variance, or else the variance at white."""
         levels = self.raw.levels if self.levels is None and self.raw is not None else self.levels
         return sum(levels or ()) if self.variance is None else self.variance.mean().item()
 
     @property
     def given(self) -> Noisy:
-        """What a denoiser of this kind of image gets."""
+        """The input of a denoiser of this kind of image."""
         return Noisy(self.noisy, self.variance, self.levels, self.cfa)
 
     def given_to(self, denoiser: Any) -> Noisy:
-        """What this denoiser gets: of a developed picture a denoiser of RAW gets the RAW before."""
+        """The input of this denoiser: a denoiser of RAW gets the RAW that a picture was developed from."""
         return self.raw if self.raw is not None and denoiser.takes == "raw" else self.given
 
 
@@ -98,57 +99,85 @@ def trial_of(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: 
     """
     pair, cfa = pair.with_levels(), CFA(pair.cfa if cfa is None else cfa)
     clean = bayer.pack(crop_to_cfa(pair.raw, pair.cfa, cfa)[None], cfa)
-    levels: Levels | None
     if pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None:
-        noisy, levels = bayer.pack(crop_to_cfa(pair.noisy, pair.cfa, cfa)[None], cfa), (pair.shot_var, pair.read_var)
-        variance = noise_variance(noisy, *levels)
+        captured = Noisy.of(
+            bayer.pack(crop_to_cfa(pair.noisy, pair.cfa, cfa)[None], cfa), (pair.shot_var, pair.read_var), cfa
+        )
+        noisy, variance, levels, _ = captured
     else:
-        params = noise.sample(1, keyed_generator(seed, "test noise", pair.name))
-        noisy = noise.apply(clean, params)
-        variance = noise.variance(noisy, params)
-        levels = (params["shot_var"].item(), params["read_var"].item()) if "shot_var" in params else None
+        noisy, variance, levels = freeze_noise(clean, noise, pair.name, seed)
+    assert variance is not None
     return raw_trial(pair, noisy, clean, variance, levels, cfa, levels_from_clean=pair.levels_from_clean, **about)
+
+
+def freeze_noise(clean: Tensor, noise: NoiseModel, name: str, seed: int = 0) -> tuple[Tensor, Tensor, Levels | None]:
+    """Noise on a clean frame, the same for the same seed and name.
+
+    Args:
+        clean: packed RAW ``(1, 4, h, w)``.
+        noise: what is drawn.
+        name: of the frame.
+        seed: of the test.
+
+    Returns:
+        Noisy RAW and the variance of its noise, both ``(1, 4, h, w)``, and (shot_var, read_var) if the noise has any.
+    """
+    params = noise.sample(1, keyed_generator(seed, "test noise", name))
+    noisy = noise.apply(clean, params)
+    levels = (params["shot_var"].item(), params["read_var"].item()) if "shot_var" in params else None
+    return noisy, noise.variance(noisy, params), levels
 
 
 def raw_trial(
     pair: Pair, noisy: Tensor, clean: Tensor, variance: Tensor, levels: Levels | None, cfa: CFA, **about: Any
 ) -> Trial:
-    """Packed RAW of a frame, clean and with noise, as a trial that is developed with the frame's colours."""
+    """Packed RAW of a frame as a trial that is developed with the frame's colours.
+
+    Args:
+        pair: the frame.
+        noisy: ``(1, 4, h, w)``.
+        clean: ``(1, 4, h, w)``.
+        variance: of the noise, ``(1, 4, h, w)``.
+        levels: (shot_var, read_var) of the noise, if it has any.
+        cfa: the pattern by which all three are packed.
+        about: other attributes of the trial.
+    """
     develop = partial(develop_packed, cfa=cfa, pair=pair, exposure=exposure_of(clean, pair))
     own = None if pair.own_noise is None else noise_variance(clean, *pair.own_noise).mean().item()
     return Trial(noisy, clean, variance, pair.name, levels=levels, cfa=cfa, develop=develop, own=own, **about)
 
 
 class _Made(Sequence[Trial]):
-    def __init__(self, pairs: Sequence[Pair], make: Callable[[Pair], Trial]) -> None:
-        self.pairs, self.make = pairs, make
+    def __init__(self, cases: Sequence[Case], make: Callable[[Case], Trial]) -> None:
+        self.cases, self.make = cases, make
 
     def __len__(self) -> int:
-        return len(self.pairs)
+        return len(self.cases)
 
     def __getitem__(self, index: Any) -> Any:
-        return self.make(self.pairs[index])
+        return self.make(self.cases[index])
 
 
-def trials_of(pairs: Sequence[Pair], make: Callable[[Pair], Trial]) -> Sequence[Trial]:
-    """``make(pair)`` of every pair, made when asked for and kept, up to :data:`KEPT`."""
-    kept: Any = Cached(_Made(pairs, make), KEPT)
+def make_trials(cases: Sequence[Case], make: Callable[[Case], Trial]) -> Sequence[Trial]:
+    """``make(case)`` of every case, made when it is asked for and kept, up to :data:`KEPT`."""
+    kept: Any = Cached(_Made(cases, make), KEPT)
     return kept
 
 
 # -- the references' own noise -----------------------------------------------------------------------------------------
 
 MUCH = 0.1
-"""Share of an error above which a line says so."""
+"""Share of the squared error above which a line warns of the references' own noise."""
 MOST_MEASURED = 12
-"""Frames measured, evenly spaced: seconds for each of 12 megapixels."""
+"""Frames whose own noise is measured, evenly spaced; one of 12 megapixels takes seconds."""
 SHOWN = 4
 ADVICE = "bin the references (bin 4), or add the noise of a higher ISO"
 
 
 class Measured(SomePairs):
-    """Whole references whose own noise is measured as they are read, where they do not state it: of ``most`` of them,
-    evenly spaced, since each takes seconds.
+    """Whole references whose own noise is measured as they are read, unless they state it.
+
+    Only ``most`` of them are measured, evenly spaced, since each takes seconds.
     """
 
     def __init__(self, pairs: Sequence[Pair], most: int = MOST_MEASURED) -> None:
@@ -157,6 +186,7 @@ class Measured(SomePairs):
         self.measured = {k * len(pairs) // count for k in range(count)}
 
     def read(self, index: int) -> Pair:
+        """The reference at ``index``, with its own noise if it is one of those that are measured."""
         pair = super().read(index)
         if pair.own_noise is not None or index not in self.measured:
             return pair
@@ -164,7 +194,7 @@ class Measured(SomePairs):
 
 
 def own_noise_note(summaries: Mapping[str, Mapping[str, Any]]) -> str:
-    """A line on scores that the references' own noise makes up much of; empty if there are none."""
+    """A line on scores of which the references' own noise is a large part; empty if there are none."""
     shares = {name: scores.get("own_noise", 0.0) for name, scores in summaries.items()}
     much = sorted((name for name, share in shares.items() if share > MUCH), key=lambda name: -shares[name])
     named = ", ".join(f"{name} {shares[name]:.0%}" for name in much[:SHOWN])
@@ -173,7 +203,7 @@ def own_noise_note(summaries: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def added_noise_note(trials: Iterable[Trial]) -> str:
-    """A line on a test whose noise is hardly stronger than that of its references; empty if it is much stronger."""
+    """A line that warns of noise hardly stronger than that of the references; empty if it is much stronger."""
     known = [
         (one.own, one.variance.mean().item()) for one in trials if one.own is not None and one.variance is not None
     ]

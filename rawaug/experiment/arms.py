@@ -1,4 +1,4 @@
-"""What an arm of a recipe is trained on: its estimator, its stream of samples, and the samples it is watched on."""
+"""What an arm of a recipe is trained on: its stream of samples, and the samples by which its weights are chosen."""
 
 from __future__ import annotations
 
@@ -18,24 +18,21 @@ from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.registry import ESTIMATORS, SRGB_NOISE, spec_label
-from rawaug.seeding import derive_seed, keyed_generator
+from rawaug.seeding import derive_seed
 from rawaug.training.estimators import SelfSupervised
-from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
+from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, noisy_frame, r2r_trials
 from rawaug.training.srgb_noise import NoisyPictures
-from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
-
-WATCHED = 16
-"""Samples made from pictures on which a training without validation pairs is watched."""
+from rawaug.training.stream import WATCHED, PictureCrops, RealCrops, Source, TrainingStream, freeze_samples
 
 
 def methods_of(recipe: Recipe) -> dict[str, str]:
-    """What each row of the table is, in a line."""
+    """By row of the table what it is, in a line."""
     filters = {spec_label(spec): "a filter, nothing is trained" for spec in recipe.classical}
     unchanged = {Path(name).stem: "trained weights as they are" for name in recipe.untouched}
-    return {**filters, **unchanged, **{label: _explained(recipe, label) for label in recipe.arms}}
+    return {**filters, **unchanged, **{label: _explain(recipe, label) for label in recipe.arms}}
 
 
-def _explained(recipe: Recipe, label: str) -> str:
+def _explain(recipe: Recipe, label: str) -> str:
     arm, network = recipe.arms[label], recipe.network_of(label)
     begun = f"{network.name} from random weights" if network.start is None else f"{network.start}, trained further"
     real, made = "real pairs" if arm.sees_clean else "real noisy frames", "RAW made from pictures"
@@ -45,8 +42,8 @@ def _explained(recipe: Recipe, label: str) -> str:
     return f"{begun}, on {frames}{how}"
 
 
-def in_pattern(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
-    """The ISP of the same camera behind another CFA, a copy."""
+def change_cfa(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
+    """The ISP of the same camera behind a CFA: itself, or a copy if it had another."""
     if isp.cfa == cfa:
         return isp
     other = copy.deepcopy(isp)
@@ -55,7 +52,7 @@ def in_pattern(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
 
 
 def frames_of(recipe: Recipe, pairs: Sequence[Pair], isp: DictionaryISP) -> Sequence[Any]:
-    """The real frames as the arms take them: pairs, or a :class:`NoisyFrame` of each where no arm sees clean ones."""
+    """The real frames as the arms take them: pairs, or a :class:`NoisyFrame` of each if no arm sees clean ones."""
     return [noisy_frame(pair, isp.info.get("noise")) for pair in pairs] if recipe.self_supervised else pairs
 
 
@@ -68,7 +65,17 @@ def training_stream(
     noise: NoiseModel,
     seed: int,
 ) -> TrainingStream:
-    """The training samples of one arm."""
+    """The training samples of one arm.
+
+    Args:
+        recipe: the whole recipe.
+        arm: its part on this arm.
+        frames: the real frames, see :func:`frames_of`.
+        pictures: the sRGB pictures.
+        isp: makes RAW of them, in the CFA of the arm's network.
+        noise: added to clean RAW.
+        seed: of the run.
+    """
     crop, seed, estimator = recipe.train.crop, derive_seed(seed, "stream"), ESTIMATORS.make(arm.estimator)
     real: Source | None = None
     made: Source | None = None
@@ -92,23 +99,29 @@ def training_stream(
 def validation_samples(
     recipe: Recipe, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
 ) -> list[Trial]:
-    """The frozen samples by which weights are chosen, the same in every arm and run."""
+    """The frozen samples by which weights are chosen, the same in every arm and run.
+
+    Args:
+        recipe: the whole recipe.
+        frames: the validation frames, see :func:`frames_of`; without any, samples are made from pictures.
+        pictures: the sRGB pictures.
+        isp: makes RAW of them, and says the CFA of all samples.
+        noise: added to clean RAW.
+    """
     augment = RawAugment(isp, noise, target=recipe.target)
     if recipe.self_supervised:
         frozen = frames or FrozenPictures(pictures, augment, derive_seed("validation"))[:WATCHED]
-        return [Trial(*sample) for sample in held_out(frozen, isp.cfa)]
+        return r2r_trials(frozen, isp.cfa)
     if frames:
         return [trial_of(pair, noise, isp.cfa) for pair in frames]
-    crops = PictureCrops(RawPairs(pictures, augment, recipe.train.crop))
-    drawn = (crops.draw(keyed_generator("validation", k)) for k in range(WATCHED))
-    return [Trial(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]
+    return freeze_samples(PictureCrops(RawPairs(pictures, augment, recipe.train.crop)), "validation")
 
 
-def chosen(candidates: Mapping[str, str], folders: Sequence[Path], best: bool) -> dict[str, dict[str, float]]:
-    """The candidates of every arm with a search, with their mean validation PSNR over the runs, the highest first.
+def rank_candidates(candidates: Mapping[str, str], folders: Sequence[Path], best: bool) -> dict[str, dict[str, float]]:
+    """By arm with a search its candidates, with their mean validation PSNR over the runs, the highest first.
 
-    ``candidates`` is a candidate to its arm, ``best`` whether the best validation counts, else the last. No test frame
-    has a say.
+    ``candidates`` maps a candidate to its arm. ``best`` says whether the best validation counts, or else the last. No
+    test frame has a say.
     """
     found: dict[str, dict[str, float]] = {}
     for label, arm in candidates.items():

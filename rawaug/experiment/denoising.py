@@ -12,7 +12,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import denoisers
 from denoisers.files import find
@@ -23,21 +23,20 @@ from rawaug.data.folders import reports
 from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, stamps
 from rawaug.denoise.denoiser import RawDenoiser, require_classical
 from rawaug.errors import extra
-from rawaug.evaluation.page import Page, draw_curves, shown_on_page
-from rawaug.evaluation.scores import NOISY, Panels, Row, by_denoiser, panels_of, require_numbers, score, summary
-from rawaug.evaluation.tables import draw, first_runs, print_table, verdict
-from rawaug.evaluation.trials import Trial, added_noise_note, own_noise_note, trial_of, trials_of
+from rawaug.evaluation.page import Page, plot_curves, select_for_page
+from rawaug.evaluation.scores import NOISY, Panels, Row, group_rows, panels_of, require_numbers, score, summary
+from rawaug.evaluation.tables import first_runs, print_table, save_picture, verdict
+from rawaug.evaluation.trials import Trial, added_noise_note, make_trials, own_noise_note, trial_of
 from rawaug.experiment.arms import (
-    chosen,
+    change_cfa,
     frames_of,
-    in_pattern,
     methods_of,
+    rank_candidates,
     training_stream,
     validation_samples,
 )
-from rawaug.experiment.plan import planned, require_usable, with_given_pairs
+from rawaug.experiment.plan import claim, name_given_pairs, plan_data, require_free, require_usable, run_folder
 from rawaug.experiment.recipe import Recipe
-from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import find_weights, fingerprint, one_at_a_time, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, camera_law, noise_model
@@ -46,12 +45,12 @@ from rawaug.progress import time_stage
 from rawaug.registry import ESTIMATORS, EXPERIMENTS, FILTERS, Spec, spec_label, split_spec
 from rawaug.training.config import weights_key
 from rawaug.training.loop import require_trainable, train
-from rawaug.training.noisy_frames import faintness_note, noisy_only
+from rawaug.training.noisy_frames import drop_clean, faintness_note
 from rawaug.training.state import first_network, start_of
 from rawaug.training.stream import TrainingStream
 
 SHOWN = 3
-"""Test frames in the picture."""
+"""Test frames in ``picture.png``."""
 
 KINDS = ("plain", "self_ensemble")
 """How a denoiser is scored, in this order."""
@@ -75,31 +74,43 @@ def run(
 
     Args:
         recipe: what is run.
-        overwrite: replace a run of this name with other settings; what does not depend on them is kept.
-        pairs, validation, test: in place of what ``data.pairs``, ``data.validation`` and ``data.test`` name. With
-            ``pairs`` alone a part of them is held out for validation.
+        overwrite: whether a run of this name with other settings is replaced; what does not depend on them is kept.
+        pairs: frames in place of those that ``data.pairs`` names. Without ``validation`` a part of them is held out.
+        validation: frames in place of those that ``data.validation`` names.
+        test: frames in place of those that ``data.test`` names.
     """
     given = {"pairs": pairs, "validation": validation, "test": test}
     given_frames = {key: frames for key, frames in given.items() if frames is not None}
-    return TrainingRun(recipe, overwrite, given_frames).all_stages()
+    return TrainingRun(recipe, overwrite, given_frames).run_stages()
 
 
 class TrainingRun:
     """One recipe on its data; what could be missing or wrong is opened or tried before anything is fitted.
 
-    A kind of experiment with another target overrides :meth:`stream`, :meth:`watched`, :meth:`trial`,
-    :meth:`evaluated` or :meth:`reported`.
+    ``isp``, ``noise``, ``frames`` and ``trials`` are those of the seed that runs. A kind of experiment with another
+    target overrides :meth:`stream`, :meth:`validation_trials`, :meth:`test_trials`, :meth:`evaluate` or :meth:`report`.
+
+    Args:
+        recipe: what is run.
+        overwrite: whether a run of this name with other settings is replaced.
+        given: frames in place of those that the recipe names: ``pairs``, ``validation``, ``test``.
     """
 
     input: Any = NOISY
     """What stands for the noisy input in tables."""
+    compared_in: ClassVar[str] = ""
+    """What the images are that are compared, for the table's title, if they are not RAW."""
+    isp: DictionaryISP
+    noise: NoiseModel
+    frames: Mapping[str, Sequence[Any]]
+    trials: Sequence[Trial]
 
     def __init__(self, recipe: Recipe, overwrite: bool, given: Mapping[str, Sequence[Pair]]) -> None:
-        recipe = with_given_pairs(recipe, given)
+        recipe = name_given_pairs(recipe, given)
         require_free(recipe, overwrite)
         require_trainable(recipe.device, recipe.devices, recipe.train.precision)
         self.recipe, self.data, self.overwrite = recipe, recipe.data, overwrite
-        self.folder = run_folder(recipe)
+        self.folder, self.seeds = run_folder(recipe), range(recipe.seed, recipe.seed + recipe.seeds)
         self.classical = installed_classical(recipe.classical, shown=_leads())
         if recipe.noise != "camera":
             noise_model(recipe.noise)
@@ -112,60 +123,59 @@ class TrainingRun:
                 gives = "full colour: rawaug run demosaic trains it" if network.upscale > 1 else "no full colour"
                 raise ValueError(f"denoiser: {named} gives {gives}; take another network")
         self.starts = {arm: start_of(recipe.network_of(arm)) for arm in recipe.arms}
-        self.untouched = [RawDenoiser.of(find(name), recipe.device, name=Path(name).stem) for name in recipe.untouched]
-        plan = planned(recipe, given)
+        untouched = [RawDenoiser.of(find(name), recipe.device, name=Path(name).stem) for name in recipe.untouched]
+        self.others = [one.require_mosaic() for one in (*map(RawDenoiser.of, self.classical), *untouched)]
+        plan = plan_data(recipe, given)
         _say(*plan.lines(recipe))
         plan, self.unreadable = plan.read()
         _say(*self.unreadable)
         self.pairs, self.validation, self.test = list(plan.pairs), plan.validation, plan.test
         if recipe.self_supervised:  # from here on nothing knows a clean frame but the test
-            self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
+            self.pairs, self.validation = ([drop_clean(p) for p in part] for part in (self.pairs, self.validation))
         self.pictures = PairPictures(self.pairs) if self.data.pictures == OWN_PICTURES else plan.pictures
-        self.frames: dict[str, Sequence[Any]] = {}
-        self._trials: tuple[NoiseModel, Sequence[Trial]] | None = None
-        self._noisy: list[Row] | None = None
+        self.results: Results = {arm: [] for arm in recipe.arms}
+        self.models: dict[str, Denoiser] = {}
         self.seconds: dict[str, float] = {}
         require_usable(recipe, self.pairs, self.validation)
 
     @one_at_a_time(lambda self: self.folder if _leads() else None)
-    def all_stages(self) -> Results:
-        recipe = self.recipe
+    def run_stages(self) -> Results:
+        """Fit, train and evaluate with every seed, then report; the results by arm, one entry a seed."""
         if _leads():
-            claim(recipe, self.overwrite)
-        results: Results = {arm: [] for arm in recipe.arms}
-        models: dict[str, Denoiser] = {}
+            claim(self.recipe, self.overwrite)
         for seed in self.seeds:
-            isp = self.fitted_isp(seed)
-            if not models or recipe.noise == "camera":  # another fit may have measured another law
-                noise = noise_for(isp, recipe.noise)
-            if _leads() and not models:
-                _say(added_noise_note(self.trials(noise, isp)))
-            if not self.frames or recipe.noise == "camera":
-                parts = {"pairs": self.pairs, "validation": self.validation}
-                self.frames = {part: frames_of(recipe, pairs, isp) for part, pairs in parts.items()}
-                _say(faintness_note(self.frames["pairs"]) if recipe.self_supervised else "")
-            for arm in recipe.arms:
-                models[arm] = self.trained(arm, in_pattern(isp, self.pattern(arm, isp)), noise, seed)
+            self.isp = self.fit_isp(seed)
+            if not self.models or self.recipe.noise == "camera":  # another fit may have measured another law
+                self._add_noise()
+            for arm in self.recipe.arms:
+                self.models[arm] = self.train_arm(arm, seed)
                 if _leads():
-                    results[arm].append(self.evaluated(arm, models[arm], noise, isp, seed))
+                    self.results[arm].append(self.evaluate(arm, seed))
         if _leads():
-            self.reported(results, models, noise, isp)
-        return results
+            self.report()
+        return self.results
 
-    @property
-    def seeds(self) -> range:
-        return range(self.recipe.seed, self.recipe.seed + self.recipe.seeds)
+    def _add_noise(self) -> None:
+        """The noise of the seed's ISP, and the frames with it."""
+        self.noise = noise_for(self.isp, self.recipe.noise)
+        self.trials, self._noisy = self.test_trials(), list[Row]()
+        parts = {"pairs": self.pairs, "validation": self.validation}
+        self.frames = {part: frames_of(self.recipe, pairs, self.isp) for part, pairs in parts.items()}
+        if _leads() and not self.models:
+            _say(added_noise_note(self.trials))
+            _say(faintness_note(self.frames["pairs"]) if self.recipe.self_supervised else "")
 
-    def place(self, arm: str, seed: int) -> Path:
+    def arm_folder(self, arm: str, seed: int) -> Path:
+        """Where an arm's weights, log and scores are written."""
         return self.folder / f"seed{seed}" / arm
 
-    def pattern(self, arm: str, isp: DictionaryISP) -> CFA:
+    def pattern(self, arm: str) -> CFA:
         """The CFA that an arm is trained for: that of the weights that it starts from, else the ISP's."""
         start = self.starts[arm]
-        return isp.cfa if start is None else start.cfa
+        return self.isp.cfa if start is None else start.cfa
 
     @time_stage("fit")
-    def fitted_isp(self, seed: int) -> DictionaryISP:
+    def fit_isp(self, seed: int) -> DictionaryISP:
         """The ISP of the few pairs, or the recipe's own."""
         if self.recipe.camera is not None:
             weights = find_weights(self.recipe.camera)
@@ -187,31 +197,22 @@ class TrainingRun:
         return isp
 
     @time_stage("training")
-    def trained(self, arm: str, isp: DictionaryISP, noise: NoiseModel, seed: int) -> Denoiser:
-        recipe, place = self.recipe, self.place(arm, seed)
-        path = place / "denoiser.safetensors"
+    def train_arm(self, arm: str, seed: int) -> Denoiser:
+        """The network of an arm, trained, or loaded if it has been trained with the same settings."""
+        recipe, folder = self.recipe, self.arm_folder(arm, seed)
+        path = folder / "denoiser.safetensors"
         config, network, start = recipe.loop_of(arm), recipe.network_of(arm), self.starts[arm]
-        key = self.weights_key(arm, isp, seed)
+        key = self.weights_key(arm, seed)
         if path.is_file():
             model, info = denoisers.load(path)
             if info.get("key") == key:
                 print(f"already trained: {path}")
                 return model
-        stream = self.stream(arm, isp, noise, seed)
-        model = train(
-            stream,
-            self.watched(isp, noise),
-            network,
-            config,
-            place,
-            seed,
-            recipe.device,
-            recipe.devices,
-            label=f"seed {seed}, {arm}",
-            estimator=self.estimators[arm],
-            choose=bool(self.validation),
-            key=key,
-        )
+        isp = change_cfa(self.isp, self.pattern(arm))
+        stream, watched = self.stream(arm, isp, seed), self.validation_trials(isp)
+        where: dict[str, Any] = {"device": recipe.device, "devices": recipe.devices, "label": f"seed {seed}, {arm}"}
+        how: dict[str, Any] = {"estimator": self.estimators[arm], "choose": bool(self.validation), "key": key}
+        model = train(stream, watched, network, config, folder, seed, **where, **how)
         if not _leads():
             return model
         levels = camera_law(isp.info["noise"]).spec() if recipe.noise == "camera" else recipe.noise
@@ -220,34 +221,33 @@ class TrainingRun:
         info |= {} if start is None else {"start": network.start, "start_sha256": start.sha256}
         info |= {"real_pairs": [pair.name for pair in self.pairs], "pictures": self.data.pictures}
         denoisers.save(model, path, info)
-        (place / "last.pt").unlink(missing_ok=True)
+        (folder / "last.pt").unlink(missing_ok=True)
         return model
 
-    def stream(self, arm: str, isp: DictionaryISP, noise: NoiseModel, seed: int) -> TrainingStream:
-        """The training samples of an arm."""
-        return training_stream(
-            self.recipe, self.recipe.arms[arm], self.frames["pairs"], self.pictures, isp, noise, seed
-        )
+    def stream(self, arm: str, isp: DictionaryISP, seed: int) -> TrainingStream:
+        """The training samples of an arm; ``isp`` has the arm's CFA."""
+        settings, frames = self.recipe.arms[arm], self.frames["pairs"]
+        return training_stream(self.recipe, settings, frames, self.pictures, isp, self.noise, seed)
 
-    def watched(self, isp: DictionaryISP, noise: NoiseModel) -> list[Trial]:
-        """The frozen samples by which the weights of every arm are chosen."""
-        return validation_samples(self.recipe, self.frames["validation"], self.pictures, isp, noise)
+    def validation_trials(self, isp: DictionaryISP) -> list[Trial]:
+        """The frozen samples by which the weights of every arm are chosen; ``isp`` has the arm's CFA."""
+        return validation_samples(self.recipe, self.frames["validation"], self.pictures, isp, self.noise)
 
-    def weights_key(self, arm: str, isp: DictionaryISP, seed: int) -> str:
-        """What the weights of an arm depend on."""
+    def weights_key(self, arm: str, seed: int) -> str:
+        """What the weights of an arm depend on, as a short hash."""
         recipe, data, start = self.recipe, self.data, self.starts[arm]
-        real = isp.info["key"], recipe.noise, data.pairs, stamps(self.pairs)
+        real = self.isp.info["key"], recipe.noise, data.pairs, stamps(self.pairs)
         pictures = data.pictures, len(self.pictures), data.max_pixels
         how = recipe.target, asdict(recipe.arms[arm]), self.estimators[arm].revision, start and start.sha256
-        watched = data.validation, data.validation_crop, stamps(self.validation), recipe.validated_with
+        watched = data.validation, data.validation_crop, stamps(self.validation), recipe.validation_noise
         validation = watched if self.validation else None
         samples = (seed, *real, *pictures, *how)
         return weights_key(recipe.network_of(arm), recipe.loop_of(arm), samples, validation)
 
     @time_stage("scores of the arms")
-    def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, isp: DictionaryISP, seed: int) -> dict[str, Any]:
-        """Plain and self-ensemble scores on the test frames."""
-        path = self.place(arm, seed) / "evaluation.json"
+    def evaluate(self, arm: str, seed: int) -> dict[str, Any]:
+        """The arm's summaries ``plain`` and ``self_ensemble`` on the test frames; those in its file are kept."""
+        path = self.arm_folder(arm, seed) / "evaluation.json"
         known = json.loads(path.read_text()) if path.is_file() else {}
         key = self.scores_key(sha256(path.with_name("denoiser.safetensors")))
         result: dict[str, Any] = known if known.get("key") == key else {"key": key}
@@ -255,122 +255,110 @@ class TrainingRun:
         if not missing:
             print(f"already evaluated: {path}")
         for kind in missing:
-            one = self.denoiser(arm, model, isp, self.recipe.views if kind == "self_ensemble" else 1)
-            (rows,) = self.scored([one], noise, isp, f"evaluate {arm}, {kind}").values()
-            result[kind] = summary(rows, self.noisy_rows(noise, isp))
+            one = self.denoiser(arm, self.recipe.views if kind == "self_ensemble" else 1)
+            rows = list(score([one], self.trials, f"evaluate {arm}, {kind}"))
+            result[kind] = summary(rows, self.noisy_rows())
             write_json(result, path)
             print(f"evaluated {arm}, seed {seed}, {kind}: {result[kind].get('psnr', math.nan):.2f} dB: {path}")
         return {kind: result[kind] for kind in KINDS if kind in result}
 
     def scores_key(self, digest: str) -> str:
-        """What the scores of an arm depend on, besides the noise and the arm's own settings."""
+        """What the scores of an arm depend on besides the noise and the arm's own settings, as a short hash.
+
+        ``digest`` is that of its weights.
+        """
         frames = self.data.test, self.data.test_crop, self.data.bin, stamps(self.test)
         return fingerprint(digest, *frames, self.recipe.views)
 
-    def trials(self, noise: NoiseModel, isp: DictionaryISP) -> Sequence[Trial]:
-        """The test cases, made once; another seed's fit may have measured another noise."""
-        if self._trials is None or self._trials[0] is not noise:
-            self._trials = noise, trials_of(self.test, lambda pair: self.trial(pair, noise, isp))
-            self._noisy = None
-        return self._trials[1]
+    def test_trials(self) -> Sequence[Trial]:
+        """The test frames with their frozen noise, each made when it is first asked for."""
+        return make_trials(self.test, lambda pair: trial_of(pair, self.noise, self.isp.cfa))
 
-    def trial(self, pair: Pair, noise: NoiseModel, isp: DictionaryISP) -> Trial:
-        """A test case of a frame."""
-        return trial_of(pair, noise, isp.cfa)
-
-    def scored(
-        self, denoisers: Sequence[Any], noise: NoiseModel, isp: DictionaryISP, label: str
-    ) -> dict[str, list[Row]]:
-        """The rows of every denoiser, by name; all see a test case before the next one is made."""
-        return by_denoiser(score(denoisers, self.trials(noise, isp), label))
-
-    def noisy_rows(self, noise: NoiseModel, isp: DictionaryISP) -> list[Row]:
+    def noisy_rows(self) -> list[Row]:
         """The scores of the input itself."""
-        trials = self.trials(noise, isp)
-        if self._noisy is None:
-            self._noisy = next(iter(by_denoiser(score([self.input], trials)).values()))
+        self._noisy = self._noisy or list(score([self.input], self.trials))
         return self._noisy
 
-    def denoiser(self, arm: str, model: Denoiser, isp: DictionaryISP, views: int = 1) -> RawDenoiser:
+    def denoiser(self, arm: str, views: int = 1) -> RawDenoiser:
         """An arm's network as it is tested; one whose training diverged is scored as it is."""
-        around, cfa = self.estimators[arm].at_test, self.pattern(arm, isp)
+        around, cfa = self.estimators[arm].wrap_for_test, self.pattern(arm)
         made = {"name": arm, "cfa": cfa, "views": views, "around": around, "checked": False}
-        return RawDenoiser.of(model, self.recipe.device, **made)
+        return RawDenoiser.of(self.models[arm], self.recipe.device, **made)
 
-    def untrained(self) -> list[RawDenoiser]:
-        """What the arms are compared with: classical denoisers, and trained ones as they are."""
-        return [*map(RawDenoiser.of, self.classical), *self.untouched]
-
-    def reported(self, results: Results, models: dict[str, Denoiser], noise: NoiseModel, isp: DictionaryISP) -> None:
-        """``results.json``, the table, the picture, and the page with all of it."""
-        recipe = self.recipe
-        others = self.untrained()
+    def report(self) -> None:
+        """Write ``results.json``, the table, the picture, and the page with all of it."""
+        recipe, results = self.recipe, self.results
         candidates = {label: arm.candidate_of for label, arm in recipe.arms.items() if arm.candidate_of is not None}
-        searches = chosen(candidates, [self.folder / f"seed{s}" for s in self.seeds], bool(self.validation))
-        classical: dict[str, Any] = {}
-        everything: dict[str, Any] = {"recipe": asdict(recipe), "results": results, "classical": classical}
+        searches = rank_candidates(candidates, [self.folder / f"seed{s}" for s in self.seeds], bool(self.validation))
+        others: dict[str, Any] = {}
+        everything: dict[str, Any] = {"recipe": asdict(recipe), "results": results, "others": others}
         everything |= {"chosen": searches} if searches else {}
         everything |= {"unreadable": self.unreadable} if self.unreadable else {}
-        write_json(everything, self.folder / "results.json")
-        for name, rows in self.compared(others, noise, isp).items():
-            classical[name] = summary(rows, self.noisy_rows(noise, isp))
-        write_json(everything, self.folder / "results.json")
+        file = self.folder / "results.json"
+        write_json(everything, file)
+        others |= {name: summary(rows, self.noisy_rows()) for name, rows in self._score_others().items()}
+        write_json(everything, file)
         settings = f"real pairs: {len(self.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
-        title = f"{recipe.name} tested on {self.data.test} ({settings})"
-        everyone = [*others, *(self.denoiser(arm, model, isp) for arm, model in models.items())]
-        facts = {"Noise": recipe.noise, "To use it": self.usage(results, classical)[-1].partition(": ")[2]}
+        title = f"{recipe.name} tested on {self.data.test} ({settings}){self.compared_in}"
+        use = self.usage(others)
+        facts = {"Noise": recipe.noise, "To use it": use[-1].partition(": ")[2]}
+        everyone = [*self.others, *(self.denoiser(arm) for arm in self.models)]
         named = {one.name for one in everyone}
         about = {name: text for name, text in methods_of(recipe).items() if name in named}
-        page = Page.of_scores(title, results, classical, facts, about)
-        picture = self.pictured(page, everyone, self.trials(noise, isp))
-        print_table(results, title, classical)
-        _say(page.lead, own_noise_note(first_runs(results, classical)))
-        print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {self.folder / 'report.html'}")
+        page = Page.of_scores(title, results, others, facts, about)
+        picture = self._draw(page, everyone)
+        print_table(results, title, others)
+        _say(page.lead, own_noise_note(first_runs(results, others)))
+        print(f"table: {file}\npicture: {picture}\npage: {self.folder / 'report.html'}")
         searched = [
             f"{arm}, by validation: " + ", ".join(f"{name} {score:.2f} dB" for name, score in found.items())
             for arm, found in searches.items()
         ]
         spent = "time: " + ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in self.seconds.items())
-        _say(*reports(self.pictures), *self.unreadable, *searched, spent, *self.usage(results, classical))
-        summaries = [scores for runs in results.values() for run in runs for scores in run.values()]
-        require_numbers([*summaries, *classical.values()])
+        _say(*reports(self.pictures), *self.unreadable, *searched, spent, *use)
+        require_numbers(
+            [*(scores for runs in results.values() for run in runs for scores in run.values()), *others.values()]
+        )
 
     @time_stage("other denoisers")
-    def compared(self, others: Sequence[RawDenoiser], noise: NoiseModel, isp: DictionaryISP) -> dict[str, list[Row]]:
-        """The rows of what the arms are compared with."""
-        return self.scored(others, noise, isp, "other denoisers") if others else {}
+    def _score_others(self) -> dict[str, list[Row]]:
+        return group_rows(score(self.others, self.trials, "other denoisers")) if self.others else {}
 
     @time_stage("report")
-    def pictured(self, page: Page, denoisers: Sequence[RawDenoiser], trials: Sequence[Trial]) -> Path:
+    def _draw(self, page: Page, denoisers: Sequence[RawDenoiser]) -> Path:
         """Write the page, with curves and frames, and the picture; of the classical denoisers they show the first."""
-        logs = {arm: [self.place(arm, seed) / "log.csv" for seed in self.seeds] for arm in self.recipe.arms}
-        page.add_curves(draw_curves(logs))
+        page.add_curves(self.curves())
         hidden = [spec_label(spec) for spec in self.classical[1:]]
         shown = [one for one in denoisers if one.name not in hidden]
         rows: list[Panels] = []
-        for trial in shown_on_page(trials):
-            row = panels_of(shown, trial)
+        for trial in select_for_page(self.trials):
+            row = panels_of(shown, trial, self.input)
             page.add_frame(row)
             rows += [row] if len(rows) < SHOWN else []
         page.write(self.folder / "report.html", asdict(self.recipe))
-        return draw(rows, self.folder / "picture.png")
+        return save_picture(rows, self.folder / "picture.png")
 
-    def usage(self, results: Results, others: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    def curves(self) -> dict[str, bytes]:
+        """PNG files of the arms' loss and validation PSNR, by title."""
+        logs = {arm: [self.arm_folder(arm, seed) / "log.csv" for seed in self.seeds] for arm in self.recipe.arms}
+        return plot_curves(logs)
+
+    def usage(self, others: Mapping[str, Mapping[str, Any]]) -> list[str]:
         """The files of weights, and the command that uses what the verdict names; of an arm the best seed's."""
-        files = {(arm, s): self.place(arm, s) / "denoiser.safetensors" for arm in results for s in self.seeds}
+        files = {(arm, s): self.arm_folder(arm, s) / "denoiser.safetensors" for arm in self.results for s in self.seeds}
         lines = [f"denoiser, {arm}: {file}" for (arm, _), file in files.items()]
-        chosen, _ = verdict(results, others)
-        if chosen in results:
-            runs = [run["plain"].get("psnr", 0.0) for run in results[chosen]]
-            what = f"--denoiser {files[chosen, self.seeds[runs.index(max(runs))]]}"
-        elif untouched := [name for name in self.recipe.untouched if Path(name).stem == chosen]:
+        best, _ = verdict(self.results, others)
+        if best in self.results:
+            runs = [run["plain"].get("psnr", 0.0) for run in self.results[best]]
+            what = f"--denoiser {files[best, self.seeds[runs.index(max(runs))]]}"
+        elif untouched := [name for name in self.recipe.untouched if best.partition(", ")[0] == Path(name).stem]:
             what = f"--denoiser {untouched[0]}"
-        elif chosen in others:
-            spec = next(spec for spec in self.classical if spec_label(spec) == chosen)
+        elif best in others:
+            spec = next(spec for spec in self.classical if f"{best}, ".startswith(f"{spec_label(spec)}, "))
             what = f"--classical {spec if isinstance(spec, str) else shlex.quote(json.dumps(spec))}"
         else:
             return [*lines, "to use: nothing, the frames are best as they are"]
-        return [*lines, f"to use {chosen}: rawaug denoise IN.dng OUT.dng {what}"]
+        return [*lines, f"to use {best}: rawaug denoise IN.dng OUT.dng {what}"]
 
 
 def _say(*lines: str) -> None:
@@ -388,8 +376,10 @@ def _leads() -> bool:
 
 
 def installed_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
-    """The classical denoisers of a recipe, without BM3D where its wheel is missing, which is then printed if
-    ``shown``.
+    """The classical denoisers of a recipe; BM3D is left out if its wheel is missing, which is printed if ``shown``.
+
+    Raises:
+        ValueError: if another filter's library is missing, or a filter or setting is unknown.
     """
     bm3d = {"BM3D": FILTERS["BM3D"].missing()}
     kept = [spec for spec in specs if not bm3d.get(split_spec(spec)[0])]

@@ -1,12 +1,18 @@
-"""What a run will use: its frames, opened and divided but not yet read, the lines that say so, and the dry run."""
+"""What a run will use: its data, opened and divided but not yet read, and its folder; and the dry run.
+
+The folder ``OUT/NAME`` holds one run alone. ``run.json`` in it has the run's settings. The same settings resume it;
+others are refused, but for those that change no result.
+"""
 
 from __future__ import annotations
 
 import io
+import json
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, get_type_hints
 
@@ -25,10 +31,10 @@ from rawaug.data.pairs import (
 )
 from rawaug.evaluation.trials import Measured
 from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
-from rawaug.experiment.run_folder import require_free
-from rawaug.files import find_weights
+from rawaug.files import LOCK, find_weights, require_writable, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.registry import ESTIMATORS, EXPERIMENTS
+from rawaug.training.config import SAME_WEIGHTS
 from rawaug.training.noisy_frames import noise_of
 
 MOST_HELD_OUT = 16
@@ -36,14 +42,24 @@ MOST_HELD_OUT = 16
 GIVEN = "given pairs"
 """What ``data.pairs``, ... say in results of pairs that were given from Python."""
 _NAMED = 6
+STAMP = "run.json"
+FREE = frozenset({"name", "out", "device", "devices", "seeds", "self_ensemble", "views"})
+"""Keys of a run that may change when it is resumed: they say where it runs, or only add to its results."""
+FREE_ANYWHERE = SAME_WEIGHTS | {"memory_mb"}
+"""Such keys in parts of the recipe."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The data of a run: what is fitted and trained on, what chooses the weights, what the result is scored on.
+    """The data of a run.
 
-    ``available`` is the number of frames that
-    ``pairs``, ``validation`` and ``test`` were taken from; with ``held_out``, ``validation`` is a part of ``pairs``.
+    Attributes:
+        pairs: what the ISP is fitted to, and real training frames.
+        validation: what chooses the weights.
+        test: what the result is scored on.
+        pictures: sRGB pictures to make RAW of.
+        available: the number of frames that ``pairs``, ``validation`` and ``test`` were taken from.
+        held_out: whether ``validation`` is a part of ``pairs``.
     """
 
     pairs: Sequence[Pair]
@@ -54,24 +70,24 @@ class Plan:
     held_out: bool
 
     def lines(self, recipe: Recipe) -> list[str]:
-        """What is used of what, a line each."""
+        """By part of the run the number and the names of its frames, a line each, for the user to check."""
         data, (pairs, validation, test) = recipe.data, self.available
         part = f"{data.pairs}, held out" if self.held_out else data.validation
         fitted = f"fitted to {len(self.pairs)} frame{'s' * (len(self.pairs) != 1)}"
         watched = "no frames: monitored on RAW made from the pictures; the final weights are kept"
         found = {
-            "train": used(self.pairs, pairs, data.pairs) if self.pairs else "no RAW frames",
-            "validate": used(self.validation, validation, part, MOST_HELD_OUT) if self.validation else watched,
-            "test": used(self.test, test, data.test),
+            "train": listing(self.pairs, pairs, data.pairs) if self.pairs else "no RAW frames",
+            "validate": listing(self.validation, validation, part, MOST_HELD_OUT) if self.validation else watched,
+            "test": listing(self.test, test, data.test),
             "pictures": f"{len(self.pictures)} of {data.pictures}",
             "ISP": fitted if recipe.camera is None else f"{recipe.camera}, unchanged",
         }
         return [f"{what:<10}{said}" for what, said in found.items()]
 
     def read(self) -> tuple[Plan, list[str]]:
-        """The plan without the frames that cannot be read, those of ``pairs`` in memory; and lines that name them.
+        """The plan without the frames that cannot be read, and lines that name these.
 
-        All are read once: a damaged frame is better found now than after the training.
+        All frames are read once: a damaged one is better found now than after the training.
         """
         parts = {key: Readable(getattr(self, key)) for key in ("pairs", "validation", "test")}
         found = list(parts["pairs"])
@@ -81,10 +97,11 @@ class Plan:
         return replace(self, pairs=found, validation=parts["validation"].kept(), test=parts["test"].kept()), lines
 
 
-def with_own_pairs(recipe: Recipe, content: Mapping[str, Any], given: Collection[str]) -> Recipe:
-    """A recipe whose pairs were replaced uses all of them, and holds out a part of them to validate on.
+def use_all_pairs(recipe: Recipe, content: Mapping[str, Any], given: Collection[str]) -> Recipe:
+    """The recipe with all of the pairs that replace its own, a part of which is held out to validate on.
 
     What its file says of ``data.count`` and ``data.validation`` is about its own pairs; a validation of null stays.
+    ``content`` is what the file says, and ``given`` the keys that the user has set.
     """
     usual = (content.get("data") or {}).get("pairs", DataConfig.pairs)
     if "data.pairs" not in given or recipe.data.pairs is None or _kind(recipe.data.pairs) == _kind(usual):
@@ -95,20 +112,26 @@ def with_own_pairs(recipe: Recipe, content: Mapping[str, Any], given: Collection
 
 
 def _kind(spec: str | None) -> str | None:
-    """The dataset of a spec; a folder is one of its own."""
+    """The dataset that a spec names; each folder counts as a dataset."""
     kind, colon, _ = (spec or "").partition(":")
     return kind if colon and len(kind) > 1 and kind != "pairs" else spec
 
 
-def with_given_pairs(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Recipe:
-    """The recipe whose data are named :data:`GIVEN` where they are given; with pairs alone, some are held out."""
+def name_given_pairs(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Recipe:
+    """The recipe with :data:`GIVEN` as the name of data that are given; if pairs alone are, some are held out."""
     named: dict[str, Any] = dict.fromkeys(given, GIVEN)
     if "pairs" in given and "validation" not in given and recipe.data.validation is not None:
         named["validation"] = HELD_OUT
     return replace(recipe, data=replace(recipe.data, **named))
 
 
-def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
+def plan_data(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
+    """Open and divide the data that a recipe names, or that are ``given`` in their place; no frame is read.
+
+    Raises:
+        FileNotFoundError: if there are no such data.
+        ValueError: if they are not what the recipe needs, or a test frame is also among the others.
+    """
     data, clean = recipe.data, not recipe.self_supervised
     test = _opened(data, given.get("test", data.test), "test", True)
     pairs = _opened(data, given.get("pairs", data.pairs), "train", clean)
@@ -127,15 +150,15 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
     together = recipe.together
     return Plan(
         pairs=chosen,
-        validation=some(validation, data.validation_count, data.validation_crop, data.bin, together),
-        test=some(test, data.test_count, data.test_crop, data.bin, together, measure=True),
+        validation=select_pairs(validation, data.validation_count, data.validation_crop, data.bin, together),
+        test=select_pairs(test, data.test_count, data.test_crop, data.bin, together, measure=True),
         pictures=Cached(pictures, data.memory_mb) if data.memory_mb else pictures,
         available=(len(pairs), len(pairs) if held_out else len(validation), len(test)),
         held_out=held_out,
     )
 
 
-def some(
+def select_pairs(
     pairs: Sequence[Pair],
     count: int | None,
     crop: int | None,
@@ -143,10 +166,16 @@ def some(
     together: bool = False,
     measure: bool = False,
 ) -> Sequence[Pair]:
-    """The first ``count`` pairs, binned by ``factor``, the middle of each, read once; None for all, or whole frames.
+    """Pairs for a test or a validation, each of which is read once.
 
-    With ``together``, as for a truth of full colour, the sites of a cell are brought to one centre even if ``factor``
-    is 1. With ``measure`` the frames' own noise is measured before they are binned.
+    Args:
+        pairs: frames to take them from.
+        count: how many, the first ones; None takes all.
+        crop: side of the middle of each frame that is used, in pixels; None uses whole frames.
+        factor: K bins them K x K by colour site.
+        together: whether the sites of a cell are brought to one centre even if ``factor`` is 1, as a truth of full
+            colour needs.
+        measure: whether the frames' own noise is measured before they are binned.
     """
     chosen = pairs if count is None else SomePairs(pairs, range(len(pairs))[:count])
     measured = Measured(chosen) if measure else chosen
@@ -158,14 +187,22 @@ def _opened(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, cle
     return [] if spec is None else open_pairs(spec, split, clean, data.max_pixels, **data.settings_of(spec))
 
 
-def used(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
+def listing(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
+    """``"2 of 8 of demo:train: a, b"``.
+
+    Args:
+        frames: what is used.
+        available: the number of frames that they are taken from.
+        source: its name.
+        most: the number of frames that are named.
+    """
     names = names_of(frames)
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return f"{len(names)} of {available} of {source}: {', '.join(names[:most])}{more}"
 
 
 def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[Pair]) -> None:
-    """Check that frames, as they were read, have what fit and arms need of them."""
+    """Raise ValueError unless the frames, as they were read, have what the fit and the arms need of them."""
     real = {name: arm for name, arm in recipe.arms.items() if arm.augmented < 1.0}
     for pair in pairs:
         if recipe.camera is None and not pair.color_known:
@@ -189,18 +226,75 @@ def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[P
 
 
 def settings_of(kind: str) -> type[Any]:
-    """The dataclass of the keys of a kind of experiment: the type of its function's first argument."""
+    """The dataclass with the keys of a kind of experiment, which is the type of its function's first argument."""
     settings: type[Any] = next(iter(get_type_hints(EXPERIMENTS[kind]).values()))
     return settings
 
 
 def dry_run(kind: str, settings: Any, overwrite: bool = False) -> None:
-    """Print what data a training would use, and do the run in its shortest form in a temporary folder."""
+    """Print what data a training would use, and try the run in its shortest form in a temporary folder.
+
+    ``kind`` names the experiment, and ``settings`` are its recipe; ``overwrite`` as for the run itself.
+    """
     folder = require_free(settings, overwrite)
     if isinstance(settings, Recipe):
-        print("\n".join(planned(settings, {}).lines(settings)))
+        print("\n".join(plan_data(settings, {}).lines(settings)))
     with TemporaryDirectory() as elsewhere, redirect_stdout(io.StringIO()) as said:
         EXPERIMENTS[kind](replace(settings.shortest(), out=elsewhere))
     notes = [line for line in said.getvalue().splitlines() if line.startswith("note: ")]
     found = "it runs, but see the note above" if notes else "no problems found"
     print("\n".join([*notes, f"Dry run: {found}, nothing written to {folder}"]))
+
+
+# -- the folder of a run -----------------------------------------------------------------------------------------------
+
+
+def run_folder(settings: Any) -> Path:
+    """``OUT/NAME`` of a recipe; ValueError if the name leads out of OUT."""
+    out, name = Path(settings.out), Path(settings.name)
+    if name.is_absolute() or ".." in name.parts or not name.parts:
+        raise ValueError(
+            f"name {settings.name!r}: must be a folder within {out}; give a name without .. and not beginning with /"
+        )
+    return out / name
+
+
+def require_free(settings: Any, overwrite: bool = False) -> Path:
+    """The folder of a run; ValueError unless it can be written, and is empty, this run's, or to be replaced."""
+    folder = run_folder(settings)
+    require_writable(folder, folder=True)
+    rests = (LOCK, ".partial")  # what a run has as it begins, or left when it was killed there
+    if overwrite or not folder.is_dir() or all(file.name.endswith(rests) for file in folder.iterdir()):
+        return folder
+    advice = "give this run another --name, or --overwrite to replace that one"
+    stamp = folder / STAMP
+    if not stamp.is_file():
+        raise ValueError(f"{folder}: holds files, but not the settings of a run ({STAMP}); {advice}")
+    try:
+        known = dict(_flatten(json.loads(stamp.read_text())))
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{stamp}: not valid JSON ({error.msg}); {advice}") from None
+    asked = dict(_flatten(json.loads(json.dumps(asdict(settings)))))
+    changed = [key for key in sorted(known | asked) if known.get(key) != asked.get(key)]
+    changed = [key for key in changed if key not in FREE and key.rpartition(".")[2] not in FREE_ANYWHERE]
+    if changed:
+        differences = ", ".join(f"{key} {known.get(key)}, now {asked.get(key)}" for key in changed[:3])
+        more = f", and {len(changed) - 3} more" if len(changed) > 3 else ""
+        raise ValueError(f"{folder}: holds a run with other settings ({differences}{more}); {advice}")
+    return folder
+
+
+def claim(settings: Any, overwrite: bool = False) -> Path:
+    """The folder of a run with the run's settings in it; ValueError if it is another run's."""
+    folder = require_free(settings, overwrite)
+    write_json(asdict(settings), folder / STAMP)
+    return folder
+
+
+def _flatten(value: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys, as on the command line, and their values."""
+    for key, inner in value.items():
+        if isinstance(inner, Mapping) and inner:
+            yield from _flatten(inner, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", inner or None if isinstance(inner, Mapping) else inner

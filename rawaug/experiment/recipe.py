@@ -1,4 +1,4 @@
-"""Recipes: one dataclass per part, every key explained; the types decide what a value may be, see rawaug run."""
+"""Recipes: a dataclass for each part, which explains every key; the types of its fields say what a value may be."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from rawaug.registry import ESTIMATORS, EXPERIMENTS, SRGB_NOISE, require_between
 from rawaug.training.config import MOST, DenoiserConfig, TrainConfig, Weighing
 
 SHORT_CROP = 256
-"""Of the frames of a dry run."""
+"""Side in pixels of the middles of frames that a dry run uses."""
 HELD_OUT = "auto"
-"""``data.validation`` that is a part of ``data.pairs``."""
+"""The value of ``data.validation`` for a part of ``data.pairs``."""
 _PAIRS = "pairs:"
 MOST_BYTES = 2**16
 _BOUNDS: dict[str, tuple[float, float]] = {
@@ -261,8 +261,8 @@ class Recipe:
         return replace(self, data=data, isp=self.isp.shortest(), train=train, steps=None, seeds=1, views=4)
 
     @property
-    def validated_with(self) -> object:
-        """What the scores of validation frames depend on, besides the frames and what the training depends on."""
+    def validation_noise(self) -> object:
+        """The noise of validation frames, if it is another than that of the training."""
         return None
 
     @property

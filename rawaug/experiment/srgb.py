@@ -22,13 +22,12 @@ import torch
 from torch import Tensor
 
 from denoisers.files import DEFAULT
-from denoisers.network import Denoiser
 from rawaug import bayer
 from rawaug.bayer import noise_variance
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import Levels, Noisy, RawDenoiser
 from rawaug.denoise.pictures import PictureDenoiser
-from rawaug.evaluation.page import Figure, Page, Part, draw_curves, most_detailed
+from rawaug.evaluation.page import Figure, Page, Part, find_detail
 from rawaug.evaluation.scores import NoisyInput, Panels, Row, panels_of, score
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial
@@ -38,7 +37,7 @@ from rawaug.files import write_json
 from rawaug.io import RawFrame, develop, write_dng
 from rawaug.io.pictures import encode_png, write_picture
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseModel, noise_model
+from rawaug.noise import noise_model
 from rawaug.plugin.targets import Target
 from rawaug.progress import progress
 from rawaug.registry import EXPERIMENTS, Spec, spec_label, split_spec
@@ -87,14 +86,15 @@ class SrgbRecipe(Recipe):
                 raise ValueError(f"classical: {name} is for RAW; on sRGB use one of {', '.join(_WITHOUT_PLANES)}")
 
     @property
-    def validated_with(self) -> object:
+    def validation_noise(self) -> object:
+        """``levels``."""
         return self.levels
 
 
 @EXPERIMENTS.register("srgb")
 def run(recipe: SrgbRecipe, overwrite: bool = False) -> Results:
     """Train the arms and score them on developed frames; by arm, a table of :data:`Scores` a seed."""
-    return SrgbRun(recipe, overwrite, {}).all_stages()
+    return SrgbRun(recipe, overwrite, {}).run_stages()
 
 
 class SrgbRun(TrainingRun):
@@ -116,23 +116,26 @@ class SrgbRun(TrainingRun):
         """The validation frames at every level."""
         return srgb_trials(self.validation, self.recipe.levels, "develop validation")
 
-    def trials(self, noise: NoiseModel, isp: DictionaryISP) -> Sequence[Trial]:
+    def test_trials(self) -> Sequence[Trial]:
+        """The test frames at every level."""
         return self.tests
 
-    def watched(self, isp: DictionaryISP, noise: NoiseModel) -> list[Trial]:
+    def validation_trials(self, isp: DictionaryISP) -> list[Trial]:
+        """The validation frames at every level."""
         return self.validations
 
-    def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, isp: DictionaryISP, seed: int) -> dict[str, Any]:
-        scores = means(score([self.applied(arm, model)], self.tests, f"seed {seed}, {arm}"))[arm]
-        write_json(scores, self.place(arm, seed) / "evaluation.json")
+    def evaluate(self, arm: str, seed: int) -> dict[str, Any]:
+        """PSNR and SSIM by level."""
+        scores = means(score([self.picture_denoiser(arm)], self.tests, f"seed {seed}, {arm}"))[arm]
+        write_json(scores, self.arm_folder(arm, seed) / "evaluation.json")
         return scores
 
-    def applied(self, arm: str, model: Denoiser) -> PictureDenoiser:
-        """A network of sRGB as it is tested."""
-        return PictureDenoiser.of_network(arm, model, self.recipe.device)
+    def picture_denoiser(self, arm: str) -> PictureDenoiser:
+        """An arm's network of sRGB as it is tested."""
+        return PictureDenoiser.of_network(arm, self.models[arm], self.recipe.device)
 
     @cached_property
-    def others(self) -> dict[str, list[Any]]:
+    def methods(self) -> dict[str, list[Any]]:
         """What the arms are compared with, by level: the noisy picture, filters on sRGB, RAW denoisers."""
         chosen = {
             level: [best_filter(spec, at_level(self.validations, level)) for spec in self.recipe.classical]
@@ -140,24 +143,25 @@ class SrgbRun(TrainingRun):
         }
         return {level: [NoisyInput("noisy"), *filters, *self.rivals] for level, filters in chosen.items()}
 
-    def reported(self, results: Results, models: dict[str, Denoiser], noise: NoiseModel, isp: DictionaryISP) -> None:
-        """``results.json``, the table, crops at 100 % and the page."""
-        rows = [row for level, some in self.others.items() for row in score(some, at_level(self.tests, level), level)]
+    def report(self) -> None:
+        """Write ``results.json``, the table, crops at 100 % and the page."""
+        results = self.results
+        rows = [row for level, some in self.methods.items() for row in score(some, at_level(self.tests, level), level)]
         scores = means(rows)
         known = [(p.name, noise_variance(p.raw, *p.own_noise)) for p in self.test if p.own_noise is not None]
         own = {name: variance.mean().item() for name, variance in known}
         content = {"recipe": asdict(self.recipe), "results": results, "others": scores, "own_noise": own}
         write_json(content, self.folder / "results.json")
-        arms = [self.applied(arm, model) for arm, model in models.items()]
-        firsts = [panels_of([*some[1:], *arms], at_level(self.tests, level)[0]) for level, some in self.others.items()]
+        arms = [self.picture_denoiser(arm) for arm in self.models]
+        firsts = [panels_of([*some[1:], *arms], at_level(self.tests, level)[0]) for level, some in self.methods.items()]
         picture = crops(firsts)
         write_picture(self.folder / "picture.png", picture)
         cells = {name: [one] for name, one in scores.items()} | results
-        table = {name: [_cell(runs, level) for level in self.others] for name, runs in cells.items()}
-        head = ["sRGB PSNR / SSIM", *self.others]
+        table = {name: [_cell(runs, level) for level in self.methods] for name, runs in cells.items()}
+        head = ["sRGB PSNR / SSIM", *self.methods]
         title = f"{self.recipe.name} on {self.data.test}, steps: {self.recipe.train.steps}, seeds: {len(self.seeds)}"
         page = Page(title)
-        page.add_curves(draw_curves({arm: [self.place(arm, s) / "log.csv" for s in self.seeds] for arm in models}))
+        page.add_curves(self.curves())
         page.parts.append(Part("Scores", head=head, rows=table))
         caption = f"crops at 100 %, a level in each row: {', '.join(firsts[0].images)}"
         page.parts.append(Part("Pictures", figures=[Figure(encode_png(picture), "crops", caption=caption)]))
@@ -232,7 +236,7 @@ def crops(rows: Sequence[Panels]) -> Tensor:
     """A row of crops of each frame, every image's where the clean one has most detail; sRGB ``(3, h, w)``."""
     found = []
     for row in rows:
-        top, left = most_detailed(row.trial.clean, PANEL)
+        top, left = find_detail(row.trial.clean, PANEL)
         parts = [row.shown(image[..., top : top + PANEL, left : left + PANEL]) for image in row.images.values()]
         found.append(torch.cat(parts, dim=-1))
     return torch.cat(found, dim=-2)

@@ -5,14 +5,14 @@ luminance Y and in chrominance UV (ITU-R BT.601), as in the ablation figure of C
 frame's as-shot gains and blind. And the other way round: fits that lack one stage.
 
 *Learned parts*: encoders, end-to-end training, the loss on the images between the stages and that on the weights'
-consistency are switched off one by one. Each seed draws its own frames, which all variants share: photographs as scenes
-before the demo camera's lens and sensor, in the colour and balance of a published camera and a light. Each fit's
-figures go into a file of their own, so that a stopped run can resume.
+consistency are switched off one by one. Each seed draws its own frames, which all variants share: photographs are the
+scenes before the demo camera's lens and sensor, in the colours of a published camera and the balance of a light. The
+figures of each fit go into a file of their own, so that a stopped run can resume.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -31,7 +31,7 @@ from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair
 from rawaug.errors import extra
 from rawaug.evaluation.tables import mean_and_spread, print_rows
-from rawaug.experiment.run_folder import claim, require_free
+from rawaug.experiment.plan import claim, require_free
 from rawaug.files import fingerprint, write_json
 from rawaug.isp import staged
 from rawaug.isp.cameras import camera_from_srgb, gains_in_light, load_cameras, sample_lights
@@ -43,7 +43,7 @@ from rawaug.isp.fit.samples import block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, frame_coordinates
 from rawaug.metrics import psnr, worst_and_best_quarter
-from rawaug.paper.methods import cycled_without_mosaic, resumed, reverse_parameters
+from rawaug.paper.methods import cycle_without_mosaic, resume, reverse_parameters
 from rawaug.progress import progress
 from rawaug.registry import EXPERIMENTS, check_settings
 from rawaug.seeding import keyed_generator
@@ -59,19 +59,17 @@ STRIDE = 4
 
 @dataclass
 class Ablation:
-    """The contribution of each stage.
+    """The settings of the experiment with stages.
 
     Args:
-        experiment: "ablation".
-        name: of the folder in ``out`` that it writes.
+        name: of the output folder within ``out``.
         data: the pairs; every frame is measured by a fit on the others.
-        count: only the first so many of them.
+        count: number of pairs to use, the first ones; null for all.
         fit: of the ISP.
         seed: of the fits.
         out: folder of all runs.
     """
 
-    experiment: str = "ablation"
     name: str = "ablation"
     data: str = "demo:train"
     count: int | None = None
@@ -86,7 +84,14 @@ class Ablation:
 
 @EXPERIMENTS.register("ablation")
 def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
-    """Run an ablation: a table, ``ablation.json`` and ``ablation.png``; ``overwrite`` replaces another of its name."""
+    """Run it: a table, ``ablation.json`` and ``ablation.png``; ``overwrite`` replaces another run of its name.
+
+    Returns:
+        ``settings``; ``stages``, PSNR in dB of :data:`TITLES` by :data:`SPACES`; and ``without``, PSNR_r by stage.
+
+    Raises:
+        ValueError: if there are fewer than two frames.
+    """
     require_free(ablation, overwrite)
     pairs = list(skip_broken(open_pairs(ablation.data, split="train"), "data"))[: ablation.count]
     if len(pairs) < 2:
@@ -107,7 +112,7 @@ def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
         for given, rows in means.items()
     ]
     print_rows("PSNR against RAW after each stage (dB), frames left out", ["given, space", *TITLES], *sections)
-    print("PSNR_r without a stage:", ", ".join(f"{stage} {value:.2f}" for stage, value in result["without"].items()))
+    print("PSNR_r without a stage:", ", ".join(f"{stage} {value:.2f}" for stage, value in without.items()))
     print(f"picture: {picture}")
     return result
 
@@ -115,7 +120,7 @@ def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
 def measure(
     others: Sequence[Pair], left_out: Pair, config: FitConfig
 ) -> tuple[dict[str, list[list[float]]], dict[str, float]]:
-    """One frame, by fits on the others: PSNR after each stage, and PSNR_r without a stage."""
+    """Measure one frame by fits on the others: :func:`stage_psnr`, blind and with its gains, and PSNR_r by stage."""
     isp = fit_isp(others, config, progress=False)
     curves = {given: stage_psnr(isp, left_out, given != "blind") for given in ("blind", "as-shot gains")}
     without = {"none": psnr_r(isp, left_out, white_balance=True)}
@@ -128,31 +133,31 @@ def measure(
 
 @torch.no_grad()
 def stage_psnr(isp: DictionaryISP, pair: Pair, white_balance: bool) -> list[list[float]]:
-    """PSNR of x, x1 ... x5 (a stage that is left out repeats the one before) in RGB, Y and UV: 6 rows of 3."""
-    srgb, raw, place, known = _comparable(pair)
+    """PSNR in dB of x, x1 ... x5 in RGB, Y and UV: 6 rows of 3; a stage that is left out repeats the one before."""
+    srgb, raw, coordinates, known = _comparable_pixels(pair)
     given = pair.white_balance if white_balance else None
     params = staged.with_white_balance(isp, isp.choose(pair.srgb[None]), given, None)
     seen: dict[str, Tensor] = {}
-    isp.reverse_pixels(srgb, params, place, seen)
+    isp.reverse_pixels(srgb, params, coordinates, seen)
     rows, image = [], srgb
-    for name in ("x", "x1", "x2", "x3", "x4", "x5"):
-        image = seen.get(name, image)
+    for title in TITLES:
+        image = seen.get(title[:2].rstrip(), image)
         difference = (image - raw).permute(1, 0, 2, 3)[:, known[:, 0]]
         yuv = torch.tensor(YUV) @ difference
         rows.append([_decibels(difference), _decibels(yuv[:1]), _decibels(yuv[1:])])
     return rows
 
 
-def _comparable(pair: Pair) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """sRGB, RAW of three colours, places and the mask of unclipped pixels, all ``(1, C, h, w)``."""
+def _comparable_pixels(pair: Pair) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """sRGB, RAW of three colours, coordinates and the mask of unclipped pixels, all ``(1, C, h, w)``."""
     if not pair.registered:
         blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
         return blocks.srgb[None], blocks.raw[None], blocks.coordinates, (~blocks.clipped)[None, None]
     picked = (..., slice(None, None, STRIDE), slice(None, None, STRIDE))
     raw = bayer.demosaic(pair.raw[None], pair.cfa)[picked]
-    place = frame_coordinates(*pair.raw.shape[-2:])[picked]
+    coordinates = frame_coordinates(*pair.raw.shape[-2:])[picked]
     srgb = as_float(pair.srgb[None])[picked]
-    return srgb, raw, place, (srgb.amax(1, keepdim=True) < 0.98) & (raw.amax(1, keepdim=True) < 0.98)
+    return srgb, raw, coordinates, (srgb.amax(1, keepdim=True) < 0.98) & (raw.amax(1, keepdim=True) < 0.98)
 
 
 def _decibels(difference: Tensor) -> float:
@@ -195,13 +200,12 @@ COLUMNS = {
 
 @dataclass
 class ComponentAblation:
-    """What the learned parts are worth.
+    """The settings of the experiment with learned parts.
 
     Args:
-        experiment: "learned".
-        name: of the folder in ``out`` that it writes.
+        name: of the output folder within ``out``.
         pictures: a folder of photographs of 288 x 448 or more, or "demo:"; one frame is made of each.
-        cameras: published ones, in turn.
+        cameras: names of published cameras, which the frames have in turn.
         frames: number of frames that an ISP is fitted to.
         left_out: number of further frames that it is scored on.
         fit: of the ISP with all parts.
@@ -211,7 +215,6 @@ class ComponentAblation:
         out: folder of all runs.
     """
 
-    experiment: str = "learned"
     name: str = "learned"
     pictures: str = "demo:"
     cameras: list[str] = field(default_factory=lambda: list(CAMERAS))
@@ -241,7 +244,11 @@ class ComponentAblation:
 
 @EXPERIMENTS.register("learned")
 def ablate_components(learned: ComponentAblation, overwrite: bool = False) -> dict[str, dict[str, Any]]:
-    """Run it: a table, and ``table.json`` with every figure; ``overwrite`` replaces another of its name."""
+    """Run it: a table, and ``table.json`` with every figure; ``overwrite`` replaces another run of its name.
+
+    Returns:
+        By variant the figures of ``COLUMNS``, means over frames in dB, one a seed.
+    """
     pictures = open_pictures(learned.pictures, min_side=min(FRAME))
     folder = claim(learned, overwrite)
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in learned.variants}
@@ -251,8 +258,8 @@ def ablate_components(learned: ComponentAblation, overwrite: bool = False) -> di
         left_out = synthetic_frames(chosen[learned.frames :], learned.cameras, seed, "left-out")
         for name, changes in progress(learned.variants.items(), label=f"seed {seed}", unit="fit"):
             config = replace(learned.fit, **changes, seed=seed)
-            place = folder / f"seed{seed}" / f"{name.replace(' ', '-').replace('/', '_')}.json"
-            found[name].append(variant_scores(place, config, frames, left_out))
+            path = folder / f"seed{seed}" / f"{name.replace(' ', '-').replace('/', '_')}.json"
+            found[name].append(score_variant(path, config, frames, left_out))
     rows = {name: _row(runs) for name, runs in found.items()}
     write_json({"settings": asdict(learned), "rows": rows}, folder / "table.json")
     title = (
@@ -269,36 +276,43 @@ def ablate_components(learned: ComponentAblation, overwrite: bool = False) -> di
 
 
 def synthetic_frames(pictures: Sequence[Tensor], cameras: Sequence[str], seed: int, part: str) -> list[Pair]:
-    """A frame of 288 x 448 of each picture, the cameras in turn, each in a light of its own."""
+    """A frame of 288 x 448 of each picture, each in a light of its own.
+
+    Args:
+        pictures: uint8 sRGB ``(3, H, W)``, the scenes.
+        cameras: names of published ones, which take turns.
+        seed: decides crops and lights.
+        part: of the experiment; its name is part of the seed and of the frames' names.
+    """
     matrices = load_cameras().select(cameras)
     frames = []
     for k, picture in enumerate(pictures):
-        which = k % len(cameras)
-        name = f"{part}_{k:03d}_{cameras[which].replace(' ', '-')}"
-        frames.append(_frame(picture, matrices[which], keyed_generator(seed, "varied frame", part, k), name))
+        which, generator = k % len(cameras), keyed_generator(seed, "varied frame", part, k)
+        shot_of = _camera_in_light(matrices[which], generator)
+        factor = min(side // size for side, size in zip(picture.shape[-2:], FRAME, strict=True))
+        small = F.avg_pool2d(picture[None].float(), factor)[0].round().to(torch.uint8)  # the largest whole reduction
+        scene = bayer.RandomCrop(FRAME)(small, generator)
+        frames.append(shot_of(scene, f"{part}_{k:03d}_{cameras[which].replace(' ', '-')}"))
     return frames
 
 
-def _frame(picture: Tensor, xyz_to_camera: Tensor, generator: torch.Generator, name: str) -> Pair:
+def _camera_in_light(xyz_to_camera: Tensor, generator: torch.Generator) -> Callable[[Tensor, str], Pair]:
+    """The demo camera with these colours in a random light: a function from scene and name to a frame."""
     balances = gains_in_light(xyz_to_camera, torch.from_numpy(sample_lights(LIGHTS_TRIED, generator))).numpy()
     red, green, blue = balances[is_plausible(balances)][0].tolist()
     least = min(red, green, blue)
     to_srgb = torch.linalg.inv(camera_from_srgb(xyz_to_camera)).tolist()
     camera = DemoCamera(color_matrix=tuple((r, g, b) for r, g, b in to_srgb))
     shot = camera.sample(generator, iso=100)._replace(white_balance=(red / least, green / least, blue / least))
-    return camera.apply(_scene(picture, generator), shot, name)
-
-
-def _scene(picture: Tensor, generator: torch.Generator) -> Tensor:
-    """A crop of the picture at the largest whole reduction that still holds a frame."""
-    factor = min(side // size for side, size in zip(picture.shape[-2:], FRAME, strict=True))
-    small = F.avg_pool2d(picture[None].float(), factor)[0].round().to(torch.uint8)
-    scene: Tensor = bayer.RandomCrop(FRAME)(small, generator)
-    return scene
+    return lambda scene, name: camera.apply(scene, shot, name)
 
 
 def photographs(pictures: Sequence[Tensor] | PictureFolder, learned: ComponentAblation, seed: int) -> list[Tensor]:
-    """As many as are needed of those that hold a frame, in a random order."""
+    """As many uint8 pictures ``(3, H, W)`` as are needed, of those that hold a frame, in a random order.
+
+    Raises:
+        ValueError: if there are too few.
+    """
     order = torch.randperm(len(pictures), generator=keyed_generator(seed, "photographs")).tolist()
     large = (p for p in (pictures[k] for k in order) if p.shape[-2] >= FRAME[0] and p.shape[-1] >= FRAME[1])
     chosen = list(islice(large, learned.frames + learned.left_out))
@@ -310,18 +324,25 @@ def photographs(pictures: Sequence[Tensor] | PictureFolder, learned: ComponentAb
     return chosen
 
 
-def variant_scores(place: Path, config: FitConfig, frames: Sequence[Pair], left_out: Sequence[Pair]) -> dict[str, Any]:
-    """The scores of one fit, from its file where it is there."""
-    sums = [float(pair.raw.double().sum()) for pair in (*frames, *left_out)]
-    place.parent.mkdir(parents=True, exist_ok=True)
+def score_variant(path: Path, config: FitConfig, frames: Sequence[Pair], left_out: Sequence[Pair]) -> dict[str, Any]:
+    """The scores of one fit.
 
-    def measured() -> dict[str, Any]:
-        isp = fit_isp(frames, config, progress=False, state=place.with_suffix(".state"))
+    Args:
+        path: of the JSON file that holds them once they are measured.
+        config: of the fit.
+        frames: what is fitted.
+        left_out: what is scored.
+    """
+    sums = [float(pair.raw.double().sum()) for pair in (*frames, *left_out)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+    def measure() -> dict[str, Any]:
+        isp = fit_isp(frames, config, progress=False, state=path.with_suffix(".state"))
         scores = [score(isp, pair) for pair in left_out]
         by_name = {name: [one[name] for one in scores] for name in scores[0]}
         return {"joint": isp.info.get("joint"), "parameters": reverse_parameters(isp), **by_name}
 
-    return resumed(place, fingerprint("learned", asdict(config), sums), measured)
+    return resume(path, fingerprint("learned", asdict(config), sums), measure)
 
 
 @torch.no_grad()
@@ -334,7 +355,7 @@ def score(isp: DictionaryISP, pair: Pair) -> dict[str, float]:
         "psnr_r": psnr_r(isp, pair),
         "as_shot": psnr_r(isp, pair, white_balance=True),
         "forward": float(-10.0 * forward.log10()),
-        "cycle": psnr(cycled_without_mosaic(isp, srgb), srgb).item(),
+        "cycle": psnr(cycle_without_mosaic(isp, srgb), srgb).item(),
     }
 
 

@@ -18,6 +18,10 @@ InvISP's figure on MIT-Adobe FiveK is the PSNR of demosaiced, white-balanced and
 
 with the as-shot white balance w, bilinear interpolation and :math:`\hat y` within [0, 1]: the mean over a frame's 3 x 3
 equal pieces, which begin at even sites here. Source: Xing et al., CVPR 2021, and the authors' published scripts.
+
+PSNR_d is that of a denoiser trained on the RAW that a method makes of sRGB pictures, on real RAW. Pictures, network,
+steps and noise are the same for every method. The dictionary ISP draws camera settings from its hull, UPI from its
+published distributions; a network has one answer.
 """
 
 from __future__ import annotations
@@ -25,7 +29,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 from pathlib import Path
 from statistics import fmean
@@ -34,10 +38,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from denoisers import Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.camera.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
-from rawaug.data.pairs import Pair
+from rawaug.data import open_pairs
+from rawaug.data.folders import skip_broken
+from rawaug.data.pairs import Pair, Sample, SomePairs
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.evaluation.scores import Row, score
+from rawaug.evaluation.trials import trial_of
 from rawaug.files import find_weights, write_json
 from rawaug.isp import staged
 from rawaug.isp.config import ISPParams
@@ -46,26 +56,34 @@ from rawaug.isp.fit.samples import PixelSamples, block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, coordinates_or_full, frame_coordinates
 from rawaug.metrics import PATCH, psnr
+from rawaug.noise import NoiseModel, noise_model
 from rawaug.paper.baselines import BASELINES, Training, fit_baseline
 from rawaug.paper.baselines.base import BaselineISP, CropTrainedISP
-from rawaug.seeding import keyed_generator
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.draw import Draw
+from rawaug.seeding import derive_seed, keyed_generator
+from rawaug.training.config import DenoiserConfig, TrainConfig
+from rawaug.training.loop import train
+from rawaug.training.stream import PictureCrops, Source, TrainingStream, freeze_samples
 
 FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
 ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples", "oracle": "oracle weights"}
 SAMPLES = 64
-
-
+SHORTEST_CROP = 256
 Method = BaselineISP | DictionaryISP
 
 
 class Fitted(NamedTuple):
+    """A method after its fit, the time that it took, and the number of parameters of its reverse pass."""
+
     model: Method
     seconds: float
     parameters: int
 
 
-def resumed(path: Path, key: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """The figures that an earlier run wrote to ``path`` under the same key, else measured and written."""
+def resume(path: Path, key: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """The figures in ``path`` if an earlier run wrote them under the same key; else they are measured and written."""
     figures: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
     if figures.get("key") != key:
         figures = {"key": key, **measure()}
@@ -90,32 +108,44 @@ def learns_by_descent(family: str) -> bool:
 
 
 def fit_family(family: str, pairs: Sequence[Pair], config: FitConfig, training: Training) -> Fitted:
-    """Fit a family to pairs of one CFA, with the seed of ``training``."""
+    """Fit a family to pairs of one CFA.
+
+    Args:
+        family: one of :data:`FAMILIES`, or an ISP to take as it is, by a shipped one's name or a file.
+        pairs: the frames to fit.
+        config: of the dictionary ISP.
+        training: budget and crops of the networks; its seed is used by every family.
+
+    Raises:
+        ValueError: if the ISP's CFA is not that of the frames.
+    """
     start = time.perf_counter()
     if family not in FAMILIES:
         isp = DictionaryISP.from_pretrained(family)
         if isp.cfa != CFA(pairs[0].cfa):
             raise ValueError(f"{family}: makes {isp.cfa.value} RAW, but the frames are {CFA(pairs[0].cfa).value}")
         return Fitted(isp, 0.0, reverse_parameters(isp))
+    model: Method
     if family.startswith("dictionary"):
         config = replace(config, seed=training.seed, encoders="on" if family == "dictionary-encoders" else "off")
-        isp = fit_isp(pairs, config)
-        return Fitted(isp, time.perf_counter() - start, reverse_parameters(isp))
-    method = BASELINES[family]
-    start_of: dict[str, Any] = {"seed": training.seed} if issubclass(method, CropTrainedISP) else {}
-    model = fit_baseline(method(cfa=pairs[0].cfa, **start_of), pairs, training)
+        model = fit_isp(pairs, config)
+    else:
+        drawn: dict[str, Any] = {"seed": training.seed} if learns_by_descent(family) else {}
+        model = fit_baseline(BASELINES[family](cfa=pairs[0].cfa, **drawn), pairs, training)
     return Fitted(model, time.perf_counter() - start, reverse_parameters(model))
 
 
 def reverse_parameters(model: Method) -> int:
     """Number of parameters of the reverse pass."""
-    network = model.reverse_network if isinstance(model, BaselineISP) else model
-    named = network.named_parameters()
+    named = getattr(model, "reverse_network", model).named_parameters()
     return sum(p.numel() for name, p in named if not name.startswith("forward_") and ".forward_" not in name)
 
 
 def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any]:
-    """PSNR_r of every row that the family fills, and the Mpix/s of the reverse pass; over blocks if unregistered."""
+    """``rows``, the PSNR_r in dB of every row that the family fills, and ``mpix_s``, the speed of its reverse pass.
+
+    An unregistered pair is compared as averages over blocks, and has no speed. ``patches`` None scores all patches.
+    """
     pair.require_rendered()
     model = fitted.model
     if not pair.registered:
@@ -131,27 +161,27 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any
 
 
 def balanced_rows(fitted: Fitted, pair: Pair) -> dict[str, float]:
-    """InvISP's PSNR (:func:`balanced_psnr`) of every row that the family fills."""
+    """InvISP's PSNR in dB (:func:`balanced_psnr`) of every row that the family fills."""
     return {row: balanced_psnr(make, pair) for row, make in _makers(fitted.model, pair).items()}
 
 
 def _makers(model: Method, pair: Pair) -> dict[str, Callable[[Tensor, Tensor], Tensor]]:
-    """Row to the function from an sRGB patch and its place in the frame to a mosaic."""
+    """Row to the function from an sRGB patch and its coordinates to a mosaic."""
 
     def maker(given: Any) -> Callable[[Tensor, Tensor], Tensor]:
         if isinstance(model, DictionaryISP):
-            return lambda patch, place: model.reverse(patch, given, coordinates=place).raw
-        return lambda patch, place: model.reverse(patch, given)
+            return lambda patch, coordinates: model.reverse(patch, given, coordinates=coordinates).raw
+        return lambda patch, _: model.reverse(patch, given)
 
     return {row: maker(given) for row, given in settings(model, pair).items()}
 
 
 def settings(model: Method, pair: Pair) -> dict[str, Any]:
-    """Row to the camera setting that it is made with; a method that has no use for gains has one row."""
+    """By row the camera setting that it is made with; a method that makes no use of gains has one row."""
     if isinstance(model, DictionaryISP):
         return dictionary_params(model, pair)
-    balanced = model.balanced(pair.white_balance) if pair.balance_known else None
-    return {"blind": None} | ({} if balanced is None else {"as-shot": balanced})
+    as_shot = model.setting_of(pair.white_balance) if pair.balance_known else None
+    return {"blind": None} | ({} if as_shot is None else {"as-shot": as_shot})
 
 
 def _block_rows(model: Method, pair: Pair) -> dict[str, float]:
@@ -169,11 +199,8 @@ def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
     with torch.no_grad():
         blind = isp.choose(pair.srgb[None])
         as_shot = staged.with_white_balance(isp, blind, pair.white_balance, None)
-        known = {
-            "blind": blind,
-            **({"as-shot": as_shot} if pair.balance_known else {}),
-            "samples": _from_samples(isp, pair, blind),
-        }
+        known = {"blind": blind} | ({"as-shot": as_shot} if pair.balance_known else {})
+        known["samples"] = _from_samples(isp, pair, blind)
         return known | {"oracle": oracle(isp, pair, list(known.values()))}
 
 
@@ -187,24 +214,27 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
 
 @torch.no_grad()
 def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
-    """Mean PSNR of sRGB -> RAW -> sRGB over pictures ``(3, H, W)`` uint8; empty for a method without a way back."""
+    """Mean PSNR in dB of sRGB to RAW and back over uint8 pictures ``(3, H, W)``; empty for a method without a way back.
+
+    The dictionary ISP has a second figure, ``cycle_without_mosaic``.
+    """
     model, shown = fitted.model, [as_float(picture[None]) for picture in pictures]
     if not isinstance(model, DictionaryISP):
         return {"cycle": fmean(psnr(model.cycle(x), x).item() for x in shown)} if model.bidirectional else {}
     made = (model.reverse(x) for x in shown)
     cycled = [model.forward(result.raw.clamp(0.0, 1.0), result.params).srgb for result in made]
-    ways = {"cycle": cycled, "cycle_without_mosaic": [cycled_without_mosaic(model, x) for x in shown]}
+    ways = {"cycle": cycled, "cycle_without_mosaic": [cycle_without_mosaic(model, x) for x in shown]}
     return {way: fmean(psnr(a, b).item() for a, b in zip(found, shown, strict=True)) for way, found in ways.items()}
 
 
-def cycled_without_mosaic(isp: DictionaryISP, srgb: Tensor) -> Tensor:
-    """sRGB to x5 and back: what the stages alone lose."""
+def cycle_without_mosaic(isp: DictionaryISP, srgb: Tensor) -> Tensor:
+    """sRGB ``(B, 3, H, W)`` to x5 and back to the same shape: what the stages alone lose."""
     params = isp.choose(srgb)
     return isp.forward_pixels(isp.reverse_pixels(srgb, params), params).clamp(0.0, 1.0)
 
 
 def mosaic_only_psnr(pictures: Sequence[Tensor], cfa: CFA | str = "RGGB") -> float:
-    """What the mosaic and bilinear interpolation alone leave: the ceiling of a cycle."""
+    """Mean PSNR in dB of pictures ``(3, H, W)`` after a mosaic and bilinear interpolation: the ceiling of a cycle."""
     values = [as_float(p[None]) for p in pictures]
     return fmean(psnr(bayer.demosaic(bayer.mosaic(x, cfa), cfa).clamp(0.0, 1.0), x).item() for x in values)
 
@@ -215,7 +245,10 @@ PARTS = 3
 
 @torch.no_grad()
 def balanced_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair) -> float:
-    """Mean over the pieces; ``make`` maps sRGB ``(1, 3, h, w)`` and its place in the frame to RAW ``(1, 1, h, w)``."""
+    """InvISP's PSNR in dB, the mean over nine pieces; ValueError if the pair is not registered.
+
+    ``make`` maps sRGB ``(1, 3, h, w)`` and its coordinates in the frame ``(1, 2, h, w)`` to RAW ``(1, 1, h, w)``.
+    """
     if not pair.registered:
         raise ValueError(f"{pair.name}: is not registered pixel by pixel, so it has no balanced PSNR")
     height, width = pair.raw.shape[-2:]
@@ -223,14 +256,14 @@ def balanced_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair) -> float
     values = []
     for (top, bottom), (left, right) in product(*map(pairwise, edges)):
         piece = (None, slice(None), slice(top, bottom), slice(left, right))
-        place = frame_coordinates(bottom - top, right - left, (top, left), (height, width))
-        made = make(pair.srgb[piece], place).clamp(0.0, 1.0)
-        values.append(psnr(_seen(made, pair), _seen(pair.raw[piece], pair)).item())
+        coordinates = frame_coordinates(bottom - top, right - left, (top, left), (height, width))
+        made = make(pair.srgb[piece], coordinates).clamp(0.0, 1.0)
+        values.append(psnr(_balanced(made, pair), _balanced(pair.raw[piece], pair)).item())
     return fmean(values)
 
 
-def _seen(raw: Tensor, pair: Pair) -> Tensor:
-    """z of a mosaic ``(1, 1, h, w)``: ``(1, 3, h, w)``."""
+def _balanced(raw: Tensor, pair: Pair) -> Tensor:
+    """z of a mosaic ``(1, 1, h, w)``, of shape ``(1, 3, h, w)``."""
     gains = torch.tensor(pair.white_balance)
     balanced = bayer.demosaic(raw, pair.cfa) * (gains / gains.max()).reshape(3, 1, 1)
     return balanced.clamp_min(0.0) ** (1.0 / GAMMA)
@@ -254,18 +287,21 @@ def oracle(isp: DictionaryISP, pair: Pair, others: Sequence[ISPParams]) -> ISPPa
     if isp.config.cameras:
         own, value = pixels.site[:, :, 0], pixels.target.sum(dim=(1, 2))
         start = staged.with_readings(isp, pixels.srgb, pixels.coordinates, own, value, others[0])
-    found = [*others, _descended(isp, pixels, start)]
+    found = [*others, _descend(isp, pixels, start)]
     return min(found, key=lambda setting: squared_error(isp, pixels, setting).item())
 
 
 def squared_error(isp: DictionaryISP, pixels: PixelSamples, setting: ISPParams) -> Tensor:
-    """Mean over the readings that are not clipped: a few that are would outweigh all others. Held to [0, 1]."""
+    """Mean squared error of the reverse pass, within [0, 1], over readings that are not clipped, a scalar.
+
+    The few clipped ones would outweigh all others.
+    """
     made = isp.reverse_pixels(pixels.srgb, setting, pixels.coordinates).clamp(0.0, 1.0)
     return ((made - pixels.target) ** 2 * pixels.known).sum() / pixels.known.sum()
 
 
 @torch.enable_grad()
-def _descended(isp: DictionaryISP, pixels: PixelSamples, start: ISPParams | None) -> ISPParams:
+def _descend(isp: DictionaryISP, pixels: PixelSamples, start: ISPParams | None) -> ISPParams:
     """From ``start``, with free gains; or from uniform weights of all atoms, those of the gains among them."""
     config = isp.config
     if start is None:
@@ -294,3 +330,111 @@ def _descended(isp: DictionaryISP, pixels: PixelSamples, start: ISPParams | None
         (error + EPS).log().backward()
         optimiser.step()
     return ISPParams(*(value.detach() for value in best))
+
+
+# -- PSNR_d -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class DownstreamConfig:
+    """How PSNR_d is measured.
+
+    Args:
+        methods: the families of which it is measured.
+        test: RAW frames of unseen cameras; folders, or ``kind:path``.
+        test_crop: side of the central crop scored of each test frame; null for the whole frame.
+        test_count: number of frames of each of ``test``; null for all.
+        bin: K bins these frames K x K by colour site: clean references of real photographs.
+        exposure: lowest and highest exposure in stops at which the RAW of a fitted ISP is drawn, for the test cameras'
+            headroom is not known; ISPs of published cameras and UPI's published distributions have their own.
+        noise: preset, in training and on the test frames.
+        denoiser: the network.
+        train: the loop.
+    """
+
+    methods: list[str] = field(default_factory=lambda: ["dictionary", "upi"])
+    test: list[str] = field(default_factory=lambda: ["demo:test"])
+    test_crop: int | None = 1024
+    test_count: int | None = None
+    bin: int = 1
+    exposure: tuple[float, float] | None = (-1.5, 0.0)
+    noise: str = "cycleisp_sidd"
+    denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+    def shortest(self) -> DownstreamConfig:
+        """One step, one small test frame."""
+        one = replace(self.train, steps=1, batch=2, warmup=1, validate_every=1, checkpoint_every=1)
+        return replace(self, test_crop=SHORTEST_CROP, test_count=1, train=one)
+
+
+def psnr_d(model: Method, pictures: Sequence[Tensor], config: DownstreamConfig, folder: Path, seed: int) -> float:
+    """Mean PSNR in dB, on the test frames, of a denoiser that is trained on a method's RAW.
+
+    Args:
+        model: makes the RAW.
+        pictures: uint8 sRGB ``(3, H, W)``.
+        config: network, loop, noise and test frames.
+        folder: of the training's files, one folder a seed in it, from which a stopped training goes on.
+        seed: of the training.
+    """
+    net = train_on(_crops(model, pictures, noise_model(config.noise), config), config, folder, seed)
+    return fmean(row.psnr for row in score_on(net, config, CFA(model.cfa)))
+
+
+def train_on(crops: Source, config: DownstreamConfig, folder: Path, seed: int) -> Denoiser:
+    """A denoiser trained on ``crops``; ``config``, ``folder`` and ``seed`` as in :func:`psnr_d`."""
+    stream = TrainingStream(None, crops, config.train.batch, 1.0, derive_seed(seed, "downstream"))
+    samples, label = freeze_samples(crops, "watched"), f"{folder.name} {seed}"
+    return train(stream, samples, config.denoiser, config.train, folder / f"seed{seed}", seed, label=label)
+
+
+def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> list[Row]:
+    """The scores of a network on the test frames, whose noise is frozen with seed 0; ``cfa`` is the network's."""
+    opened = ((open_pairs(spec, split="test", bin=config.bin), spec) for spec in config.test)
+    chosen = ((SomePairs(found, range(len(found))[: config.test_count]), spec) for found, spec in opened)
+    pairs = (pair for frames, spec in chosen for pair in skip_broken(frames, spec))
+    noise, denoiser = noise_model(config.noise), RawDenoiser.of(net, cfa=cfa)
+    frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in pairs]
+    return list(score([denoiser], (trial_of(pair, noise, cfa) for pair in frames), "PSNR_d"))
+
+
+def _crops(model: Method, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:
+    if not isinstance(model, DictionaryISP):
+        return MadeCrops(pictures, model.draw, model.cfa, noise, config.train.crop)
+    # The plugin keeps each crop's place in its frame.
+    draw = Draw(exposure=None if model.config.cameras else config.exposure)
+    return PictureCrops(RawPairs(pictures, RawAugment(model, noise, draw=draw), config.train.crop))
+
+
+class MadeCrops:
+    """Crops of pictures, turned at random, made RAW by any function.
+
+    Args:
+        pictures: uint8 sRGB ``(3, H, W)``.
+        make: maps float sRGB ``(1, 3, h, w)`` and a generator to a mosaic ``(1, 1, h, w)``.
+        cfa: the pattern of these mosaics.
+        noise: drawn for each crop.
+        crop: side of the crops in pixels.
+    """
+
+    def __init__(
+        self,
+        pictures: Sequence[Tensor],
+        make: Callable[[Tensor, torch.Generator], Tensor],
+        cfa: CFA,
+        noise: NoiseModel,
+        crop: int,
+    ) -> None:
+        self.pictures, self.make, self.cfa, self.noise = pictures, make, cfa, noise
+        self.crop = bayer.RandomCrop(crop)
+
+    @torch.no_grad()
+    def draw(self, generator: torch.Generator) -> Sample:
+        """A sample of packed RAW ``(4, crop / 2, crop / 2)``."""
+        picture = self.pictures[int(torch.randint(len(self.pictures), (), generator=generator))]
+        patch = bayer.RandomTurn(self.cfa, keep_cfa=False)(self.crop(picture, generator), generator)
+        clean = bayer.pack(self.make(as_float(patch[None]), generator).clamp(0.0, 1.0), self.cfa)
+        params = self.noise.sample(1, generator)
+        noisy = self.noise.apply(clean, params)
+        return Sample(noisy[0], clean[0], self.noise.variance(noisy, params)[0])

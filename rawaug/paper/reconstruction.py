@@ -1,15 +1,15 @@
 """The reconstruction table: every method fitted on the same pairs, measured on frames left out.
 
 PSNR_r is leave-one-frame-out: a method is fitted on all frames but one, and scored on that one. With ``test`` it is
-that of a published split: a method is fitted once to all frames, and scored on every frame of another set.
-PSNR_d is that of a denoiser trained on the RAW that a method makes of sRGB pictures, on frames of cameras that no
-method has seen. Each fit's figures go into a file of their own, so that a stopped run can resume.
+that of a published split: a method is fitted once to all frames, and scored on every frame of another set. PSNR_d is
+measured on frames of cameras that no method has seen. The figures of each fit go into a file of their own, so that a
+stopped run can resume.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -26,17 +26,17 @@ from rawaug.data.folders import Readable, skip_broken
 from rawaug.data.pairs import Pair, SomePairs, names_of, selected, shared_frame
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.evaluation.trials import trial_of
-from rawaug.experiment.run_folder import claim, require_free, run_folder
+from rawaug.experiment.plan import claim, require_free, run_folder
 from rawaug.files import fingerprint, write_json
 from rawaug.io import decode_srgb, encode_srgb
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
 from rawaug.noise import noise_model
 from rawaug.paper.baselines import Training
-from rawaug.paper.downstream import DownstreamConfig, psnr_d
 from rawaug.paper.methods import (
     FAMILIES,
     ROWS,
+    DownstreamConfig,
     Fitted,
     balanced_rows,
     cycle_psnr,
@@ -44,7 +44,8 @@ from rawaug.paper.methods import (
     is_method,
     learns_by_descent,
     mosaic_only_psnr,
-    resumed,
+    psnr_d,
+    resume,
     score_rows,
 )
 from rawaug.plugin.pictures import trim_to_even
@@ -59,27 +60,28 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def _cells(row: dict[str, Any], columns: Sequence[str]) -> list[str]:
-    values = (row.get(name) or [] for name in columns)
-    listed = [value if isinstance(value, list) else [value] for value in values]
-    figures = [mean_and_spread(value, 2) if value else "" for value in listed]
-    speed = "" if row["mpix_s"] is None else f"{row['mpix_s']:.3g}"
-    return [*figures, f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}", speed]
+def print_methods(title: str, rows: Mapping[str, Mapping[str, Any]], balanced: bool, ceiling: float) -> None:
+    """Print the rows of a comparison.
 
+    Args:
+        title: of the table.
+        rows: by name, as in ``table.json``.
+        balanced: whether there is a column with InvISP's figure.
+        ceiling: PSNR in dB that the mosaic alone leaves of a cycle.
+    """
+    columns = {key: head for key, head in COLUMNS.items() if key != "balanced" or balanced}
 
-def print_methods(title: str, rows: dict[str, dict[str, Any]], balanced: bool, ceiling: float) -> None:
-    """Print the rows of a comparison; ``ceiling`` is the PSNR that the mosaic alone leaves of a cycle."""
-    columns = [name for name in COLUMNS if name != "balanced" or balanced]
-    heads = [COLUMNS[name] for name in columns] + ["M par.", "s to fit", "Mpix/s"]
-    print_rows(title, ["method", *heads], [[name, *_cells(row, columns)] for name, row in rows.items()])
+    def cells(row: Mapping[str, Any]) -> Iterator[str]:
+        for value in map(row.get, columns):
+            yield "" if value is None else mean_and_spread(value if isinstance(value, list) else [value], 2)
+        yield f"{row['parameters'] / 1e6:.3f}"
+        yield f"{row['seconds']:.1f}"
+        yield "" if row["mpix_s"] is None else f"{row['mpix_s']:.3g}"
+
+    heads = ["method", *columns.values(), "M par.", "s to fit", "Mpix/s"]
+    print_rows(title, heads, [[name, *cells(row)] for name, row in rows.items()])
     threads = torch.get_num_threads()
     print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); threads: {threads}")
-
-
-def row_name(family: str, row: str) -> str:
-    """Of a row of a fold: "as-shot, overexposed" and the like."""
-    setting, _, kind = row.partition(", ")
-    return ", ".join([family, *([] if setting == "blind" else [ROWS[setting]]), *([kind] if kind else [])])
 
 
 STOPS, CONTRAST, SATURATION = 1.0, 0.5, 1.3
@@ -87,22 +89,22 @@ LUMA = (0.2126, 0.7152, 0.0722)
 """Of ITU-R BT.709."""
 
 
-def overexposed(pair: Pair) -> Pair:
-    """The shot with more light, RAW and picture clipped at white."""
+def overexpose(pair: Pair) -> Pair:
+    """The shot with a stop more light, RAW and picture clipped at white."""
     factor = 2.0**STOPS
     picture = encode_srgb((factor * decode_srgb(pair.srgb.float() / 255.0)).clamp(max=1.0))
     return replace(pair, srgb=_as_8_bits(picture), raw=(factor * pair.raw).clamp(max=1.0))
 
 
-def retouched(pair: Pair) -> Pair:
-    """The RAW stays, the picture is given an S curve and more saturated colour."""
+def retouch(pair: Pair) -> Pair:
+    """The pair with an S curve and more saturated colour in its picture; the RAW stays."""
     x = pair.srgb.float() / 255.0
     x = x + CONTRAST * (3.0 * x**2 - 2.0 * x**3 - x)
     luma = (torch.tensor(LUMA).reshape(3, 1, 1) * x).sum(0, keepdim=True)
     return replace(pair, srgb=_as_8_bits((luma + SATURATION * (x - luma)).clamp(0.0, 1.0)))
 
 
-PERTURBED: dict[str, Callable[[Pair], Pair]] = {"overexposed": overexposed, "retouched": retouched}
+PERTURBED: dict[str, Callable[[Pair], Pair]] = {"overexposed": overexpose, "retouched": retouch}
 
 
 def _as_8_bits(picture: Tensor) -> Tensor:
@@ -111,19 +113,18 @@ def _as_8_bits(picture: Tensor) -> Tensor:
 
 @dataclass
 class Comparison:
-    """A table of methods.
+    """The settings of a table of methods.
 
     Args:
-        experiment: "reconstruction".
         name: of the output folder within ``out``.
         data: the pairs, of one CFA; methods that train on crops need them registered. A dataset's split is ``train``.
         test: score on these pairs, of the split ``test``, instead of on frames left out of ``data``; frames of any
             pattern are brought to that of the first training frame.
         count: number of pairs of ``data`` to use; null for all.
-        select: which, as ``data.select`` of recipes that train.
+        select: which of them, as ``data.select`` of recipes that train.
         test_count: number of test pairs; null for all.
         noise: preset added once to every frame; the dictionary ISP is then fitted to these noisy
-            frames and never sees a clean one, and the scores are against the clean frames. Null: no noise.
+            frames and never sees a clean one, and the scores are against the clean frames. Null adds no noise.
         methods: families to fit: dictionary, dictionary-encoders and the baselines; or ISPs to take as they are, by
             a shipped one's name or a file.
         seconds: training budget of methods trained by gradient descent, without file reading.
@@ -132,17 +133,16 @@ class Comparison:
         patches: random patches of each left-out frame that are scored; null scores all.
         balanced: a column with InvISP's figure as well, on whole frames: PSNR of demosaiced, white-balanced and
             gamma-compressed RAW.
-        perturbed: more rows, of frames that are "overexposed" by a stop, or whose picture was "retouched", see
-            below; methods are fitted to frames as they are.
+        perturbed: more rows, of frames that are "overexposed" by a stop, or whose picture was "retouched" with an S
+            curve and more saturated colour; methods are fitted to frames as they are.
         pictures: sRGB pictures for the cycle and for PSNR_d.
         fit: of the dictionary ISP.
-        downstream: PSNR_d; null skips it.
+        downstream: how PSNR_d is measured; null skips it.
         seed: of the first run.
         seeds: number of runs.
         out: folder of all runs.
     """
 
-    experiment: str = "reconstruction"
     name: str = "reconstruction"
     data: str = "demo:train"
     test: str | None = None
@@ -187,11 +187,11 @@ class Comparison:
 
 @EXPERIMENTS.register("reconstruction")
 def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[str, Any]]:
-    """Run a comparison; the rows as in ``table.json``; ``overwrite`` replaces another of its name."""
+    """Run a comparison and return its rows as in ``table.json``; ``overwrite`` replaces another run of its name."""
     require_free(comparison, overwrite)
     table = Table(comparison)
     claim(comparison, overwrite)
-    return table.filled()
+    return table.fill()
 
 
 class Table:
@@ -201,6 +201,7 @@ class Table:
         if settings.downstream is not None:
             require_trainable("cpu", 1, settings.downstream.train.precision)
         self.settings, self.folder = settings, run_folder(settings)
+        self.seeds = range(settings.seed, settings.seed + settings.seeds)
         found = open_pairs(settings.data, split="train")
         self.pairs = _fitted_frames(settings, found)
         self.scored = _test_frames(settings, found) if settings.test else self.pairs
@@ -210,14 +211,14 @@ class Table:
         pictures = open_pictures(settings.pictures, min_side=side)
         self.pictures = [trim_to_even(pictures[k]) for k in range(len(pictures))]
 
-    def filled(self) -> dict[str, dict[str, Any]]:
-        """All rows; printed, and written with every single figure."""
+    def fill(self) -> dict[str, dict[str, Any]]:
+        """All rows by name, which are printed, and written with every single figure."""
         settings, rows = self.settings, dict[str, dict[str, Any]]()
         for family in settings.methods:
             rows |= self._rows(family)
         ceiling = mosaic_only_psnr(self.pictures, CFA(self.pairs[0].cfa))
         write_json({"settings": asdict(settings), "rows": rows, "mosaic_only_psnr": ceiling}, self._path("table"))
-        frames = len(next(iter(rows.values()))["frames"])
+        frames = len(self.scored)
         on = f"one of {frames} frames left out" if settings.test is None else f"{frames} frames of {settings.test}"
         title = f"{settings.name}: {on}, seeds: {settings.seeds}, {settings.data}"
         print_methods(title, rows, settings.balanced, ceiling)
@@ -225,82 +226,82 @@ class Table:
 
     def _rows(self, family: str) -> dict[str, dict[str, Any]]:
         names = names_of(self.scored)
-        drawn = progress(list(product(self._seeds(), range(len(names)))), label=family, unit="fit")
-        every = [self._fold(family, seed, frame) for seed, frame in drawn]
-        folds = [every[k : k + len(names)] for k in range(0, len(every), len(names))]
-        speeds = [fold["mpix_s"] for fold in every if fold["mpix_s"] is not None]
-        whole = self._whole(family)
+        fits = list(product(self.seeds, range(len(names))))
+        folds = [self._fold(family, seed, frame) for seed, frame in progress(fits, label=family, unit="fit")]
+        speeds = [fold["mpix_s"] for fold in folds if fold["mpix_s"] is not None]
+        whole = self._all_frames(family)
 
         def by_seed(kind: str, row: str) -> list[list[float]]:
-            return [[fold[kind][row] for fold in of_seed] for of_seed in folds]
+            values = [fold[kind][row] for fold in folds]
+            return [values[k : k + len(names)] for k in range(0, len(values), len(names))]
 
         rows = {}
-        for row in every[0]["rows"]:
+        for row in folds[0]["rows"]:
             values = by_seed("rows", row)
-            name = row_name(family, row)
+            worst, best = zip(*map(worst_and_best_quarter, values), strict=True)
+            setting, _, kind = row.partition(", ")
+            name = ", ".join([family, *([] if setting == "blind" else [ROWS[setting]]), *([kind] if kind else [])])
             rows[name] = {
                 "psnr_r": [fmean(of_seed) for of_seed in values],
-                "frames": {name: [of_seed[k] for of_seed in values] for k, name in enumerate(names)},
-                "worst25": [worst_and_best_quarter(of_seed)[0] for of_seed in values],
-                "best25": [worst_and_best_quarter(of_seed)[1] for of_seed in values],
-                "seconds": fmean(fold["seconds"] for fold in every),
+                "frames": {
+                    name: list(of_frame) for name, of_frame in zip(names, zip(*values, strict=True), strict=True)
+                },
+                "worst25": list(worst),
+                "best25": list(best),
+                "seconds": fmean(fold["seconds"] for fold in folds),
                 "mpix_s": median(speeds) if speeds else None,
-                "parameters": every[0]["parameters"],
+                "parameters": folds[0]["parameters"],
                 **(whole if row == "blind" else {}),
             }
-            if row in every[0].get("balanced", {}):
+            if row in folds[0].get("balanced", {}):
                 rows[name]["balanced"] = [fmean(of_seed) for of_seed in by_seed("balanced", row)]
         return rows
 
     def _fold(self, family: str, seed: int, frame: int) -> dict[str, Any]:
-        """Fitted without one frame, scored on it; or fitted to all, scored on a test frame."""
-        settings, name = self.settings, names_of(self.scored)[frame]
-        training = self._training(seed)
+        """The figures of a fit without one frame, scored on it; or of a fit to all, scored on a test frame."""
+        settings, training = self.settings, self._training(seed)
         measured = settings.patches, settings.balanced, settings.perturbed
         key = fingerprint(family, asdict(training), *measured, *self._frames())
+        name = names_of(self.scored)[frame]
         path = self._path(f"{family}-{'on' if settings.test else 'without'}-{name}-seed{seed}")
-        return resumed(path, key, lambda: self._scored(family, training, frame, key))
 
-    def _scored(self, family: str, training: Training, frame: int, key: str) -> dict[str, Any]:
-        """The figures of one fold."""
-        settings, pair = self.settings, self.scored[frame]
-        if settings.test:
-            pair = pair.in_pattern(self.pairs[0].cfa)
-            if key not in self._fitted:
+        def measure() -> dict[str, Any]:
+            pair = self.scored[frame]
+            if settings.test and key not in self._fitted:
                 self._fitted = {key: fit_family(family, self.pairs, self.fit, training)}
-            fitted = self._fitted[key]
-        else:
-            fitted = fit_family(family, [p for p in self.pairs if p is not pair], self.fit, training)
-        result = score_rows(fitted, pair, settings.patches)
-        for kind in settings.perturbed:
-            found = score_rows(fitted, PERTURBED[kind](pair), settings.patches)["rows"]
-            result["rows"] |= {f"{row}, {kind}": value for row, value in found.items()}
-        if settings.balanced:
-            result["balanced"] = balanced_rows(fitted, pair)
-        return result | {**fitted.model.info, "seconds": fitted.seconds, "parameters": fitted.parameters}
+            others = [other for other in self.pairs if other is not pair]
+            fitted = self._fitted[key] if settings.test else fit_family(family, others, self.fit, training)
+            pair = pair.in_pattern(self.pairs[0].cfa) if settings.test else pair
+            result = score_rows(fitted, pair, settings.patches)
+            for kind in settings.perturbed:
+                found = score_rows(fitted, PERTURBED[kind](pair), settings.patches)["rows"]
+                result["rows"] |= {f"{row}, {kind}": value for row, value in found.items()}
+            if settings.balanced:
+                result["balanced"] = balanced_rows(fitted, pair)
+            return result | {**fitted.model.info, "seconds": fitted.seconds, "parameters": fitted.parameters}
 
-    def _whole(self, family: str) -> dict[str, Any]:
-        """What is measured elsewhere than on the pairs, by a fit on all of them: cycle and PSNR_d."""
+        return resume(path, key, measure)
+
+    def _all_frames(self, family: str) -> dict[str, Any]:
+        """What a fit to all pairs is measured by on other data than these: cycle and PSNR_d."""
         settings = self.settings
         downstream = settings.downstream if settings.downstream and family in settings.downstream.methods else None
-        training, seeds = self._training(settings.seed), self._seeds()
+        training = self._training(settings.seed)
         samples = (family, asdict(training), settings.pictures, *self._frames())
-        key = fingerprint(*samples, list(seeds), downstream and asdict(downstream))
 
-        def measured() -> dict[str, Any]:
+        def measure() -> dict[str, Any]:
             fitted = fit_family(family, self.pairs, self.fit, training)
             result: dict[str, Any] = cycle_psnr(fitted, self.pictures)
             if downstream:
                 drawn = (*samples, downstream.noise, downstream.exposure)
                 trained = weights_key(downstream.denoiser, downstream.train, drawn, validation="watched")
-                place = self.folder / f"{family.replace('/', '_')}-denoisers-{trained}"
-                result["psnr_d"] = [psnr_d(fitted.model, self.pictures, downstream, place, seed) for seed in seeds]
+                folder = self.folder / f"{family.replace('/', '_')}-denoisers-{trained}"
+                seeds = self.seeds
+                result["psnr_d"] = [psnr_d(fitted.model, self.pictures, downstream, folder, seed) for seed in seeds]
             return result
 
-        return resumed(self._path(f"{family}-all-frames"), key, measured)
-
-    def _seeds(self) -> range:
-        return range(self.settings.seed, self.settings.seed + self.settings.seeds)
+        key = fingerprint(*samples, list(self.seeds), downstream and asdict(downstream))
+        return resume(self._path(f"{family}-all-frames"), key, measure)
 
     def _training(self, seed: int) -> Training:
         return Training(self.settings.seconds, crop=self.settings.crop, batch=self.settings.batch, seed=seed)
@@ -308,7 +309,7 @@ class Table:
     def _frames(self) -> tuple[Any, ...]:
         """What a fit depends on besides its family, budget and seed."""
         settings = self.settings
-        return asdict(self.fit), settings.noise, settings.data, [pair.name for pair in self.pairs], settings.test
+        return asdict(self.fit), settings.noise, settings.data, names_of(self.pairs), settings.test
 
     def _path(self, stem: str) -> Path:
         return self.folder / f"{stem.replace('/', '_')}.json"

@@ -9,10 +9,10 @@ from rawaug.files import fingerprint
 from rawaug.registry import DENOISERS, LOSSES, require_between
 
 MOST = 2**31
-"""Of steps, samples and processes."""
+"""The largest number of steps, samples or processes that a setting may have."""
 
 Weighing = Literal["linear", "normalised", "stabilised", "mixed", "relative"]
-"""How the loss weighs light and shade, see :mod:`rawaug.training.criteria`."""
+"""How the loss weighs light and shade; :mod:`rawaug.training.criteria` has the formulas."""
 
 
 @dataclass
@@ -22,8 +22,8 @@ class DenoiserConfig:
     Args:
         name: of the network; another one than the recipe's has its own settings.
         settings: its constructor's keys.
-        start: weights that training continues from: the name of a shipped denoiser or a file; name and settings are
-            then the file's, unless they are given, and must agree with it. Null starts from random weights.
+        start: weights that training continues from: the name of a shipped denoiser or a file. Name and settings are
+            then the file's; where they are given, they must agree with it. Null starts from random weights.
     """
 
     name: str = field(default="UNet", metadata={"registry": DENOISERS})
@@ -99,9 +99,15 @@ SAME_WEIGHTS = frozenset({"workers", "compile", "checkpoint_every"})
 
 
 def weights_key(network: DenoiserConfig, config: TrainConfig, samples: Any, validation: Any) -> str:
-    """What the weights of a training depend on, as a short hash: files with this key need no new training.
+    """A short hash of what the weights of a training depend on: weights with the same key need no new training.
 
-    The device and the number of processes are no part of it, nor is anything that is used after the training.
+    It leaves out the device, the number of processes, and what is used after the training.
+
+    Args:
+        network: what is trained.
+        config: how it is trained.
+        samples: what the training samples depend on, as JSON.
+        validation: what the validation samples depend on; None if the weights of the last step are kept.
     """
     left_out = SAME_WEIGHTS if validation is not None else SAME_WEIGHTS | {"validate_every"}
     settings = {key: value for key, value in asdict(config).items() if key not in left_out}

@@ -27,11 +27,10 @@ from rawaug.data.pairs import Sample
 from rawaug.registry import LOSSES
 
 Criterion = Callable[[Tensor, Tensor], Tensor]
-"""Of a denoised and a clean (or target) RAW, a scalar."""
+"""``criterion(denoised, target)``: two batches ``(B, 4, h, w)`` to a scalar."""
 
 LEAST_ERROR = 1.0 / 255.0
-"""Of a picture with hardly any noise: the step of an 8-bit file."""
-
+"""The unit of ``relative`` for pictures with hardly any noise: one step of an 8-bit file."""
 
 LOSSES.register("l1")(nn.L1Loss)
 LOSSES.register("l2")(nn.MSELoss)
@@ -39,33 +38,34 @@ LOSSES.register("l2")(nn.MSELoss)
 
 @LOSSES.register("charbonnier")
 class Charbonnier(nn.Module):
-    """The mean of ``sqrt((a - b)^2 + epsilon^2)``: l1 without the kink."""
+    """The mean of ``sqrt((a - b)^2 + epsilon^2)``: l1 without the kink at 0."""
 
     def __init__(self, epsilon: float = 1e-3) -> None:
         super().__init__()
         self.epsilon = epsilon
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        """A scalar, of two images of any shape that agree."""
         return ((a - b) ** 2 + self.epsilon**2).sqrt().mean()
 
 
-def normalised(loss: Criterion, sample: Sample) -> Criterion:
+def _normalised(loss: Criterion, sample: Sample) -> Criterion:
     deviation = sample.variance.sqrt().clamp_min(1e-6)
     return lambda denoised, clean: loss(denoised / deviation, clean / deviation)
 
 
-def stabilised(loss: Criterion, sample: Sample) -> Criterion:
+def _stabilised(loss: Criterion, sample: Sample) -> Criterion:
     levels, root = fit_levels(sample.noisy, sample.variance), DOMAINS["anscombe"]
     return lambda denoised, clean: loss(*(root.forward(y, *levels) for y in (denoised, clean)))
 
 
-def mixed(loss: Criterion, sample: Sample) -> Criterion:
-    in_root = stabilised(loss, sample)
+def _mixed(loss: Criterion, sample: Sample) -> Criterion:
+    in_root = _stabilised(loss, sample)
     deviation = sample.variance.sqrt().mean((1, 2, 3), keepdim=True).clamp_min(1e-12)
     return lambda denoised, clean: 0.5 * (in_root(denoised, clean) + loss(denoised / deviation, clean / deviation))
 
 
-def relative(loss: Criterion, sample: Sample) -> Criterion:
+def _relative(loss: Criterion, sample: Sample) -> Criterion:
     """``loss`` in units of the picture's root mean square error, so that weak noise counts as much as strong noise."""
     error = (sample.noisy - sample.clean).square().mean((1, 2, 3), keepdim=True).sqrt().clamp_min(LEAST_ERROR)
     return lambda denoised, clean: loss(denoised / error, clean / error)
@@ -73,13 +73,13 @@ def relative(loss: Criterion, sample: Sample) -> Criterion:
 
 WEIGHINGS: dict[str, Callable[[Criterion, Sample], Criterion]] = {
     "linear": lambda loss, sample: loss,
-    "normalised": normalised,
-    "stabilised": stabilised,
-    "mixed": mixed,
-    "relative": relative,
+    "normalised": _normalised,
+    "stabilised": _stabilised,
+    "mixed": _mixed,
+    "relative": _relative,
 }
 
 
-def weighed(loss: Criterion, weigh: str, sample: Sample) -> Criterion:
-    """``loss`` with light and shade weighed for the noise of ``sample``'s pictures ``(B, 4, h, w)``."""
+def weigh_loss(loss: Criterion, weigh: str, sample: Sample) -> Criterion:
+    """The loss with light and shade weighed as ``weigh`` says for the noise of a batch ``(B, 4, h, w)``."""
     return WEIGHINGS[weigh](loss, sample)

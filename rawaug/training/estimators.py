@@ -41,11 +41,11 @@ from rawaug.training.criteria import WEIGHINGS, Criterion
 
 @ESTIMATORS.register("supervised")
 class Supervised:
-    """Clean targets: ``loss = criterion(model(noisy, variance), clean)``. Base of all estimators.
+    """Training with clean targets: ``loss = criterion(model(noisy, variance), clean)``. Base of all estimators.
 
     Attributes:
         sees_clean: whether it needs clean frames; a recipe cannot mix estimators that do with others.
-        revision: increased whenever it makes other samples of the same frames, so that old weights are trained anew.
+        revision: a number that grows whenever the same frames give other samples, so that weights are trained anew.
         weighings: those of :mod:`rawaug.training.criteria` that it can be trained with.
     """
 
@@ -54,23 +54,37 @@ class Supervised:
     weighings: ClassVar[Collection[str]] = WEIGHINGS
 
     def loss(self, model: Any, sample: Any, criterion: Criterion, progress: float = 1.0) -> Tensor:
-        """The loss of a batch, a scalar; ``progress`` is the share of the training that is over."""
+        """The loss of a batch, a scalar.
+
+        Args:
+            model: maps noisy RAW and its variance, both ``(B, 4, h, w)``, to denoised RAW.
+            sample: the batch.
+            criterion: the distance of denoised RAW from the target.
+            progress: the share of the training that is over, from 0 to 1.
+        """
         return criterion(model(sample.noisy, sample.variance), sample.clean)
 
     def require(self, model: Denoiser) -> None:
-        """Refuse a network that it cannot train, by a ValueError."""
+        """Raise ValueError if it cannot train this network."""
 
-    def corrected(self, model: Denoiser) -> Denoiser:
-        """The denoiser to use in place of the trained network: itself, or a new one."""
+    def correct_network(self, model: Denoiser) -> Denoiser:
+        """The denoiser that a trained network becomes: by default the network itself."""
         return model
 
-    def at_test(self, run: Callable[..., Tensor]) -> Callable[..., Tensor]:
-        """What to call at a test in place of ``run(noisy, variance)``: itself, or something around it."""
+    def wrap_for_test(self, run: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        """The function to test in place of ``run(noisy, variance)``, which maps ``(B, 4, h, w)`` to the same shape."""
         return run
 
 
 class NoisyCrop(NamedTuple):
-    """What is known of one scene."""
+    """A packed crop of one scene, as far as it is known.
+
+    Attributes:
+        shots: noisy RAW ``(N, 4, h, w)``, the same scene in each.
+        signal: the scene without noise, or an estimate of it, ``(4, h, w)``.
+        shot_var: slope of the noise's variance over the signal.
+        read_var: its variance at black.
+    """
 
     shots: Tensor
     signal: Tensor
@@ -78,19 +92,19 @@ class NoisyCrop(NamedTuple):
     read_var: float
 
     def variance(self, signal: Tensor) -> Tensor:
-        """Of the noise at ``signal``, its shape."""
+        """The variance of the noise at a signal of any shape, in that shape."""
         return noise_variance(signal, self.shot_var, self.read_var)
 
     @property
     def deviation(self) -> Tensor:
-        """Standard deviation of the noise of a shot, ``(4, h, w)``."""
+        """The standard deviation of a shot's noise, ``(4, h, w)``."""
         return self.variance(self.signal).sqrt()
 
 
 class SelfSupervised(Supervised, ABC):
-    """Base: ``apply(crop, sample(shape, generator))`` makes a training sample of noisy frames.
+    """Training with noisy targets: ``apply(crop, sample(shape, generator))`` makes a sample of noisy frames.
 
-    Of the weighings those remain whose factors do not depend on the noisy target: the others would move its mean.
+    Only weighings whose factors do not depend on the noisy target remain: the others would move its mean.
     """
 
     shots: ClassVar[int] = 1
@@ -100,12 +114,12 @@ class SelfSupervised(Supervised, ABC):
     weighings: ClassVar[Collection[str]] = ("linear", "normalised")
 
     def sample(self, shape: torch.Size, generator: torch.Generator) -> Tensor:
-        """All that is random for a packed crop of ``shape`` (4, h, w); by default white noise of variance 1."""
+        """All that is random for a packed crop of ``shape``, ``(4, h, w)``: by default white noise of variance 1."""
         return torch.randn(shape, generator=generator)
 
     @abstractmethod
     def apply(self, crop: NoisyCrop, drawn: Tensor) -> Any:
-        """The training sample of a crop with at least ``shots`` shots; pure."""
+        """The training sample of a crop, of images ``(4, h, w)``; the crop has ``shots`` shots or more. Pure."""
 
 
 class _AddsNoise(SelfSupervised):
@@ -118,20 +132,20 @@ class _AddsNoise(SelfSupervised):
             raise ValueError(f"alpha must be positive, got {alpha}")
         self.alpha = alpha
 
-    def recorrupted(self, crop: NoisyCrop, drawn: Tensor) -> tuple[Tensor, Tensor]:
-        """``y + alpha m`` clipped at white, and the variance map of all its noise."""
+    def recorrupt(self, crop: NoisyCrop, drawn: Tensor) -> tuple[Tensor, Tensor]:
+        """``y + alpha m`` clipped at white, and the variance of all its noise, both ``(4, h, w)``."""
         noisier = (crop.shots[0] + self.alpha * crop.deviation * drawn).clamp(max=1.0)
         return noisier, (1.0 + self.alpha**2) * crop.variance(noisier)
 
 
 @ESTIMATORS.register("noisier")
 class Noisier(_AddsNoise):
-    """Input made noisier, the noisy frame as target.
+    """The input is made noisier; the noisy frame is the target.
 
     Args:
-        alpha: standard deviation of the extra noise over that of the noise.
-        correct: extrapolate the trained network to the clean signal. As the network is ``z + R(z)``, the corrected one
-            is ``z + (1 + 1/alpha^2) R(z)``: its last convolution times a constant.
+        alpha: standard deviation of the extra noise in units of that of the noise.
+        correct: whether the trained network is extrapolated to the clean signal. As the network is ``z + R(z)``, the
+            corrected one is ``z + (1 + 1/alpha^2) R(z)``: its last convolution times a constant.
     """
 
     def __init__(self, alpha: float = 1.0, correct: bool = False) -> None:
@@ -139,17 +153,20 @@ class Noisier(_AddsNoise):
         self.correct = correct
 
     def apply(self, crop: NoisyCrop, drawn: Tensor) -> Sample:
-        noisier, variance = self.recorrupted(crop, drawn)
+        """Noisier RAW, the frame as it was shot, and the variance, each ``(4, h, w)``."""
+        noisier, variance = self.recorrupt(crop, drawn)
         return Sample(noisier, crop.shots[0], variance)
 
     def require(self, model: Denoiser) -> None:
+        """Raise ValueError if the result is to be corrected, but the network does not add to the RAW."""
         if self.correct and model.domain not in ("linear", "ksigma"):
             raise ValueError(
                 f"estimator: noisier with correct extrapolates the RAW, which a network in the domain {model.domain} "
                 "does not add to; use r2r, or a network in the domain linear or ksigma"
             )
 
-    def corrected(self, model: Denoiser) -> Denoiser:
+    def correct_network(self, model: Denoiser) -> Denoiser:
+        """A copy of the network whose last convolution is multiplied, if ``correct`` is set."""
         if not self.correct:
             return model
         model = copy.deepcopy(model)
@@ -162,12 +179,13 @@ class Noisier(_AddsNoise):
 
 @ESTIMATORS.register("r2r")
 class R2R(_AddsNoise):
-    """Recorrupted twice, with noise that cancels in the covariance: ``(y + a m, y - m / a)``.
+    """Input and target are made of the frame with the same noise, whose covariance cancels: ``(y + a m, y - m / a)``.
 
     Args:
-        alpha: small: the input is little noisier than the frame, the target much; 1: both have twice the variance.
-        average: at a test, denoise the frame to know its noise, then denoise this many recorrupted copies of it and
-            average them, as published; 0 denoises the frame itself.
+        alpha: a above. If it is small, the input is little noisier than the frame, but the target much; if it is 1,
+            both have twice the variance.
+        average: at a test, the frame is denoised to know its noise, then so many recorrupted copies of it are denoised
+            and averaged, as published; 0 denoises the frame itself.
     """
 
     def __init__(self, alpha: float = 0.5, average: int = 0) -> None:
@@ -177,10 +195,12 @@ class R2R(_AddsNoise):
         self.average = average
 
     def apply(self, crop: NoisyCrop, drawn: Tensor) -> Sample:
-        noisier, variance = self.recorrupted(crop, drawn)
+        """Noisier RAW, a target with the opposite noise, and the variance, each ``(4, h, w)``."""
+        noisier, variance = self.recorrupt(crop, drawn)
         return Sample(noisier, crop.shots[0] - crop.deviation * drawn / self.alpha, variance)
 
-    def at_test(self, run: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    def wrap_for_test(self, run: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        """``run`` of ``(B, 4, h, w)``, or its mean over recorrupted copies if ``average`` is set."""
         return Recorrupted(run, self.alpha, self.average) if self.average else run
 
 
@@ -191,16 +211,17 @@ class Noise2Noise(SelfSupervised):
     shots = 2
 
     def sample(self, shape: torch.Size, generator: torch.Generator) -> Tensor:
-        """Which of the two is the input: 0 or 1."""
+        """The number of the shot that is the input, 0 or 1, a scalar."""
         return torch.randint(2, (), generator=generator)
 
     def apply(self, crop: NoisyCrop, drawn: Tensor) -> Sample:
+        """One shot, the other, and the variance, each ``(4, h, w)``."""
         noisy, target = crop.shots[drawn], crop.shots[1 - drawn]
         return Sample(noisy, target, crop.variance(noisy))
 
 
 class NeighborSample(NamedTuple):
-    """A noisy frame and, for each 2 x 2 cell of a plane, which two neighbours make the pair."""
+    """Noisy RAW and its variance ``(4, h, w)``, and for each 2 x 2 cell the pair of neighbours, ``(1, h/2, w/2)``."""
 
     noisy: Tensor
     variance: Tensor
@@ -213,7 +234,7 @@ NEIGHBOURS = ((0, 1), (1, 0), (2, 3), (3, 2), (0, 2), (2, 0), (1, 3), (3, 1))
 
 @ESTIMATORS.register("neighbor2neighbor")
 class Neighbor2Neighbor(SelfSupervised):
-    """Two neighbours of every 2 x 2 cell of each packed plane, one as input and one as target.
+    """Two neighbours of every 2 x 2 cell of each packed plane are input and target.
 
     ``loss = c(f(g1 y), g2 y) + gamma c(f(g1 y) - g2 y, g1 f(y) - g2 f(y))``: the second term takes off what the
     neighbours' own difference, as the network sees it, adds to the first; gradients do not pass through f(y). An
@@ -232,13 +253,15 @@ class Neighbor2Neighbor(SelfSupervised):
         self.gamma = gamma
 
     def sample(self, shape: torch.Size, generator: torch.Generator) -> Tensor:
-        """The choice of every cell; the planes share it, so that their colours belong together."""
+        """The choice of every cell, ``(1, h/2, w/2)``; the planes share it, so that their colours belong together."""
         return torch.randint(len(NEIGHBOURS), (1, shape[-2] // 2, shape[-1] // 2), generator=generator)
 
     def apply(self, crop: NoisyCrop, drawn: Tensor) -> NeighborSample:
+        """The shot ``(4, h, w)`` with the choice of its neighbours."""
         return NeighborSample(crop.shots[0], crop.variance(crop.shots[0]), drawn)
 
     def loss(self, model: Any, sample: NeighborSample, criterion: Criterion, progress: float = 1.0) -> Tensor:
+        """The scalar above; ``model``, ``sample``, ``criterion`` and ``progress`` as in :meth:`Supervised.loss`."""
         (first, second), (variance, _) = (neighbours(x, sample.choice) for x in (sample.noisy, sample.variance))
         with torch.no_grad():
             denoised_first, denoised_second = neighbours(model(sample.noisy, sample.variance), sample.choice)

@@ -1,8 +1,11 @@
-"""The training loop: one denoiser, one stream of samples; and what it logs, to ``log.csv`` and for TensorBoard.
+"""The training loop: one denoiser, one stream of samples; its validation, and its logs for people and TensorBoard.
 
 ``theta <- Adam(grad loss(net(noisy, variance; theta), target))`` with a warm-up, a cosine and a running average of the
 weights. Lightning Fabric places model and data: the same code on a CPU, one GPU, or the processes of several nodes, as
 ``torchrun`` or ``fabric run`` start them.
+
+The validation is the PSNR on frozen frames, in RAW and developed to sRGB. The frames are sorted by their mean noise
+variance and split in thirds: *low*, *middle* and *high*.
 """
 
 from __future__ import annotations
@@ -13,36 +16,46 @@ import time
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torch.nn import functional as F
 from torch.utils.data import DataLoader
 
+import denoisers
 from denoisers.network import Denoiser
+from rawaug.data.pairs import centre
 from rawaug.errors import extra
 from rawaug.evaluation.trials import Trial
 from rawaug.files import replacing
 from rawaug.kernels.runtime import find_device
+from rawaug.metrics import psnr
 from rawaug.progress import progress
 from rawaug.registry import LOSSES
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.criteria import Criterion, weighed
+from rawaug.training.criteria import Criterion, weigh_loss
 from rawaug.training.estimators import Supervised
 from rawaug.training.state import TrainingState, first_network
 from rawaug.training.stream import StepSampler, TrainingStream
-from rawaug.training.validation import panels, validate
 
 SHOWN, SHOWINGS = 3, 20
 """Validation frames of which TensorBoard shows crops, and how often at most."""
+PANEL = 96
+"""Largest side of these crops, in packed pixels."""
+THIRDS = ("low", "middle", "high")
 
 
 class Journal:
-    """``log.csv`` and TensorBoard's files of a run from ``start`` on; what a killed run logged beyond it is dropped.
+    """The log of a training: ``log.csv``, and TensorBoard's files.
 
     A row has the mean loss since the row before, the validation PSNR, the learning rate of the step and the speed.
-    TensorBoard shows the middles of :data:`SHOWN` validation frames besides. A run from its beginning clears what
-    another one has left.
+    TensorBoard shows the middles of :data:`SHOWN` validation frames besides.
+
+    Args:
+        folder: of these files. A training from its first step clears what another one has left there.
+        start: the step from which the training goes on; rows that a killed one wrote beyond it are dropped.
     """
 
     def __init__(self, folder: Path, start: int) -> None:
@@ -61,7 +74,7 @@ class Journal:
         self.writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
 
     def log(self, step: int, **values: float) -> None:
-        """One row in the CSV file and one point in each TensorBoard curve."""
+        """Write a row of the CSV file, and a point of each curve in TensorBoard."""
         begun = self.path.is_file() and self.path.stat().st_size
         with self.path.open("a", newline="") as file:
             rows = csv.writer(file, lineterminator="\n")
@@ -72,13 +85,21 @@ class Journal:
             self.writer.add_scalar(name, value, step)
 
     def show(self, step: int, steps: int, net: nn.Module, frames: Sequence[Trial]) -> None:
-        """Noisy, denoised and clean crops in TensorBoard, at most :data:`SHOWINGS` times in ``steps``."""
+        """Write noisy, denoised and clean crops for TensorBoard.
+
+        Args:
+            step: the step at which this is called.
+            steps: of the whole training, during which crops are written :data:`SHOWINGS` times at most.
+            net: denoises the crops.
+            frames: the validation frames.
+        """
         if self.next_shown <= step:
             self.next_shown = step + steps // SHOWINGS
             for k, frame in enumerate(frames[:SHOWN]):
                 self.writer.add_image(f"noisy_denoised_clean/{k}", panels(net, frame), step)
 
     def close(self) -> None:
+        """Close TensorBoard's files."""
         self.writer.close()
 
 
@@ -96,19 +117,21 @@ def train(
     choose: bool = True,
     key: str = "",
 ) -> Denoiser:
-    """Train a denoiser, resuming from the last checkpoint in ``folder``, if any.
+    """Train a denoiser; if there is a checkpoint in ``folder``, from there on.
 
     Args:
-        stream: keyed samples.
-        validation: frozen crops ``(1, 4, h, w)``, looked at every ``validate_every`` steps.
-        network, config: what is trained, and how.
+        stream: the training samples.
+        validation: frozen images ``(1, 4, h, w)``, scored every ``validate_every`` steps.
+        network: what is trained.
+        config: how it is trained.
         folder: gets ``last.pt`` (all that a resume needs), ``log.csv`` and TensorBoard's files.
         seed: of the initial weights.
-        device, devices: Fabric's accelerator and number of devices; torchrun's processes count instead where it runs.
+        device: Fabric's accelerator.
+        devices: number of devices; where torchrun runs, its processes count instead.
         label: heads the progress bar.
-        estimator: makes the loss of a batch, and of the trained network the denoiser; by default supervised.
-        choose: keep the averaged weights of the best validation; if not, those of the end.
-        key: what the weights depend on; a checkpoint that was saved with another one is written over.
+        estimator: makes the loss of a batch, and the denoiser of the trained network; by default supervised.
+        choose: whether the averaged weights of the best validation are kept, or else those of the last step.
+        key: what the weights depend on; a checkpoint that was saved with another key is written over.
 
     Returns:
         The network with the weights that are kept, in eval mode, on the CPU.
@@ -118,36 +141,36 @@ def train(
     """
     estimator = estimator or Supervised()
     norm: Criterion = LOSSES.make(config.loss)
-    fabric = launched(device, devices, config.precision)
+    fabric = launch(device, devices, config.precision)
     folder.mkdir(parents=True, exist_ok=True)
     state = TrainingState(first_network(network, seed), config)
     state.load(folder / "last.pt", key)
-    start, model = state.step, state.place(fabric)
+    start, model = state.step, state.set_up(fabric)
     loader = _batches(stream, start, config, fabric)
     journal = Journal(folder, start) if fabric.is_global_zero else None
     began, shown = time.perf_counter(), journal is not None
     bar = progress(loader, label=label, unit="step", total=config.steps, initial=start, leave=True, shown=shown)
     for step, batch in enumerate(bar, start=start + 1):
         sample = type(batch)(*(x.to(fabric.device, memory_format=state.layout) for x in batch))
-        loss = estimator.loss(model, sample, weighed(norm, config.weigh, sample), step / config.steps)
+        loss = estimator.loss(model, sample, weigh_loss(norm, config.weigh, sample), step / config.steps)
         learning_rate = state.update(loss)
         looks, saves = (step % n == 0 or step == config.steps for n in (config.validate_every, config.checkpoint_every))
         if looks or saves:
             state.losses = fabric.all_reduce(state.losses, reduce_op="mean")
         if looks:
-            scores = validate(estimator.corrected(state.averaged), validation, fabric.device)
-            state.note(scores["psnr"], choose)
+            scores = validate(estimator.correct_network(state.average_network), validation, fabric.device)
+            state.keep_average(scores["psnr"], choose)
             row = {"loss": state.mean_loss(), **scores, "learning_rate": learning_rate}
             row["samples_per_second"] = (step - start) * stream.batch / (time.perf_counter() - began)
             if journal is not None:
                 journal.log(step, **row)
-                journal.show(step, config.steps, estimator.corrected(state.averaged), validation)
+                journal.show(step, config.steps, estimator.correct_network(state.average_network), validation)
             bar.set_postfix_str(_status(row, state.best["step"]), refresh=False)
         if saves and journal is not None:
             state.save(folder / "last.pt", key)
     if journal is not None:
         journal.close()
-    return estimator.corrected(state.kept(label)).eval()
+    return estimator.correct_network(state.best_network(label)).eval()
 
 
 def _batches(stream: TrainingStream, start: int, config: TrainConfig, fabric: Any) -> DataLoader[Any]:
@@ -162,8 +185,65 @@ def _status(row: dict[str, float], kept: int) -> str:
     return f"{row['samples_per_second']:.0f} images/s, {scores}"
 
 
+@torch.no_grad()
+def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> dict[str, float]:
+    """Mean PSNR in dB of a network, which denoises large frames in tiles.
+
+    Returns:
+        ``psnr`` over all frames; of three or more also ``psnr_low``, ``psnr_middle`` and ``psnr_high`` over the thirds;
+        the same as ``psnr_srgb``, ... where every frame can be developed; and ``psnr_CONDITION`` by condition.
+    """
+    net.eval()
+    raw, srgb = [], []
+    for frame in frames:
+        variance = None if frame.variance is None else frame.variance.to(device)
+        denoised = denoisers.tiled(net, frame.noisy.to(device), variance).cpu()
+        raw.append(psnr(denoised, frame.clean).mean().item())
+        if frame.develop is not None and frame.domain != "srgb":
+            srgb.append(psnr(*(frame.develop(x)[None] for x in (denoised, frame.clean))).item())
+    net.train()
+    noise = [frame.amount for frame in frames]
+    scores = _by_thirds("psnr", raw, noise)
+    for kind in dict.fromkeys(frame.condition for frame in frames if frame.condition):
+        scores[f"psnr_{kind}"] = fmean(x for x, frame in zip(raw, frames, strict=True) if frame.condition == kind)
+    return scores | (_by_thirds("psnr_srgb", srgb, noise) if len(srgb) == len(frames) else {})
+
+
+def _by_thirds(name: str, scores: Sequence[float], noise: Sequence[float]) -> dict[str, float]:
+    result, count = {name: fmean(scores)}, len(scores)
+    order = sorted(range(count), key=lambda k: noise[k])
+    for part, label in enumerate(THIRDS if count >= len(THIRDS) else ()):
+        third = order[part * count // len(THIRDS) : (part + 1) * count // len(THIRDS)]
+        result[f"{name}_{label}"] = fmean(scores[k] for k in third)
+    return result
+
+
+@torch.no_grad()
+def panels(net: nn.Module, frame: Trial) -> Tensor:
+    """The middle of a frame noisy, denoised and clean, beside each other: sRGB ``(3, h, 3 w)`` in [0, 1].
+
+    Where the camera is not known the mean of the greens is shown, through the power 1/2.2; full colour as it is.
+    """
+    scale = frame.clean.shape[-1] // frame.noisy.shape[-1]  # 2 where packed RAW becomes full colour
+    noisy, clean = centre(frame.noisy, PANEL, PANEL, 1), centre(frame.clean, scale * PANEL, scale * PANEL, scale)
+    device = next((weights.device for weights in net.parameters()), noisy.device)
+    variance = None if frame.variance is None else centre(frame.variance, PANEL, PANEL, 1).to(device)
+    net.eval()
+    denoised = net(noisy.to(device), variance).cpu().nan_to_num()  # black where the training has diverged
+    net.train()
+    noisy = noisy[:, :1] if clean.shape[1] == 1 else noisy  # without the planes of its colours
+    images = [(frame.develop or _show)(image) for image in (noisy, denoised, clean)]
+    return torch.cat([F.interpolate(image[None], images[-1].shape[-2:])[0] for image in images], dim=-1)
+
+
+def _show(image: Tensor) -> Tensor:
+    if image.shape[1] == 3:
+        return image[0].clamp(0.0, 1.0)
+    return image[0, image.shape[1] // 4 : 3].mean(0).clamp(0.0, 1.0).pow(1 / 2.2).expand(3, -1, -1)
+
+
 def require_trainable(device: str, devices: int, precision: str) -> None:
-    """Check a training's libraries, device and precision before any work."""
+    """Raise ValueError or ImportError if a training's libraries, device or precision are not there."""
     with extra("train"):
         for name in ("torch.utils.tensorboard.writer", "matplotlib", "skimage", "PIL"):
             import_module(name)
@@ -179,8 +259,8 @@ def require_trainable(device: str, devices: int, precision: str) -> None:
         raise ValueError(f"train.precision: {' '.join(str(error).split())}") from None
 
 
-def launched(device: str, devices: int, precision: str) -> Any:
-    """Fabric in the processes that torchrun or ``fabric run`` started, or in those that it starts itself."""
+def launch(device: str, devices: int, precision: str) -> Any:
+    """Start Fabric in the processes that torchrun or ``fabric run`` started, or in those that it starts itself."""
     with extra("train"):
         from lightning_fabric import Fabric
 

@@ -27,7 +27,8 @@ from denoisers.classical import NonLocalMeans, Stabilised
 from rawaug import bayer
 from rawaug.bayer import CFA, crop_to_cfa
 from rawaug.data.development import develop_packed
-from rawaug.data.pairs import Lazy, Pair, Sample
+from rawaug.data.pairs import Lazy, Pair
+from rawaug.evaluation.trials import Trial
 from rawaug.noise import ShotReadModel, anscombe, camera_law
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import to_rgb_tensor, trim_to_even
@@ -38,7 +39,16 @@ from rawaug.training.stream import packed_crop
 
 
 def signal_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) -> Tensor:
-    """The signal of a mosaic ``(1, H, W)``; the mosaic itself where there is no shot noise to know it for."""
+    """An estimate of the signal of a noisy mosaic, ``(1, H, W)``, by non-local means.
+
+    Without shot noise the signal does not matter, and the mosaic comes back as it is.
+
+    Args:
+        noisy: ``(1, H, W)``.
+        shot_var: slope of the noise's variance over the signal.
+        read_var: its variance at black.
+        cfa: of the mosaic.
+    """
     if not shot_var > 0:
         return noisy
     packed = bayer.pack(noisy[None], cfa)
@@ -51,7 +61,16 @@ CACHED = 64
 
 @dataclass(frozen=True, eq=False)
 class NoisyFrame:
-    """One scene."""
+    """One scene, of which noisy RAW is known.
+
+    Attributes:
+        name: of the frame.
+        shots: mosaics ``(N, H, W)`` of the scene.
+        shot_var: slope of the noise's variance over the signal.
+        read_var: its variance at black.
+        cfa: of the mosaics.
+        clean: the scene without noise ``(1, H, W)``, if it was made from a picture.
+    """
 
     name: str
     shots: Tensor
@@ -62,18 +81,18 @@ class NoisyFrame:
 
     @cached_property
     def signal(self) -> Tensor:
-        """The scene without noise ``(1, H, W)``; for a real frame an estimate (half a second a megapixel)."""
+        """The scene without noise ``(1, H, W)``: for a real frame an estimate, which takes 0.5 s a megapixel."""
         if self.clean is not None:
             return self.clean
         return signal_estimate(self.shots[:1], self.shot_var, self.read_var, self.cfa)
 
 
-def noisy_only(pair: Pair) -> Pair:
-    """The pair without anything derived from a clean frame.
+def drop_clean(pair: Pair) -> Pair:
+    """The pair without anything that was derived from a clean frame.
 
-    Of a pair with a noisy capture ``raw`` becomes that capture and ``srgb`` the camera's picture of it, or else its
-    development (bilinear demosaic, the camera's white balance and matrix, the sRGB curve). A pair without one is a RAW
-    file as shot: it is noisy itself.
+    If there is a noisy capture, it takes the place of ``raw``, and the camera's picture of it that of ``srgb``; without
+    such a picture the capture is developed (bilinear demosaic, the camera's white balance and matrix, the sRGB curve).
+    A pair without a capture is a RAW file as shot: it is noisy itself.
     """
     if pair.noisy is None:
         return pair
@@ -84,7 +103,11 @@ def noisy_only(pair: Pair) -> Pair:
 
 
 def noise_of(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float]:
-    """(shot_var, read_var) of a real noisy frame."""
+    """(shot_var, read_var) of a real noisy frame: its own levels, or those of its camera's law at its ISO.
+
+    Raises:
+        ValueError: if neither is known.
+    """
     if pair.shot_var is not None and pair.read_var is not None:
         return pair.shot_var, pair.read_var
     if camera is None:
@@ -99,15 +122,16 @@ def noise_of(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float
 
 
 def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
+    """A real noisy frame with its levels; ``camera`` is a noise law as an ISP's file holds it."""
     return NoisyFrame(pair.name, pair.raw, *noise_of(pair, camera), pair.cfa)
 
 
 FAINT = 45.0
-"""PSNR in dB of noisy frames from which on there is next to nothing to remove."""
+"""PSNR in dB of noisy frames above which there is next to nothing to remove."""
 
 
 def faintness_note(frames: Sequence[NoisyFrame]) -> str:
-    """A line on frames with next to no noise, by their levels; empty for others."""
+    """A line that warns of frames with next to no noise, by their levels; empty if there is enough."""
     variances = [bayer.noise_variance(frame.shots, frame.shot_var, frame.read_var) for frame in frames]
     found = [-10.0 * math.log10(max(float(variance.mean()), 1e-12)) for variance in variances]
     if not found or (typical := median(found)) < FAINT:
@@ -119,7 +143,14 @@ def faintness_note(frames: Sequence[NoisyFrame]) -> str:
 
 
 class FrozenPictures(Lazy[NoisyFrame]):
-    """sRGB pictures as noisy RAW frames that never change; up to :data:`CACHED` of them stay in memory."""
+    """sRGB pictures as noisy RAW frames that never change; up to :data:`CACHED` of them stay in memory.
+
+    Args:
+        pictures: a Dataset of pictures.
+        augment: makes RAW of them; its noise must be shot and read noise.
+        seed: of the camera settings and the noise.
+        shots: number of noisy shots of each scene.
+    """
 
     def __init__(self, pictures: Any, augment: RawAugment, seed: int, shots: int = 1) -> None:
         if not isinstance(augment.noise, ShotReadModel):
@@ -129,12 +160,13 @@ class FrozenPictures(Lazy[NoisyFrame]):
         super().__init__([f"picture {index}" for index in range(len(pictures))])
 
     def read(self, index: int) -> NoisyFrame:
-        frame = self._kept.get(index) or self._made(index)
+        """The frame of a picture, the same at every call."""
+        frame = self._kept.get(index) or self._make(index)
         if len(self._kept) < CACHED:
             self._kept[index] = frame
         return frame
 
-    def _made(self, index: int) -> NoisyFrame:
+    def _make(self, index: int) -> NoisyFrame:
         srgb = trim_to_even(to_rgb_tensor(self.pictures[index]))[None]
         params = self.augment.sample(srgb, keyed_generator(self.seed, "frozen", index))
         shots = []
@@ -148,7 +180,14 @@ class FrozenPictures(Lazy[NoisyFrame]):
 
 
 class NoisyCrops:
-    """Crops of noisy frames, in eight turns that keep the CFA, as an estimator's training samples."""
+    """Crops of noisy frames, in eight turns that keep the CFA, as an estimator's training samples.
+
+    Args:
+        frames: of any patterns.
+        estimator: makes a sample of a crop.
+        crop: side in pixels.
+        cfa: the pattern in which all crops are packed.
+    """
 
     def __init__(self, frames: Sequence[NoisyFrame], estimator: SelfSupervised, crop: int, cfa: CFA) -> None:
         self.frames, self.estimator, self.crop, self.cfa = frames, estimator, crop, cfa
@@ -157,6 +196,7 @@ class NoisyCrops:
                 _ = frame.signal
 
     def draw(self, generator: torch.Generator) -> Any:
+        """A sample of packed RAW ``(4, crop / 2, crop / 2)``; ValueError if the frame has too few shots."""
         frame = self.frames[int(torch.randint(len(self.frames), (), generator=generator))]
         if len(frame.shots) < self.estimator.shots:
             name, count = type(self.estimator).__name__, len(frame.shots)
@@ -167,18 +207,18 @@ class NoisyCrops:
         return self.estimator.apply(NoisyCrop(packed[:-1], packed[-1], frame.shot_var, frame.read_var), drawn)
 
 
-def held_out(frames: Sequence[NoisyFrame], cfa: CFA, seed: int = 0) -> list[Sample]:
-    """Whole noisy frames as r2r pairs ``(1, 4, h, w)``: a score that no clean frame is needed for.
+def r2r_trials(frames: Sequence[NoisyFrame], cfa: CFA, seed: int = 0) -> list[Trial]:
+    """Whole noisy frames as r2r pairs ``(1, 4, h, w)``, whose score needs no clean frame.
 
     The error against a target of independent noise is the error against the clean frame plus that noise's variance, a
     constant: the weights that score best are the best, as far as the estimate of the signal is right, though the
     decibels are lower than against a clean frame.
     """
-    samples, estimator = [], R2R()
+    trials, estimator = [], R2R()
     for frame in frames:
         images = torch.cat([frame.shots[:1], frame.signal])
         packed = bayer.pack(crop_to_cfa(images, frame.cfa, cfa)[:, None], cfa)
         drawn = estimator.sample(packed.shape[1:], keyed_generator(seed, "held out", frame.name))
         sample = estimator.apply(NoisyCrop(packed[:1], packed[1], frame.shot_var, frame.read_var), drawn)
-        samples.append(Sample(*(x[None] for x in sample)))
-    return samples
+        trials.append(Trial(sample.noisy[None], sample.clean[None], sample.variance[None]))
+    return trials

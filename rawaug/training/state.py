@@ -1,4 +1,4 @@
-"""What a training changes step by step: where it starts, its running average, and the checkpoint that it resumes from.
+"""The state of a training: the network it starts from, the running average, and the checkpoint that it resumes from.
 
 ``theta <- Adam(gradient of the loss)``, then ``average <- d average + (1 - d) theta``; the learning rate warms up and
 falls.
@@ -26,14 +26,18 @@ from rawaug.training.config import DenoiserConfig, TrainConfig
 
 
 class Start(NamedTuple):
-    """The hash of the file that a training continues from, and the pattern of its network."""
+    """The hash of the file that a training continues from, and the CFA that its network is for."""
 
     sha256: str
     cfa: CFA
 
 
 def start_of(config: DenoiserConfig) -> Start | None:
-    """What ``config.start`` names; None if the training starts from nothing."""
+    """The weights that ``config.start`` names; None if the training starts from random ones.
+
+    Raises:
+        FileNotFoundError: if there are no such weights.
+    """
     if config.start is None:
         return None
     path = find(config.start)
@@ -41,7 +45,11 @@ def start_of(config: DenoiserConfig) -> Start | None:
 
 
 def first_network(config: DenoiserConfig, seed: int) -> Denoiser:
-    """The network before its first step, in train mode; layers that it has beyond those of its start are drawn."""
+    """The network before its first step, in train mode; layers that its start does not have are drawn from ``seed``.
+
+    Raises:
+        ValueError: if the start is another network than the settings say.
+    """
     drawn = {"seed": derive_seed(seed, "network") % 2**31, **config.settings}
     if config.start is None:
         return denoisers.build(config.name, **drawn)
@@ -71,7 +79,7 @@ class TrainingState:
         self.layout = torch.channels_last if config.channels_last else torch.contiguous_format
 
     @property
-    def averaged(self) -> Any:
+    def average_network(self) -> Any:
         """The network that is validated and kept."""
         return self.average.module
 
@@ -103,14 +111,16 @@ class TrainingState:
         with replacing(path) as partial:
             partial.write_bytes(content.getbuffer())
 
-    def place(self, fabric: Any) -> Any:
-        placed = fabric.setup(self.net.to(memory_format=self.layout), self.optimiser)  # type: ignore[call-overload]
-        self.fabric, (self.model, self.optimiser) = fabric, placed
+    def set_up(self, fabric: Any) -> Any:
+        """Move everything to Fabric's device; the model to train, compiled if the settings say so."""
+        net = self.net.to(memory_format=self.layout)  # type: ignore[call-overload]
+        self.fabric, (self.model, self.optimiser) = fabric, fabric.setup(net, self.optimiser)
         self.average.to(fabric.device)
         self.losses = self.losses.to(fabric.device)
         return torch.compile(self.model) if self.config.compile else self.model
 
     def update(self, loss: Tensor) -> float:
+        """One step down the gradient of ``loss``, a scalar; the learning rate of the step."""
         self.optimiser.zero_grad(set_to_none=True)
         self.fabric.backward(loss)
         if self.config.clip_norm:
@@ -121,27 +131,28 @@ class TrainingState:
         if self.config.ema:
             self.average.update_parameters(self.net)
         else:
-            self.averaged.load_state_dict(self.net.state_dict())
+            self.average_network.load_state_dict(self.net.state_dict())
         self.losses += torch.stack([loss.detach().float(), self.losses.new_ones(())])
         self.step += 1
         return learning_rate
 
     def mean_loss(self) -> float:
+        """The mean loss since the last call."""
         mean = float(self.losses[0] / self.losses[1])
         self.losses = torch.zeros_like(self.losses)
         return mean
 
-    def note(self, score: float, choose: bool) -> None:
-        """Keep the average as it is now, if it is the best so far or ``choose`` is off."""
+    def keep_average(self, score: float, choose: bool) -> None:
+        """Keep the running average as it is now if its ``score`` is the highest so far, or ``choose`` is off."""
         if score > self.best["psnr"] or not choose:
-            self.best = {"psnr": score, "step": self.step, "net": copy.deepcopy(self.averaged.state_dict())}
+            self.best = {"psnr": score, "step": self.step, "net": copy.deepcopy(self.average_network.state_dict())}
 
-    def kept(self, label: str) -> Any:
-        """The network with the weights that are kept, on the CPU."""
+    def best_network(self, label: str) -> Any:
+        """The network with the weights that were kept, on the CPU; ValueError if no score was a number."""
         if not math.isfinite(self.best["psnr"]):
             raise ValueError(f"{label}: diverged, every validation score is NaN; lower train.learning_rate")
-        self.averaged.load_state_dict(self.best["net"])
-        return self.averaged.cpu().to(memory_format=torch.contiguous_format)
+        self.average_network.load_state_dict(self.best["net"])
+        return self.average_network.cpu().to(memory_format=torch.contiguous_format)
 
 
 def running_average(decay: float) -> Any:

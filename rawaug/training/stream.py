@@ -6,48 +6,73 @@ captured; or of frames that are only known noisy), part RAW made from sRGB pictu
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
+from denoisers.mosaic import entry_pattern, with_planes
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair, Sample
+from rawaug.evaluation.trials import Trial
 from rawaug.noise import NoiseModel
+from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.seeding import keyed_generator
+
+WATCHED = 16
+"""Samples made from pictures on which a training without validation pairs is watched."""
 
 
 class Source(Protocol):
     """Where samples come from."""
 
     def draw(self, generator: torch.Generator) -> Any:
-        """A training sample, a named tuple of tensors, that depends on ``generator`` alone."""
+        """A training sample, a named tuple of tensors ``(C, h, w)``, that depends on ``generator`` alone."""
         ...
 
 
+def freeze_samples(source: Source, key: str) -> list[Trial]:
+    """:data:`WATCHED` samples of a source as trials, the same for the same ``key``."""
+    samples = (source.draw(keyed_generator(key, k)) for k in range(WATCHED))
+    return [Trial(sample.noisy[None], sample.clean[None], sample.variance[None]) for sample in samples]
+
+
+def add_noise(clean: Tensor, noise: NoiseModel, generator: torch.Generator) -> Sample:
+    """Clean packed RAW ``(1, 4, h, w)`` and drawn noise as a sample of ``(4, h, w)``."""
+    params = noise.sample(1, generator)
+    noisy = noise.apply(clean, params)
+    return Sample(noisy[0], clean[0], noise.variance(noisy, params)[0])
+
+
 class RealCrops:
-    """Crops of real RAW pairs, in eight turns that keep the CFA."""
+    """Crops of real RAW pairs, in eight turns that keep the CFA.
+
+    Args:
+        pairs: clean frames, with a noisy capture or without.
+        noise: drawn for frames without a capture.
+        crop: side of the crops in pixels.
+        cfa: the pattern in which all crops are packed.
+    """
 
     def __init__(self, pairs: Sequence[Pair], noise: NoiseModel, crop: int, cfa: CFA) -> None:
         self.pairs = [pair.with_levels() for pair in pairs]
         self.noise, self.crop, self.cfa = noise, crop, cfa
 
     def draw(self, generator: torch.Generator) -> Sample:
+        """A sample of packed RAW ``(4, crop / 2, crop / 2)``."""
         pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
         mosaics = [pair.raw] if pair.noisy is None else [pair.raw, pair.noisy]
         packed = packed_crop(pair.name, mosaics, pair.cfa, self.crop, self.cfa, generator)
-        params = self.noise.sample(1, generator)
-        if pair.noisy is not None:
-            params = {"shot_var": torch.tensor([pair.shot_var]), "read_var": torch.tensor([pair.read_var])}
-            clean, noisy = packed[:1], packed[1:]
-            level = bayer.noise_variance(noisy, params["shot_var"], params["read_var"])
-            return Sample(noisy[0], clean[0], level[0])
-        noisy = self.noise.apply(packed, params)
-        return Sample(noisy[0], packed[0], self.noise.variance(noisy, params)[0])
+        if pair.noisy is None:
+            return add_noise(packed, self.noise, generator)
+        clean, noisy = packed
+        levels = torch.tensor(pair.shot_var), torch.tensor(pair.read_var)
+        return Sample(noisy, clean, bayer.noise_variance(noisy, *levels))
 
 
 class PictureCrops:
@@ -57,6 +82,7 @@ class PictureCrops:
         self.pairs = pairs
 
     def draw(self, generator: torch.Generator) -> Sample:
+        """A sample of one crop, ``(C, h, w)`` as the target has it."""
         return self.draw_batch([generator])[0]
 
     def draw_batch(self, generators: Sequence[torch.Generator]) -> list[Sample]:
@@ -67,12 +93,58 @@ class PictureCrops:
         return [Sample(*tensors) for tensors in zip(pair.noisy, pair.clean, variance, strict=True)]
 
 
+class MosaicCrops:
+    """Crops of pictures as RAW of a pattern drawn by its share, with the planes of its colours, from any of its cells.
+
+    Args:
+        pictures: a Dataset of pictures.
+        augment: of a Bayer pattern; noise of planes is then of the four sites of every 2 x 2 square.
+        crop: side in pixels.
+        zoom: see :class:`rawaug.RawPairs`.
+        patterns: shares of patterns by name.
+    """
+
+    def __init__(
+        self, pictures: Any, augment: RawAugment, crop: int, zoom: float, patterns: Mapping[str, float]
+    ) -> None:
+        self.crop, self.patterns = crop, [entry_pattern(bayer.pattern(name)) for name in patterns]
+        self.shares = torch.tensor([*patterns.values()])
+        room = max(pattern.period for pattern in self.patterns)
+        self.pairs = []
+        for pattern in self.patterns:
+            of_pattern = copy(augment)
+            of_pattern.pattern = pattern
+            self.pairs.append(RawPairs(pictures, of_pattern, crop + room, zoom=zoom))
+
+    def draw(self, generator: torch.Generator) -> Sample:
+        """A sample: noisy RAW and three planes ``(4, crop, crop)``, clean RAW and variance ``(1, crop, crop)``."""
+        kind = int(torch.multinomial(self.shares, 1, generator=generator))
+        pairs, pattern = self.pairs[kind], self.patterns[kind]
+        pair = pairs.draw(int(torch.randint(len(pairs), (), generator=generator)), generator)
+        top, left = (2 * torch.randint(pattern.period // 2, (2,), generator=generator)).tolist()
+        window = (..., slice(top, top + self.crop), slice(left, left + self.crop))
+        noisy = with_planes(pair.noisy[None], pattern)[0]
+        return Sample(noisy[window], pair.clean[window], pair.variance[window])
+
+
 def packed_crop(
     name: str, mosaics: Sequence[Tensor], own: CFA, crop: int, cfa: CFA, generator: torch.Generator
 ) -> Tensor:
-    """One random place of mosaics ``(C, H, W)`` of pattern ``own``, in one of eight turns, packed in that of ``cfa``.
+    """One random part of all mosaics of a frame, in one of eight turns, packed.
 
-    Returns ``(sum of C, 4, crop / 2, crop / 2)``.
+    Args:
+        name: of the frame.
+        mosaics: each ``(C, H, W)``, of the pattern ``own``.
+        own: their pattern.
+        crop: side in pixels.
+        cfa: the pattern in which the result is packed.
+        generator: draws the part and the turn.
+
+    Returns:
+        ``(sum of C, 4, crop / 2, crop / 2)``.
+
+    Raises:
+        ValueError: if the frame is too small.
     """
     height, width = mosaics[0].shape[-2:]
     if min(height, width) < crop + 6:
@@ -87,7 +159,15 @@ def packed_crop(
 
 
 class TrainingStream(Dataset[Any]):
-    """Sample i of an arm: the first ``augmented`` of every batch from pictures, the rest real."""
+    """The samples of an arm by their number.
+
+    Args:
+        real: samples of real frames; needed if ``augmented`` is below 1.
+        pictures: samples made from sRGB pictures; needed if ``augmented`` is above 0.
+        batch: samples in a step.
+        augmented: share of every batch, from 0 to 1, that is made from pictures; these come first.
+        seed: of all samples.
+    """
 
     def __init__(
         self, real: Source | None, pictures: Source | RawPairs | None, batch: int, augmented: float, seed: int
@@ -101,17 +181,17 @@ class TrainingStream(Dataset[Any]):
             raise ValueError("this arm needs real pairs; set data.pairs")
 
     def __getitem__(self, index: int) -> Any:
-        source = self.pictures if self._pictured(index) else self.real
+        source = self.pictures if self._is_made(index) else self.real
         assert source is not None
         return source.draw(self._generator(index))
 
     def __getitems__(self, indices: Sequence[int]) -> list[Any]:
         made: dict[int, Any] = {}
-        if isinstance(self.pictures, PictureCrops) and (pictured := [*filter(self._pictured, indices)]):
-            made = dict(zip(pictured, self.pictures.draw_batch([*map(self._generator, pictured)]), strict=True))
+        if isinstance(self.pictures, PictureCrops) and (numbers := [*filter(self._is_made, indices)]):
+            made = dict(zip(numbers, self.pictures.draw_batch([*map(self._generator, numbers)]), strict=True))
         return [made[index] if index in made else self[index] for index in indices]
 
-    def _pictured(self, index: int) -> bool:
+    def _is_made(self, index: int) -> bool:
         return index % self.batch < self.from_pictures
 
     def _generator(self, index: int) -> torch.Generator:
@@ -119,7 +199,15 @@ class TrainingStream(Dataset[Any]):
 
 
 class StepSampler(Sampler[list[int]]):
-    """The samples of each step from ``start`` on; of several processes each takes every ``world``-th."""
+    """The numbers of the samples of each step; of several processes each takes every ``world``-th.
+
+    Args:
+        start: the first step.
+        steps: the step to stop before.
+        batch: samples in a step, over all processes.
+        rank: number of this process.
+        world: number of processes, which must divide ``batch``.
+    """
 
     def __init__(self, start: int, steps: int, batch: int, rank: int = 0, world: int = 1) -> None:
         if batch % world:

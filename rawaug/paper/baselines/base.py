@@ -21,6 +21,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from rawaug import bayer
 from rawaug.bayer import CFA
@@ -36,15 +37,15 @@ CLIP_NORM = 1.0
 
 @dataclass(frozen=True)
 class Training:
-    """How a network is trained.
+    """The budget and the samples of a network's training.
 
     Args:
-        seconds: stop after these; the step under way is finished.
-        steps: stop after these. At least one of the two is given, and one step is done in any case.
-        crop: side of the crops, even.
-        batch: crops a step.
-        seed: of the crops.
-        progress: show a progress bar.
+        seconds: training stops when these have passed; the step under way is finished.
+        steps: training stops after this many. One of the two limits must be given; the first step is always done.
+        crop: side of the square crops in pixels, even.
+        batch: number of crops in a step.
+        seed: decides which crops a step sees.
+        progress: whether a progress bar is shown.
     """
 
     seconds: float | None = None
@@ -54,16 +55,19 @@ class Training:
     seed: int = 0
     progress: bool = True
 
-    def spent(self, seconds: float, steps: int) -> float:
-        """The part of the budget that is used up, of that limit which is nearer."""
+    def share_done(self, seconds: float, steps: int) -> float:
+        """How far the training has come, from 0 to 1: the share of the time or of the steps, whichever is larger."""
         by_time = 0.0 if self.seconds is None or not steps else seconds / self.seconds  # one step is done in any case
         return max(by_time, 0.0 if self.steps is None else steps / self.steps)
 
 
 class BaselineISP(nn.Module, ABC):
-    """A method that the dictionary ISP is compared with; ``cfa`` is the pattern of the RAW that it makes and takes.
+    """A method that the dictionary ISP is compared with.
 
-    The ``setting`` of a pass is what the method may be told of the shot, such as its gains; without, it takes its own.
+    The ``setting`` of a pass is what the method may know of a shot, such as its gains; None leaves it to its own.
+
+    Args:
+        cfa: the pattern of the RAW that it makes and takes.
     """
 
     name: ClassVar[str]
@@ -74,21 +78,16 @@ class BaselineISP(nn.Module, ABC):
         self.cfa = CFA(cfa)
         self.info: dict[str, Any] = {}
 
-    @property
-    def reverse_network(self) -> nn.Module:
-        """The part that the reverse pass uses: what the published numbers of parameters count."""
-        return self
-
-    def balanced(self, white_balance: tuple[float, float, float]) -> Any:
-        """The setting with these as-shot multipliers R, G, B; None for a method that has no use for them."""
+    def setting_of(self, white_balance: tuple[float, float, float]) -> Any:
+        """The setting for as-shot multipliers R, G, B; None if the method makes no use of them."""
         return None
 
     def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
-        """The mosaic under a setting drawn at random, where the method has others than its own."""
+        """sRGB ``(B, 3, H, W)`` to a mosaic ``(B, 1, H, W)`` under a random setting, if the method has any to draw."""
         return self.reverse(srgb)
 
     def learn(self, pairs: Sequence[FramePair], training: Training) -> tuple[int, float]:
-        """Fit to the pairs; the number of steps and the last loss. A method as published has nothing to fit."""
+        """Fit to the pairs and return the number of steps and the last loss; by default there is nothing to fit."""
         return 0, math.nan
 
     @abstractmethod
@@ -96,7 +95,7 @@ class BaselineISP(nn.Module, ABC):
         """Float sRGB ``(B, 3, H, W)`` to linear camera colour ``(B, 3, H, W)``, not clipped."""
 
     def render(self, raw: Tensor, setting: Any = None) -> Tensor:
-        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``, not clipped; overridden where the method has it."""
+        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``, not clipped; ValueError if the method cannot."""
         raise ValueError(
             f"{self.name} only converts sRGB to RAW; rawaug.paper.baselines lists the methods that also render RAW"
         )
@@ -110,11 +109,12 @@ class BaselineISP(nn.Module, ABC):
         return self.render(raw, setting).clamp(0.0, 1.0)
 
     def cycle(self, srgb: Tensor) -> Tensor:
+        """sRGB ``(B, 3, H, W)`` to RAW and back to sRGB of the same shape."""
         return self.forward(self.reverse(srgb))
 
 
 class Crops(NamedTuple):
-    """A training batch, in the CFA of the model that is trained."""
+    """A training batch, in the CFA of the model: sRGB ``(B, 3, H, W)``, mosaics ``(B, 1, H, W)``, gains ``(B, 3)``."""
 
     srgb: Tensor
     raw: Tensor
@@ -122,19 +122,33 @@ class Crops(NamedTuple):
 
 
 class CropTrainedISP(BaselineISP):
-    """A network that learns by gradient descent on random crops."""
+    """A network that learns by gradient descent on random crops.
 
+    ``reverse_network`` maps sRGB to camera colour; the published numbers of parameters count it alone.
+    """
+
+    reverse_network: nn.Module
     learning_rate: ClassVar[float]
     """For Adam, at the start."""
+
+    def unprocess(self, srgb: Tensor, setting: Any = None) -> Tensor:
+        made: Tensor = self.reverse_network(srgb)
+        return made
 
     def prepare(self, pairs: Sequence[FramePair]) -> None:
         """Set from the pairs what descent does not learn; called once, before training."""
 
-    @abstractmethod
     def loss(self, crops: Crops) -> Tensor:
-        """The method's own loss, a scalar, of the two directions where it has them."""
+        """The scalar that training lowers: :meth:`raw_error`, and l1 on the sRGB of methods that render RAW."""
+        error = self.raw_error(bayer.mosaic(self.unprocess(crops.srgb), self.cfa), crops.raw)
+        return error + F.l1_loss(self.render(crops.raw, crops.srgb), crops.srgb) if self.bidirectional else error
+
+    def raw_error(self, predicted: Tensor, raw: Tensor) -> Tensor:
+        """The error of predicted mosaics ``(B, 1, H, W)``, a scalar: by default l1."""
+        return F.l1_loss(predicted, raw)
 
     def learn(self, pairs: Sequence[FramePair], training: Training) -> tuple[int, float]:
+        """Train on crops; ValueError if there is no budget, or a pair is too small or not registered."""
         given = [limit for limit in (training.seconds, training.steps) if limit is not None]
         if not given or min(given) <= 0:
             raise ValueError(f"give seconds or steps above 0, got {training.seconds} and {training.steps}")
@@ -147,7 +161,7 @@ class CropTrainedISP(BaselineISP):
             parameters,
             self.learning_rate,
             lambda step: self.loss(random_crops(pairs, self.cfa, training, step, parameters[0].device)),
-            lambda step: training.spent(time.perf_counter() - start, step),
+            lambda step: training.share_done(time.perf_counter() - start, step),
             clip_norm=CLIP_NORM,
         )
         bar = progress_bar(
@@ -172,27 +186,35 @@ def require_crops(pairs: Sequence[FramePair], side: int) -> None:
 def random_crops(
     pairs: Sequence[FramePair], cfa: CFA, training: Training, step: int, device: torch.device | str = "cpu"
 ) -> Crops:
-    """The batch of a step: crops of random pairs, keyed by the seed and the step."""
+    """The batch of a step, the same for the same seed and step.
+
+    Args:
+        pairs: registered frames of any pattern.
+        cfa: the pattern in which all crops arrive.
+        training: says the crops' number, side and seed.
+        step: counts from 0.
+        device: where the batch is put.
+    """
     generator = keyed_generator(training.seed, "baseline crops", step)
     crop = bayer.RandomCrop(training.crop)
 
-    def drawn() -> Iterator[Crops]:
+    def draw() -> Iterator[Crops]:
         for k in torch.randint(len(pairs), (training.batch,), generator=generator).tolist():
             pair = pairs[k]
             srgb, raw = (bayer.crop_to_cfa(image, CFA(pair.cfa), cfa) for image in (pair.srgb, pair.raw))
-            place = crop.sample(raw.shape[-2], raw.shape[-1], generator)
-            yield Crops(as_float(crop.apply(srgb, place)), crop.apply(raw, place), torch.tensor(pair.white_balance))
+            corner = crop.sample(raw.shape[-2], raw.shape[-1], generator)
+            yield Crops(as_float(crop.apply(srgb, corner)), crop.apply(raw, corner), torch.tensor(pair.white_balance))
 
-    return Crops(*(torch.stack(values).to(device) for values in zip(*drawn(), strict=True)))
+    return Crops(*(torch.stack(values).to(device) for values in zip(*draw(), strict=True)))
 
 
 Model = TypeVar("Model", bound=BaselineISP)
 
 
 def fit_baseline(model: Model, pairs: Sequence[FramePair], training: Training) -> Model:
-    """Fit one of :data:`rawaug.paper.baselines.BASELINES` in place; ``model.info`` records steps, seconds and loss.
+    """Fit a method in place and return it in eval mode; ``model.info`` records frames, steps, seconds and loss.
 
-    UPI as published comes back as it is; tuned UPI is solved in closed form, whatever the budget.
+    UPI as published has nothing to fit; tuned UPI is solved in closed form, whatever the budget.
     """
     if not pairs:
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")

@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -64,7 +65,13 @@ def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Conv2d:
 
 @BASELINES.register("unet")
 class UNetISP(CropTrainedISP):
-    """The U-Net, ``width`` features in its first scale; it has no forward pass."""
+    """The U-Net, which has no forward pass.
+
+    Args:
+        cfa: the pattern of the RAW that it makes.
+        width: number of features in the first scale.
+        seed: decides the initial weights.
+    """
 
     name = "unet"
     bidirectional = False
@@ -72,27 +79,21 @@ class UNetISP(CropTrainedISP):
 
     def __init__(self, cfa: CFA | str = "RGGB", width: int = PUBLISHED_WIDTH, seed: int = 0) -> None:
         super().__init__(cfa)
-        self.network = UNet(width, channels=3, variance_map=False, seed=seed)
-
-    def unprocess(self, srgb: Tensor, setting: None = None) -> Tensor:
-        return self.network(srgb)
-
-    def loss(self, crops: Crops) -> Tensor:
-        return F.l1_loss(bayer.mosaic(self.unprocess(crops.srgb), self.cfa), crops.raw)
+        self.reverse_network = UNet(width, channels=3, variance_map=False, seed=seed)
 
 
 # -- invertible greyscale ---------------------------------------------------------------------------------------------
 
 
-class ResidualBlock(nn.Module):
-    """``x + conv(relu(conv(x)))``."""
+class ResidualBlock(nn.Sequential):
+    """``x + conv(relu(conv(x)))`` of features ``(B, C, H, W)``."""
 
     def __init__(self, features: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(_conv(features, features), nn.ReLU(), _conv(features, features))
+        super().__init__(_conv(features, features), nn.ReLU(), _conv(features, features))
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.layers(x)
+        """Features ``(B, C, H, W)`` to features of the same shape."""
+        return x + super().forward(x)
 
 
 def _blocks(features: int, count: int) -> nn.Sequential:
@@ -105,7 +106,7 @@ def _scale(inputs: int, outputs: int, stride: int) -> nn.Sequential:
 
 
 class Encoder(nn.Module):
-    """E, RAW to sRGB; sides are padded to multiples of 4 inside."""
+    """E, demosaiced RAW to sRGB, with ``features``, twice and four times as many in its three scales."""
 
     def __init__(self, features: int) -> None:
         super().__init__()
@@ -117,6 +118,7 @@ class Encoder(nn.Module):
         self.last = nn.Sequential(_blocks(fine, 2), _conv(fine, 3))
 
     def forward(self, x: Tensor) -> Tensor:
+        """``(B, 3, H, W)`` to ``(B, 3, H, W)``; sides are padded to multiples of 4 inside."""
         fine = self.first(pad_to_multiple(x, 4))
         middle = self.down[0](fine)
         features = self.centre(self.down[1](middle))
@@ -127,7 +129,14 @@ class Encoder(nn.Module):
 
 @BASELINES.register("invgrey")
 class InvertibleGrey(CropTrainedISP):
-    """The invertible-greyscale network, one network a direction; ``blocks`` are the residual ones of the way back."""
+    """The invertible-greyscale network, one network a direction.
+
+    Args:
+        cfa: the pattern of the RAW that it makes and takes.
+        features: in the finest scale of either direction.
+        blocks: number of residual blocks of the decoder, from sRGB to RAW.
+        seed: decides the initial weights.
+    """
 
     name = "invgrey"
     learning_rate = 1e-3
@@ -138,45 +147,37 @@ class InvertibleGrey(CropTrainedISP):
             self.encoder = Encoder(features)
             last = nn.Conv2d(4 * features, 3, 1)
             body = (_conv(3, features), _blocks(features, blocks), _conv(features, 4 * features))
-            self.decoder = nn.Sequential(*body, last)
+            self.reverse_network = nn.Sequential(*body, last)
 
-    @property
-    def reverse_network(self) -> nn.Module:
-        return self.decoder
-
-    def unprocess(self, srgb: Tensor, setting: None = None) -> Tensor:
-        return self.decoder(srgb)
-
-    def render(self, raw: Tensor, setting: None = None) -> Tensor:
+    def render(self, raw: Tensor, setting: Any = None) -> Tensor:
+        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``; there are no settings."""
         return self.encoder(bayer.demosaic(raw, self.cfa))
-
-    def loss(self, crops: Crops) -> Tensor:
-        reverse = F.l1_loss(bayer.mosaic(self.unprocess(crops.srgb), self.cfa), crops.raw)
-        return reverse + F.l1_loss(self.render(crops.raw), crops.srgb)
 
 
 # -- CycleISP ---------------------------------------------------------------------------------------------------------
 
 
 class RGB2RAW(cycleisp.Trunk):
-    """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape."""
+    """The network from sRGB to linear camera colour, with the ``sizes`` features, groups, blocks and reduction."""
 
-    def __init__(self, features: int, groups: int, blocks: int, reduction: int) -> None:
-        super().__init__(3, features, groups, blocks, reduction)
-        self.tail = nn.Sequential(_conv(features, 3))
+    def __init__(self, *sizes: int) -> None:
+        super().__init__(3, *sizes)
+        self.tail = nn.Sequential(_conv(sizes[0], 3))
 
     def forward(self, srgb: Tensor) -> Tensor:
+        """``(B, 3, H, W)`` to ``(B, 3, H, W)``."""
         return self.tail(self.body(self.head(srgb)))
 
 
 class ColourBranch(cycleisp.Trunk):
-    """A picture ``(B, 3, H, W)`` to weights of features in (0, 1), ``(B, features, H/2, W/2)``."""
+    """The branch that guides the way to sRGB by the colours of a picture."""
 
     def __init__(self, features: int, reduction: int) -> None:
         super().__init__(3, features, groups=2, blocks=2, reduction=reduction)
         self.tail = nn.Sequential(_conv(features, features), nn.Sigmoid())
 
     def forward(self, srgb: Tensor) -> Tensor:
+        """A picture ``(B, 3, H, W)`` to weights of features in (0, 1), ``(B, features, H/2, W/2)``."""
         from kornia.filters import gaussian_blur2d
 
         if min(srgb.shape[-2:]) <= BLUR_SIZE // 2:
@@ -187,14 +188,15 @@ class ColourBranch(cycleisp.Trunk):
 
 
 class RAW2RGB(cycleisp.Trunk):
-    """Packed RAW ``(B, 4, H/2, W/2)`` and the colour branch's weights to sRGB ``(B, 3, H, W)``."""
+    """The network from packed RAW to sRGB, with the ``sizes`` features, groups, blocks and reduction."""
 
-    def __init__(self, features: int, groups: int, blocks: int, reduction: int) -> None:
-        super().__init__(4, features, groups, blocks, reduction)
-        self.tail = nn.Sequential(_conv(features, features), self.body[-1])
-        self.tail_rgb = nn.Sequential(nn.Conv2d(features, 12, 1))
+    def __init__(self, *sizes: int) -> None:
+        super().__init__(4, *sizes)
+        self.tail = nn.Sequential(_conv(sizes[0], sizes[0]), self.body[-1])
+        self.tail_rgb = nn.Sequential(nn.Conv2d(sizes[0], 12, 1))
 
     def forward(self, packed: Tensor, colour: Tensor) -> Tensor:
+        """RAW ``(B, 4, H/2, W/2)`` and weights ``(B, features, H/2, W/2)`` of the branch to sRGB ``(B, 3, H, W)``."""
         features = self.body[:-1](self.head(packed))
         features = self.body[-1](features + features * colour)
         return F.pixel_shuffle(self.tail_rgb(self.tail(features)), 2)
@@ -202,7 +204,16 @@ class RAW2RGB(cycleisp.Trunk):
 
 @BASELINES.register("cycleisp")
 class CycleISP(CropTrainedISP):
-    """CycleISP. To render RAW it needs a picture of the same scene whose colours it takes: ``model(raw, srgb)``."""
+    """CycleISP. To render RAW it needs a picture of the same scene whose colours it takes: ``model(raw, srgb)``.
+
+    Args:
+        cfa: the pattern of the RAW that it makes and takes.
+        features: in every layer.
+        groups: of dual-attention blocks, in each network.
+        blocks: in each group.
+        reduction: of the features in channel attention.
+        seed: decides the initial weights.
+    """
 
     name = "cycleisp"
     learning_rate = 3e-4
@@ -223,26 +234,24 @@ class CycleISP(CropTrainedISP):
             self.ccm = ColourBranch(features, reduction)
 
     @property
-    def reverse_network(self) -> nn.Module:
+    def reverse_network(self) -> nn.Module:  # type: ignore[override]
+        """The network from sRGB to RAW, under its published name."""
         return self.rgb2raw
 
-    def unprocess(self, srgb: Tensor, setting: None = None) -> Tensor:
-        return self.rgb2raw(srgb)
-
     def render(self, raw: Tensor, setting: Tensor | None = None) -> Tensor:
-        """As in the base class; the setting is an sRGB picture ``(B, 3, H, W)`` of the same scene, as published."""
+        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``; the setting is an sRGB picture of the same scene."""
         if setting is None:
             raise ValueError("cycleisp renders RAW in the colours of a picture: pass the sRGB of the same scene")
         return self.raw2rgb(bayer.pack(raw, self.cfa), self.ccm(as_float(setting)))
 
     def cycle(self, srgb: Tensor) -> Tensor:
+        """sRGB ``(B, 3, H, W)`` to RAW and back, in its own colours."""
         return self.forward(self.reverse(srgb), srgb)
 
-    def loss(self, crops: Crops) -> Tensor:
-        predicted = bayer.mosaic(self.unprocess(crops.srgb), self.cfa)
-        log_predicted, log_raw = (image.clamp_min(LOG_FLOOR).log() for image in (predicted, crops.raw))
-        reverse = F.l1_loss(predicted, crops.raw) + F.l1_loss(log_predicted, log_raw)
-        return reverse + F.l1_loss(self.render(crops.raw, crops.srgb), crops.srgb)
+    def raw_error(self, predicted: Tensor, raw: Tensor) -> Tensor:
+        """l1 of mosaics ``(B, 1, H, W)`` and of their logarithms, a scalar."""
+        log_predicted, log_raw = (image.clamp_min(LOG_FLOOR).log() for image in (predicted, raw))
+        return F.l1_loss(predicted, raw) + F.l1_loss(log_predicted, log_raw)
 
     def load_published(self, path: str | os.PathLike[str], part: str = "rgb2raw") -> None:
         """Take the RGGB weights of a published checkpoint for a part: "rgb2raw", "raw2rgb" or "ccm", the colour branch.
@@ -266,6 +275,7 @@ class DenseBlock(nn.Module):
         nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
+        """``(B, inputs, H, W)`` to ``(B, outputs, H, W)``."""
         for layer in self.hidden:
             x = torch.cat([x, F.leaky_relu(layer(x), 0.2)], dim=1)
         return self.last(x)
@@ -282,11 +292,13 @@ class InvertibleBlock(nn.Module):
         self.add_two = DenseBlock(1, 2, growth)
 
     def forward(self, x: Tensor) -> Tensor:
+        """``(B, 3, H, W)`` to ``(B, 3, H, W)``."""
         one, two = F.conv2d(x, self.weight[:, :, None, None]).split([1, 2], dim=1)
         one = one + self.add_one(two)
         return torch.cat([one, two * self._log_scale(one).exp() + self.add_two(one)], dim=1)
 
     def inverse(self, x: Tensor) -> Tensor:
+        """The input ``(B, 3, H, W)`` that :meth:`forward` makes ``x`` of, which has the same shape."""
         one, two = x.split([1, 2], dim=1)
         two = (two - self.add_two(one)) * (-self._log_scale(one)).exp()
         one = one - self.add_one(two)
@@ -305,13 +317,13 @@ class Flow(nn.Module):
         self.blocks = nn.ModuleList(InvertibleBlock(growth, shift) for shift in shifts)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Compressed, balanced RAW ``(B, 3, H, W)`` to sRGB."""
+        """Compressed, balanced RAW ``(B, 3, H, W)`` to sRGB of the same shape."""
         for block in self.blocks:
             x = block(x)
         return x
 
     def inverse(self, x: Tensor) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to compressed, balanced RAW."""
+        """sRGB ``(B, 3, H, W)`` to compressed, balanced RAW of the same shape."""
         for block in reversed(self.blocks):
             x = block.inverse(x)  # type: ignore[operator]
         return x
@@ -321,8 +333,15 @@ class Flow(nn.Module):
 class InvISP(CropTrainedISP):
     """InvISP; the setting of a pass is the shot's as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``.
 
-    Without, both passes take the geometric mean of the training pairs'. With ``jpeg_quality``, 1 to 100, the way back
-    is trained through a differentiable JPEG of the network's own rendering.
+    Without a setting both passes take the geometric mean of the training pairs' multipliers.
+
+    Args:
+        cfa: the pattern of the RAW that it makes and takes.
+        blocks: number of invertible blocks.
+        growth: features that each layer of a dense block adds.
+        jpeg_quality: from 1 to 100: the way back is trained through a differentiable JPEG of the network's own
+            rendering. None leaves that out.
+        seed: decides the initial weights.
     """
 
     name = "invisp"
@@ -339,25 +358,30 @@ class InvISP(CropTrainedISP):
         self.register_buffer("balance", torch.ones(1, 3))
 
     def prepare(self, pairs: Sequence[FramePair]) -> None:
+        """Take the pairs' mean multipliers as those of shots that state none."""
         self.balance.copy_(torch.tensor([pair.white_balance for pair in pairs]).log().mean(0, keepdim=True).exp())
 
-    def balanced(self, white_balance: tuple[float, float, float]) -> Balance:
+    def setting_of(self, white_balance: tuple[float, float, float]) -> Balance:
+        """The multipliers themselves."""
         return white_balance
 
     def unprocess(self, srgb: Tensor, setting: Balance = None) -> Tensor:
+        """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape."""
         balanced = stages.gamma_expand(self.flow.inverse(srgb), GAMMA)
         return stages.apply_gains(balanced, 1.0 / self._gains(setting, len(srgb)))
 
     def render(self, raw: Tensor, setting: Balance = None) -> Tensor:
-        return self.flow(self.compressed(raw, setting))
+        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``."""
+        return self.flow(self.compress(raw, setting))
 
-    def compressed(self, raw: Tensor, setting: Balance) -> Tensor:
-        """What the flow takes ``(B, 3, H, W)`` of a mosaic ``(B, 1, H, W)``."""
+    def compress(self, raw: Tensor, setting: Balance) -> Tensor:
+        """Mosaic ``(B, 1, H, W)`` to balanced, gamma-compressed colour ``(B, 3, H, W)``, the input of the flow."""
         balanced = stages.apply_gains(bayer.demosaic(raw, self.cfa), self._gains(setting, len(raw)))
         return stages.gamma_compress(balanced, GAMMA)
 
     def loss(self, crops: Crops) -> Tensor:
-        raw = self.compressed(crops.raw, crops.white_balance)
+        """l1 of both passes, a scalar; the way back starts from the rendering as a JPEG if ``jpeg_quality`` is set."""
+        raw = self.compress(crops.raw, crops.white_balance)
         rendered = self.flow(raw)
         picture = crops.srgb if self.jpeg_quality is None else self._jpeg(rendered.clamp(0.0, 1.0))
         return F.l1_loss(rendered, crops.srgb) + F.l1_loss(self.flow.inverse(picture), raw)

@@ -45,14 +45,14 @@ RED, BLUE = (1.9, 2.4), (1.5, 1.9)
 
 
 class UPIParams(NamedTuple):
-    """One camera setting a picture; replays a pass."""
+    """One camera setting a picture: matrices ``(B, 3, 3)`` from linear sRGB to the camera, and gains ``(B, 3)``."""
 
     matrix: Tensor
     gains: Tensor
 
 
 def smoothstep(x: Tensor) -> Tensor:
-    """The tone curve ``3x^2 - 2x^3`` on [0, 1]; values beyond are clipped, where it would turn back."""
+    """The tone curve ``3x^2 - 2x^3`` of values of any shape, clipped to [0, 1], beyond which it would turn back."""
     x = x.clamp(0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 
@@ -68,18 +68,21 @@ class SmoothstepISP(BaselineISP):
     """UPI's stages with a matrix and gains from wherever: the setting of a pass is :class:`UPIParams`."""
 
     @abstractmethod
-    def default_params(self, batch: int) -> UPIParams: ...
+    def default_params(self, batch: int) -> UPIParams:
+        """The setting of ``batch`` pictures of which nothing is known."""
 
-    def balanced(self, white_balance: tuple[float, float, float]) -> UPIParams:
+    def setting_of(self, white_balance: tuple[float, float, float]) -> UPIParams:
         """The defaults with as-shot multipliers R, G, B in place of their own; the digital gain stays."""
         params = self.default_params(1)
         balance = torch.tensor(white_balance) / white_balance[1]
         return params._replace(gains=params.gains[:, 1:2].cpu() * balance)
 
     def unprocess(self, srgb: Tensor, setting: UPIParams | None = None) -> Tensor:
+        """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape."""
         return unprocess_pixels(srgb, setting or self.default_params(len(srgb)))
 
     def render(self, raw: Tensor, setting: UPIParams | None = None) -> Tensor:
+        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``."""
         return render_pixels(bayer.demosaic(raw, self.cfa), setting or self.default_params(len(raw)))
 
 
@@ -103,6 +106,7 @@ class UPI(SmoothstepISP):
     name = "upi"
 
     def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
+        """sRGB ``(B, 3, H, W)`` to mosaics ``(B, 1, H, W)``, each by a camera of its own."""
         return self.reverse(srgb, self.sample(len(srgb), generator))
 
     def default_params(self, batch: int) -> UPIParams:
@@ -140,6 +144,7 @@ class TunedUPI(SmoothstepISP):
         self.gains = nn.Parameter(torch.ones(3), requires_grad=False)
 
     def default_params(self, batch: int) -> UPIParams:
+        """The fitted matrix and gains for each of ``batch`` pictures."""
         return UPIParams(self.matrix.expand(batch, 3, 3), self.gains.expand(batch, 3))
 
     def learn(self, pairs: Sequence[FramePair], training: Training) -> tuple[int, float]:
@@ -157,15 +162,15 @@ class TunedUPI(SmoothstepISP):
 
 
 class Moments(NamedTuple):
-    """What the frames' squared errors depend on, in double precision, as means over each frame's known readings."""
+    """What the squared errors of F frames depend on, in double precision, as means over each frame's known readings."""
 
-    a: Tensor
-    b: Tensor
-    energy: Tensor
+    a: Tensor  # (F, 3, 3, 3): products of the inputs, by output channel
+    b: Tensor  # (F, 3, 3): of input and output
+    energy: Tensor  # (F,): of the output
 
     @classmethod
     def of(cls, samples: PixelSamples) -> Moments:
-        """Of pixels below the highlights, where the inverse gains are plain divisions."""
+        """Moments of the pixels below the highlights, where the inverse gains are plain divisions."""
         linear = stages.gamma_expand(inverse_smoothstep(samples.srgb), GAMMA)
         known = samples.known * (linear.mean(1, keepdim=True) < HIGHLIGHT_KNEE)
         x, y, weight = (value[:, :, 0].double() for value in (linear, samples.target, known))
@@ -176,12 +181,12 @@ class Moments(NamedTuple):
         return cls(a, torch.einsum("fip,fcp,fcp->fci", x, y, weight), (weight * y * y).sum((1, 2)))
 
     def solve(self, weights: Tensor) -> Tensor:
-        """The matrix ``(3, 3)`` of least weighted error, weights ``(F,)``."""
+        """The matrix ``(3, 3)`` of least weighted error; ``weights`` of the frames are ``(F,)``."""
         a, b = torch.einsum("f,fcij->cij", weights, self.a), torch.einsum("f,fci->ci", weights, self.b)
         ridge = 1e-9 * a.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(3).to(a)
         return torch.linalg.solve(a + ridge, b)
 
     def error(self, product: Tensor) -> Tensor:
-        """The frames' mean squared errors ``(F,)``."""
+        """The frames' mean squared errors ``(F,)`` under a matrix ``product`` of shape ``(3, 3)``."""
         square = torch.einsum("ci,fcij,cj->f", product, self.a, product)
         return (square - 2.0 * (product * self.b).sum((1, 2)) + self.energy).clamp_min(0.0)

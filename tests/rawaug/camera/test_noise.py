@@ -18,7 +18,7 @@ from rawaug.bayer import CFA
 from rawaug.camera.fit import fit, measure_camera_noise
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import RawDenoiser
-from rawaug.denoise.levels import levels_of, stored_noise
+from rawaug.denoise.levels import find_levels, load_noise
 from rawaug.io import RawFrame
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, camera_law, estimate_noise, noise_model
 from rawaug.plugin.augment import noise_for
@@ -142,15 +142,15 @@ def test_denoise_takes_the_law_at_the_files_iso(noisy_pair: Pair, tmp_path: Path
     law = MeasuredLevels([IsoLevel(100, 2e-4, 1e-6), IsoLevel(400, 8e-4, 1e-5)], "Maker Model")
     weights = tmp_path / "small.safetensors"
     save(build("PMRID", width=4, variance_map=True), weights, {"cfa": "RGGB", "noise": law.spec()})
-    stored = stored_noise("camera", RawDenoiser.of(weights))
+    stored = load_noise("camera", RawDenoiser.of(weights))
     frame = RawFrame(
         noisy_pair.raw, CFA.GRBG, (0.0, 0.0, 0.0, 0.0), 4095.0, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0), torch.eye(3),
         camera="Maker Model", iso=400, noise_profile=None, orientation=0, name="a",
     )  # fmt: skip
-    assert levels_of(frame, stored) == (8e-4, 1e-5, "camera")
+    assert find_levels(frame, stored) == (8e-4, 1e-5, "camera")
     with pytest.raises(ValueError, match="a: is from Other, but the noise law is of Maker Model"):
-        levels_of(replace(frame, camera="Other"), stored)
+        find_levels(replace(frame, camera="Other"), stored)
     with pytest.raises(ValueError, match=r"a: ISO 800 is outside the measured range .*pass --noise estimate"):
-        levels_of(replace(frame, iso=800), stored)
+        find_levels(replace(frame, iso=800), stored)
     with pytest.raises(ValueError, match="rawaug-small: holds no camera's noise law"):
-        stored_noise("camera", RawDenoiser.of("rawaug-small"))
+        load_noise("camera", RawDenoiser.of("rawaug-small"))

@@ -30,7 +30,7 @@ def noisy() -> Noisy:
     """A grey ramp with the noise of a phone."""
     clean = torch.linspace(0.1, 0.9, 64).expand(1, 4, 64, 64)
     noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
-    return Noisy.told(clean + noise * (LEVELS[0] * clean + LEVELS[1]).sqrt(), LEVELS, CFA.RGGB)
+    return Noisy.of(clean + noise * (LEVELS[0] * clean + LEVELS[1]).sqrt(), LEVELS, CFA.RGGB)
 
 
 @pytest.mark.parametrize(
@@ -53,8 +53,8 @@ def test_a_function_is_imported_from_the_command_line_alone(tmp_path: Path, monk
     assert (named("blind_one:half")(Noisy(torch.ones(1, 4, 8, 8))) == 0.5).all()
     (tmp_path / "evil.py").write_text("raise SystemExit('imported')\n")
     given: dict[str, Any] = {"camera": "universal", "arms": {"joint": ArmConfig(1.0)}, "out": str(tmp_path)}
-    recipe = JointRecipe(data=DataConfig(pairs=None), rivals=["evil:f"], **given)
-    with pytest.raises(ValueError, match="evil:f: no such denoiser"):
+    recipe = JointRecipe(data=DataConfig(pairs=None), untouched=["evil:f"], **given)
+    with pytest.raises(FileNotFoundError, match="evil:f: no such denoiser"):
         EXPERIMENTS["demosaic"](recipe)
     with pytest.raises(ValueError, match="evil:f: no such denoiser"):
         RawDenoiser.of("evil:f")
@@ -144,6 +144,6 @@ def test_the_views_of_a_self_ensemble_keep_the_frame_s_own_pattern(cfa: CFA) -> 
         return pack(F.avg_pool2d(unpack(noisy, cfa), 3, 1, 1, count_include_pad=False), cfa)
 
     noisy = torch.rand(1, 4, 16, 20, generator=torch.Generator().manual_seed(0))
-    given = Noisy.told(noisy, (1e-3, 1e-5), cfa)
+    given = Noisy.of(noisy, (1e-3, 1e-5), cfa)
     plain, views = (RawDenoiser.of(mean, views=count)(given)[..., 3:-3, 3:-3] for count in (1, 8))
     torch.testing.assert_close(views, plain, rtol=0.0, atol=1e-6)

@@ -20,7 +20,7 @@ from rawaug.cli import main
 from rawaug.commands.denoise import run
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.denoise.frames import denoise_file, denoise_folder
-from rawaug.denoise.levels import levels_of
+from rawaug.denoise.levels import find_levels
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng
 from rawaug.noise import noise_levels
 
@@ -74,7 +74,7 @@ def test_a_frame_of_any_pattern_becomes_cleaner_where_it_stands(
     frame = read_raw(shot(tmp_path / "a.dng", bayer_dng, own))
     model, packed = LocalMean(width=4, scales=2), pack(frame.mosaic[None], own)
     denoiser = RawDenoiser.of(model, cfa=CFA.GRBG, views=8 if self_ensemble else 1)
-    denoised = unpack(denoiser(Noisy.told(packed, LEVELS, own)), own)[0]
+    denoised = unpack(denoiser(Noisy.of(packed, LEVELS, own)), own)[0]
     assert denoised.shape == frame.mosaic.shape
     clean = a_scene(own)
     inner = (..., slice(12, -12), slice(12, -12))
@@ -108,41 +108,41 @@ def test_below_the_digital_number_0_is_counted(tmp_path: Path, bayer_dng: Dng, a
 
 def test_where_the_levels_come_from(tmp_path: Path, bayer_dng: Dng) -> None:
     frame = read_raw(shot(tmp_path / "a.dng", bayer_dng))
-    assert levels_of(frame) == (*LEVELS, "profile")
-    assert levels_of(frame, (1e-2, 1e-4)) == (1e-2, 1e-4, "given")
+    assert find_levels(frame) == (*LEVELS, "profile")
+    assert find_levels(frame, (1e-2, 1e-4)) == (1e-2, 1e-4, "given")
     phone = dataclasses.replace(frame, iso=800.0)
-    assert levels_of(phone, "Google Pixel")[0] == pytest.approx(0.001764, rel=1e-3)
+    assert find_levels(phone, "Google Pixel")[0] == pytest.approx(0.001764, rel=1e-3)
     for camera in ("SonyA7S2", "NikonD850"):  # the law itself, not a draw about it
         draws = noise_levels(camera, iso=800).sample(4001, torch.Generator().manual_seed(0))[1]
-        assert levels_of(phone, camera)[1] == pytest.approx(draws.median().item(), rel=0.05)
+        assert find_levels(phone, camera)[1] == pytest.approx(draws.median().item(), rel=0.05)
     with pytest.raises(ValueError, match="a: ISO 800000"):
-        levels_of(dataclasses.replace(frame, iso=8e5), "Google Pixel")
+        find_levels(dataclasses.replace(frame, iso=8e5), "Google Pixel")
     with pytest.raises(ValueError, match="not negative"):
-        levels_of(frame, (-1e-3, -0.1))
+        find_levels(frame, (-1e-3, -0.1))
     with pytest.raises(ValueError, match="has no ISO tag"):
-        levels_of(frame, "Google Pixel")
+        find_levels(frame, "Google Pixel")
     with pytest.raises(ValueError, match="'upi' is no camera; use auto, profile, estimate"):
-        levels_of(frame, "upi")
-    assert levels_of(phone, "nikon d5000")[0] == levels_of(phone, "Nikon D5000")[0] > 0
+        find_levels(frame, "upi")
+    assert find_levels(phone, "nikon d5000")[0] == find_levels(phone, "Nikon D5000")[0] > 0
     bare = dataclasses.replace(frame, noise_profile=None)
     with pytest.raises(ValueError, match="a: has no NoiseProfile tag"):
-        levels_of(bare, "profile")
+        find_levels(bare, "profile")
     with pytest.raises(ValueError, match=r"a: too few .* pass --noise"):
-        levels_of(bare)
+        find_levels(bare)
 
 
 @pytest.mark.parametrize("wrong", [0.5, 1.0, 1.4, 4.0])
 def test_a_tag_that_the_frame_contradicts_or_lacks_gives_way_to_the_estimate(wrong: float) -> None:
     frame = dataclasses.replace(gradient(), noise_profile=(wrong * LEVELS[0], wrong * LEVELS[1]))
-    shot_var, _, noise_source = levels_of(frame)
+    shot_var, _, noise_source = find_levels(frame)
     if wrong in (0.5, 4.0):
         assert noise_source.startswith("estimate; the NoiseProfile tag says ")
         assert float(noise_source.split()[5]) == pytest.approx(wrong, rel=0.1)
         assert shot_var == pytest.approx(LEVELS[0], rel=0.1)
     else:
         assert (shot_var, noise_source) == (wrong * LEVELS[0], "profile")
-    assert levels_of(frame, "profile")[0] == wrong * LEVELS[0]
-    shot_var, read_var, noise_source = levels_of(gradient())
+    assert find_levels(frame, "profile")[0] == wrong * LEVELS[0]
+    shot_var, read_var, noise_source = find_levels(gradient())
     assert noise_source.startswith("estimate, R^2 0.9") and read_var < 4e-5
     assert shot_var == pytest.approx(LEVELS[0], rel=0.1)
 

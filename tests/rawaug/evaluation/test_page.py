@@ -17,7 +17,7 @@ from PIL import Image
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.page import WINDOW, Page, draw_curves, most_detailed
+from rawaug.evaluation.page import WINDOW, Page, find_detail, plot_curves
 from rawaug.evaluation.scores import Panels
 from rawaug.evaluation.trials import raw_trial
 
@@ -36,7 +36,7 @@ def page(tmp_path: Path) -> str:
     log.write_text("step,loss,psnr,samples_per_second\n2,0.1,30,9\n4,0.05,31,9\n")
     results = {"real": [{"plain": scores(40.123), "self_ensemble": scores(41.0)}]}
     made = Page.of_scores("a & b", results, {"Wavelet": scores(37.5)}, {"Noise": "upi"}, {"real": "a U-Net"})
-    made.add_curves(draw_curves({"real": [log]}))
+    made.add_curves(plot_curves({"real": [log]}))
     generator = torch.Generator().manual_seed(0)
     raw = torch.rand(1, 200, 800, generator=generator)
     pair = Pair("a <frame>", torch.zeros(3, 200, 800, dtype=torch.uint8), raw, CFA.GRBG, (2, 1, 1.6), torch.eye(3))
@@ -73,14 +73,14 @@ def test_its_pictures_open_and_have_the_promised_sizes(page: str) -> None:
 def test_the_window_is_where_the_detail_is() -> None:
     packed = torch.full((1, 4, 200, 300), 0.2)
     packed[..., 120:150, 200:240] = torch.rand(30, 40, generator=torch.Generator().manual_seed(0))
-    top, left = most_detailed(packed)
+    top, left = find_detail(packed)
     assert top <= 120 and top + WINDOW >= 150 and left <= 200 and left + WINDOW >= 240
-    assert most_detailed(packed[..., :20, :30]) == (0, 0)
+    assert find_detail(packed[..., :20, :30]) == (0, 0)
 
 
 def test_a_curve_of_one_point_is_seen(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text("step,loss,psnr\n4,0.1,30\n")
-    pictures = draw_curves({"real": [tmp_path / "log.csv"]})
+    pictures = plot_curves({"real": [tmp_path / "log.csv"]})
     assert set(pictures) == {"loss", "validation PSNR, RAW (dB)"}
     for png in pictures.values():
         pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))

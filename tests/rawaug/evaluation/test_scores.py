@@ -19,7 +19,7 @@ from rawaug.cli import main
 from rawaug.commands.evaluate import run as evaluate
 from rawaug.data import Pair, demo_pairs
 from rawaug.denoise.denoiser import Noisy, RawDenoiser, require_classical
-from rawaug.evaluation.scores import NOISY, Row, compared, score, summary
+from rawaug.evaluation.scores import NOISY, Row, compare, score, summary
 from rawaug.evaluation.tables import print_scores
 from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.denoising import installed_classical
@@ -145,9 +145,9 @@ def test_the_development_is_the_same_for_both() -> None:
     """Halving clean and result alike changes nothing after development, since the exposure is the clean frame's."""
     pair = demo_pairs("test", count=1)[0]
     trial = trial_of(pair, noise_model("cycleisp_sidd"))
-    whole = compared(trial.noisy, trial)
+    whole = compare(trial.noisy, trial)
     dark = replace(trial_of(replace(pair, raw=pair.raw / 2), noise_model((0.0, 0.0))), noisy=trial.noisy / 2)
-    half = compared(dark.noisy, dark)
+    half = compare(dark.noisy, dark)
     assert half[2:] == pytest.approx(whole[2:], rel=1e-4) and half[0] == pytest.approx(whole[0] + 6.02, abs=0.01)
 
 

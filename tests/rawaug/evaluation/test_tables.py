@@ -15,7 +15,7 @@ from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.scores import Panels
-from rawaug.evaluation.tables import draw, mean_and_spread, print_table, verdict
+from rawaug.evaluation.tables import mean_and_spread, print_table, save_picture, verdict
 from rawaug.evaluation.trials import raw_trial
 
 
@@ -42,7 +42,7 @@ def test_the_figure_is_written(grey_pair: Pair, tmp_path: Path) -> None:
     packed = bayer.pack(grey_pair.raw[None], "GBRG")
     trial = raw_trial(grey_pair, packed, packed, packed, None, CFA.GBRG)
     row = Panels(trial, {"noisy": packed, "clean": packed}, {"noisy": "20.00 dB", "clean": "grey"})
-    assert draw([row], tmp_path / "new" / "figure.png").stat().st_size > 1000
+    assert save_picture([row], tmp_path / "new" / "figure.png").stat().st_size > 1000
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import torch
 
 from rawaug.commands.run import with_values
 from rawaug.data import demo_pictures
-from rawaug.experiment.arms import chosen, training_stream, validation_samples
+from rawaug.experiment.arms import rank_candidates, training_stream, validation_samples
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
@@ -79,8 +79,8 @@ def test_the_best_of_every_log_counts_and_runs_are_averaged(tmp_path: Path) -> N
         (tmp_path / name).mkdir(parents=True)
         (tmp_path / name / "log.csv").write_text("step,psnr\n" + "".join(f"1,{value}\n" for value in values))
     folders = [tmp_path / "seed0", tmp_path / "seed1"]
-    best = chosen(arms, folders, best=True)
+    best = rank_candidates(arms, folders, best=True)
     assert best == {"n2n": {"n2n_gamma16": 33.0, "n2n_gamma2": 32.5}} and next(iter(best["n2n"])) == "n2n_gamma16"
-    last = chosen(arms, folders, best=False)
+    last = rank_candidates(arms, folders, best=False)
     assert last == {"n2n": {"n2n_gamma16": 32.5, "n2n_gamma2": 30.5}}
-    assert chosen({}, folders, True) == {}
+    assert rank_candidates({}, folders, True) == {}

@@ -16,10 +16,10 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import demo_pictures
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.scores import compared
-from rawaug.experiment.demosaicing import JointRecipe, demosaiced, full_colour, rgb_trial, run
+from rawaug.evaluation.scores import compare
+from rawaug.experiment.demosaicing import JointRecipe, demosaic, full_colour, rgb_trial, run
 from rawaug.experiment.denoising import run as train_denoiser
-from rawaug.experiment.plan import planned
+from rawaug.experiment.plan import plan_data
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.io.pictures import decode_srgb
 from rawaug.metrics import psnr
@@ -56,7 +56,7 @@ def test_the_truth_of_a_grey_scene_is_grey(cfa: CFA, factor: int) -> None:
     grey = F.avg_pool2d(F.interpolate(light, size=(642, 898), mode="bicubic"), 3, stride=1)[0]
     pair = Pair("grey", torch.zeros(3, 640, 896, dtype=torch.uint8), grey, cfa)
     recipe = small(Path(), data=DataConfig(pairs=None, validation=None, test_crop=None, bin=factor))
-    truth = full_colour(planned(recipe, {"test": [pair]}).test[0])
+    truth = full_colour(plan_data(recipe, {"test": [pair]}).test[0])
     red, green, blue = truth[..., 8:-8, 8:-8].unbind(1)
     assert red.std() > 0.04
     assert min(psnr(red[None], blue[None]).item(), psnr(red[None], green[None]).item()) > 50
@@ -74,10 +74,10 @@ def test_noise_is_on_the_mosaic_of_the_truth_and_the_same_every_time() -> None:
 def test_what_is_smooth_is_demosaiced_to_itself(method: str) -> None:
     """LibRaw's result is in the same units, though it works on balanced RAW: red and blue are twice as bright there."""
     trial = rgb_trial(a_pair(), NOISE)
-    rgb = demosaiced(bayer.pack_rgb(trial.clean, CFA.RGGB), a_pair(), method)
+    rgb = demosaic(bayer.pack_rgb(trial.clean, CFA.RGGB), a_pair(), method)
     error = (rgb - trial.clean)[..., 6:-6, 6:-6].abs().amax(dim=(0, 2, 3))
     assert error.max() < 4e-3, error
-    assert compared(rgb, trial)[0] > compared(rgb + 0.01, trial)[0] > 35
+    assert compare(rgb, trial)[0] > compare(rgb + 0.01, trial)[0] > 35
 
 
 def small(folder: Path, **changes: Any) -> JointRecipe:
@@ -89,7 +89,8 @@ def small(folder: Path, **changes: Any) -> JointRecipe:
         out=str(folder),
         **{
             "data": DataConfig(pairs=None, validation_crop=128, test_crop=128, test_count=1),
-            "rivals": ["Wavelet"],
+            "classical": ["Wavelet"],
+            "untouched": [],
             "demosaicing": ["malvar", "DCB"],
             **changes,
         },
@@ -99,12 +100,12 @@ def small(folder: Path, **changes: Any) -> JointRecipe:
 def test_the_recipe_compares_it_with_one_after_the_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     results = run(small(tmp_path), test=[a_pair(name="test")], validation=[a_pair(name="validation")])
     written = json.loads((tmp_path / "experiment" / "results.json").read_text())
-    assert list(written["rivals"]) == ["Wavelet, malvar", "Wavelet, DCB"]
+    assert list(written["others"]) == ["Wavelet, malvar", "Wavelet, DCB"]
     plain = results["joint"][0]["plain"]
     assert plain["psnr"] == pytest.approx(plain["psnr_noisy"], abs=1.0), "two steps from the interpolation of the noisy"
-    assert all(scores["psnr"] > plain["psnr_noisy"] + 3 for scores in written["rivals"].values())
+    assert all(scores["psnr"] > plain["psnr_noisy"] + 3 for scores in written["others"].values())
     assert "Wavelet, DCB" in capsys.readouterr().out
-    other = small(tmp_path, test_noise="upi", rivals=[])
+    other = small(tmp_path, test_noise="upi", classical=[])
     run(other, overwrite=True, test=[a_pair(name="test")], validation=[a_pair(name="validation")])
     assert "already trained" not in capsys.readouterr().out, "the noise of validation chooses the weights"
 
@@ -112,8 +113,8 @@ def test_the_recipe_compares_it_with_one_after_the_other(tmp_path: Path, capsys:
 def test_what_it_cannot_compare_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="demosaicing 'AMAZE' is unknown; use one of bilinear, malvar, VNG"):
         small(tmp_path, demosaicing=["AMAZE"])
-    with pytest.raises(ValueError, match=r"classical and untouched: .* are named in rivals"):
-        small(tmp_path, classical=["Wavelet"])
+    with pytest.raises(ValueError, match="rawaug-joint: demosaics, too"):
+        run(small(tmp_path, untouched=["rawaug-joint"]), test=[a_pair()], validation=[])
     with pytest.raises(ValueError, match="denoiser: UNet gives no full colour; take another network"):
         run(replace(small(tmp_path), denoiser=DenoiserConfig("UNet")), test=[a_pair()], validation=[])
     with pytest.raises(ValueError, match="denoiser: JointDRUNet gives full colour: rawaug run demosaic trains it"):

@@ -17,13 +17,12 @@ from rawaug.data import demo_pairs
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import RawDenoiser
 from rawaug.evaluation.scores import NOISY, score
-from rawaug.experiment.demosaicing import by_libraw, full_colour
-from rawaug.experiment.mosaics import MosaicRecipe, mosaic_trial, watched_trial
+from rawaug.experiment.demosaicing import MosaicRecipe, full_colour, libraw_demosaic, mosaic_trial, planes_trial
 from rawaug.experiment.recipe import ArmConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.seeding import keyed_generator
-from rawaug.training.mosaics import MosaicCrops
+from rawaug.training.stream import MosaicCrops
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +33,7 @@ def pair() -> Pair:
 def test_a_frame_has_the_same_light_in_every_pattern(pair: Pair) -> None:
     noise = noise_model((1e-3, 1e-5))
     for name in ("GRBG", "XTRANS", "QUAD-BGGR"):
-        trial, own = mosaic_trial(pair, name, noise), watched_trial(pair, name, noise)
+        trial, own = mosaic_trial(pair, name, noise), planes_trial(pair, name, noise)
         assert torch.equal(trial.clean, full_colour(pair)) and torch.equal(own.clean, pattern(name).mosaic(trial.clean))
         raw = trial.noisy if name != "GRBG" else bayer.unpack(trial.noisy, name)
         assert torch.equal(raw, own.noisy[:, :1])
@@ -46,7 +45,7 @@ def test_a_frame_has_the_same_light_in_every_pattern(pair: Pair) -> None:
 def test_libraw_demosaics_small_frames_of_every_pattern(pair: Pair) -> None:
     scene = torch.tensor([0.5, 0.4, 0.3])[:, None, None] * torch.linspace(0.5, 1.0, 70)
     for name in ("RGGB", "XTRANS"):
-        rgb = by_libraw(pattern(name).mosaic(scene.expand(1, 3, 62, 70)), pair, "AHD", name)
+        rgb = libraw_demosaic(pattern(name).mosaic(scene.expand(1, 3, 62, 70)), pair, "AHD", name)
         assert rgb.shape == (1, 3, 62, 70)
         assert (rgb - scene)[..., 8:-8, 8:-8].abs().max() < 0.02
 
@@ -95,14 +94,14 @@ def test_the_recipe_trains_and_scores_by_pattern(tmp_path: Path, capsys: pytest.
         "train.crop": 32,
         "train.batch": 2,
     }
-    keys |= {"data.validation": "demo:validation", "data.test": "demo:test", "rivals": ["NonLocalMeans"]}
+    keys |= {"data.validation": "demo:validation", "data.test": "demo:test", "classical": ["NonLocalMeans"]}
     keys |= {"data.validation_crop": 64, "data.test_crop": 64, "data.validation_count": 1, "data.test_count": 1}
     given = [word for key, value in keys.items() for word in (f"--{key.replace('_', '-')}", json.dumps(value))]
     assert main(["run", "any", *given, "--out", str(tmp_path), "--device", "cpu"]) == 0
     results = json.loads((tmp_path / "any" / "results.json").read_text())
     for name in ("RGGB", "XTRANS", "QUAD-RGGB"):
         assert 10.0 < results[name]["results"]["any"][0]["plain"]["psnr_srgb"] < 60.0
-        assert ("NonLocalMeans" in results[name]["rivals"]) == (name == "RGGB")
+        assert ("NonLocalMeans" in results[name]["others"]) == (name == "RGGB")
     head, *rows = (tmp_path / "any" / "seed0" / "any" / "log.csv").read_text().splitlines()
     assert rows and {"psnr_RGGB", "psnr_XTRANS", "psnr_QUAD-RGGB"} <= set(head.split(","))
     assert "XTRANS" in capsys.readouterr().out

@@ -14,7 +14,7 @@ from rawaug.bayer import bin_mosaic
 from rawaug.cli import main
 from rawaug.data import Pair, demo_pairs
 from rawaug.data.pairs import names_of, stamps
-from rawaug.experiment.plan import planned, require_usable, with_given_pairs, with_own_pairs
+from rawaug.experiment.plan import name_given_pairs, plan_data, require_usable, use_all_pairs
 from rawaug.experiment.recipe import (
     ArmConfig,
     DataConfig,
@@ -58,25 +58,25 @@ def data(tmp_path: Path) -> DataConfig:
 
 
 def plan_of(recipe: Recipe, **given: Any) -> Any:
-    return planned(with_given_pairs(recipe, given), given)
+    return plan_data(name_given_pairs(recipe, given), given)
 
 
 def test_own_pairs_are_all_used_and_a_part_of_them_is_held_out(own: Path, data: DataConfig) -> None:
     content = read_recipe(find_recipe("fewshot"))
     shipped = Recipe(arms=ARMS, data=data)
     mine = replace(shipped, data=replace(shipped.data, pairs=f"pairs:{own}"))
-    assert with_own_pairs(shipped, content, set()) == shipped
-    reset = with_own_pairs(mine, content, {"data.pairs"}).data
+    assert use_all_pairs(shipped, content, set()) == shipped
+    reset = use_all_pairs(mine, content, {"data.pairs"}).data
     assert (reset.count, reset.validation, reset.test) == (None, "auto", data.test)
-    kept = with_own_pairs(mine, content, {"data.pairs", "data.count", "data.validation"}).data
+    kept = use_all_pairs(mine, content, {"data.pairs", "data.count", "data.validation"}).data
     assert (kept.count, kept.validation) == (2, "demo:validation")  # as the command line says
     unwatched = replace(mine, data=replace(mine.data, validation=None))
-    assert with_own_pairs(unwatched, content, {"data.pairs"}).data.validation is None
+    assert use_all_pairs(unwatched, content, {"data.pairs"}).data.validation is None
 
     elsewhere = Recipe(arms=ARMS, data=DataConfig(pairs="sidd:/elsewhere", count=56, validation=None))
-    assert with_own_pairs(elsewhere, read_recipe(find_recipe("sidd/fewshot")), {"data.pairs"}) == elsewhere
+    assert use_all_pairs(elsewhere, read_recipe(find_recipe("sidd/fewshot")), {"data.pairs"}) == elsewhere
 
-    recipe = with_own_pairs(mine, content, {"data.pairs"})
+    recipe = use_all_pairs(mine, content, {"data.pairs"})
     plan = plan_of(recipe)
     assert names_of(plan.pairs) == [f"shot{k}" for k in range(6)] and names_of(plan.validation) == ["shot6"]
     train, validate, test, pictures, isp = plan.lines(recipe)

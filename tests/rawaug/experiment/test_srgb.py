@@ -15,7 +15,7 @@ from rawaug.data import demo_pairs
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import RawDenoiser
 from rawaug.denoise.pictures import PictureDenoiser
-from rawaug.evaluation.scores import results, score
+from rawaug.evaluation.scores import score, to_domain
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.recipe import ArmConfig, DataConfig
 from rawaug.experiment.srgb import SrgbRecipe, SrgbRun, best_filter, developed, srgb_trials
@@ -68,7 +68,7 @@ def test_noise_is_that_of_the_level_the_same_for_all(trials: list[Trial], pairs:
 def test_a_raw_denoiser_is_developed_after(trials: list[Trial]) -> None:
     def brighter(by: float) -> torch.Tensor:
         denoiser = RawDenoiser.of(lambda noisy: noisy + by, name="brighter")
-        ((name, image),) = results(denoiser.name, denoiser(trials[1].given_to(denoiser)), trials[1])
+        ((name, image),) = to_domain(denoiser.name, denoiser(trials[1].given_to(denoiser)), trials[1])
         assert name == "brighter, then LibRaw"
         return image
 
@@ -131,13 +131,13 @@ def test_the_strength_of_a_filter_is_chosen_on_validation_whatever_the_test_fram
     )
     found = {}
     for frame in (flat, detailed):
-        SrgbRun(recipe, True, {"validation": [frame], "test": [test]}).all_stages()
+        SrgbRun(recipe, True, {"validation": [frame], "test": [test]}).run_stages()
         others = json.loads((tmp_path / "a" / "results.json").read_text())["others"]
         found[frame.name] = others["NonLocalMeans"]["0.008, 0.0001"]["psnr"]
     assert found["flat"] < found["detailed"] - 0.2
     capsys.readouterr()
     other = replace(recipe, classical=[], levels=[(2e-3, 1e-5)])
-    SrgbRun(other, True, {"validation": [detailed], "test": [test]}).all_stages()
+    SrgbRun(other, True, {"validation": [detailed], "test": [test]}).run_stages()
     assert "already trained" not in capsys.readouterr().out, "the levels of validation choose the weights"
 
 

@@ -48,13 +48,13 @@ def test_a_filter_or_nothing_is_used_as_the_verdict_says() -> None:
 
 def usage(results: Any, others: Any) -> list[str]:
     made: Any = SimpleNamespace(
-        place=lambda arm, seed: Path("runs") / f"seed{seed}" / arm,
+        results=results,
+        arm_folder=lambda arm, seed: Path("runs") / f"seed{seed}" / arm,
         seeds=range(len(results["mine"])),
-        untouched={"rawaug-small": None},
         recipe=SimpleNamespace(untouched=["rawaug-small"]),
         classical=[{"name": "Wavelet", "settings": {"strength": 0.5}}],
     )
-    return TrainingRun.usage(made, results, others)
+    return TrainingRun.usage(made, others)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig
 from rawaug.paper import reconstruction
 from rawaug.paper.baselines import Training
-from rawaug.paper.downstream import DownstreamConfig
+from rawaug.paper.methods import DownstreamConfig
 from rawaug.paper.reconstruction import Comparison, compare
 
 FrameOf = Callable[..., Pair]

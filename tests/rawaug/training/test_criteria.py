@@ -9,7 +9,7 @@ from torch.nn import L1Loss, MSELoss
 
 from denoisers.domains import Anscombe
 from rawaug.data.pairs import Sample
-from rawaug.training.criteria import Charbonnier, weighed
+from rawaug.training.criteria import Charbonnier, weigh_loss
 
 SHOT, READ = 2e-3, 1e-5
 NOISY = torch.rand(2, 4, 8, 8, generator=torch.Generator().manual_seed(0)) * 0.8
@@ -31,7 +31,9 @@ def test_charbonnier_is_its_formula() -> None:
 
 def test_normalised_is_the_loss_in_units_of_the_noise_of_each_pixel() -> None:
     expected = float((0.1 / SAMPLE.variance.sqrt()).mean())
-    assert weighed(L1Loss(), "normalised", SAMPLE)(level(0.5), level(0.4)).item() == pytest.approx(expected, rel=1e-4)
+    assert weigh_loss(L1Loss(), "normalised", SAMPLE)(level(0.5), level(0.4)).item() == pytest.approx(
+        expected, rel=1e-4
+    )
 
 
 def test_with_noisy_targets_normalised_is_unbiased_and_stabilised_is_not() -> None:
@@ -43,7 +45,7 @@ def test_with_noisy_targets_normalised_is_unbiased_and_stabilised_is_not() -> No
     levels = torch.linspace(0.0, 2 * clean, 81)
 
     def best(weigh: str) -> float:
-        loss = weighed(MSELoss(), weigh, sample)
+        loss = weigh_loss(MSELoss(), weigh, sample)
         return float(levels[torch.stack([loss(y.expand_as(shots[1]), shots[1]) for y in levels]).argmin()])
 
     assert best("normalised") == pytest.approx(clean, rel=0.03)
@@ -53,7 +55,7 @@ def test_with_noisy_targets_normalised_is_unbiased_and_stabilised_is_not() -> No
 def test_stabilised_is_the_loss_of_the_roots() -> None:
     for clean, denoised in ((0.1, 0.12), (0.7, 0.65)):
         expected = abs(root(denoised) - root(clean))
-        assert weighed(L1Loss(), "stabilised", SAMPLE)(level(denoised), level(clean)).item() == pytest.approx(
+        assert weigh_loss(L1Loss(), "stabilised", SAMPLE)(level(denoised), level(clean)).item() == pytest.approx(
             expected, rel=1e-3
         )
     assert Anscombe.least_shot < SHOT  # below it the root has fewer photons
@@ -62,21 +64,23 @@ def test_stabilised_is_the_loss_of_the_roots() -> None:
 def test_mixed_is_the_mean_of_both_in_units_of_the_noise() -> None:
     deviation = SAMPLE.variance.sqrt().mean((1, 2, 3))
     expected = 0.5 * (root(0.5) - root(0.4) + float((0.1 / deviation).mean()))
-    assert weighed(L1Loss(), "mixed", SAMPLE)(level(0.5), level(0.4)).item() == pytest.approx(expected, rel=1e-3)
+    assert weigh_loss(L1Loss(), "mixed", SAMPLE)(level(0.5), level(0.4)).item() == pytest.approx(expected, rel=1e-3)
 
 
 def test_mixed_takes_each_picture_in_units_of_its_own_noise() -> None:
     variance = SAMPLE.variance * torch.tensor([1.0, 100.0]).reshape(2, 1, 1, 1)
     sample, a, b = Sample(NOISY, NOISY, variance), level(0.5), level(0.4)
-    alone = [weighed(L1Loss(), "mixed", Sample(*(x[k : k + 1] for x in sample)))(a[:1], b[:1]).item() for k in (0, 1)]
-    assert weighed(L1Loss(), "mixed", sample)(a, b).item() == pytest.approx(sum(alone) / 2, rel=1e-4)
+    alone = [
+        weigh_loss(L1Loss(), "mixed", Sample(*(x[k : k + 1] for x in sample)))(a[:1], b[:1]).item() for k in (0, 1)
+    ]
+    assert weigh_loss(L1Loss(), "mixed", sample)(a, b).item() == pytest.approx(sum(alone) / 2, rel=1e-4)
 
 
 def test_shadows_count_more_the_more_is_stabilised() -> None:
     """An error in the shadow over the same one in the light."""
 
     def ratio(weigh: str) -> float:
-        loss = weighed(L1Loss(), weigh, SAMPLE)
+        loss = weigh_loss(L1Loss(), weigh, SAMPLE)
         return loss(level(0.02), level(0.01)).item() / loss(level(0.81), level(0.80)).item()
 
     assert ratio("linear") == pytest.approx(1.0, rel=1e-4)
@@ -88,6 +92,6 @@ def test_relative_counts_a_picture_by_the_share_of_its_error_that_stays() -> Non
     noisy = clean + torch.tensor([0.02, 0.2])[:, None, None, None]
     half = 0.5 * (noisy + clean)
     sample = Sample(noisy, clean, torch.zeros_like(noisy))
-    assert weighed(L1Loss(), "relative", sample)(half, clean).item() == pytest.approx(0.5, rel=1e-3)
+    assert weigh_loss(L1Loss(), "relative", sample)(half, clean).item() == pytest.approx(0.5, rel=1e-3)
     same = Sample(clean, clean, torch.zeros_like(clean))
-    assert weighed(L1Loss(), "relative", same)(clean + 0.01, clean).item() == pytest.approx(0.01 * 255, rel=1e-3)
+    assert weigh_loss(L1Loss(), "relative", same)(clean + 0.01, clean).item() == pytest.approx(0.01 * 255, rel=1e-3)

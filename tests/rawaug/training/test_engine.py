@@ -25,7 +25,7 @@ warnings.filterwarnings("ignore")
 torch.set_num_threads(1)
 from safetensors.torch import save_file
 from rawaug.bayer import CFA
-from rawaug.training.noisy_frames import NoisyCrops, NoisyFrame, held_out
+from rawaug.training.noisy_frames import NoisyCrops, NoisyFrame, r2r_trials
 from rawaug.training.estimators import Noisier, Neighbor2Neighbor
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.stream import TrainingStream
@@ -39,7 +39,7 @@ config = TrainConfig(
     learning_rate=3e-3,
 )
 network = DenoiserConfig("UNet", {"width": 4, "scales": 2})
-watched = [Trial(*sample) for sample in held_out([frame], CFA.RGGB)]
+watched = r2r_trials([frame], CFA.RGGB)
 for name in names:
     estimator = {"noisier": Noisier(1.0, correct=True), "neighbor2neighbor": Neighbor2Neighbor()}[name]
     stream = TrainingStream(NoisyCrops([frame], estimator, 32, CFA.RGGB), None, 4, 0.0, seed=0)

@@ -135,11 +135,11 @@ def test_the_correction_is_the_extrapolation_of_the_network(name: str, settings:
     noisy, variance = torch.rand(1, 4, 16, 16, generator=generator), torch.full((1, 4, 16, 16), 1e-3)
     alpha = 0.5
     with torch.no_grad():
-        taught, corrected = net(noisy, variance), Noisier(alpha, correct=True).corrected(net)(noisy, variance)
+        taught, corrected = net(noisy, variance), Noisier(alpha, correct=True).correct_network(net)(noisy, variance)
         expected = ((1 + alpha**2) * taught - noisy) / alpha**2
         torch.testing.assert_close(corrected, expected, rtol=1e-4, atol=1e-4)
         assert torch.equal(net(noisy, variance), taught)  # the trained network itself is left as it was
-    assert Noisier(alpha).corrected(net) is net and Supervised().corrected(net) is net
+    assert Noisier(alpha).correct_network(net) is net and Supervised().correct_network(net) is net
 
 
 @pytest.mark.parametrize("domain", ["linear", "ksigma", "anscombe"])
@@ -149,7 +149,9 @@ def test_a_network_whose_correction_is_no_extrapolation_is_refused(domain: str) 
     noisy = 0.1 + 0.5 * torch.rand(1, 4, 16, 16, generator=torch.Generator().manual_seed(0))
     variance, estimator = noise_variance(noisy, SHOT_VAR, READ_VAR), Noisier(1.0, correct=True)
     with torch.no_grad():
-        exact = torch.allclose(estimator.corrected(net)(noisy, variance), 2 * net(noisy, variance) - noisy, atol=1e-4)
+        exact = torch.allclose(
+            estimator.correct_network(net)(noisy, variance), 2 * net(noisy, variance) - noisy, atol=1e-4
+        )
     assert exact == (domain != "anscombe")
     Noisier(1.0).require(net)
     if exact:
@@ -201,9 +203,9 @@ def test_r2r_averages_at_a_test_only_where_asked() -> None:
     def run(noisy: Tensor, variance: Tensor) -> Tensor:
         return noisy
 
-    assert R2R().at_test(run) is run and Supervised().at_test(run) is run
+    assert R2R().wrap_for_test(run) is run and Supervised().wrap_for_test(run) is run
     noisy, variance = torch.rand(1, 4, 8, 8), torch.full((1, 4, 8, 8), 1e-3)
-    assert not torch.equal(R2R(0.5, average=2).at_test(run)(noisy, variance), noisy)
+    assert not torch.equal(R2R(0.5, average=2).wrap_for_test(run)(noisy, variance), noisy)
     for make, said in (
         (lambda: R2R(average=-1), "average must be at least 0, got -1"),
         (lambda: R2R(0.0), "alpha must be positive"),

@@ -113,7 +113,7 @@ def test_the_average_warms_up(steps: int) -> None:
             torch.nn.init.constant_(weights, value)
         for _ in range(count):
             state.average.update_parameters(net)
-    left = next(state.averaged.parameters()).flatten()[0].sub(1).abs().item()
+    left = next(state.average_network.parameters()).flatten()[0].sub(1).abs().item()
     assert left == pytest.approx(factorial(10) * factorial(steps + 1) / factorial(steps + 10), abs=1e-6)
 
 
@@ -155,8 +155,8 @@ def test_a_diverged_training_says_so(stream: TrainingStream, validation: list[Tr
 
 
 MEET = """
-from rawaug.training.loop import launched
-fabric = launched("cpu", 1, "32-true")
+from rawaug.training.loop import launch
+fabric = launch("cpu", 1, "32-true")
 (where / str(fabric.global_rank)).write_text(str(fabric.world_size))
 """
 NODE = """

@@ -22,18 +22,17 @@ from rawaug.noise import FixedLevels, SensorNoise, noise_model
 from rawaug.plugin.augment import RawAugment
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, NoisyCrop, SelfSupervised
-from rawaug.training.loop import train
+from rawaug.training.loop import train, validate
 from rawaug.training.noisy_frames import (
     FrozenPictures,
     NoisyCrops,
     NoisyFrame,
-    held_out,
+    drop_clean,
     noisy_frame,
-    noisy_only,
+    r2r_trials,
     signal_estimate,
 )
 from rawaug.training.stream import TrainingStream
-from rawaug.training.validation import validate
 
 LEVELS = (0.01, 1e-3)
 
@@ -99,7 +98,7 @@ def test_a_self_supervised_recipe_never_meets_a_clean_frame(pictures: list[torch
     isp, noise = DictionaryISP(), noise_model("cycleisp_sidd")
 
     def seen(pairs: list[Pair]) -> list[torch.Tensor]:
-        known = [noisy_only(pair) for pair in pairs]
+        known = [drop_clean(pair) for pair in pairs]
         frames = frames_of(recipe, known, isp)
         stream = training_stream(recipe, recipe.arms["r2r"], frames, pictures, isp, noise, seed=0)
         watched = validation_samples(recipe, frames, pictures, isp, noise)
@@ -111,7 +110,7 @@ def test_a_self_supervised_recipe_never_meets_a_clean_frame(pictures: list[torch
 
 def test_frames_as_shot_need_measured_levels() -> None:
     pair = replace(demo_pairs("train", count=1)[0], noisy=None, shot_var=None, read_var=None)
-    assert noisy_only(pair) is pair
+    assert drop_clean(pair) is pair
     with pytest.raises(ValueError, match="train_00_astronaut: has no noise levels"):
         noisy_frame(pair, None)
     assert noisy_frame(pair, {"shot_var": 1e-3, "read_var": 1e-5, "r2": 1.0}).read_var == 1e-5
@@ -128,7 +127,7 @@ def test_of_pictures_the_signal_is_known(pictures: list[torch.Tensor], augment: 
 def test_held_out_frames_are_recorrupted_at_their_signal() -> None:
     clean = torch.full((1, 128, 128), 0.02)
     shot = clean + 0.02 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
-    (sample,) = held_out([NoisyFrame("known", shot, 8e-3, 3e-4, CFA.RGGB, clean)], CFA.RGGB)
+    (sample,) = r2r_trials([NoisyFrame("known", shot, 8e-3, 3e-4, CFA.RGGB, clean)], CFA.RGGB)
     added = (sample.noisy - bayer.pack(shot[None], CFA.RGGB)) / (0.5 * (8e-3 * 0.02 + 3e-4) ** 0.5)
     assert float(added.var()) == pytest.approx(1.0, rel=0.03)
 
@@ -136,7 +135,7 @@ def test_held_out_frames_are_recorrupted_at_their_signal() -> None:
 def test_held_out_frames_have_noise_of_their_own_by_name() -> None:
     scene = torch.full((1, 32, 32), 0.2)
     first, other, again = (
-        held_out([NoisyFrame(name, scene, 8e-3, 3e-4, CFA.RGGB, scene)], CFA.RGGB)[0] for name in ("a", "b", "a")
+        r2r_trials([NoisyFrame(name, scene, 8e-3, 3e-4, CFA.RGGB, scene)], CFA.RGGB)[0] for name in ("a", "b", "a")
     )
     assert torch.equal(first.noisy, again.noisy)
     noise, others = ((sample.noisy - 0.2).flatten() for sample in (first, other))
@@ -170,12 +169,12 @@ def test_what_an_estimator_lacks_is_named() -> None:
 def test_the_held_out_score_ranks_as_clean_frames_do() -> None:
     """Scores against held-out noisy targets order blends of noisy and clean as their true errors do."""
     pair = demo_pairs("validation", count=1)[0]
-    frame = noisy_frame(noisy_only(pair), None)
-    (sample,) = held_out([frame], pair.cfa)
+    frame = noisy_frame(drop_clean(pair), None)
+    (sample,) = r2r_trials([frame], pair.cfa)
     clean = bayer.pack(pair.raw[None], pair.cfa)
     errors = [float(((1 - t) * clean + t * sample.noisy - sample.clean).square().mean()) for t in (0.0, 0.1, 0.3, 1.0)]
     assert errors == sorted(errors)
-    (again,) = held_out([frame], pair.cfa)
+    (again,) = r2r_trials([frame], pair.cfa)
     assert torch.equal(again.clean, sample.clean)
 
 
@@ -203,7 +202,7 @@ def test_each_estimator_learns_to_denoise_from_one_noisy_frame(estimator: SelfSu
     stream = TrainingStream(NoisyCrops([frame], estimator, 32, CFA.RGGB), None, 4, 0.0, seed=0)
     config = TrainConfig(steps=80, batch=4, crop=32, learning_rate=5e-3, warmup=5, loss="l2", ema=0.9)
     network = DenoiserConfig("UNet", {"width": 8, "scales": 2})
-    frames = [Trial(*sample) for sample in held_out([frame], CFA.RGGB)]
+    frames = r2r_trials([frame], CFA.RGGB)
     net = train(stream, frames, network, config, tmp_path, device="cpu", estimator=estimator)
     packed, unseen = (bayer.pack(image[None], CFA.RGGB) for image in (clean[2:], shots[2:]))
     sample = Trial(unseen, packed, noise_variance(unseen, 0.01, 1e-3))

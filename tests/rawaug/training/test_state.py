@@ -12,7 +12,7 @@ from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
 from rawaug.denoise.denoiser import RawDenoiser
 from rawaug.evaluation.trials import trial_of
-from rawaug.experiment.arms import in_pattern
+from rawaug.experiment.arms import change_cfa
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
@@ -63,19 +63,19 @@ def test_the_average_forgets_at_the_decay_of_the_recipe(decay: float) -> None:
     state = TrainingState(net, TrainConfig(ema=decay))
     for _ in range(150):  # at first it forgets faster
         state.average.update_parameters(net)
-    before = [weights.clone() for weights in state.averaged.parameters()]
+    before = [weights.clone() for weights in state.average_network.parameters()]
     with torch.no_grad():
         for weights in net.parameters():
             weights.add_(1.0)
     state.average.update_parameters(net)
-    for old, new in zip(before, state.averaged.parameters(), strict=True):
+    for old, new in zip(before, state.average_network.parameters(), strict=True):
         torch.testing.assert_close(new, old + (1.0 - decay), rtol=0.0, atol=1e-5)
 
 
 def test_an_isp_behind_another_pattern_has_the_same_colours() -> None:
     isp = DictionaryISP(ISPConfig(cfa="GRBG"), seed=0)
-    other = in_pattern(isp, CFA.RGGB)
-    assert (str(isp.cfa), str(other.cfa)) == ("GRBG", "RGGB") and in_pattern(isp, CFA.GRBG) is isp
+    other = change_cfa(isp, CFA.RGGB)
+    assert (str(isp.cfa), str(other.cfa)) == ("GRBG", "RGGB") and change_cfa(isp, CFA.GRBG) is isp
     grey = torch.full((1, 3, 8, 8), 128, dtype=torch.uint8)
     ours, theirs = (x.reverse(grey).raw for x in (isp, other))
     assert torch.equal(ours[..., 0::2, 1::2], theirs[..., 0::2, 0::2])  # red

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from rawaug.data import demo_pairs
-from rawaug.evaluation.scores import compared
+from rawaug.evaluation.scores import compare
 from rawaug.evaluation.trials import Trial, trial_of
 from rawaug.noise import noise_model
-from rawaug.training.validation import panels, validate
+from rawaug.training.loop import panels, validate
 
 CPU = torch.device("cpu")
 
@@ -67,5 +67,5 @@ def test_srgb_is_that_of_the_evaluation() -> None:
     pair = demo_pairs("validation", count=1)[0]
     trial = trial_of(pair, noise_model("cycleisp_sidd"))
     scores = validate(Nothing(), [trial], CPU)
-    expected = compared(trial.noisy, trial)
+    expected = compare(trial.noisy, trial)
     assert (scores["psnr"], scores["psnr_srgb"]) == pytest.approx((expected[0], expected[2]), abs=1e-3)
