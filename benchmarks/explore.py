@@ -19,8 +19,7 @@ import torch
 from benchmarks.measure import arguments, finish, show, start
 from rawaug.data.demo import demo_files
 from rawaug.explore.page import as_html
-from rawaug.explore.view_state import Look
-from rawaug.explore.views import VIEWS, denoise
+from rawaug.explore.views import VIEWS, Look, denoise
 from rawaug.io import read_picture, write_picture
 from rawaug.plugin.config import AugmentConfig
 

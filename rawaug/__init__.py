@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from rawaug.isp.config import ISPParams as ISPParams
     from rawaug.isp.config import ISPResult as ISPResult
     from rawaug.isp.model import DictionaryISP as DictionaryISP
-    from rawaug.plugin import adapters as adapters
-    from rawaug.plugin.adapters import isp_model as isp_model
+    from rawaug.plugin.augment import ISPModel as ISPModel
     from rawaug.plugin.augment import RawAugment as RawAugment
     from rawaug.plugin.dataset import RawPairs as RawPairs
     from rawaug.plugin.dataset import RawPairStream as RawPairStream
@@ -43,8 +42,7 @@ _PUBLIC = {
     "rawaug.denoise.denoiser": ("RawDenoiser",),
     "rawaug.isp.config": ("ISPConfig", "ISPParams", "ISPResult"),
     "rawaug.isp.model": ("DictionaryISP",),
-    "rawaug.plugin.adapters": ("adapters", "isp_model"),
-    "rawaug.plugin.augment": ("RawAugment",),
+    "rawaug.plugin.augment": ("ISPModel", "RawAugment"),
     "rawaug.plugin.dataset": ("RawPairStream", "RawPairs"),
     "rawaug.plugin.draw": ("Draw",),
     "rawaug.plugin.finishing": ("Finish",),
@@ -62,7 +60,7 @@ def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = import_module(_MODULE_OF[name])
-    value = globals()[name] = module if name in ("adapters", "denoise") else getattr(module, name)
+    value = globals()[name] = module if name == "denoise" else getattr(module, name)
     return value
 
 

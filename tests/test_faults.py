@@ -25,7 +25,6 @@ from rawaug.errors import resource_error
 from rawaug.files import LOCK, locked, replacing, write_json, write_tensors
 from rawaug.io import RawFrame, read_picture, write_dng, write_picture
 from rawaug.synthesis import files as pair_files
-from rawaug.synthesis import maker as pair_maker
 from rawaug.synthesis.folder import synth
 from rawaug.training.config import TrainConfig
 from rawaug.training.state import TrainingState
@@ -211,7 +210,7 @@ def test_a_picture_that_vanishes_or_changes_is_named_and_the_rest_is_made(
             path.unlink() if fault == "vanishes" else path.write_bytes(path.read_bytes() + b"more")
         return picture
 
-    monkeypatch.setattr(pair_maker, "read_picture", unlucky)
+    monkeypatch.setattr(pair_files, "read_picture", unlucky)
     result = synth(tmp_path / "in", tmp_path / "out", workers=0)
     assert result.made == 2 and list(result.broken) == ["1.png"] and "1.png" in result.broken["1.png"]
 

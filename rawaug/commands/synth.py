@@ -11,8 +11,8 @@ from rawaug.evaluation.tables import print_rows
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.config import AugmentConfig
 from rawaug.plugin.draw import Draw
+from rawaug.synthesis.files import Format
 from rawaug.synthesis.folder import Synthesis, synth
-from rawaug.synthesis.maker import Format
 from rawaug.synthesis.shards import PER_SHARD
 
 

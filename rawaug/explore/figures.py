@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,11 +11,21 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.errors import extra
-from rawaug.explore.view_state import Example
 from rawaug.io import encode_srgb
 from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.tone import STEPS
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.params import RawPair
+
+
+class Example(NamedTuple):
+    """The picture uint8 ``(3, H, W)``, the augmentation, and one pair without the leading B."""
+
+    srgb: Tensor
+    augment: RawAugment
+    pair: RawPair
+
 
 COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue"}
 _ATOMS = 60  # colour atoms drawn, at most
@@ -70,8 +80,8 @@ def colours(drawn: Example) -> np.ndarray:
     return _pixels(figure)
 
 
-def noise(drawn: Example) -> list[np.ndarray]:
-    """Variance of noisy minus clean against the clean signal, by colour, and its law; linear and logarithmic."""
+def noise(drawn: Example) -> np.ndarray:
+    """Plot the variance of noisy minus clean against the clean signal, by colour, and its law, on logarithmic axes."""
     pair = drawn.pair
     ramp = torch.logspace(-4, 0, 100)
     params = {name: value[None] for name, value in pair.params.noise.items()}
@@ -81,24 +91,16 @@ def noise(drawn: Example) -> list[np.ndarray]:
     expected = bayer.unpack(drawn.augment.noise.variance(clean, params)[0], layout)
     sites = (_by_colour(drawn, raw) for raw in (pair.clean, pair.noisy, expected))
     measured = [variance_by_signal(*values) for values in zip(*sites, strict=True)]
-    highest = max([float(variance.max()) for _, variance in measured if len(variance)], default=float(law[-1]))
-    lowest = float(law[0])
-    made = []
-    for scale in ("linear", "log"):
-        figure, axis = _figure()
-        for (name, colour), (signal, variance) in zip(COLOURS.items(), measured, strict=True):
-            axis.scatter(signal, variance, s=14, color=colour, label=f"{name}, measured")
-        axis.plot(ramp, law, color="black", linewidth=1.2, label="law")
-        axis.set(xscale=scale, yscale=scale, xlabel="clean signal", ylabel="variance of the noise")
-        if scale == "linear":
-            brightest = max([float(signal.max()) for signal, _ in measured if len(signal)], default=1.0)
-            axis.set(xlim=(0, 1.1 * brightest), ylim=(0, 1.3 * max(highest, lowest)))
-            axis.legend(fontsize=8)
-        else:
-            _plain_numbers(axis, axis.xaxis, axis.yaxis)
-            axis.set(xlim=(1e-4, 1), ylim=(lowest / 3, 3 * max(highest, float(law[-1]))))
-        made.append(_pixels(figure))
-    return made
+    figure, axis = _figure()
+    for (name, colour), (signal, variance) in zip(COLOURS.items(), measured, strict=True):
+        axis.scatter(signal, variance, s=14, color=colour, label=f"{name}, measured")
+    axis.plot(ramp, law, color="black", linewidth=1.2, label="law")
+    axis.set(xscale="log", yscale="log", xlabel="clean signal", ylabel="variance of the noise")
+    _plain_numbers(axis, axis.xaxis, axis.yaxis)
+    highest = max([float(law[-1]), *(float(variance.max()) for _, variance in measured if len(variance))])
+    axis.set(xlim=(1e-4, 1), ylim=(float(law[0]) / 3, 3 * highest))
+    axis.legend(fontsize=8)
+    return _pixels(figure)
 
 
 def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[Tensor, Tensor]:

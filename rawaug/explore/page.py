@@ -20,17 +20,20 @@ from markupsafe import Markup
 
 from rawaug.bayer import PATTERNS
 from rawaug.errors import MissingExtra, escape, extra
-from rawaug.explore.view_state import (
+from rawaug.explore.views import (
+    VIEWS,
     Look,
+    Panel,
     command,
+    denoise,
     drop_inapplicable,
     iso_range,
     load_isp,
     noise_choices,
     python,
     tone_names,
+    with_tab,
 )
-from rawaug.explore.views import VIEWS, Panel, denoise, with_tab
 from rawaug.files import WEIGHTS
 from rawaug.isp.cameras import LAMPS, load_cameras
 from rawaug.plugin.config import AugmentConfig

@@ -8,8 +8,9 @@ that cameras, lights and exposures can be seen to differ.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,14 +25,19 @@ from denoisers.network import PACKED
 from rawaug.bayer import CFA, pattern
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.explore import figures
-from rawaug.explore.view_state import Example, Look, make_example
-from rawaug.io import encode_srgb
+from rawaug.explore.figures import Example
+from rawaug.io import encode_srgb, read_picture
 from rawaug.isp.config import ISPParams
+from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import frame_coordinates
 from rawaug.metrics import psnr
-from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.config import pair_generator
+from rawaug.noise import noise_levels, noise_names
+from rawaug.noise.cameras import ProfileLevels
+from rawaug.plugin.augment import RawAugment, with_iso
+from rawaug.plugin.config import AugmentConfig, pair_generator
+from rawaug.plugin.draw import Draw
 from rawaug.plugin.pictures import trim_to_even
+from rawaug.registry import NOISE
 
 DRAWS = 8
 HEIGHT, WIDTH = 512, 768
@@ -40,6 +46,139 @@ _WHOLE_CELLS = 12  # parts begin at multiples of it, where the cells of all patt
 _THUMBNAIL = 384
 _ZOOM = (24, 36)
 _SCALE = 8
+
+
+@dataclass(frozen=True)
+class Look:
+    """A picture's file, what is drawn for it, and the seed of the draws, as that of ``rawaug synth``."""
+
+    picture: str
+    config: AugmentConfig = field(default_factory=AugmentConfig)
+    seed: int = 0
+
+
+def make_example(look: Look, number: int = 0) -> Example:
+    """The pair of this number, as ``rawaug synth`` makes it of the picture."""
+    return _make_example(look, number, Path(look.picture).stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=16)
+def _make_example(look: Look, number: int, changed: int) -> Example:
+    srgb, augment = _read_even(look.picture, changed), make_augment(look.config)
+    return Example(srgb, augment, augment(srgb, pair_generator(look.seed, Path(look.picture).name, number)))
+
+
+@lru_cache(maxsize=2)
+def _read_even(picture: str, changed: int) -> Tensor:
+    """The picture as it is augmented; ``changed`` says which state of the file."""
+    return trim_to_even(read_picture(picture))
+
+
+def make_augment(config: AugmentConfig) -> RawAugment:
+    """What :meth:`AugmentConfig.make` makes, from an ISP that is baked once."""
+    baked = _baked(AugmentConfig(config.isp, config.camera, target=config.target, burst=config.burst, cfa=config.cfa))
+    return baked.with_draws(with_iso(config.noise, config.iso), config.draw)
+
+
+_baked = lru_cache(maxsize=4)(AugmentConfig.make)
+
+
+@lru_cache(maxsize=4)
+def load_isp(isp: str) -> DictionaryISP:
+    return DictionaryISP.from_pretrained(isp)
+
+
+def tone_names(isp: str) -> list[str]:
+    """The tone curves of an ISP; none where its tone is learned."""
+    return list(load_isp(isp).info.get("tones", []))
+
+
+def noise_choices(isp: str) -> list[str]:
+    """Noise by name: presets, measured cameras, and the ISP's own where it was measured."""
+    own = ["camera"] if "noise" in load_isp(isp).info else []
+    return [*own, *(name for name in noise_names() if name not in NOISE)]
+
+
+def iso_range(noise: str) -> tuple[float, float] | None:
+    """Lowest and highest ISO of a camera's noise; None where the noise does not depend on one."""
+    if noise == "camera":
+        return None
+    levels = noise_levels(noise)
+    if isinstance(levels, ProfileLevels):
+        return round(math.exp(levels.limits[:, 0].min())), round(math.exp(levels.limits[:, 1].max()))
+    limits: tuple[float, float] | None = getattr(levels, "iso", None)
+    return limits
+
+
+def drop_inapplicable(config: AugmentConfig) -> AugmentConfig:
+    """The settings without those that do not apply to their ISP and noise.
+
+    A fitted ISP has no light, tone and camera to choose, and noise that is not a measured camera's has no ISO.
+    """
+    if not load_isp(config.isp).config.cameras:
+        config = replace(config, camera=None, draw=replace(config.draw, light=None, tone=None))
+    elif config.draw.tone not in tone_names(config.isp):
+        config = replace(config, draw=replace(config.draw, tone=None))
+    if not isinstance(config.noise, str) or iso_range(config.noise) is None:
+        config = replace(config, iso=None)
+    return config
+
+
+def command(look: Look, out: str = "pairs") -> str:
+    """The command that writes the pair as ``NAME_0.npz``; with ``--per-image 8`` all eight draws of the page.
+
+    Example:
+        >>> command(Look("cat.png", AugmentConfig(draw=Draw(light=5500, exposure=-0.5)), seed=3))
+        'rawaug synth cat.png pairs --format npz --exposure=-0.5 --light 5500 --seed 3'
+    """
+    words = ["rawaug", "synth", look.picture, out, "--format", "npz"]
+    given = changes(look.config)
+    draw = given.pop("draw", None)
+    for name, value in {**given, **(changes(draw) if draw else {})}.items():
+        text = _text(value)
+        words += [f"--{name}={text}"] if text.startswith("-") else [f"--{name}", text]
+    return shlex.join([*words, "--seed", str(look.seed)])
+
+
+def python(look: Look) -> str:
+    """The Python that makes the pair.
+
+    Example:
+        >>> print(python(Look("cat.png", AugmentConfig(noise="upi", draw=Draw(light=5500)))))
+        import rawaug
+        from rawaug.io import read_picture
+        from rawaug.plugin.config import pair_generator
+        <BLANKLINE>
+        augment = rawaug.RawAugment.from_pretrained('universal', noise='upi', draw=rawaug.Draw(light=5500))
+        pair = augment(read_picture('cat.png'), pair_generator(0, 'cat.png', 0))
+    """
+    given = {"isp": look.config.isp, **changes(look.config)}
+    arguments = ", ".join([repr(given.pop("isp")), *(f"{name}={_as_code(value)}" for name, value in given.items())])
+    return (
+        "import rawaug\n"
+        "from rawaug.io import read_picture\n"
+        "from rawaug.plugin.config import pair_generator\n\n"
+        f"augment = rawaug.RawAugment.from_pretrained({arguments})\n"
+        f"pair = augment(read_picture({look.picture!r}), pair_generator({look.seed}, {Path(look.picture).name!r}, 0))"
+    )
+
+
+def changes(settings: AugmentConfig | Draw) -> dict[str, Any]:
+    """The fields of a dataclass that differ from their defaults."""
+    return {f.name: value for f in fields(settings) if (value := getattr(settings, f.name)) != f.default}
+
+
+def _as_code(value: object) -> str:
+    if not isinstance(value, Draw):
+        return repr(value)
+    return f"rawaug.Draw({', '.join(f'{name}={one!r}' for name, one in changes(value).items())})"
+
+
+def _text(value: object) -> str:
+    """As an option of the command line: whole numbers without a point, levels as a list."""
+    if isinstance(value, tuple):
+        return str(list(value))
+    return f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else str(value)
 
 
 class Panel(NamedTuple):
@@ -118,8 +257,7 @@ def camera(look: Look) -> list[Panel]:
 def noise(look: Look) -> list[Panel]:
     """Measured variance of the noise against the law that it was drawn from."""
     made = make_example(look)
-    titles = f"noise of the pair and its law: {_levels(made)}", "the same on logarithmic axes"
-    return [Panel(title, image) for title, image in zip(titles, figures.noise(made), strict=True)]
+    return [Panel(f"noise of the pair and its law: {_levels(made)}", figures.noise(made))]
 
 
 @torch.no_grad()

@@ -18,6 +18,7 @@ from copy import copy, deepcopy
 from pathlib import Path
 from typing import Any, TypeVar, get_args, overload
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
@@ -32,6 +33,7 @@ from rawaug.plugin.draw import Draw, SettingSampler
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import find_picture, get_picture, is_picture, replace_picture, to_rgb_batch, trim_to_even
 from rawaug.plugin.targets import Burst, Srgb, Target, keep_white
+from rawaug.registry import spec_label
 from rawaug.seeding import keyed_generator, rank_key
 
 
@@ -145,7 +147,7 @@ class RawAugment(nn.Module):
             ['Nikon D750']
             >>> RawAugment.from_pretrained("universal", camera="Nikon D750", iso=800)
             RawAugment, camera: Nikon D750, convex, exposure -0.5 to 1 stops
-              noise: Nikon D750, iso 800
+              noise: Nikon D750 iso=800
               target: raw, RGGB
         """
         usual = "cycleisp_sidd" if iso is None or camera is None else camera
@@ -397,13 +399,9 @@ def _float32(like: Tensor) -> torch.autocast:
 
 
 def _noise_name(noise: NoiseSpec | NoiseModel) -> str:
-    if isinstance(noise, Mapping):
-        own = {key: value for key, value in noise.items() if key != "name"}
-        said = [f"{key} {value}" for key, value in own.pop("settings", own).items()]
-        return ", ".join([str(noise.get("name", "calibrated")), *said])
-    if isinstance(noise, NoiseModel):
-        return type(noise).__name__
-    return noise if isinstance(noise, str) else str(tuple(noise))
+    if isinstance(noise, str) or (isinstance(noise, Mapping) and "name" in noise):
+        return spec_label(noise)
+    return type(noise).__name__ if isinstance(noise, NoiseModel) else str(noise)
 
 
 def with_iso(noise: NoiseSpec | NoiseModel, iso: Iso) -> NoiseSpec | NoiseModel:
@@ -422,3 +420,42 @@ def noise_for(isp: DictionaryISP, noise: NoiseSpec | NoiseModel) -> NoiseModel:
     if "noise" not in isp.info:
         raise ValueError('noise "camera": this ISP was fitted without measuring noise; fit it again or use a preset')
     return ShotReadNoise(camera_law(isp.info["noise"]))
+
+
+class ISPModel:
+    """Camera noise as KAIR and BSRGAN call it, by ``isp_model``, among the degradations of their low-quality pictures.
+
+    Args:
+        augment: with the target ``"srgb"``; each call draws anew, from its own seed.
+
+    Raises:
+        ValueError: if its target is another.
+
+    Example:
+        >>> model = ISPModel(RawAugment.from_pretrained("universal", target="srgb"))
+        >>> lq, hq = model.forward(np.full((31, 40, 3), 0.5), np.full((124, 160, 3), 0.5))
+        >>> lq.shape, lq.dtype
+        ((31, 40, 3), dtype('float32'))
+    """
+
+    def __init__(self, augment: RawAugment) -> None:
+        if augment.target != "srgb":
+            raise ValueError(f"ISPModel needs an augmentation with target 'srgb', got {augment.target!r}")
+        self.augment = augment
+
+    def forward(self, img: np.ndarray, hq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Add a camera's noise to a picture ``(H, W, 3)``, sRGB in [0, 1].
+
+        Returns:
+            The noisy picture ``(H, W, 3)``, float32 in [0, 1], and ``hq`` as it is.
+        """
+        height, width = img.shape[:2]
+        even = np.pad(img, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        srgb = torch.from_numpy(np.ascontiguousarray(even, np.float32)).permute(2, 0, 1).clamp(0.0, 1.0)
+        srgb = srgb.to(self.augment.device)
+        params = self.augment.sample(srgb)
+        params = params._replace(isp=keep_white(params.isp))  # or an overexposed picture would be brighter than hq
+        noisy: Tensor = self.augment.apply(srgb, params).noisy
+        return noisy[:, :height, :width].permute(1, 2, 0).cpu().numpy(), hq
+
+    __call__ = forward

@@ -28,8 +28,7 @@ from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.config import AugmentConfig
 from rawaug.progress import progress
 from rawaug.synthesis import shards
-from rawaug.synthesis.files import PictureTask, picture_tasks
-from rawaug.synthesis.maker import TARGETS, Format, PairMaker, Settings
+from rawaug.synthesis.files import TARGETS, Format, PairMaker, PictureTask, Settings, picture_tasks
 from rawaug.synthesis.shards import PER_SHARD, ShardTask
 
 Task = PictureTask | ShardTask

@@ -29,7 +29,7 @@ from rawaug.files import digest, parse_object, replacing, write_json
 from rawaug.plugin.config import AugmentConfig
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.targets import Burst
-from rawaug.synthesis.maker import Origin, PairMaker, Settings, pair_levels, replay_pair
+from rawaug.synthesis.files import Origin, PairMaker, Settings, pair_levels, replay_pair
 
 PER_SHARD = 500
 """Pictures in a shard: of half a megapixel each, two gigabytes."""

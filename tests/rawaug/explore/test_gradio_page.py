@@ -20,7 +20,7 @@ from PIL import Image
 
 from rawaug.commands.explore import choices
 from rawaug.data import demo_pictures
-from rawaug.explore import view_state as looks
+from rawaug.explore import views as looks
 from rawaug.explore.page import FIRST_SEED, open_socket
 from rawaug.explore.views import pair as view
 from rawaug.io import write_picture

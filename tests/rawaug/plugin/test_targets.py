@@ -16,11 +16,11 @@ from rawaug import (
     AugmentParams,
     DictionaryISP,
     Draw,
+    ISPModel,
     RawAugment,
     RawPair,
     RawPairs,
     Srgb,
-    isp_model,
     load_params,
     save_params,
     wrap,
@@ -148,14 +148,14 @@ def test_kair_s_call_gets_camera_noise_on_the_picture_and_its_target_back(univer
     augment = RawAugment(universal, noise=(1e-3, 1e-5), target=Srgb(jpeg=(60, 90)))
     srgb = smooth(1, 48, 64)[0].permute(1, 2, 0).numpy().astype(np.float64)[:47, :63]
     hq = np.zeros((94, 126, 3))
-    first, same = degradation(srgb, hq, isp_model(augment))
-    second, _ = degradation(srgb, hq, isp_model(augment))
+    first, same = degradation(srgb, hq, ISPModel(augment))
+    second, _ = degradation(srgb, hq, ISPModel(augment))
     assert first.shape == srgb.shape and first.dtype == np.float32 and same is hq
     assert first.min() >= 0 and first.max() <= 1
     assert not np.array_equal(first, second)
     assert 20 < -10 * np.log10(np.mean((first - srgb) ** 2)) < 45
     with pytest.raises(ValueError, match="needs an augmentation with target 'srgb', got 'raw'"):
-        isp_model(RawAugment(universal))
+        ISPModel(RawAugment(universal))
 
 
 @pytest.mark.parametrize(
