@@ -20,7 +20,7 @@ from rawaug.plugin.params import RawPair
 
 
 class Example(NamedTuple):
-    """The picture uint8 ``(3, H, W)``, the augmentation, and one pair without the leading B."""
+    """A picture, uint8 ``(3, H, W)``, its augmentation, and one pair of it, without B."""
 
     srgb: Tensor
     augment: RawAugment
@@ -35,7 +35,7 @@ _FEWEST = 50  # values in a bin of the signal, for its variance to mean somethin
 
 
 def histograms(drawn: Example) -> np.ndarray:
-    """How often RAW has each value, by colour: clean as a line, noisy as an area."""
+    """Plot how often RAW has each value, by colour: clean as a line, noisy as an area; uint8 ``(H, W, 3)``."""
     figure, axis = _figure()
     clean, noisy = (_by_colour(drawn, raw) for raw in (drawn.pair.clean, drawn.pair.noisy))
     edges = torch.linspace(-0.05, 1.0, 106)
@@ -52,6 +52,7 @@ def histograms(drawn: Example) -> np.ndarray:
 
 
 def tone_curve(drawn: Example) -> np.ndarray:
+    """Plot the drawn tone curve over those of the ISP."""
     figure, tone = _figure()
     isp, setting = drawn.augment.isp, drawn.pair.params.isp
     code = np.arange(256)
@@ -64,7 +65,7 @@ def tone_curve(drawn: Example) -> np.ndarray:
 
 
 def colours(drawn: Example) -> np.ndarray:
-    """What the drawn matrix makes of colours, over the colour atoms."""
+    """Plot what the drawn matrix makes of colours, over what the colour atoms make of them."""
     figure, colour = _figure()
     isp, setting = drawn.augment.isp, drawn.pair.params.isp
     atoms = isp.colour.atoms()
@@ -104,7 +105,16 @@ def noise(drawn: Example) -> np.ndarray:
 
 
 def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[Tensor, Tensor]:
-    """Means of the signal in logarithmic bins, and the mean squares of the noise there."""
+    """Mean signal and mean square of the noise in logarithmic bins of the signal.
+
+    Args:
+        clean: values ``(N,)``.
+        noisy: values ``(N,)`` of the same sites.
+        expected: variance ``(N,)`` by the law, by which sites that could saturate are left out.
+
+    Returns:
+        Mean and variance, each ``(K,)``, of the K bins that have enough values.
+    """
     seen = (clean > 1e-4) & (clean + 3.0 * expected.sqrt() < 1.0)
     signal, square = clean[seen], (noisy[seen] - clean[seen]).square()
     where = ((signal.log10() + 4) * (_BINS / 4)).long().clamp(0, _BINS - 1)
@@ -116,7 +126,7 @@ def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[
 
 
 def _by_colour(drawn: Example, raw: Tensor) -> list[Tensor]:
-    """Values of red, green and blue sites, each ``(N,)``; of many, evenly spaced ones."""
+    """The values of the red, green and blue sites, ``(N,)`` each; of many, evenly spaced ones."""
     mosaic = raw if len(raw) == 1 else drawn.augment.mosaic(raw)
     values = [mosaic[0][plane > 0] for plane in bayer.pattern(drawn.augment.cfa).planes(*mosaic.shape[-2:])]
     return [of_colour[:: max(1, -(-len(of_colour) // _MOST))] for of_colour in values]
@@ -138,7 +148,7 @@ def _figure() -> tuple[Any, Any]:
 
 
 def _plain_numbers(axis: Any, *scales: Any) -> None:
-    """Powers of ten as 0.01, without ticks between them: typeset ones take longer than the rest of the figure."""
+    """Label powers of ten as 0.01, without ticks between: typeset labels take longer than the rest of the figure."""
     axis.minorticks_off()
     for scale in scales:
         scale.set_major_formatter("{x:g}")
@@ -151,7 +161,7 @@ def _pixels(figure: Any) -> np.ndarray:
 
 @torch.no_grad()
 def grey_curve(isp: DictionaryISP, setting: ISPParams) -> Tensor:
-    """x2 of the 256 greys of sRGB under a setting without the leading B, ``(256,)``."""
+    """Linear values ``(256,)`` of the 256 greys of sRGB under a setting without B."""
     if isp.tone is None:
         return isp.tone_curve().mean(dim=1)
     return isp.tone.combine(setting.tone_weights[None])[0, ::STEPS]

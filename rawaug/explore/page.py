@@ -69,13 +69,14 @@ _PANELS = """
 
 
 def as_html(panels: Sequence[Panel]) -> str:
-    """A grid of pictures with their titles."""
+    """A grid of pictures with their titles, as HTML."""
     templates = Environment(autoescape=True)
     templates.filters["data_url"] = data_url
     return templates.from_string(_PANELS).render(panels=panels)
 
 
 def message(text: str) -> str:
+    """An error as HTML."""
     return str(Markup('<div class="message" role="alert">{}</div>').format(escape(text)))
 
 
@@ -97,7 +98,7 @@ FIRST_SEED = 2
 
 
 def parse_look(values: Mapping[str, Any]) -> Look:
-    """The look that the controls' values mean."""
+    """Read the values of the controls, by their names; ValueError if no picture is chosen."""
     picture = values["picture"]
     if not picture:
         raise ValueError("choose a picture")
@@ -122,7 +123,15 @@ def _given(choice: str) -> str | None:
 
 
 def show(tab: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """What changes on the page: ``message``, ``python``, ``command``, and the content of the open tab by its name."""
+    """Draw the open tab.
+
+    Args:
+        tab: its name.
+        values: those of the controls, by their names.
+
+    Returns:
+        What changes on the page: ``message``, ``python``, ``command``, and the content of the tab by its name.
+    """
     try:
         look = with_tab(tab, parse_look(values))
         if tab == DENOISE:
@@ -140,7 +149,12 @@ def _code(look: Look) -> dict[str, str]:
 
 
 def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
-    """The page as Gradio's Blocks, with pictures to choose from besides uploaded ones."""
+    """Build the page as Gradio's Blocks.
+
+    Args:
+        pictures: files to choose from, besides uploaded ones.
+        names: their names on the page; those of the files by default.
+    """
     os.environ["GRADIO_ANALYTICS_ENABLED"] = "False"
     with extra("explore"):
         import gradio as gr
@@ -236,7 +250,7 @@ def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, An
 
 
 def _update_choices(gr: Any, isp: str, tone: str, noise: str) -> list[Any]:
-    """Cameras, lights and tones are those of published cameras; the noise of the ISP's own goes with it."""
+    """Offer cameras, lights and tones of published cameras alone, and an ISP's own noise with this ISP alone."""
     published, tones, noises = bool(load_isp(isp).config.cameras), [ANY, *tone_names(isp)], noise_choices(isp)
     toned = gr.update(interactive=published, choices=tones, **({} if tone in tones else {"value": ANY}))
     usual = AugmentConfig().noise
@@ -250,7 +264,7 @@ def _about_iso(noise: str) -> str:
 
 
 def make_server(page: Any) -> Any:
-    """A server of uvicorn for the page; ``server.run(sockets=[...])`` runs it until it is interrupted."""
+    """Make uvicorn's server of a page; ``server.run(sockets=[...])`` runs it until it is interrupted."""
     with extra("explore"):
         import fastapi
         import gradio as gr
@@ -262,7 +276,7 @@ def make_server(page: Any) -> Any:
 
 
 def open_socket(host: str, port: int) -> socket.socket:
-    """A socket for :func:`make_server`; port 0 takes any that is free."""
+    """Open a socket for :func:`make_server`; port 0 takes any that is free. OSError if the port cannot be used."""
     try:
         return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:
@@ -270,5 +284,6 @@ def open_socket(host: str, port: int) -> socket.socket:
 
 
 def socket_url(open_: socket.socket) -> str:
+    """The address that a browser opens."""
     host, port = open_.getsockname()[:2]
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

@@ -1,8 +1,8 @@
-"""What the page shows: pure functions from a :class:`Look` to titled pictures, in :data:`VIEWS` by the tab's name.
+"""The views of the page: functions that make titled pictures of a :class:`Look`, in :data:`VIEWS` by the tab's name.
 
-Noisy and clean are shown pixel by pixel, of large pictures the central part. RAW is demosaiced bilinearly and developed
-by the ISP's forward pass with the setting of the draw; the eight draws are developed alike, with that of the first, so
-that cameras, lights and exposures can be seen to differ.
+Noisy and clean are shown pixel by pixel; of a large picture the central part is shown. RAW is demosaiced bilinearly and
+developed by the ISP's forward pass with the setting of the draw. The eight draws are all developed with the setting of
+the first, so that cameras, lights and exposures can be seen to differ. Python and a command make the pair again.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from rawaug.registry import NOISE
 
 DRAWS = 8
 HEIGHT, WIDTH = 512, 768
-"""Of the largest part of a picture that is shown pixel by pixel."""
+"""Largest part of a picture that is shown pixel by pixel."""
 _WHOLE_CELLS = 12  # parts begin at multiples of it, where the cells of all patterns do
 _THUMBNAIL = 384
 _ZOOM = (24, 36)
@@ -50,7 +50,7 @@ _SCALE = 8
 
 @dataclass(frozen=True)
 class Look:
-    """A picture's file, what is drawn for it, and the seed of the draws, as that of ``rawaug synth``."""
+    """What the page is set to: a picture's file, the settings of its pair, and the seed, as of ``rawaug synth``."""
 
     picture: str
     config: AugmentConfig = field(default_factory=AugmentConfig)
@@ -58,7 +58,7 @@ class Look:
 
 
 def make_example(look: Look, number: int = 0) -> Example:
-    """The pair of this number, as ``rawaug synth`` makes it of the picture."""
+    """Make the pair of this number of the picture, as ``rawaug synth`` makes it."""
     return _make_example(look, number, Path(look.picture).stat().st_mtime_ns)
 
 
@@ -70,12 +70,12 @@ def _make_example(look: Look, number: int, changed: int) -> Example:
 
 @lru_cache(maxsize=2)
 def _read_even(picture: str, changed: int) -> Tensor:
-    """The picture as it is augmented; ``changed`` says which state of the file."""
+    """The picture as it is augmented; ``changed`` stands for the state of the file."""
     return trim_to_even(read_picture(picture))
 
 
 def make_augment(config: AugmentConfig) -> RawAugment:
-    """What :meth:`AugmentConfig.make` makes, from an ISP that is baked once."""
+    """Make what :meth:`AugmentConfig.make` makes, but bake an ISP only once."""
     baked = _baked(AugmentConfig(config.isp, config.camera, target=config.target, burst=config.burst, cfa=config.cfa))
     return baked.with_draws(with_iso(config.noise, config.iso), config.draw)
 
@@ -85,16 +85,17 @@ _baked = lru_cache(maxsize=4)(AugmentConfig.make)
 
 @lru_cache(maxsize=4)
 def load_isp(isp: str) -> DictionaryISP:
+    """An ISP by its name or path, which is kept in memory."""
     return DictionaryISP.from_pretrained(isp)
 
 
 def tone_names(isp: str) -> list[str]:
-    """The tone curves of an ISP; none where its tone is learned."""
+    """The names of an ISP's tone curves; it has none where its tone is learned."""
     return list(load_isp(isp).info.get("tones", []))
 
 
 def noise_choices(isp: str) -> list[str]:
-    """Noise by name: presets, measured cameras, and the ISP's own where it was measured."""
+    """The names of noise: presets, measured cameras, and ``camera`` where the ISP's own was measured."""
     own = ["camera"] if "noise" in load_isp(isp).info else []
     return [*own, *(name for name in noise_names() if name not in NOISE)]
 
@@ -175,7 +176,7 @@ def _as_code(value: object) -> str:
 
 
 def _text(value: object) -> str:
-    """As an option of the command line: whole numbers without a point, levels as a list."""
+    """A value as the command line takes it: whole numbers without a point, levels as a list."""
     if isinstance(value, tuple):
         return str(list(value))
     return f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else str(value)
@@ -189,7 +190,7 @@ class Panel(NamedTuple):
 
 
 def pair(look: Look) -> list[Panel]:
-    """The noisy and the clean RAW made from the picture, developed; PSNR is that of the RAW."""
+    """The noisy and the clean RAW of the picture, developed; the PSNR is that of the RAW."""
     made = make_example(look)
     noisy, clean = (_crop(raw) for raw in (made.pair.noisy, made.pair.clean))
     quality = psnr(noisy[None], clean[None]).item()
@@ -210,7 +211,17 @@ def stages(look: Look) -> list[Panel]:
 def stage_pictures(
     augment: RawAugment, srgb: Tensor, setting: ISPParams | None, place: Tensor | None = None
 ) -> dict[str, Tensor]:
-    """What the stages make of sRGB uint8 ``(3, H, W)``, by title: ``(3, H, W)`` in [0, 1] for the eye."""
+    """Show what the stages of an ISP make of a picture.
+
+    Args:
+        augment: its ISP and pattern are used.
+        srgb: the picture, uint8 ``(3, H, W)``.
+        setting: the camera setting, with B = 1; the ISP chooses it by default.
+        place: coordinates of the pixels in the full frame, ``(1, 2, H, W)``; those of a full frame by default.
+
+    Returns:
+        By title pictures ``(3, H, W)`` in [0, 1], linear ones through the sRGB curve.
+    """
     result = augment.isp.reverse(srgb[None], setting, coordinates=place, intermediates=True)
     names = {f"x{stage.makes}": stage.name for stage in augment.isp.ordered_stages}
     shown = {"sRGB x": srgb / 255.0}
@@ -324,6 +335,7 @@ FORMS: dict[str, dict[str, Any]] = {"sRGB": {"target": "srgb"}, "Burst": {"burst
 
 
 def with_tab(tab: str, look: Look) -> Look:
+    """The look with the target and the burst that a tab shows."""
     return replace(look, config=replace(look.config, **FORMS.get(tab, {})))
 
 
@@ -333,7 +345,7 @@ def _network() -> RawDenoiser:
 
 
 def _half(made: Example) -> Tensor:
-    """Noisy RAW in three colours at half the size, ``(3, H/2, W/2)``: of Bayer patterns a pixel a cell."""
+    """Noisy RAW in three colours at half the size, ``(3, H/2, W/2)``: one pixel for each cell of a Bayer pattern."""
     noisy = made.pair.noisy
     if made.augment.pattern is None:
         return torch.stack([noisy[0], (noisy[1] + noisy[2]) / 2, noisy[3]])
@@ -341,7 +353,7 @@ def _half(made: Example) -> Tensor:
 
 
 def _setting(made: Example) -> str:
-    """Gains of the draw: white balance and exposure."""
+    """The white balance of the draw, and the mean of its RAW, in words."""
     red, green, blue = (made.pair.params.isp.gains / made.pair.params.isp.gains[1]).tolist()
     return f"white balance {red:.2f}, {green:.0f}, {blue:.2f}; mean {made.pair.clean.mean().item():.3f}"
 
@@ -355,7 +367,7 @@ def _levels(made: Example) -> str:
 
 @torch.no_grad()
 def _develop(made: Example, part: Tensor, scale: int = 1) -> np.ndarray:
-    """The central part of RAW, or of linear RGB at 1 / ``scale`` of the size, developed by a draw's own setting."""
+    """Develop the central part of RAW, or of linear RGB at 1 / ``scale`` of the size, by the setting of a draw."""
     rgb = part if scale > 1 else pattern(made.augment.cfa).demosaic(made.augment.mosaic(part)[None])[0]
     top, left, height, width = (place // scale for place in (*_centre(made.srgb)[:2], *made.srgb.shape[-2:]))
     place = frame_coordinates(rgb.shape[-2], rgb.shape[-1], (top, left), (height, width))

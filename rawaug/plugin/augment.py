@@ -38,9 +38,10 @@ from rawaug.seeding import keyed_generator, rank_key
 
 
 class RawAugment(nn.Module):
-    """sRGB batches to RAW pairs.
+    """Make RAW pairs of batches of sRGB pictures.
 
-    It has no parameters and adds nothing to the ``state_dict`` of a surrounding network.
+    The module has no parameters and adds nothing to the ``state_dict`` of a surrounding network. Calling it draws
+    parameters (:meth:`sample`) and applies them (:meth:`apply`), on the device of the batch.
 
     Args:
         isp: the camera; a frozen copy is taken, later changes do not reach it.
@@ -107,7 +108,11 @@ class RawAugment(nn.Module):
         self._calls = 0
 
     def with_draws(self, noise: NoiseSpec | NoiseModel, draw: Draw = Draw()) -> RawAugment:
-        """An augmentation with the same ISP, pattern and target and with other draws; nothing is baked again."""
+        """An augmentation with the same ISP, pattern and target but with other draws; nothing is baked again.
+
+        Args:
+            noise, draw: as in the constructor, whose errors they raise.
+        """
         other = copy(self)
         other._set_draws(noise, draw)
         return other
@@ -159,12 +164,14 @@ class RawAugment(nn.Module):
     @eager
     @torch.no_grad()
     def sample(self, srgb: Any, generator: torch.Generator | None = None, crop: Tensor | None = None) -> AugmentParams:
-        """Draw parameters for a batch; for a single picture without the leading B.
+        """Draw the parameters of a batch; those of a single picture have no leading B.
 
         Args:
-            srgb: the pictures; only ``perturb`` and ``chosen`` look at them, ``convex`` counts them.
+            srgb: pictures ``(B, 3, H, W)`` in any form that :mod:`rawaug.plugin.pictures` lists. Only the samplings
+                ``perturb`` and ``chosen`` look at them, the others count them.
             generator: on the CPU; the module's own by default.
-            crop: ``(B, 5)`` top, left, height, width of the full frames, view; untouched full frames by default.
+            crop: ``(B, 5)`` where the pictures are in their full frames, as :class:`AugmentParams` has it; by default
+                they are full frames.
         """
         params = self._sample(self._batch(srgb), generator or self._own_generator(), crop)
         return params.map(lambda t: t[0]) if is_picture(srgb) else params
@@ -182,10 +189,12 @@ class RawAugment(nn.Module):
     @eager
     @torch.no_grad()
     def apply(self, srgb: Any, params: AugmentParams | None = None) -> Any:
-        """The :class:`RawPair` that ``params`` describe: pure, bit for bit the same at every call.
+        """Make the :class:`RawPair` that parameters describe, bit for bit the same at every call.
 
-        For a single picture ``params`` and the pair have no leading B. With a function alone it is ``nn.Module.apply``,
-        which a surrounding module may call.
+        Args:
+            srgb: pictures ``(B, 3, H, W)`` in any form that :mod:`rawaug.plugin.pictures` lists. A function alone, as a
+                surrounding module may pass it, goes to ``nn.Module.apply``.
+            params: those of as many pictures; for a single picture they and the pair have no leading B.
 
         Raises:
             ValueError: if ``srgb`` is no batch of pictures, or ``params`` are for another number of them.
@@ -199,7 +208,13 @@ class RawAugment(nn.Module):
     @eager
     @torch.no_grad()
     def make_pair(self, srgb: Tensor, generator: torch.Generator, crop: Tensor | None = None) -> RawPair:
-        """Sample, then apply, of ``(B, 3, H, W)`` that :mod:`rawaug.plugin.pictures` has converted already."""
+        """Sample, then apply, without converting the pictures.
+
+        Args:
+            srgb: ``(B, 3, H, W)`` with even sides, uint8 or float32, on the module's device.
+            generator: on the CPU.
+            crop: ``(B, 5)``, as for :meth:`sample`.
+        """
         self._require_here(srgb)
         return self._pair(srgb, self._sample(srgb, generator, crop))
 
@@ -217,7 +232,7 @@ class RawAugment(nn.Module):
     @eager
     @torch.no_grad()
     def develop(self, raw: Tensor, params: AugmentParams, demosaicing: str = "malvar") -> Tensor:
-        """RAW of a pair, noisy, clean or denoised, back to sRGB by the camera setting that made it, to look at.
+        """Develop RAW of a pair, noisy, clean or denoised, by the camera setting that made it, to look at.
 
         Args:
             raw: packed RAW ``(B, 4, h, w)``, or ``(4, h, w)`` of a sample of a Dataset; white = 1.
@@ -256,7 +271,7 @@ class RawAugment(nn.Module):
         return self.display
 
     def __repr__(self) -> str:
-        """What is drawn, in three lines: the camera, the noise, the target."""
+        """Tell in three lines what is drawn: the camera, the noise and the target."""
         frames = "" if self.burst is None else f", bursts of {self.burst.frames} frames"
         return (
             f"RawAugment, camera: {self.settings!r}\n"
@@ -270,13 +285,13 @@ class RawAugment(nn.Module):
         return self._planes(self.baked.colours(srgb, params.isp, params.crop, white=1.0))
 
     def _planes(self, rgb: Tensor) -> Tensor:
-        """RAW as four planes: packed, or, of other patterns, the sites of every 2 x 2 square as they come."""
+        """Sample RGB ``(B, 3, H, W)`` as four planes: packed RAW, or the sites of every 2 x 2 square of other patterns."""
         if self.pattern is None:
             return bayer.pack_rgb(rgb, self.isp.cfa)
         return bayer.pack(self.pattern.mosaic(rgb), CFA.RGGB)
 
     def _noisy(self, planes: Tensor, params: AugmentParams) -> tuple[Tensor, Tensor, Tensor]:
-        """Noisy, clean and variance of clean planes, as RAW or developed."""
+        """Add noise to clean planes ``(B, 4, H/2, W/2)``; noisy, clean and variance, as RAW or developed."""
         if self.srgb is not None:
             raw = self.noise.apply(planes, params.noise)
             _require_finite(raw)
@@ -312,7 +327,7 @@ class RawAugment(nn.Module):
     @eager
     @torch.no_grad()
     def forward(self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None) -> Any:
-        """Sample, then apply.
+        """Draw parameters for a batch and apply them.
 
         Args:
             batch: pictures ``(B, 3, H, W)`` in any form that :mod:`rawaug.plugin.pictures` lists, or a tuple or mapping
@@ -343,14 +358,16 @@ class RawAugment(nn.Module):
 
     @property
     def cfa(self) -> str:
+        """The pattern of the RAW, such as ``"RGGB"`` or ``"XTRANS"``."""
         return str(self.isp.cfa) if self.pattern is None else self.pattern.name
 
     def mosaic(self, raw: Tensor) -> Tensor:
-        """RAW of a pair as the mosaic ``(..., 1, H, W)``: packed Bayer RAW unpacked, other patterns as they are."""
+        """Unpack RAW of a pair ``(..., 4, H/2, W/2)`` to a mosaic ``(..., 1, H, W)``; RAW of other patterns is one."""
         return bayer.unpack(raw, self.isp.cfa) if self.pattern is None else raw
 
     @property
     def device(self) -> torch.device:
+        """The device that pairs are made on."""
         return self.isp.gain.log_gains.device
 
     def _batch(self, pictures: Any) -> Tensor:
@@ -366,7 +383,7 @@ class RawAugment(nn.Module):
             raise ValueError(f"pictures on {srgb.device}, but augmentation on {self.device}; call augment.to(...)")
 
     def _own_generator(self) -> torch.Generator:
-        """A new one for each call, worker and process."""
+        """A new generator for each call, worker and process."""
         self._calls += 1
         worker = get_worker_info()
         return keyed_generator(self.seed, "augment", worker.seed if worker else 0, self._calls, *rank_key())
@@ -376,7 +393,7 @@ M = TypeVar("M", bound=nn.Module)
 
 
 def freeze(module: M) -> M:
-    """A copy in eval mode whose tensors are buffers outside of ``state_dict``."""
+    """Copy a module in eval mode, with its tensors as buffers that no ``state_dict`` holds."""
     copy = deepcopy(module).eval()
     for part in copy.modules():
         tensors = {**part._parameters, **part._buffers}
@@ -414,7 +431,10 @@ def with_iso(noise: NoiseSpec | NoiseModel, iso: Iso) -> NoiseSpec | NoiseModel:
 
 
 def noise_for(isp: DictionaryISP, noise: NoiseSpec | NoiseModel) -> NoiseModel:
-    """The noise model that ``noise`` means for this ISP: ``"camera"`` is the law in its file, at any measured ISO."""
+    """The noise model that ``noise`` means for this ISP.
+
+    ``"camera"`` is the law in the ISP's file, at any ISO that was measured; ValueError if none was.
+    """
     if noise != "camera":
         return noise_model(noise)
     if "noise" not in isp.info:
@@ -423,7 +443,7 @@ def noise_for(isp: DictionaryISP, noise: NoiseSpec | NoiseModel) -> NoiseModel:
 
 
 class ISPModel:
-    """Camera noise as KAIR and BSRGAN call it, by ``isp_model``, among the degradations of their low-quality pictures.
+    """Camera noise as a degradation of the pictures of KAIR and BSRGAN, which call it ``isp_model``.
 
     Args:
         augment: with the target ``"srgb"``; each call draws anew, from its own seed.

@@ -1,6 +1,6 @@
-"""Which epoch a draw belongs to, where nobody announces it; and a DataLoader's share of a distributed run.
+"""The epoch that a draw belongs to, and a DataLoader's share of a distributed run.
 
-A DataLoader does not tell its Dataset that a new pass begins. So draws are counted where they are made:
+A DataLoader does not tell its Dataset that a new pass begins, so draws are counted where they are made:
 
 - of a picture with an index, the epoch is the number of earlier visits of this picture (:class:`Visits`): in a pass
   that visits every picture once, visit k is epoch k, however many workers share the pass and in whatever order;
@@ -26,14 +26,23 @@ from rawaug.seeding import rank_key
 
 
 def world_size() -> int:
+    """The number of processes of a distributed run, 1 without one."""
     distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
     return torch.distributed.get_world_size() if distributed else 1
 
 
 def own_share(loader: Any, seed: int) -> Any:
-    """The loader over this process's pictures; the loader itself if its sampler was chosen or it is no DataLoader.
+    """Divide a DataLoader between the processes of a distributed run.
 
     Lightning and Fabric divide only a DataLoader, which a wrapped one is not.
+
+    Args:
+        loader: a DataLoader whose order comes from its ``shuffle``.
+        seed: of the order, the same in all processes.
+
+    Returns:
+        A loader over this process's pictures; ``loader`` itself in a single process, where its sampler was chosen by
+        the user, and where it is no DataLoader.
     """
     if world_size() == 1 or not isinstance(loader, DataLoader) or not _has_own_order(loader):
         return loader
@@ -64,7 +73,11 @@ MAX_WORKERS = 512
 
 
 def require_epoch(epoch: SupportsIndex) -> int:
-    """The epoch (or batch number) as an int of 63 bits, which is what a shared counter holds."""
+    """Convert an epoch, or the number of a batch, to an int.
+
+    Raises:
+        ValueError: if it does not fit the 63 bits of a shared counter.
+    """
     if not isinstance(epoch, SupportsIndex) or not 0 <= index(epoch) < 2**63:
         raise ValueError(f"an epoch is an integer from 0 to 2^63 - 1, got {epoch!r}")
     return index(epoch)
@@ -85,6 +98,7 @@ class _Epochs:
         return None if epoch == _COUNTED else epoch
 
     def pin(self, epoch: int) -> None:
+        """Fix the epoch, in the workers too, until the next call."""
         self._pinned[0] = require_epoch(epoch)
 
     def rank(self) -> tuple[int, ...]:
@@ -105,15 +119,15 @@ class _Epochs:
 
 
 class Visits(_Epochs):
-    """Epochs of ``size`` pictures that are asked for by index.
+    """Counts of how often each of ``size`` pictures was asked for by its index.
 
-    A pass that is broken off counts what its workers had fetched ahead. A picture drawn with replacement counts each
-    time, in the order in which workers come to it. Distributed processes take turns with a picture, so counted draws
-    also have the rank as a key.
+    A pass that is broken off counts what its workers had fetched ahead. A picture that is drawn with replacement counts
+    each time, in the order in which workers come to it. Distributed processes take turns with a picture, so the key of
+    a counted draw also has the rank.
     """
 
     def key(self, index: int) -> tuple[int, ...]:
-        """Count a visit of picture ``index``; return epoch, index and rank, which key its draw."""
+        """Count a visit of picture ``index``, and return the key of its draw: epoch, index and rank."""
         if self.pinned is not None:
             return (self.pinned, index)
         if index >= len(self._counts):
@@ -123,11 +137,14 @@ class Visits(_Epochs):
         return (visit, index, *self.rank())
 
     def state_dict(self) -> dict[str, Any]:
-        """The pinned epoch, and each picture's visits; in a distributed run, which shares one state, the passes."""
+        """The pinned epoch and each picture's visits.
+
+        The processes of a distributed run share one state: there each picture's visits are the passes so far.
+        """
         return {"epoch": self.pinned, "visits": self._shared_by_ranks(self._counts.clone())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from ``state``; ValueError if it is not one of as many pictures."""
+        """Go on from ``state``; ValueError if it belongs to another number of pictures."""
         visits = torch.as_tensor(state["visits"])
         if visits.shape != self._counts.shape:
             raise ValueError(f"the state is that of {len(visits)} pictures, the dataset has {len(self._counts)}")
@@ -144,10 +161,10 @@ class Visits(_Epochs):
 
 
 class Passes(_Epochs):
-    """Epochs of a stream: its passes, and where a resumed one goes on.
+    """Counts of the passes over a stream, and the sample at which a resumed pass goes on.
 
-    Worker w of W counts in row W, column w; row 0 is the main process. Passes with another number of workers are those
-    that their first worker has begun.
+    Worker w of W counts in row W, column w, and the main process in row 0. Of passes with another number of workers
+    those count that their first worker has begun.
     """
 
     def __init__(self) -> None:
@@ -156,7 +173,7 @@ class Passes(_Epochs):
         self._running: tuple[int, int] | None = None  # in this process: the pass, and the number of the next sample
 
     def begin(self, workers: int, worker: int) -> tuple[int, int]:
-        """Count a pass of a worker; return its epoch and the number of the first sample."""
+        """Count a pass of one of ``workers`` workers, and return its epoch and the number of its first sample."""
         # Other rows alone: a sibling may be counting the same pass in this one.
         others = self._counts[:workers, 0].sum() + self._counts[workers + 1 :, 0].sum()
         started = int(self._counts[workers, worker] + others)
@@ -167,22 +184,25 @@ class Passes(_Epochs):
         return (started if self.pinned is None else self.pinned), start
 
     def at(self, number: int) -> None:
-        """Sample ``number`` comes next in this process."""
+        """Note that sample ``number`` comes next in this process."""
         if self._running is not None:
             self._running = (self._running[0], number)
 
     def end(self) -> None:
+        """Note that the pass of this process is over."""
         self._running = None
 
     def state_dict(self) -> dict[str, Any]:
-        """The pinned epoch, the finished passes, and the number of the next sample.
+        """The pinned epoch, the number of finished passes, and the number of the next sample.
 
-        The main process does not know how far its workers have come in a pass: the state is then that of the next pass.
+        The main process does not know how far its workers have come in a pass: with workers, the state is that of the
+        next pass.
         """
         started, position = self._running or (int(self._counts[:, 0].sum()), 0)
         return {"epoch": self.pinned, "passes": started, "position": position}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from ``state`` with the next sample of the next pass."""
         self._resume(state["epoch"])
         self._counts.zero_()
         self._counts[0, 0] = state["passes"]

@@ -36,7 +36,7 @@ from rawaug.seeding import keyed_generator, rank_key
 
 
 class Position(NamedTuple):
-    """Where a pass begins or has come to: the next batch, and how many the wrapped loader gives again before it."""
+    """The next batch of a pass, and the number of batches before it that the wrapped loader gives once more."""
 
     epoch: int
     batch: int
@@ -44,7 +44,11 @@ class Position(NamedTuple):
 
 
 class WrappedLoader:
-    """A loader of RAW pairs, made by :func:`wrap`; its other attributes are the wrapped loader's own."""
+    """A loader of RAW pairs, made by :func:`wrap`; its other attributes are the wrapped loader's own.
+
+    Args:
+        loader, augment, crop, key, keys, device: as for :func:`wrap`, which converts and checks them.
+    """
 
     def __init__(
         self,
@@ -65,7 +69,7 @@ class WrappedLoader:
 
     @property
     def share(self) -> Any:
-        """The wrapped loader; in a distributed run this process's part of it."""
+        """The wrapped loader, or in a distributed run this process's part of it."""
         if self._share is None and world_size() > 1:
             self._share = own_share(self.loader, self.augment.seed)
         return self.loader if self._share is None else self._share
@@ -74,19 +78,22 @@ class WrappedLoader:
         return len(self.share)
 
     def set_epoch(self, epoch: int, start: int = 0) -> None:
-        """Set the next pass's epoch and first batch number; forwarded to the wrapped loader's ``set_epoch``, if any.
+        """Set the epoch of the next pass and the number of its first batch.
 
         Without it every pass counts as the next epoch. Call it with a fixed number before each pass over validation
         data, to repeat the same noise, and with ``start`` where the wrapped loader itself resumes in the middle of
-        an epoch.
+        an epoch. It is forwarded to the wrapped loader's own ``set_epoch``, if there is one.
         """
         self._next = self._at = Position(require_epoch(epoch), require_epoch(start))
         if hasattr(self.loader, "set_epoch"):
             self.loader.set_epoch(epoch)
 
     def state_dict(self) -> dict[str, Any]:
-        """Epoch and number of the next batch, the state of the loader's own ``generator`` at the start of the pass, and
-        the ``state_dict`` of the wrapped loader, where it has these."""
+        """The state from which :meth:`load_state_dict` goes on with the next batch.
+
+        It holds the epoch and the number of that batch, and, where the wrapped loader has these, the state of its own
+        ``generator`` at the start of the pass and its ``state_dict``.
+        """
         state: dict[str, Any] = {"epoch": self._at.epoch, "batch": self._at.batch}
         if self._generator is not None:
             state["order"] = self._generator.get_state() if self._order is None else self._order
@@ -95,7 +102,7 @@ class WrappedLoader:
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on with the batch after the last one that ``state`` knows.
+        """Go on with the batch after the last one that ``state`` knows of.
 
         A wrapped loader with a ``load_state_dict`` of its own goes on by itself; of any other the first batches are
         loaded again and passed over. Their order is the same if it is sequential, drawn from the loader's own
@@ -173,7 +180,7 @@ def wrap(
     keys: Sequence[str] | None = None,
     device: torch.device | str | None = None,
 ) -> WrappedLoader:
-    """Any loader of sRGB batches as a loader of RAW pairs; the rest of the training script stays as it is.
+    """Make a loader of RAW pairs of any loader of sRGB batches; the rest of the training script stays as it is.
 
     Args:
         loader: a DataLoader, or what iterates like one. Its batches are pictures ``(B, 3, H, W)`` in any form that

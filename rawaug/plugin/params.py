@@ -1,4 +1,4 @@
-"""What was drawn for a pair, and the pair; parameters go to a file and back, and replay the pair bit for bit."""
+"""A training pair, and the parameters that were drawn for it: they go to a file and back, and replay the pair."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ _KIND = "augment_params"
 
 
 class AugmentParams(NamedTuple):
-    """All that was drawn for a batch; tensors with leading dimension B, or without it for one picture of a Dataset.
+    """Everything that was drawn for a batch of B pictures; for one picture of a Dataset the tensors have no leading B.
 
     Args:
         isp: camera settings.
         noise: levels and seeds of the noise.
-        crop: ``(B, 5)`` top, left, height, width, view: position of the picture in its full frame, and how it was
-            turned after the crop (see :func:`rawaug.bayer.turn`); ``(B, 6)`` with the number of rows that were
-            enlarged to the crop.
-        extras: of target ``"srgb"`` ``demosaicing`` (its number) and, with JPEG, ``quality``, each ``(B,)``; of bursts
-            ``motion`` ``(B, N, 3)`` and ``frame_seed`` ``(B, N)``; else empty.
+        crop: ``(B, 5)`` top and left of the picture in its full frame, height and width of the frame, and the view,
+            which is how the picture was turned after the crop (see :func:`rawaug.bayer.turn`). With a zoom it is
+            ``(B, 6)``, and the last is the number of rows that were enlarged to the crop.
+        extras: with the target ``"srgb"`` ``demosaicing`` (its number), with JPEG ``quality``, with finishing
+            ``chroma_420``, each ``(B,)``, and ``finish`` ``(B, 6)``; with bursts ``motion`` ``(B, N, 3)`` and
+            ``frame_seed`` ``(B, N)``. Else it is empty.
     """
 
     isp: ISPParams
@@ -34,24 +35,29 @@ class AugmentParams(NamedTuple):
     extras: dict[str, Tensor]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> AugmentParams:
-        """The same function applied to every tensor: ``params.map(lambda t: t[0])`` are those of the first picture."""
+        """Apply a function to every tensor.
+
+        Of a batch, ``params.map(lambda t: t[0])`` gives the parameters of the first picture, from ``(B, ...)`` to
+        ``(...)``.
+        """
         noise, extras = ({name: change(value) for name, value in drawn.items()} for drawn in (self.noise, self.extras))
         return AugmentParams(ISPParams(*map(change, self.isp)), noise, change(self.crop), extras)
 
     def tensors(self) -> dict[str, Tensor]:
-        """As a flat dict, to store with a batch; :meth:`from_tensors` is the inverse."""
+        """The parameters as a flat dict, to store with a batch; :meth:`from_tensors` reads it back."""
         groups = {"isp": self.isp._asdict(), "noise": self.noise, "extras": self.extras}
         flat = {f"{group}.{name}": value for group, drawn in groups.items() for name, value in drawn.items()}
         return flat | {"crop": self.crop}
 
     @classmethod
     def concatenate(cls, parts: Sequence[AugmentParams]) -> AugmentParams:
+        """Join the parameters of several batches ``(B, ...)`` to those of one."""
         flat = [params.tensors() for params in parts]
         return cls.from_tensors({name: torch.cat([tensors[name] for tensors in flat]) for name in flat[0]})
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> AugmentParams:
-        """The inverse of :meth:`tensors`; ValueError if one is missing."""
+        """Read the flat dict of :meth:`tensors`, ``(B, ...)`` or of one picture; ValueError if a tensor is missing."""
         missing = {"crop", *(f"isp.{name}" for name in ISPParams._fields)} - set(tensors)
         if missing:
             raise ValueError(f"not the parameters of an augmentation: {', '.join(sorted(missing))} missing")
@@ -82,16 +88,16 @@ class RawPair(NamedTuple):
     params: AugmentParams
 
     def map(self, change: Callable[[Tensor], Tensor]) -> RawPair:
-        """The same function applied to every tensor: ``pair.map(lambda t: t[0])`` is the first pair of a batch."""
+        """Apply a function to every tensor; ``pair.map(lambda t: t[0])`` is the first pair of ``(B, 4, H/2, W/2)``."""
         return RawPair(change(self.noisy), change(self.clean), change(self.variance), self.params.map(change))
 
     def as_dict(self, keys: Sequence[str]) -> dict[str, Any]:
-        """Noisy, clean, variance and params, as many as there are keys, as a dict with these: ``("lq", "gt")``."""
+        """The first of noisy, clean, variance and params as a dict with these keys, such as ``("lq", "gt")``."""
         return dict(zip(keys, self, strict=False))
 
 
 def require_keys(keys: Sequence[str] | None) -> tuple[str, ...] | None:
-    """The keys of :meth:`RawPair.as_dict`; ValueError if they are not 1 to 4 different names."""
+    """Check the keys of :meth:`RawPair.as_dict`; ValueError if they are not 1 to 4 different names."""
     if keys is None:
         return None
     named = () if isinstance(keys, str) else tuple(keys)
@@ -102,13 +108,18 @@ def require_keys(keys: Sequence[str] | None) -> tuple[str, ...] | None:
 
 
 def save_params(params: AugmentParams, path: str | Path) -> None:
-    """Write parameters to a safetensors file, atomically."""
+    """Write parameters to a safetensors file, which is replaced as a whole."""
     tensors = {name: value.detach().cpu() for name, value in params.tensors().items()}
     write_tensors(tensors, {"format": "rawaug", "kind": _KIND}, path)
 
 
 def load_params(path: str | Path) -> AugmentParams:
-    """Parameters from a file of :func:`save_params`, on the CPU; ValueError if it holds something else."""
+    """Read parameters that :func:`save_params` has written, on the CPU.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it holds something else.
+    """
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file of parameters")
     header, tensors = read_tensors(path, "save the parameters again")

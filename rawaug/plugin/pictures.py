@@ -35,11 +35,14 @@ Where = str | int | None
 
 
 def to_rgb_tensor(picture: Any) -> Tensor:
-    """A picture to ``(3, H, W)``, uint8 or float32.
+    """Convert a picture to ``(3, H, W)``, uint8 or float32.
 
-    The axis of 1, 3 or 4 is taken for the channels; where both ends could be, the first of a tensor and the last of an
-    array. 8 bits and floats keep their values. Floats may pass half an 8-bit level beyond [0, 1], as resizing leaves
-    them; they are looked at on the CPU only, elsewhere that would stall the device.
+    The axis of length 1, 3 or 4 holds the channels; where both ends could, it is the first of a tensor and the last of
+    an array. 8 bits and floats keep their values. Floats may pass half an 8-bit level beyond [0, 1], as resizing leaves
+    them; they are checked on the CPU only, because elsewhere that would stall the device.
+
+    Raises:
+        ValueError: if it is no picture, or has values outside [0, 1].
     """
     image = _as_tensor(picture)
     if image.ndim == 2:
@@ -50,7 +53,7 @@ def to_rgb_tensor(picture: Any) -> Tensor:
 
 
 def to_rgb_batch(pictures: Any) -> Tensor:
-    """A batch to ``(B, 3, H, W)``, uint8 or float32; a single picture is a batch of one."""
+    """Convert a batch to ``(B, 3, H, W)``, uint8 or float32; a single picture is a batch of one."""
     if is_picture(pictures):
         return to_rgb_tensor(pictures)[None]
     if isinstance(pictures, Sequence):
@@ -62,7 +65,7 @@ def to_rgb_batch(pictures: Any) -> Tensor:
 
 
 def stack_pictures(images: Sequence[Tensor]) -> Tensor:
-    """Pictures ``(3, H, W)`` of one size to ``(B, 3, H, W)``; where only some are 8 bits, all become float32."""
+    """Stack pictures ``(3, H, W)`` of one size to ``(B, 3, H, W)``; where only some are 8 bits, all become float32."""
     sizes = sorted({tuple(image.shape[-2:]) for image in images})
     if len(sizes) != 1:
         named = ", ".join(f"{height} x {width}" for height, width in sizes) or "no pictures"
@@ -73,7 +76,7 @@ def stack_pictures(images: Sequence[Tensor]) -> Tensor:
 
 
 def trim_to_even(image: Tensor) -> Tensor:
-    """``(..., H, W)`` without its last row or column where a side is odd: a Bayer cell is 2 x 2."""
+    """Drop the last row or column of ``(..., H, W)`` where a side is odd: a Bayer cell is 2 x 2."""
     height, width = image.shape[-2:]
     if min(image.shape[0], height // 2, width // 2) < 1:
         raise ValueError(f"a picture must be at least 2 x 2 and a batch must not be empty, got {tuple(image.shape)}")
@@ -81,15 +84,24 @@ def trim_to_even(image: Tensor) -> Tensor:
 
 
 def is_picture(value: Any) -> bool:
-    """Whether ``value`` is one picture: a PIL image, or a tensor or array with two or three axes."""
+    """Tell whether ``value`` is one picture: a PIL image, or a tensor or array with two or three axes."""
     return value.ndim in (2, 3) if isinstance(value, (Tensor, np.ndarray)) else hasattr(value, "getbands")
 
 
 def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> Where:
-    """Where the picture (``batched``: the pictures) of a sample is.
+    """Find the picture of a sample.
 
-    Under ``key`` of a mapping, at index ``key`` of a tuple or list, by default the first, with a warning if the second
-    is a picture of the same shape. A batch that is a list of pictures is not taken apart.
+    Args:
+        sample: a picture, or a tuple, list or mapping that has one.
+        key: its key in a mapping, or its index in a tuple or list. By default it is the first of a tuple, with a
+            warning if the second is a picture of the same shape.
+        batched: whether ``sample`` is a loader's batch, in which a list of pictures is a batch of them.
+
+    Returns:
+        The key or index, for :func:`get_picture`; None if the sample itself is the picture.
+
+    Raises:
+        ValueError: if there is no such key or index.
     """
     if isinstance(sample, Mapping):
         if key not in sample:
@@ -112,7 +124,7 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
 
 @cache
 def warn_of_pairs() -> None:
-    """Once a process: filters of warnings that are set anew would let it through at every sample."""
+    """Warn once a process: a filter of warnings that is set anew would let it through at every sample."""
     warnings.warn(_PAIR, stacklevel=3)
 
 
@@ -126,11 +138,12 @@ def _likely_pair(first: Any, second: Any) -> bool:
 
 
 def get_picture(sample: Any, where: Where) -> Any:
+    """The picture of a sample, at the place that :func:`find_picture` has found."""
     return sample if where is None else sample[where]
 
 
 def replace_picture(sample: Any, where: Where, value: Any) -> Any:
-    """The sample with ``value`` there, all else as it was; mappings become dicts.
+    """Put ``value`` into a sample in place of its picture; the other fields stay, and a mapping becomes a dict.
 
     A dict in place of the picture of a mapping is merged with it; ValueError if that would overwrite another field.
     """

@@ -1,4 +1,4 @@
-r"""What a pair holds besides RAW of one shot: linear camera RGB, developed sRGB, or a burst.
+r"""Targets besides RAW of one shot: linear camera RGB, developed sRGB, and bursts.
 
 *sRGB* is developed by the camera setting that made the RAW,
 

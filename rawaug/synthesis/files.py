@@ -46,7 +46,7 @@ TARGETS: dict[Format, tuple[Target, ...]] = {"dng": ("raw",), "png": ("srgb",)}
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings that the files depend on, besides the pictures; stored in ``synth.json`` beside them."""
+    """The settings that the files of a run depend on besides the pictures; ``synth.json`` beside them holds these."""
 
     format: Format
     config: AugmentConfig
@@ -54,12 +54,13 @@ class Settings:
     seed: int
 
     def to_json(self) -> dict[str, Any]:
+        """The settings as a flat dict for ``synth.json``."""
         return {"format": self.format, "isp_sha256": self.isp_sha256, "seed": self.seed, **self.config.to_json()}
 
 
 @dataclass(frozen=True)
 class Origin:
-    """What a pair was made from; with its parameters it replays the pair."""
+    """The picture and the settings that a pair was made from; with its parameters they replay the pair."""
 
     picture: str
     picture_sha256: str
@@ -69,14 +70,26 @@ class Origin:
 
 
 class PairMaker:
-    """The pairs of pictures under fixed settings; those with more than ``max_pixels`` are refused."""
+    """Makes the pairs of pictures under fixed settings; a picture of more than ``max_pixels`` is refused."""
 
     def __init__(self, settings: Settings, max_pixels: int = MAX_PIXELS) -> None:
         self.settings, self.max_pixels = settings, max_pixels
         self.augment = settings.config.make()
 
     def pairs(self, picture: Path, key: str, numbers: Iterable[int]) -> tuple[Origin, Iterator[tuple[int, RawPair]]]:
-        """The origin of a picture's pairs, and an iterator over (number, pair)."""
+        """Read a picture, and make its pairs one by one.
+
+        Args:
+            picture: an sRGB file.
+            key: the picture's name in its folder, which keys the draws.
+            numbers: those of the pairs that are wanted.
+
+        Returns:
+            The origin of the pairs, and an iterator over (number, pair), where the pair has no leading B.
+
+        Raises:
+            OSError, ValueError: if the picture cannot be read, or changes meanwhile.
+        """
         before, content = picture.stat(), sha256(picture)
         srgb = trim_to_even(read_picture(picture, self.max_pixels)).contiguous()
         after = picture.stat()
@@ -92,6 +105,7 @@ class PairMaker:
 
 
 def pair_levels(pair: RawPair) -> dict[str, float]:
+    """``shot_var`` and ``read_var`` of a pair, where its noise has these."""
     noise = pair.params.noise
     return {key: noise[key].item() for key in ("shot_var", "read_var") if key in noise}
 
@@ -123,7 +137,14 @@ def replay_pair(
 
 
 class PictureTask:
-    """The missing pairs of one picture; its name in the folder is the key of its draws."""
+    """The missing pairs of one picture.
+
+    Args:
+        picture: an sRGB file.
+        key: its name in the folder, which keys the draws.
+        stem: the beginning of its pairs' files.
+        per_image: number of pairs that there are to be.
+    """
 
     def __init__(self, picture: Path, key: str, stem: Path, per_image: int) -> None:
         self.picture, self.key, self.stem = picture, key, stem
@@ -132,7 +153,7 @@ class PictureTask:
         self.broken: dict[str, str] = {}  # what cannot be read is tried again
 
     def make(self, maker: PairMaker) -> tuple[int, dict[str, str]]:
-        """Write the missing pairs; their number, and the reason if the picture cannot be read."""
+        """Write the missing pairs; return their number, and the reason if the picture cannot be read."""
         try:
             origin, pairs = maker.pairs(self.picture, self.key, self.numbers)
         except (OSError, ValueError) as error:
@@ -143,7 +164,17 @@ class PictureTask:
 
 
 def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: int) -> Iterator[PictureTask]:
-    """One task for each picture; pictures that differ only in their extension keep it in the names of their pairs."""
+    """Make one task for each picture; pictures that differ only in their extension keep it in the names of their pairs.
+
+    Args:
+        pictures: sRGB files below ``source``.
+        source: the folder of the pictures.
+        out: the folder of the pairs, whose subfolders are those of ``source``.
+        per_image: pairs of each picture.
+
+    Raises:
+        ValueError: if the pairs of two pictures would have the same names.
+    """
     stems = Counter(picture.with_suffix("") for picture in pictures)
     taken: dict[Path, Path] = {}
     for picture in pictures:
@@ -158,7 +189,7 @@ def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: 
 
 
 def _short(name: str) -> str:
-    """The name, shortened and with a hash if the pairs' file names would become too long."""
+    """Shorten a name, and add a hash, if the pairs' file names would become too long."""
     encoded = os.fsencode(name)
     if len(encoded) <= LONGEST_STEM:
         return name
@@ -166,7 +197,15 @@ def _short(name: str) -> str:
 
 
 def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, origin: Origin) -> None:
-    """Write a pair and its parameters to files whose names begin with ``stem``."""
+    """Write a pair and its parameters.
+
+    Args:
+        stem: the beginning of the files' names.
+        pair: one pair, without B.
+        augment: the augmentation that has made it.
+        format: one of files, not of shards.
+        origin: what the pair was made from.
+    """
     _WRITERS[format](stem, pair, augment)
     header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(asdict(origin))}
     write_tensors(pair.params.tensors(), header, f"{stem}.safetensors")
@@ -210,11 +249,15 @@ _WRITERS: dict[Format, Callable[[Path, RawPair, RawAugment], None]] = {
 
 
 def replay(params: str | Path, picture: str | Path | None = None, isp: str | Path | None = None) -> RawPair:
-    """The pair described by a parameter file, bit for bit as written.
+    """Make a pair again from its file of parameters, bit for bit as it was written.
 
     Args:
         params: ``NAME.safetensors`` of a pair.
-        picture, isp: the sRGB picture and the ISP's file, if they have moved since; ValueError if they have changed.
+        picture: the sRGB picture, if it has moved since.
+        isp: the ISP's file, if it has moved since.
+
+    Raises:
+        ValueError: if ``rawaug synth`` has not written the file, or the picture or the ISP has changed.
     """
     drawn, header = load_params(params), read_header(params)
     if "origin" not in header:
@@ -223,7 +266,7 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
 
 
 def _metadata(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
-    """Metadata of the mosaics; colour that cannot be inverted is not stored."""
+    """What NPZ and TIFF say of a pair; colour that cannot be inverted is left out."""
     if augment.target == "srgb":
         return pair_levels(pair)
     stated: dict[str, Any] = {"cfa": augment.cfa, **pair_levels(pair)}
@@ -235,7 +278,14 @@ def _metadata(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
 
 
 def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[dict[str, RawFrame], float]:
-    """A RAW pair as camera frames by the ends of their files' names, and the stops of underexposure."""
+    """Describe the mosaics of a RAW pair, without B, as frames of a camera.
+
+    Returns:
+        The frames by the ends of their files' names, and by how many stops they are underexposed.
+
+    Raises:
+        ValueError: if a DNG cannot store the white balance of the pair.
+    """
     white_balance, color_matrix, stops = _color(pair, augment)
     metadata: dict[str, Any] = {
         "cfa": augment.cfa,

@@ -1,7 +1,7 @@
-"""RAW pairs on disk from a folder of sRGB pictures, in parallel, on one machine or on many.
+"""Make RAW pairs on disk from a folder of sRGB pictures, in parallel, on one machine or on many.
 
-What is drawn for a pair depends on (seed, picture's name, number) alone, and files are written whole: however often a
-run is stopped and started again, and with however many workers on however many machines, the same files come out, each
+The draws of a pair depend on (seed, picture's name, number) alone, and files are written whole. So a run may be stopped
+and started again, and may have any number of workers on any number of machines: the same files come out, and each is
 made once.
 """
 
@@ -33,12 +33,12 @@ from rawaug.synthesis.shards import PER_SHARD, ShardTask
 
 Task = PictureTask | ShardTask
 Outcome = tuple[int, dict[str, str]]
-"""Of a task: the pairs made, and the reason for each picture that could not be read."""
+"""The number of pairs that a task has made, and the reason for each picture that it could not read."""
 
 
 @dataclass
 class Synthesis:
-    """Result of a run: pairs made, pairs that existed before, and the reason for each unreadable picture."""
+    """The result of a run: the pairs that it made or found, and the reason for each picture that cannot be read."""
 
     out: Path
     pictures: int = 0
@@ -117,6 +117,7 @@ def synth(
 
 
 def parse_shard(shard: str) -> tuple[int, int]:
+    """K and N of ``"K/N"``; ValueError unless K is from 1 to N."""
     first, _, second = shard.partition("/")
     if not (first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second)):
         raise ValueError(f"shard must be K/N with K from 1 to N, as 3/32, got {shard!r}")

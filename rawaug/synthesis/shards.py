@@ -38,7 +38,15 @@ _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "
 
 
 class ShardTask:
-    """One shard: its path, the index of its first picture, and the names of its pictures."""
+    """One shard.
+
+    Args:
+        path: its tar file.
+        first: index of its first picture in the sorted folder.
+        source: the folder of the pictures.
+        names: its pictures within this folder.
+        per_image: pairs of each picture.
+    """
 
     def __init__(self, path: Path, first: int, source: Path, names: Sequence[str], per_image: int) -> None:
         self.path, self.first, self.source, self.names, self.per_image = path, first, source, names, per_image
@@ -47,7 +55,7 @@ class ShardTask:
         self.broken, self.todo = dict(known.get("broken", {})), not known
 
     def make(self, maker: PairMaker) -> tuple[int, dict[str, str]]:
-        """Write the shard; the number of its pairs, and the reason for each picture that cannot be read."""
+        """Write the shard; return the number of its pairs, and the reason for each picture that cannot be read."""
         made, broken = 0, dict[str, str]()
         with replacing(self.path) as partial, tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as tar:
             for index, name in enumerate(self.names, self.first):
@@ -75,7 +83,7 @@ def _record_path(shard: Path) -> Path:
 
 
 def _read_record(shard: Path) -> dict[str, Any]:
-    """The record that marks a shard as complete; empty if there is none."""
+    """The record that marks a shard as complete, empty if there is none."""
     record = _record_path(shard)
     if not record.is_file():
         return {}
@@ -88,6 +96,15 @@ def _read_record(shard: Path) -> dict[str, Any]:
 def shard_tasks(
     pictures: Sequence[Path], source: Path, out: Path, per_image: int, per_shard: int = PER_SHARD
 ) -> list[ShardTask]:
+    """Divide pictures into shards.
+
+    Args:
+        pictures: sRGB files below ``source``, sorted.
+        source: the folder of the pictures.
+        out: the folder of the shards.
+        per_image: pairs of each picture.
+        per_shard: pictures of each shard but the last.
+    """
     if per_shard < 1:
         raise ValueError(f"per_shard must be at least 1, got {per_shard}")
     names = _names(pictures, source)
@@ -100,7 +117,15 @@ def shard_tasks(
 def shard_settings(
     pictures: Sequence[Path], source: Path, per_image: int, per_shard: int, max_pixels: int
 ) -> dict[str, object]:
-    """Settings that must not change between runs: adding a picture would shift all later shards."""
+    """The settings that must not change between runs: adding a picture would shift all later shards.
+
+    Args:
+        pictures: sRGB files below ``source``, sorted.
+        source: the folder of the pictures.
+        per_image: pairs of each picture.
+        per_shard: pictures of each shard.
+        max_pixels: of the largest picture that is read.
+    """
     return {
         "pictures": len(pictures),
         "names_sha256": digest(os.fsencode("\n".join(_names(pictures, source)))),  # names need not be UTF-8
@@ -138,12 +163,15 @@ def _npy(tensor: Tensor) -> bytes:
 
 
 def replay_sample(described: Mapping[str, Any], pictures: str | Path, isp: str | Path | None = None) -> RawPair:
-    """The pair ``(4, h, w)`` of a sample's JSON, bit for bit as in its shard.
+    """Make the pair ``(4, h, w)`` of a sample again from its JSON, bit for bit as in its shard.
 
     Args:
         described: the sample's JSON.
-        pictures: the folder that the shards were made from; ValueError if the picture has changed since.
+        pictures: the folder that the shards were made from.
         isp: the ISP's file, unless it is a shipped one.
+
+    Raises:
+        ValueError: if the picture or the ISP has changed.
     """
     tensors = {key: torch.tensor(value) for key, value in described["params"].items()}
     origin = Origin(**{key: described[key] for key in Origin.__dataclass_fields__ if key in described})
@@ -178,7 +206,7 @@ def _form(config: AugmentConfig) -> str:
 
 
 def dataset_card(shards: Sequence[Mapping[str, Any]], settings: Settings) -> str:
-    """The dataset card, with the header that Hugging Face reads."""
+    """Write the text of the dataset card, with the header that Hugging Face reads."""
     pairs, size = (sum(shard[key] for shard in shards) for key in ("nsamples", "filesize"))
     config = settings.config
     others = {key: value for key, value in config.to_json().items() if key not in ("isp", "noise")}
