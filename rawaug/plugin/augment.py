@@ -285,7 +285,7 @@ class RawAugment(nn.Module):
         return self._planes(self.baked.colours(srgb, params.isp, params.crop, white=1.0))
 
     def _planes(self, rgb: Tensor) -> Tensor:
-        """Sample RGB ``(B, 3, H, W)`` as four planes: packed RAW, or the sites of every 2 x 2 square of other patterns."""
+        """Sample RGB ``(B, 3, H, W)`` as four planes: packed RAW, or of other patterns the sites of 2 x 2 squares."""
         if self.pattern is None:
             return bayer.pack_rgb(rgb, self.isp.cfa)
         return bayer.pack(self.pattern.mosaic(rgb), CFA.RGGB)
