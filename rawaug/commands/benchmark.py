@@ -14,7 +14,7 @@ from rawaug.data.pairs import Binned, SomePairs
 from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
 from rawaug.denoise.denoiser import RawDenoiser, shipped_of_mosaics
 from rawaug.denoise.pictures import PictureDenoiser
-from rawaug.evaluation.benchmark import TOLD, benchmark, costs_of, crops, shown_strength, strengths_of, tables, trials
+from rawaug.evaluation.benchmark import TOLD, benchmark, costs_of, crops, display_strength, strengths_of, tables, trials
 from rawaug.evaluation.page import Figure, Page, Part, plot_costs
 from rawaug.evaluation.picture_trials import picture_scores, print_pictures
 from rawaug.evaluation.tables import print_rows
@@ -89,10 +89,10 @@ def run(
         page = Page(f"Denoisers on {data}", [Part(texts=notes)])
         page.parts += [Part(title, head=["", *head], rows=cells) for title, head, cells in tables(result)]
         chart = Figure(
-            plot_costs(costs_of(result)), "PSNR over GMAC", "curve", f"{shown_strength(strengths)}, levels told"
+            plot_costs(costs_of(result)), "PSNR over GMAC", "curve", f"{display_strength(strengths)}, levels told"
         )
         page.parts.append(Part("Quality and cost", figures=[chart]))
-        page.parts.append(Part("Pictures", texts=[f"Noise: {shown_strength(strengths)}, levels told; PSNR of RAW."]))
+        page.parts.append(Part("Pictures", texts=[f"Noise: {display_strength(strengths)}, levels told; PSNR of RAW."]))
         for panels in crops(everyone, found, ON_PAGE):
             page.add_frame(panels)
         settings = {"denoisers": denoisers, "data": data, "bin": bin, "count": count, "crop": crop, "seed": seed}

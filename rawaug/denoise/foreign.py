@@ -119,7 +119,7 @@ class BiasFreeDnCNN(nn.Module):
     bias-free convolutional neural networks", ICLR 2020.
 
     Args:
-        weights: of the convolutions, ``(out, in, 3, 3)``, by names whose order is theirs.
+        weights: of the convolutions, ``(n, m, 3, 3)``, by names whose order is theirs.
     """
 
     def __init__(self, weights: Mapping[str, Tensor]) -> None:

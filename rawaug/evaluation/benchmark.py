@@ -161,7 +161,7 @@ def benchmark(denoisers: Sequence[RawDenoiser], found: Sequence[Trial]) -> dict[
 def _gmac(denoiser: RawDenoiser, trial: Trial) -> float | None:
     """Multiplications that PyTorch computes, in 10^9 a megapixel of the mosaic; None if there are none."""
     with FlopCounterMode(display=False) as counter:
-        denoiser(trial.given)
+        denoiser(trial.input)
     return round(counter.get_total_flops() / 2e3 / trial.noisy.numel(), 2) or None
 
 
@@ -171,7 +171,7 @@ def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str
         scored = {name: at["frames"] for name, at in result["rows"]["noisy input"]["scores"][condition].items()}
         count = len(result["frames"])
         head = [name if n == count else f"{name} ({n} of {count} frames)" for name, n in scored.items()]
-        shown = shown_strength(scored)
+        shown = display_strength(scored)
         head += [f"SSIM, {shown}", "GMAC", "s"] if condition == TOLD else []
         cells = {}
         for name, row in result["rows"].items():
@@ -185,20 +185,20 @@ def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str
 
 def costs_of(result: Mapping[str, Any]) -> dict[str, tuple[float | None, float, float]]:
     """By denoiser its GMAC a megapixel and its PSNR of RAW and sRGB, at the strength that is shown."""
-    shown = shown_strength(result["rows"]["noisy input"]["scores"][TOLD])
+    shown = display_strength(result["rows"]["noisy input"]["scores"][TOLD])
     rows = {name: row for name, row in result["rows"].items() if name != "noisy input"}
     scored = {name: row["scores"][TOLD][shown] for name, row in rows.items()}
     return {name: (rows[name]["gmac"], scores["psnr"], scores["psnr_srgb"]) for name, scores in scored.items()}
 
 
-def shown_strength(strengths: Collection[str]) -> str:
+def display_strength(strengths: Collection[str]) -> str:
     """The strength whose pictures and SSIM are shown."""
     *_, last = strengths
     return "strong" if "strong" in strengths else last
 
 
 def crops(denoisers: Sequence[RawDenoiser], found: Iterable[Trial], most: int) -> Iterator[Panels]:
-    """Pictures for the page, by every denoiser: of the first ``most`` frames with noise of :func:`shown_strength`."""
+    """Pictures for the page, by every denoiser: of the first ``most`` frames with noise of :func:`display_strength`."""
     told = [trial for trial in found if trial.condition == TOLD]
-    shown = shown_strength(dict.fromkeys(trial.strength for trial in told))
+    shown = display_strength(dict.fromkeys(trial.strength for trial in told))
     return (panels_of(denoisers, trial) for trial in [t for t in told if t.strength == shown][:most])

@@ -145,10 +145,10 @@ class Page:
         clean = row.trial.clean
         side = WINDOW if clean.shape[1] == PACKED else 2 * WINDOW
         top, left = find_detail(clean, side)
-        whole, pixels = row.shown(clean), 2 * WINDOW // side
+        whole, pixels = row.show(clean), 2 * WINDOW // side
         figures = []
         for name, image in row.images.items():
-            png = encode_png(row.shown(image[..., top : top + side, left : left + side]))
+            png = encode_png(row.show(image[..., top : top + side, left : left + side]))
             figures.append(Figure(png, name, "window", ", ".join(filter(None, [name, row.captions.get(name)]))))
         scale = min(1.0, WHOLE / whole.shape[-1])
         if scale < 1.0:

@@ -34,10 +34,12 @@ class Denoiser(Protocol):
     """
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """What tables call it."""
 
     @property
-    def takes(self) -> str: ...
+    def takes(self) -> str:
+        """The kind of image that it takes."""
 
     def __call__(self, given: Noisy) -> Tensor: ...
 
@@ -111,7 +113,7 @@ def score(denoisers: Sequence[Denoiser], trials: Iterable[Trial], label: str = "
 
 
 def _rows(denoiser: Denoiser, trial: Trial) -> Iterator[Row]:
-    given = trial.given_to(denoiser)
+    given = trial.input_for(denoiser)
     start = time.perf_counter()
     found = denoiser(given)
     seconds = (time.perf_counter() - start) / (given.image.numel() / 1e6)
@@ -168,7 +170,7 @@ class Panels:
     images: dict[str, Tensor] = field(default_factory=dict)
     captions: dict[str, str] = field(default_factory=dict)
 
-    def shown(self, image: Tensor) -> Tensor:
+    def show(self, image: Tensor) -> Tensor:
         """An image, or a part of one, ``(1, C, H, W)``, as sRGB ``(3, H, W)`` in [0, 1]."""
         return image[0].clamp(0.0, 1.0) if self.trial.develop is None else self.trial.develop(image)
 
@@ -177,7 +179,7 @@ def panels_of(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOI
     """The trial noisy, denoised by each, and clean; captions say the PSNR. ``noisy`` shows the noisy input."""
     panels = Panels(trial)
     for title, denoiser in {"noisy": noisy, **{one.name: one for one in denoisers}}.items():
-        for name, image in to_domain(title, denoiser(trial.given_to(denoiser)), trial):
+        for name, image in to_domain(title, denoiser(trial.input_for(denoiser)), trial):
             panels.images[name] = image
             panels.captions[name] = f"{psnr(*(_as_compared(x, trial) for x in (image, trial.clean))).item():.2f} dB"
     panels.images["clean"] = trial.clean

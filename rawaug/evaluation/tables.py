@@ -67,7 +67,7 @@ def save_picture(rows: Sequence[Panels], path: Path) -> Path:
     for row, first in zip(rows, accumulate(lines, initial=0), strict=False):
         for axis, (title, image) in zip(axes[first:].flat, row.images.items(), strict=False):
             side = PANEL // 2 if image.shape[1] == PACKED else PANEL
-            panel = row.shown(centre(image, side, side, step=1))
+            panel = row.show(centre(image, side, side, step=1))
             axis.imshow(panel.permute(1, 2, 0).numpy(), interpolation="nearest")
             caption = f"{escape(title)}\n{escape(row.captions.get(title, ''))}"
             axis.set_title(caption, fontsize=9, parse_math=False)

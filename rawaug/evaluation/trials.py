@@ -1,7 +1,7 @@
 r"""Trials: a frame with its frozen noise, read and drawn once, and all that a score of it needs.
 
 A test case is what was captured, or noise that is keyed by (seed, name) on a clean frame. A denoiser is given
-:attr:`Trial.given` alone; the clean image, and all that follows from it, stays with the trial.
+:attr:`Trial.input` alone; the clean image, and all that follows from it, stays with the trial.
 
 A "clean" reference is a photograph, ``r = x + m``, with noise m of its own. An error against it is ``|d - x|^2 +
 |m|^2`` as far as m is independent of the denoised d, so that even a perfect denoiser has the variance of m left. Binned
@@ -78,13 +78,13 @@ class Trial:
         return sum(levels or ()) if self.variance is None else self.variance.mean().item()
 
     @property
-    def given(self) -> Noisy:
+    def input(self) -> Noisy:
         """The input of a denoiser of this kind of image."""
         return Noisy(self.noisy, self.variance, self.levels, self.cfa)
 
-    def given_to(self, denoiser: Any) -> Noisy:
+    def input_for(self, denoiser: Any) -> Noisy:
         """The input of this denoiser: a denoiser of RAW gets the RAW that a picture was developed from."""
-        return self.raw if self.raw is not None and denoiser.takes == "raw" else self.given
+        return self.raw if self.raw is not None and denoiser.takes == "raw" else self.input
 
 
 def trial_of(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: int = 0, **about: Any) -> Trial:

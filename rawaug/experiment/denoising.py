@@ -111,7 +111,7 @@ class TrainingRun:
         require_trainable(recipe.device, recipe.devices, recipe.train.precision)
         self.recipe, self.data, self.overwrite = recipe, recipe.data, overwrite
         self.folder, self.seeds = run_folder(recipe), range(recipe.seed, recipe.seed + recipe.seeds)
-        self.classical = installed_classical(recipe.classical, shown=_leads())
+        self.classical = find_classical(recipe.classical, shown=_leads())
         if recipe.noise != "camera":
             noise_model(recipe.noise)
         self.estimators = {label: ESTIMATORS.make(arm.estimator) for label, arm in recipe.arms.items()}
@@ -375,7 +375,7 @@ def _leads() -> bool:
     return getattr(rank_zero_only, "rank", 0) == 0
 
 
-def installed_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
+def find_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
     """The classical denoisers of a recipe; BM3D is left out if its wheel is missing, which is printed if ``shown``.
 
     Raises:

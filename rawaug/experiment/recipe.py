@@ -88,6 +88,7 @@ class DataConfig(PairSettings):
             raise ValueError(f"data.{given[0]}: applies to {_PAIRS}PATH, which neither pairs, validation nor test is")
 
     def settings_of(self, spec: str | Sequence[Pair]) -> dict[str, Any]:
+        """The settings of ``pairs:PATH`` that are for this spec; none if it is another kind of data."""
         return self._pair_settings() if isinstance(spec, str) and spec.startswith(_PAIRS) else {}
 
     def _pair_settings(self) -> dict[str, Any]:
@@ -162,24 +163,24 @@ class ArmConfig:
 
 @dataclass
 class Recipe:
-    """A whole experiment; ``target``, which another kind of it overrides, says what its arms are trained on.
+    """A whole experiment. Other kinds of it override ``target``, the images that its arms are trained on.
 
     Args:
         name: of the output folder within ``out``.
         data: where pictures come from.
         isp: how the dictionary ISP is fitted.
         camera: an ISP to use unchanged, by a shipped one's name or a file; null fits one to ``data.pairs``.
-        noise: added to clean RAW, in training and to test frames without a noisy capture: the name of a preset
+        noise: added to clean RAW in training, and to test frames without a noisy capture: the name of a preset
             or of a camera, a list of names of which each picture draws one, [shot_var, read_var], {name, settings} of a
             camera or a model, or "camera", the levels measured on the frames that the ISP is fitted to.
         denoiser: the network.
-        train: the loop.
+        train: the training loop.
         arms: the variants to compare, by name; all supervised, or all self-supervised (no stage sees a clean frame).
         classical: classical denoisers to compare with, such as Wavelet, or {name: Wavelet, settings: {strength: 0.8}}.
-            BM3D is left out, with a line that says so, where its wheel is not installed.
-        views: of the self-ensemble: 4, the flips, as in the paper, or 8, with quarter turns.
-        untouched: trained denoisers to compare with, unchanged: names of shipped ones, or files.
-        self_ensemble: also score every arm averaged over eight views, at eight times the cost.
+            BM3D is left out if its wheel is not installed, and a line says so.
+        views: number of views of the self-ensemble: 4, the flips, as in the paper, or 8, with quarter turns.
+        untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
+        self_ensemble: whether every arm is also scored averaged over ``views``, at that many times the cost.
         seed: of the first run.
         steps: optimiser steps, in place of ``train.steps``.
         seeds: number of runs, with seeds ``seed``, ``seed + 1``, ...; several give mean and spread.
@@ -243,16 +244,18 @@ class Recipe:
                 raise ValueError(f"arms.{label}: {error}") from None
 
     def network_of(self, arm: str) -> DenoiserConfig:
+        """The network of an arm: its own, or else the recipe's."""
         return self.arms[arm].denoiser or self.denoiser
 
     def loop_of(self, arm: str) -> TrainConfig:
+        """The training loop of an arm: the recipe's, with the arm's own learning rate, weighting and steps."""
         own = self.arms[arm]
         steps = None if own.steps is None else min(own.steps, self.train.steps)
         given: dict[str, Any] = {"learning_rate": own.learning_rate, "weigh": own.weigh, "steps": steps}
         return replace(self.train, **{key: value for key, value in given.items() if value is not None})
 
     def shortest(self) -> Recipe:
-        """A run of one step an arm on the middles of a few of the same frames, in the same networks and precision."""
+        """The recipe with one step an arm, on the middles of a few of its frames; networks and precision stay."""
         data = replace(self.data, count=2, select="first", validation_count=1, test_count=1)
         data = replace(data, validation_crop=SHORT_CROP, test_crop=SHORT_CROP)
         train = replace(self.train, steps=1, validate_every=1, checkpoint_every=1, workers=min(self.train.workers, 1))
@@ -267,11 +270,12 @@ class Recipe:
 
     @property
     def self_supervised(self) -> bool:
-        """Whether noisy frames are all that may be seen."""
+        """Whether the arms may see noisy frames alone."""
         return not any(arm.sees_clean for arm in self.arms.values())
 
 
 def read_recipe(file: str | Path) -> dict[str, Any]:
+    """The keys and values of a YAML file; ValueError if it is no recipe, or has aliases or too many bytes."""
     import yaml
 
     if (size := Path(file).stat().st_size) > MOST_BYTES:
@@ -289,6 +293,7 @@ def read_recipe(file: str | Path) -> dict[str, Any]:
 
 
 def kind_of(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
+    """The kind of experiment that a recipe is for; ValueError, which names the file, if there is no such kind."""
     kind = content.get("experiment", "training")
     if not isinstance(kind, str) or kind not in EXPERIMENTS:
         raise ValueError(f"{file}: unknown experiment {kind!r:.80}; use one of {', '.join(EXPERIMENTS)}")
@@ -296,13 +301,14 @@ def kind_of(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
 
 
 def shipped_recipes() -> dict[str, Path]:
+    """The recipes that travel with the package, by name."""
     shipped = Path(str(resources.files("rawaug"))) / "recipes"
     folder = shipped if shipped.is_dir() else Path(__file__).parents[2] / "recipes"
     return {file.relative_to(folder).with_suffix("").as_posix(): file for file in sorted(folder.rglob("*.yaml"))}
 
 
 def recipe_list() -> str:
-    """The shipped recipes, a line each: name and what its file opens with."""
+    """The names of the shipped recipes and the first lines of their files, a line each."""
     shipped = sorted(shipped_recipes().items(), key=lambda item: ("/" in item[0], item[0]))  # those at the top first
     known = {name: file.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ") for name, file in shipped}
     width = max(map(len, known)) + 2
@@ -310,7 +316,11 @@ def recipe_list() -> str:
 
 
 def find_recipe(name: str) -> Path:
-    """A recipe's path: the file itself, or one that travels with the package, with or without ``.yaml``."""
+    """The path of a recipe: a file, or one that travels with the package, by its name with or without ``.yaml``.
+
+    Raises:
+        FileNotFoundError: if there is no such recipe.
+    """
     path, known = Path(name), shipped_recipes()
     if path.is_file():
         return path

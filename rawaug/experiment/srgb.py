@@ -176,6 +176,7 @@ def key_of(levels: Levels) -> str:
 
 
 def at_level(trials: Sequence[Trial], level: str) -> list[Trial]:
+    """The trials whose noise has this level."""
     return [trial for trial in trials if trial.strength == level]
 
 
@@ -237,6 +238,6 @@ def crops(rows: Sequence[Panels]) -> Tensor:
     found = []
     for row in rows:
         top, left = find_detail(row.trial.clean, PANEL)
-        parts = [row.shown(image[..., top : top + PANEL, left : left + PANEL]) for image in row.images.values()]
+        parts = [row.show(image[..., top : top + PANEL, left : left + PANEL]) for image in row.images.values()]
         found.append(torch.cat(parts, dim=-1))
     return torch.cat(found, dim=-2)

@@ -65,7 +65,7 @@ from rawaug.plugin.draw import Draw
 from rawaug.seeding import derive_seed, keyed_generator
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.loop import train
-from rawaug.training.stream import PictureCrops, Source, TrainingStream, freeze_samples
+from rawaug.training.stream import PictureCrops, Source, TrainingStream, add_noise, freeze_samples
 
 FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
 ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples", "oracle": "oracle weights"}
@@ -435,6 +435,4 @@ class MadeCrops:
         picture = self.pictures[int(torch.randint(len(self.pictures), (), generator=generator))]
         patch = bayer.RandomTurn(self.cfa, keep_cfa=False)(self.crop(picture, generator), generator)
         clean = bayer.pack(self.make(as_float(patch[None]), generator).clamp(0.0, 1.0), self.cfa)
-        params = self.noise.sample(1, generator)
-        noisy = self.noise.apply(clean, params)
-        return Sample(noisy[0], clean[0], self.noise.variance(noisy, params)[0])
+        return add_noise(clean, self.noise, generator)

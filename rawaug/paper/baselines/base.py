@@ -132,6 +132,7 @@ class CropTrainedISP(BaselineISP):
     """For Adam, at the start."""
 
     def unprocess(self, srgb: Tensor, setting: Any = None) -> Tensor:
+        """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape, by ``reverse_network``."""
         made: Tensor = self.reverse_network(srgb)
         return made
 

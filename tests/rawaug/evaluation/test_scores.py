@@ -22,7 +22,7 @@ from rawaug.denoise.denoiser import Noisy, RawDenoiser, require_classical
 from rawaug.evaluation.scores import NOISY, Row, compare, score, summary
 from rawaug.evaluation.tables import print_scores
 from rawaug.evaluation.trials import trial_of
-from rawaug.experiment.denoising import installed_classical
+from rawaug.experiment.denoising import find_classical
 from rawaug.io import write_picture
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
@@ -168,12 +168,12 @@ def test_a_filter_whose_library_is_missing_is_refused_and_bm3d_left_out_of_recip
     monkeypatch.setitem(sys.modules, "bm3d", None)
     with pytest.raises(ValueError, match="classical: BM3D: bm3d is not installed"):
         require_classical(["Wavelet", "BM3D"])
-    assert installed_classical(["Wavelet", "BM3D"]) == ["Wavelet"]
+    assert find_classical(["Wavelet", "BM3D"]) == ["Wavelet"]
     assert "BM3D is left out: bm3d is not installed" in capsys.readouterr().out
-    assert installed_classical(["BM3D"], shown=False) == [] and not capsys.readouterr().out  # another process says so
+    assert find_classical(["BM3D"], shown=False) == [] and not capsys.readouterr().out  # another process says so
     monkeypatch.setitem(sys.modules, "skimage", None)
     with pytest.raises(ValueError, match=r"classical: NonLocalMeans: skimage is not installed; run: pip install"):
-        installed_classical(["NonLocalMeans"])
+        find_classical(["NonLocalMeans"])
 
 
 @pytest.fixture

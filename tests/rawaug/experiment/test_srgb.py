@@ -68,7 +68,7 @@ def test_noise_is_that_of_the_level_the_same_for_all(trials: list[Trial], pairs:
 def test_a_raw_denoiser_is_developed_after(trials: list[Trial]) -> None:
     def brighter(by: float) -> torch.Tensor:
         denoiser = RawDenoiser.of(lambda noisy: noisy + by, name="brighter")
-        ((name, image),) = to_domain(denoiser.name, denoiser(trials[1].given_to(denoiser)), trials[1])
+        ((name, image),) = to_domain(denoiser.name, denoiser(trials[1].input_for(denoiser)), trials[1])
         assert name == "brighter, then LibRaw"
         return image
 
@@ -82,7 +82,7 @@ def test_the_filter_is_as_strong_as_the_noise_of_its_shots(trials: list[Trial]) 
     for deviation in (0.01, 0.16):
         assert sum(row.psnr for row in score([PictureDenoiser.of_filter(spec, deviation)], strong)) < sum(chosen)
     gentle = best_filter(spec, weak)
-    assert torch.equal(gentle(weak[0].given), PictureDenoiser.of_filter(spec, 0.01)(weak[0].given))
+    assert torch.equal(gentle(weak[0].input), PictureDenoiser.of_filter(spec, 0.01)(weak[0].input))
 
 
 @pytest.mark.usefixtures("tiny")

@@ -91,7 +91,7 @@ def test_a_mosaic_of_another_pattern_is_denoised_in_the_network_s_own() -> None:
     pair = demo_pairs("test", count=1)[0]
     trial = trial_of(pair, noise_model("cycleisp_sidd"))
     for own in CFA:
-        denoised = RawDenoiser.of(Red(width=4, scales=2), cfa=own)(trial.given)
+        denoised = RawDenoiser.of(Red(width=4, scales=2), cfa=own)(trial.input)
         # The two greens may exchange their names where the pattern moves by a line.
         ratio = denoised.sum((0, 2, 3)) / trial.noisy.sum((0, 2, 3))
         assert ratio[[0, 3]].tolist() == pytest.approx([2.0, 7.0], rel=1e-4)
