@@ -21,6 +21,7 @@ from rawaug.denoise.foreign import BiasFreeDnCNN
 from rawaug.experiment.demosaicing import JointRecipe
 from rawaug.experiment.recipe import ArmConfig, DataConfig
 from rawaug.registry import EXPERIMENTS
+from rawaug.training.config import DenoiserConfig
 
 LEVELS = (1.8e-3, 1.2e-5)
 
@@ -53,7 +54,8 @@ def test_a_function_is_imported_from_the_command_line_alone(tmp_path: Path, monk
     assert (named("blind_one:half")(Noisy(torch.ones(1, 4, 8, 8))) == 0.5).all()
     (tmp_path / "evil.py").write_text("raise SystemExit('imported')\n")
     given: dict[str, Any] = {"camera": "universal", "arms": {"joint": ArmConfig(1.0)}, "out": str(tmp_path)}
-    recipe = JointRecipe(data=DataConfig(pairs=None), untouched=["evil:f"], **given)
+    network = DenoiserConfig("JointDRUNet", {"width": 4, "scales": 2})
+    recipe = JointRecipe(data=DataConfig(pairs=None), denoiser=network, untouched=["evil:f"], **given)
     with pytest.raises(FileNotFoundError, match="evil:f: no such denoiser"):
         EXPERIMENTS["demosaic"](recipe)
     with pytest.raises(ValueError, match="evil:f: no such denoiser"):
