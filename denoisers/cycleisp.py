@@ -149,12 +149,7 @@ class CycleISPDenoiser(Denoiser):
     tiny: ClassVar[dict[str, Any]] = {"width": 8, "groups": 1, "blocks": 1, "reduction": 4}
 
     def __init__(
-        self,
-        width: int = 64,
-        groups: int = 4,
-        blocks: int = 8,
-        reduction: int = 16,
-        **shared: Unpack[Shared],
+        self, width: int = 64, groups: int = 4, blocks: int = 8, reduction: int = 16, **shared: Unpack[Shared]
     ) -> None:
         require_width(width, multiple=max(reduction, 1))
         if min(groups, blocks, reduction) < 1:

@@ -233,7 +233,7 @@ DENOISERS = Registry("denoiser", "rawaug.denoisers", "denoisers")
 """Networks: subclasses of :class:`denoisers.Denoiser`."""
 FILTERS = Registry("classical filter", "rawaug.filters", "denoisers")
 """Subclasses of :class:`denoisers.classical.Classical`."""
-NOISE = Registry("noise", "rawaug.noise", "rawaug.noise")
+NOISE = Registry("noise", "rawaug.noise", "rawaug.noise", "rawaug.camera")
 """Subclasses of :class:`rawaug.noise.NoiseModel`; presets and cameras have names in :mod:`rawaug.noise.cameras`."""
 SRGB_NOISE = Registry("noise on sRGB", "rawaug.srgb_noise", "rawaug.training")
 """Models of :class:`rawaug.training.srgb_noise.SrgbNoise`."""

@@ -29,7 +29,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "seeding": set(),
     "denoisers": {"bayer", "files", "registry"},
     "kernels": {"bayer", "registry"},
-    "noise": BASE | {"kernels", "io"},
+    "noise": BASE | {"kernels"},
     "isp": BASE | {"kernels"},
     "io": BASE,
     "data": BASE | {"io"},

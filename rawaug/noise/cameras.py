@@ -50,7 +50,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from rawaug.camera_names import find_camera
+from rawaug.camera_names import camera_key, find_camera
 from rawaug.noise.levels import (
     EldLevels,
     FixedLevels,
@@ -393,7 +393,7 @@ def noise_model(spec: NoiseSpec | NoiseModel, *, iso: Iso = None, poisson: bool 
         spec = {"name": spec.get("name"), "settings": {key: spec[key] for key in spec if key != "name"}}
     if isinstance(spec, (str, Mapping)):
         name, settings = split_spec(spec)
-        if name not in NOISE:
+        if _has_law(name) or name not in NOISE:
             noise_levels(name)  # an unknown name is reported before its settings
             options = check_settings(f"noise {name!r}", partial(_shot_read, name), settings)
             return _shot_read(name, **{"iso": iso, "poisson": poisson, **options})
@@ -405,6 +405,12 @@ def noise_model(spec: NoiseSpec | NoiseModel, *, iso: Iso = None, poisson: bool 
     if iso is not None or poisson:
         raise ValueError("iso and poisson apply to noise given by name, not to a noise model")
     return model
+
+
+def _has_law(name: str) -> bool:
+    """Whether a name is that of a preset or camera; then no room of noise models has to be loaded."""
+    known = {*load_presets()["presets"], *camera_names()}
+    return name in known or camera_key(name) in map(camera_key, (ANY_CAMERA, *load_profiles().names))
 
 
 def _shot_read(

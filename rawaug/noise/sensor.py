@@ -2,8 +2,8 @@ r"""Sensor noise beyond shot and read noise, each effect a model that composes w
 
 Row and column noise (banding), heavy-tailed read noise, errors of the black level, greens that disagree, dead and hot
 pixels and rounding to digital numbers, after Wei et al., "A physics-based noise formation model for extreme low-light
-raw denoising", 2020; or no model but a camera's own dark frames. All of it on black-subtracted RAW with white = 1. The
-heavy tails are those of the Tukey lambda,
+raw denoising", 2020. All of it is on black-subtracted RAW with white = 1. The heavy tails are those of the Tukey
+lambda,
 
 .. math:: Q(u) = (u^\lambda - (1 - u)^\lambda) / \lambda, \qquad \lambda > -1/2,
 
@@ -23,9 +23,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from rawaug.bayer import pack
 from rawaug.noise.cameras import noise_levels
-from rawaug.noise.estimate import estimate_dark_noise
 from rawaug.noise.levels import EldLevels, FixedLevels, Iso, NoiseLevels, log_uniform, normal, uniform
 from rawaug.noise.models import (
     NoiseModel,
@@ -44,7 +42,8 @@ Range = float | tuple[float, float]
 """One value for all pictures, or the limits between which each picture draws its own."""
 
 
-def _require_not_negative(**values: Range) -> None:
+def require_not_negative(**values: Range) -> None:
+    """Raise ValueError unless each number is at least 0, or each range is positive and ascending."""
     for name, value in values.items():
         low = value[0] if isinstance(value, tuple) else value
         if low < 0 or (isinstance(value, tuple) and not 0 < low <= value[1]):
@@ -109,7 +108,7 @@ class _Banding(NoiseModel):
     """Which of the two lines of a cell the planes R, Gr, Gb and B lie in."""
 
     def __init__(self, line_var: Range) -> None:
-        _require_not_negative(**{self.key: line_var})
+        require_not_negative(**{self.key: line_var})
         self.line_var = line_var
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
@@ -159,7 +158,7 @@ class BlackOffset(_FixedPattern):
     """Shape of the offsets of one picture."""
 
     def __init__(self, sd: float) -> None:
-        _require_not_negative(sd=sd)
+        require_not_negative(sd=sd)
         self.sd = sd
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
@@ -212,7 +211,7 @@ class DefectPixels(_FixedPattern):
     stream = "defects"
 
     def __init__(self, dead: Range = 0.0, hot: Range = 0.0, clusters: float = 0.0) -> None:
-        _require_not_negative(dead=dead, hot=hot)
+        require_not_negative(dead=dead, hot=hot)
         require_between("clusters", clusters, 0.0, 1.0)
         if sum(max(share) if isinstance(share, tuple) else share for share in (dead, hot)) > 1:
             raise ValueError(f"shares of dead and hot pixels must add up to at most 1, got {dead} and {hot}")
@@ -365,7 +364,7 @@ class SensorNoise(Compose):
         told: tuple[float, float] = (1.0, 1.0),
         share: float = 1.0,
     ) -> None:
-        _require_not_negative(told=told)
+        require_not_negative(told=told)
         require_between("share", share, 0.0, 1.0)
         self.told, self.share = told, share
         levels = noise_levels(levels) if isinstance(levels, (str, Sequence)) else levels
@@ -397,58 +396,6 @@ class SensorNoise(Compose):
         """Add up the variances ``(B, 4, h, w)``, wrong by the factor ``told`` as a file's tag may be."""
         variance = super().variance(clean, params)
         return variance.mul_(per_picture(params["told"], clean)) if "told" in params else variance
-
-
-@NOISE.register("DarkFrames")
-class DarkFrames(PoissonGaussianNoise):
-    """Photons, and read noise cut out of a camera's own dark frames: ``shot_var Poisson(y / shot_var) + dark``.
-
-    Every picture has a patch of a random frame at a random place of the same CFA phase, with all that the sensor does
-    in it: tails, banding, offsets, hot pixels, rounding. At its edges a frame goes on at the other side.
-
-    Args:
-        path: a RAW file taken with the lens capped, or a folder of them, of one camera; kept in memory.
-        shot_var: of the photons at the frames' ISO, white = 1, or limits that it is drawn between; by default that of
-            each file's NoiseProfile tag.
-
-    Example:
-        >>> model = DarkFrames("darks/iso1600", shot_var=2e-3)  # doctest: +SKIP
-    """
-
-    by_plane = True
-
-    def __init__(self, path: str, shot_var: Range | None = None) -> None:
-        from rawaug.files import files_in
-        from rawaug.io import read_raw
-        from rawaug.io.raw import RAW_EXTENSIONS
-
-        _require_not_negative(shot_var=0.0 if shot_var is None else shot_var)
-        frames = [read_raw(file) for file in files_in(path, "RAW", RAW_EXTENSIONS)]
-        untagged = [frame.name for frame in frames if shot_var is None and frame.noise_profile is None]
-        if untagged:
-            raise ValueError(f"DarkFrames: {untagged[0]} has no NoiseProfile tag; give shot_var, the photons' share")
-        self.planes = [pack(frame.mosaic[None], frame.cfa)[0] for frame in frames]
-        self.read_var = torch.tensor([estimate_dark_noise([frame.mosaic], frame.cfa).read_var for frame in frames])
-        self.shot_var = [frame.noise_profile[0] if shot_var is None else shot_var for frame in frames]  # type: ignore[index]
-
-    def sample(self, batch: int, generator: torch.Generator) -> Params:
-        """Draw a dark frame for each picture with its levels, and the seeds, each ``(batch,)``."""
-        frame = torch.randint(len(self.planes), (batch,), generator=generator, device=generator.device)
-        shot = torch.stack([draw_between(self.shot_var[k], 1, generator)[0] for k in frame.tolist()])
-        read = self.read_var.to(generator.device)[frame]
-        return {"shot_var": shot, "read_var": read, "dark_frame": frame, "seed": draw_seeds(batch, generator)}
-
-    def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
-        """Cut a patch for each picture out of its dark frame, ``(B, 4, h, w)``."""
-        noise = torch.empty_like(like, memory_format=torch.contiguous_format)
-        for picture, index, generator in zip(noise, params["dark_frame"].tolist(), generators, strict=True):
-            planes = self.planes[index].to(like)
-            rows, columns = (
-                (torch.arange(size) + int(torch.randint(side, (), generator=generator, device=like.device))) % side
-                for side, size in zip(planes.shape[-2:], like.shape[-2:], strict=True)
-            )
-            picture.copy_(planes[:, rows[:, None], columns])
-        return noise
 
 
 @NOISE.register("EldNoise")

@@ -28,8 +28,17 @@ from rawaug.files import digest
 from rawaug.isp import stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.descent import Descent, cycle_error, mean_psnr, reading_error
-from rawaug.isp.fit.encoders import FOLDS, Refit, gain_left_out, train_encoders, train_jointly
+from rawaug.isp.fit.descent import (
+    FOLDS,
+    Descent,
+    Refit,
+    cycle_error,
+    gain_left_out,
+    mean_psnr,
+    reading_error,
+    train_encoders,
+    train_jointly,
+)
 from rawaug.isp.fit.samples import FitFrames, FramePair, FrameSummary, PixelSamples, sample_pixels
 from rawaug.isp.fit.start import (
     REACH_ATOMS,

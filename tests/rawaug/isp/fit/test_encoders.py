@@ -10,9 +10,8 @@ import pytest
 import torch
 
 from rawaug.data.pairs import Pair
-from rawaug.isp.fit import FitConfig, encoders, fit_isp, pipeline
-from rawaug.isp.fit.descent import Descent, mean_psnr
-from rawaug.isp.fit.encoders import joint_steps, train_jointly
+from rawaug.isp.fit import FitConfig, descent, fit_isp, pipeline
+from rawaug.isp.fit.descent import Descent, joint_steps, mean_psnr, train_jointly
 from rawaug.isp.fit.samples import FitFrames, sample_pixels
 from rawaug.isp.model import DictionaryISP
 
@@ -24,7 +23,7 @@ SETTINGS = {"encoder_widths": (8, 8, 16)}
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     quick = {"FRAMES_A_STEP": 2, "ENCODER_PIXELS": 64, "ENCODER_RATE": 1.5e-2, "FOLDS": 2}
     for name, value in quick.items():
-        monkeypatch.setattr(encoders, name, value)
+        monkeypatch.setattr(descent, name, value)
 
 
 def config(wanted: str, encoder_steps: int = 30) -> FitConfig:
@@ -78,7 +77,7 @@ def test_frames_that_judge_were_left_out_of_curve_tone_and_atoms_too(
     exact_pair: Callable[..., Pair], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = config("auto", encoder_steps=1)
-    monkeypatch.setattr(encoders, "FEWEST_FRAMES", 4)
+    monkeypatch.setattr(descent, "FEWEST_FRAMES", 4)
     fitted: list[set[str]] = []
     judged: list[tuple[set[str], set[str]]] = []
 
@@ -94,7 +93,7 @@ def test_frames_that_judge_were_left_out_of_curve_tone_and_atoms_too(
         return 0.0
 
     monkeypatch.setattr(pipeline, "_Fit", Noted)
-    monkeypatch.setattr(encoders, "mean_psnr", mean_psnr)
+    monkeypatch.setattr(descent, "mean_psnr", mean_psnr)
     fit_isp(lit_frames(exact_pair, 4, informative=True), settings, progress=False)
     everything = {f"shot{k}" for k in range(4)}
     assert fitted[0] == everything and len(fitted) == 3 and len(judged) == 4
@@ -121,7 +120,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     monkeypatch.setattr(Descent, "report_steps", 5)
 
     def train(isp: DictionaryISP, frames: FitFrames, steps: int, learning_rate: float) -> None:
-        monkeypatch.setattr(encoders, "LEARNING_RATE", learning_rate)
+        monkeypatch.setattr(descent, "LEARNING_RATE", learning_rate)
         train_jointly(isp, frames, replace(CONFIG, joint_steps=steps), Descent(None, "", 0, False))
 
     return train
