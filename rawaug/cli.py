@@ -120,21 +120,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, MissingExtra, CycloptsError) as error:
         said = _one_line(error)
     except (RuntimeError, MemoryError) as error:
-        if (reason := resource_error(error)) is None:
+        if (said := resource_error(error)) is None:
             raise
-        said = reason + _being_read()
     except KeyboardInterrupt:
         print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
         return 130
     print(f"rawaug: {escape(said)}", file=sys.stderr)
     return BAD_INPUT
-
-
-def _being_read() -> str:
-    """The pictures that dead workers were reading, one of which may have crashed its decoder."""
-    folders = sys.modules.get("rawaug.data.folders")
-    files = folders.being_read() if folders is not None else []
-    return f"; it was reading {' or '.join(map(str, files))}" if files else ""
 
 
 def _one_line(error: Exception) -> str:

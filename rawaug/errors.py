@@ -54,7 +54,11 @@ _WAYS_OUT = (
         "shared memory is full; enlarge /dev/shm or use fewer workers",
     ),
     (r"out of memory|can't allocate memory", _MEMORY),
-    (r"dataloader worker.*(killed|exited)", "a worker process was killed, perhaps for its memory; use fewer workers"),
+    (
+        r"dataloader worker.*(killed|exited)",
+        "a worker process was killed, perhaps for its memory; use fewer workers, or find a damaged file with rawaug data "
+        "check",
+    ),
     (r"no space left on device|pytorchstreamwriter", "the disk is full; free some space"),
 )
 """Patterns of an error's text in lower case, the first of which counts, and the advice."""
@@ -65,7 +69,8 @@ def resource_error(error: BaseException) -> str | None:
 
     Example:
         >>> resource_error(RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. "))
-        'a worker process was killed, perhaps for its memory; use fewer workers, then run the same command again'
+        'a worker process was killed, perhaps for its memory; use fewer workers, or find a damaged file with rawaug data \
+check, then run the same command again'
     """
     if isinstance(error, MemoryError):
         return f"{_MEMORY}, then run the same command again"

@@ -6,12 +6,12 @@ Weights, parameters and states are safetensors (https://huggingface.co/docs/safe
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import math
 import os
 import re
+import stat
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
@@ -29,6 +29,9 @@ OF_NO_DATASET = (".DS_Store", "Thumbs.db")
 
 LOCK = "rawaug.lock"
 """Name of the lock file in an output folder."""
+
+MOST_BYTES = 2**32
+"""More than any picture, RAW file or array of a dataset has: larger files are refused before they are read."""
 
 WEIGHTS = Path(__file__).parent / "weights"
 """The folder of the shipped ISPs."""
@@ -73,8 +76,6 @@ def replacing(path: str | Path) -> Iterator[Path]:
                 partial.unlink(missing_ok=True)
                 lock.unlink(missing_ok=True)
     except OSError as error:
-        if "requested and" in str(error):  # NumPy's error on a full disk
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
         if error.errno is None or error.filename not in (None, str(partial), partial, str(lock)):
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
@@ -233,7 +234,24 @@ def digest(*parts: bytes) -> str:
 
 
 def sha256(path: str | Path) -> str:
-    return digest(Path(path).read_bytes())
+    """The SHA-256 of a file in hexadecimal, computed as it is read."""
+    require_file(path)
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def require_file(path: str | Path, what: str = "file") -> None:
+    """Refuse what is not a regular file, for a pipe or a device may never end, and more than :data:`MOST_BYTES`."""
+    try:
+        status = os.stat(path)
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path}: no such {what}") from None
+    except OSError as error:  # a link to itself, or a folder that may not be entered
+        raise OSError(f"{path}: cannot be opened ({error.strerror})") from None
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(f"{path}: is a pipe, a device or a folder, and must be a regular file")
+    if status.st_size > MOST_BYTES:
+        raise OSError(f"{path}: has {status.st_size} bytes, above the limit of {MOST_BYTES}")
 
 
 def fingerprint(*settings: Any) -> str:
@@ -276,10 +294,9 @@ def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iter
 def files_in(path: str | Path, what: str, extensions: tuple[str, ...] = ("",)) -> list[Path]:
     """:func:`files_below`, sorted, or ``path`` itself where it is a file; one of them at least."""
     path = Path(path)
-    if path.is_file():
-        return [path]
     if not path.is_dir():
-        raise FileNotFoundError(f"{path}: no such {what} file or folder")
+        require_file(path, f"{what} file or folder")
+        return [path]
     files = sorted(files_below(path, extensions))
     if not files:
         raise ValueError(f"{path}: contains no {what} file; supported extensions are {', '.join(extensions)}")

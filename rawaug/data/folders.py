@@ -16,12 +16,11 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
-from weakref import WeakSet
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import ConcatDataset, Dataset, get_worker_info
+from torch.utils.data import ConcatDataset, Dataset
 
 from rawaug.bayer import turn_back
 from rawaug.data.pairs import LazyPairs, Pair, SomePairs, centre
@@ -35,7 +34,6 @@ PICTURE_EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", "
 _JPEG_SUFFIXES = (".jpg", ".JPG", ".jpeg", ".JPEG")
 _JPEG_MARGIN = 0.03
 """Cameras cut a few lines off their JPEGs that LibRaw keeps, or the other way round."""
-_SLOTS = 64
 _NAMED = 20
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -45,8 +43,7 @@ class PictureFolder(Dataset[Tensor]):
     """The pictures of a folder and its subfolders, sorted by path: uint8 ``(3, H, W)`` of any size.
 
     A file that cannot be used is logged with the reason when it is met; :attr:`skipped` and :meth:`report` list those
-    met so far, by whichever worker. Where a decoder crashes a worker, :meth:`being_read` names the file, and ``rawaug
-    data check`` finds all such files.
+    met so far, by whichever worker. ``rawaug data check`` finds the files that crash a decoder, and a worker with it.
 
     Args:
         path: a folder; files with one of :data:`PICTURE_EXTENSIONS` are taken, links to folders are not followed.
@@ -68,10 +65,7 @@ class PictureFolder(Dataset[Tensor]):
         # an array, since the reference counts of a list would be copied into every forked worker, page by page
         self._names = np.array([os.fsencode(name) for name in found])
         self._bad = torch.zeros(len(self), dtype=torch.uint8).share_memory_()
-        # one slot a worker, which alone writes to it
-        self._reading = torch.full((_SLOTS,), -1, dtype=torch.int64).share_memory_()
         self._reasons: dict[int, str] = {}
-        _OPENED.add(self)
 
     def __len__(self) -> int:
         return len(self._names)
@@ -119,22 +113,13 @@ class PictureFolder(Dataset[Tensor]):
         head = f"{escape(self.path)}: {len(skipped)} of {len(self)} pictures skipped"
         return "\n".join([head, *map(escape, skipped.values())])
 
-    def being_read(self) -> list[Path]:
-        """The files that processes are reading now, or were reading when they died."""
-        return [self.file(index) for index in self._reading.tolist() if index >= 0]
-
     def _attempt(self, index: int) -> Tensor | None:
         """The picture, or None if it is damaged, which is then remembered."""
-        worker = get_worker_info()
-        slot = 0 if worker is None else (1 + worker.id) % _SLOTS
-        self._reading[slot] = index
         try:
             return self.read(index)
         except (OSError, ValueError) as error:
             self._reasons[index] = str(error)
             _log.warning("skipped: %s", escape(error))
-        finally:
-            self._reading[slot] = -1
         self._bad[index] = 1
         bad = self._bad.nonzero()[:, 0].tolist()
         if len(bad) > self.allowed_share * len(self):
@@ -142,14 +127,6 @@ class PictureFolder(Dataset[Tensor]):
             names = ", ".join([*(str(self.file(i)) for i in bad[:_NAMED]), *(["..."] if len(bad) > _NAMED else [])])
             raise ValueError(f"{self.path}: {count}: {names}; last: {self._reasons[index]}")
         return None
-
-
-_OPENED: WeakSet[PictureFolder] = WeakSet()
-
-
-def being_read() -> list[Path]:
-    """:meth:`PictureFolder.being_read` of all folders that this process has opened."""
-    return [file for folder in _OPENED for file in folder.being_read()]
 
 
 def reports(pictures: Any) -> list[str]:
@@ -304,8 +281,9 @@ class RawFolder(LazyPairs):
 def _names(files: Sequence[Path]) -> list[str]:
     names = [file.stem for file in files]
     if len(set(names)) < len(names):
-        above = os.path.commonpath([file.resolve().parent for file in files])
-        names = [file.resolve().relative_to(above).as_posix() for file in files]
+        paths = [Path(os.path.abspath(file)) for file in files]
+        above = os.path.commonpath([path.parent for path in paths])
+        names = [path.relative_to(above).as_posix() for path in paths]
     return names
 
 

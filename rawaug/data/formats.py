@@ -34,7 +34,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.mat import MAX_BYTES, read_array, read_value, variables
 from rawaug.errors import extra
-from rawaug.files import replacing
+from rawaug.files import replacing, require_file
 from rawaug.io import RawFrame, read_raw
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import MAX_PIXELS, read_plane
@@ -103,8 +103,15 @@ def _gains(value: Any) -> tuple[float, float, float]:
     return red / green, 1.0, blue / green
 
 
+def _cfa(value: Any) -> CFA:
+    names = np.ravel(value)
+    if len(names) != 1:
+        raise ValueError(f"{len(names)} names; use one of {', '.join(CFA)}")
+    return CFA(str(names[0]).strip().upper())
+
+
 KINDS: dict[str, Callable[[Any], Any]] = {
-    "cfa": lambda value: CFA(str(value if isinstance(value, str) else np.ravel(value)[0]).strip().upper()),
+    "cfa": _cfa,
     "black": levels,
     "white": _one,
     "white_balance": _gains,
@@ -175,6 +182,8 @@ def _read_tiff(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
         raise
     try:
         stated = json.loads(text) if text.startswith("{") else {}
+    except RecursionError:
+        raise ValueError(f"{file}: its description is nested too deeply; save it again") from None
     except ValueError:  # a description of another program
         stated = {}
     return numbers, stated
@@ -224,8 +233,7 @@ def read_mosaic(file: Path, which: str, given: Metadata, alone: bool = False, ma
         return frame
     if suffix not in READERS:
         raise ValueError(f"{file}: cannot hold a mosaic; use {', '.join(READERS)} or a RAW format")
-    if not file.is_file():
-        raise FileNotFoundError(f"{file}: no such file")
+    require_file(file)
     numbers, values = READERS[suffix](file, which, alone, max_pixels)
     stated = completed(parsed(values, file), given, file)
     if "cfa" not in stated:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from rawaug.errors import extra
+from rawaug.files import require_file
 from rawaug.io.isolated import damage_as_os_error, isolated
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -27,10 +28,8 @@ MAX_BYTES = 2**30
 
 def mat_version(path: str | Path) -> str:
     """``"5"`` or ``"7.3"``, by the header."""
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such MATLAB file")
-    with path.open("rb") as file:
+    require_file(path, "MATLAB file")
+    with Path(path).open("rb") as file:
         header = file.read(512 + len(_HDF5))
     if header.startswith(_HDF5) or header[512:] == _HDF5:
         return "7.3"

@@ -7,6 +7,7 @@ Other names go by a pattern: the parts of ``noisy`` under ``*`` and ``?`` stand 
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -125,11 +126,11 @@ class PairFolder(LazyPairs):
 
 def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:
     """Raise ValueError if a folder of RAW files holds noisy frames, by their names."""
-    files = {file.resolve() for file in folder.files}
+    files = set(map(os.path.realpath, folder.files))
     for file in folder.files:
         found = re.fullmatch(r"(.*)_noisy", file.stem, re.IGNORECASE)
         partner = found and file.with_name(f"{found[1]}_clean{file.suffix}")
-        if partner and partner.resolve() in files:
+        if partner and os.path.realpath(partner) in files:
             raise ValueError(f"{file}: is the noisy frame of {partner.name}; read both as pairs:{spec}")
         if found and as_clean:
             advice = f"noisy/clean pairs are read as pairs:{spec}; rename it if it is clean"

@@ -15,6 +15,7 @@ noise.
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -256,7 +257,7 @@ class LazyPairs(Lazy[Pair]):
 
     def stamp(self, index: int) -> str:
         """What a pair depends on: path, size and modification time of its files, or its name."""
-        files = [f"{f.resolve()} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in self.files_of(index)]
+        files = [f"{os.path.realpath(f)} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in self.files_of(index)]
         return " ".join(files) or self.names[index]
 
 
@@ -297,7 +298,7 @@ def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
 def _identities(pairs: LazyPairs) -> set[str]:
     found: set[str] = set()
     for index, name in enumerate(pairs.names):
-        found |= {str(file.resolve()) for file in pairs.files_of(index)} or {name}
+        found |= {os.path.realpath(file) for file in pairs.files_of(index)} or {name}
     return found
 
 

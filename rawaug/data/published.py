@@ -30,7 +30,7 @@ from rawaug.data.development import develop_mosaic, developed_pair
 from rawaug.data.folders import RawFolder
 from rawaug.data.formats import read_npz
 from rawaug.data.pairs import LazyPairs, Pair, require_split
-from rawaug.files import files_below, files_in
+from rawaug.files import files_below, files_in, require_file
 from rawaug.io import read_picture, read_raw
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import read_plane
@@ -142,6 +142,7 @@ def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
 
 def _array(file: Path) -> np.ndarray:
     """The array of an ``.npy`` file, mapped: one that claims more than the file holds takes no memory."""
+    require_file(file)
     with file.open("rb") as opened:
         if opened.read(6) != b"\x93NUMPY":  # NumPy would open an archive of arrays, or a pickle
             raise ValueError("does not begin as an array")

@@ -30,7 +30,7 @@ from rawaug.bayer import CFA, turn_back
 from rawaug.data.development import UNKNOWN_COLOUR, developed_pair, gains_from_neutral, srgb_from_camera
 from rawaug.data.mat import normalised, read_array, read_value
 from rawaug.data.pairs import FrameLabel, LazyPairs, Pair, captured_noise, measured_levels
-from rawaug.files import files_below
+from rawaug.files import files_below, require_file
 from rawaug.io import read_picture
 from rawaug.io.pictures import view_of_orientation
 from rawaug.registry import DATASETS
@@ -125,6 +125,7 @@ def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
     file = min(files_below(path, ("noise_level_functions.csv",)), default=None)
     if file is None:
         return {}
+    require_file(file)
     with file.open(encoding="utf-8-sig", newline="") as stream:
         rows = list(csv.DictReader(stream, skipinitialspace=True))
     levels = {}
@@ -383,6 +384,7 @@ def _pictures(path: Path, pattern: str, kinds: tuple[str, str], clean: Tensor) -
 
 
 def _patterns(file: Path) -> list[CFA]:
+    require_file(file)
     try:
         with file.open(encoding="utf-8-sig", newline="") as stream:
             names = [row[0].strip().upper() for row in csv.reader(stream) if row]

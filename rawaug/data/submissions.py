@@ -111,6 +111,7 @@ def _from_mat(path: Path, side: int) -> np.ndarray:
 
 def _from_csv(path: Path, side: int) -> np.ndarray:
     csv.field_size_limit(sys.maxsize)
+    require_file(path)
     with path.open(encoding="ascii", newline="") as file:
         rows = list(csv.reader(file))
     if rows[:1] != [["ID", "BLOCK"]] or [row[0] for row in rows[1:]] != [str(k) for k in range(COUNT)]:

@@ -26,7 +26,7 @@ from denoisers.files import DEFAULT
 from rawaug import bayer
 from rawaug.denoise.denoiser import Levels, RawDenoiser
 from rawaug.denoise.levels import Noise, Shots, UnknownNoise, as_json, find_levels, load_noise
-from rawaug.files import files_in, one_at_a_time, require_same_settings, require_writable
+from rawaug.files import files_below, files_in, one_at_a_time, require_same_settings, require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
 from rawaug.io.dng import LINEAR_WHITE
 from rawaug.io.isolated import isolated
@@ -243,7 +243,7 @@ def denoise_folder(
     settings = {**made.settings, "noise": as_json(noise)}
     settings |= {} if made.strength == 1.0 else {"strength": made.strength}
     require_same_settings(out / "denoise.json", settings, overwrite)
-    unread = [file.name for file in sorted(source.rglob("*")) if file.suffix.lower() in UNREADABLE]
+    unread = [file.name for file in sorted(files_below(source, UNREADABLE))]
     result = DenoisedFolder(unread=unread)
     read, unknown = partial(isolated, read_raw), []
     for file, target in progress(targets.items(), label="denoise", unit="file", leave=True):

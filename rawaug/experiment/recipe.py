@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import OWN_PICTURES, Pair
-from rawaug.files import yaml_value
+from rawaug.files import require_file, yaml_value
 from rawaug.isp.fit import FitConfig
 from rawaug.kernels.runtime import find_device
 from rawaug.plugin.draw import Draw
@@ -23,7 +23,7 @@ SHORT_CROP = 256
 HELD_OUT = "auto"
 """The value of ``data.validation`` for a part of ``data.pairs``."""
 _PAIRS = "pairs:"
-MOST_BYTES = 2**16
+MOST_BYTES, MOST_LEVELS = 2**16, 50
 _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("count", "validation_count", "test_count"), (1, MOST)),
     **dict.fromkeys(("validation_crop", "test_crop"), (32, MOST)),
@@ -278,12 +278,18 @@ def read_recipe(file: str | Path) -> dict[str, Any]:
     """The keys and values of a YAML file; ValueError if it is no recipe, or has aliases or too many bytes."""
     import yaml
 
+    require_file(file, "recipe")
     if (size := Path(file).stat().st_size) > MOST_BYTES:
         raise ValueError(f"{file}: has {size} bytes, a recipe at most {MOST_BYTES}")
     try:
         text = Path(file).read_text(encoding="utf-8")
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
-            raise ValueError("uses aliases (*name); write the values out")  # a few lines of them are billions of values
+        depth = 0
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent):  # a few lines of them are billions of values
+                raise ValueError("uses aliases (*name); write the values out")
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MOST_LEVELS:
+                raise ValueError(f"is nested more than {MOST_LEVELS} levels deep")
         content = yaml_value(text) or {}
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"{file}: not a recipe ({' '.join(str(error).split())})") from None

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from rawaug.bayer import turn
 from rawaug.errors import extra
+from rawaug.files import require_file
 
 MAX_PIXELS = 2**26
 """Larger pictures (8192 x 8192) are refused by default, since a few header bytes can claim any size."""
@@ -160,8 +161,7 @@ def decode_file(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tupl
 
 def _opened(path: Path) -> Any:
     oiio = _oiio()
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such picture file")
+    require_file(path, "picture file")
     require_utf8(path)
     source = oiio.ImageInput.open(str(path))
     if source is None:

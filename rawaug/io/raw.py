@@ -30,6 +30,7 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, pattern_name, plane_indices
 from rawaug.errors import extra
+from rawaug.files import require_file
 from rawaug.io.gain_map import GainMap, gains_at_sites
 from rawaug.io.pictures import require_utf8
 from rawaug.io.tiff import MAKE, MODEL, TiffTags, read_tiff_tags
@@ -212,8 +213,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
     with extra("raw"):
         import rawpy
 
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such RAW file")
+    require_file(path, "RAW file")
     require_utf8(path)
     # rawpy warns of forks, which rendering on one thread makes safe
     warnings.filterwarnings("ignore", "rawpy is being used in a process created by", RuntimeWarning)
