@@ -1,8 +1,9 @@
 """Known advisories of the pinned dependencies, asked of OSV (https://osv.dev) in one request.
 
-    python .ci/advisories.py [constraints.txt]
+    python .ci/advisories.py [--must] [constraints.txt]
 
-Exit status 1 if a pinned version has one; where the database cannot be reached, one line says so, with status 0.
+Exit status 1 if a pinned version has one. Where the database cannot be reached, one line says so, with status 0; with
+``--must``, as in the job of a release, with status 1.
 """
 
 from __future__ import annotations
@@ -35,12 +36,13 @@ def advisories(packages: list[tuple[str, str]], url: str = URL) -> dict[str, lis
 
 
 def main(arguments: list[str], url: str = URL) -> int:
-    packages = pinned(Path(arguments[0] if arguments else "constraints.txt").read_text(encoding="utf-8"))
+    must, files = "--must" in arguments, [word for word in arguments if word != "--must"]
+    packages = pinned(Path(files[0] if files else "constraints.txt").read_text(encoding="utf-8"))
     try:
         found = advisories(packages, url)
     except (OSError, ValueError, KeyError) as error:
         print(f"advisories: not checked, {url} cannot be reached ({type(error).__name__})")
-        return 0
+        return int(must)
     for package, ids in found.items():
         print(f"{package}: {', '.join(ids)}")
     print(f"advisories: {len(packages)} pinned packages, {len(found)} with a known advisory")

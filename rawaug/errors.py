@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 
 def escape(text: object) -> str:
@@ -32,18 +33,18 @@ def extra(name: str) -> Iterator[None]:
         MissingExtra: with the command that installs what is missing.
 
     Example:
-        >>> with extra("raw"):
+        >>> with extra("raw"):  # doctest: +ELLIPSIS
         ...     import rawpy_of_the_future
         Traceback (most recent call last):
         ...
-        rawaug.errors.MissingExtra: rawpy_of_the_future is not installed; run: pip install 'rawaug[raw]'
+        rawaug.errors.MissingExtra: rawpy_of_the_future is not installed; run: pip install ...
     """
     try:
         yield
     except ModuleNotFoundError as error:
-        raise MissingExtra(
-            f"{str(error.name).split('.')[0]} is not installed; run: pip install 'rawaug[{name}]'"
-        ) from None
+        checkout = Path(__file__).parents[1]
+        package = f"{checkout}[{name}]" if (checkout / "setup.cfg").is_file() else f"rawaug[{name}]"
+        raise MissingExtra(f"{str(error.name).split('.')[0]} is not installed; run: pip install '{package}'") from None
 
 
 _MEMORY = "out of memory; use a smaller batch, crop or tile"
@@ -56,8 +57,8 @@ _WAYS_OUT = (
     (r"out of memory|can't allocate memory", _MEMORY),
     (
         r"dataloader worker.*(killed|exited)",
-        "a worker process was killed, perhaps for its memory; use fewer workers, or find a damaged file with rawaug data "
-        "check",
+        "a worker process was killed, perhaps for its memory; use fewer workers, or find a damaged file with rawaug "
+        "data check",
     ),
     (r"no space left on device|pytorchstreamwriter", "the disk is full; free some space"),
 )
@@ -69,8 +70,8 @@ def resource_error(error: BaseException) -> str | None:
 
     Example:
         >>> resource_error(RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. "))
-        'a worker process was killed, perhaps for its memory; use fewer workers, or find a damaged file with rawaug data \
-check, then run the same command again'
+        'a worker process was killed, perhaps for its memory; use fewer workers, or find a damaged file with \
+rawaug data check, then run the same command again'
     """
     if isinstance(error, MemoryError):
         return f"{_MEMORY}, then run the same command again"

@@ -152,8 +152,10 @@ def parse_object(text: str) -> dict[str, Any]:
     return value
 
 
-def require_writable(path: str | Path, folder: bool = False) -> None:
-    """Refuse, before any work, a file (or ``folder``) that could not be written at the end."""
+def require_writable(path: str | Path, option: str = "", folder: bool = False) -> None:
+    """Refuse, before any work, a file (or ``folder``) that could not be written at the end, or has no name."""
+    if not str(path):
+        raise ValueError(f"--{option}: needs the name of a file")
     path = Path(path)
     if path.is_dir() and not folder:
         raise OSError(f"{path}: cannot be written: is a folder; give the name of a file")
@@ -243,7 +245,7 @@ def sha256(path: str | Path) -> str:
 def require_file(path: str | Path, what: str = "file") -> None:
     """Refuse what is not a regular file, for a pipe or a device may never end, and more than :data:`MOST_BYTES`."""
     try:
-        status = os.stat(path)
+        status = Path(path).stat()
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such {what}") from None
     except OSError as error:  # a link to itself, or a folder that may not be entered

@@ -21,7 +21,7 @@ from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.data import PictureFolder
 from rawaug.errors import resource_error
-from rawaug.files import LOCK, locked, replacing, write_json, write_tensors
+from rawaug.files import LOCK, locked, write_json, write_tensors
 from rawaug.io import RawFrame, read_picture, write_dng, write_picture
 from rawaug.synthesis import files as pair_files
 from rawaug.synthesis.folder import synth

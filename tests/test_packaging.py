@@ -110,12 +110,18 @@ def test_an_advisory_fails_the_check(check: Any, tmp_path: Path, capsys: pytest.
     assert capsys.readouterr().out.startswith("contourpy 1.3.3: GHSA-1\n")
 
 
-def test_without_a_network_it_says_so_in_one_line(check: Any, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("must", [False, True])
+def test_without_a_network_it_says_so_and_a_release_stops(
+    check: Any, must: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
     with socket.socket() as nobody:  # bound, and not listened on
         nobody.bind(("127.0.0.1", 0))
-        assert check.main([str(ROOT / "constraints.txt")], f"http://127.0.0.1:{nobody.getsockname()[1]}") == 0
+        url = f"http://127.0.0.1:{nobody.getsockname()[1]}"
+        assert check.main([str(ROOT / "constraints.txt"), *["--must"] * must], url) == must
     out = capsys.readouterr().out
     assert "not checked" in out and out.count("\n") == 1
+    release = (ROOT / ".github/workflows/release.yml").read_text()
+    assert release.index("advisories.py --must") < release.index("make dist")
 
 
 def test_a_package_index_gets_absolute_links_and_urls() -> None:

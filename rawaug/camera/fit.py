@@ -78,6 +78,8 @@ def fit(
     """
     if noise not in ("auto", "on", "off"):
         raise ValueError(f"noise must be auto, on or off, got {noise!r}")
+    if noise == "off" and dark is not None:
+        raise ValueError(f"dark {dark}: is for measuring the noise, and noise is off; leave one of them out")
     start = time.perf_counter()
     mosaics = {key: value for key, value in (("cfa", cfa), ("black", black), ("white", white)) if value is not None}
     pairs = _pairs(source, camera_jpeg, mosaics)
@@ -155,12 +157,10 @@ def _pairs(
     opened = [open_pairs(str(item), split="train", as_clean=False, **mosaics) for item in source]
     if len(opened) == 1 and not isinstance(opened[0], RawFolder):
         return opened[0]
-    files: list[Path] = []
     for item, pairs in zip(source, opened, strict=True):
         if not isinstance(pairs, RawFolder):
             raise ValueError(f"{item}: a kind:path dataset cannot be combined with other files; give it alone")
-        files += pairs.files
-    return RawFolder(files, camera_jpeg=camera_jpeg)
+    return RawFolder(map(str, source), camera_jpeg=camera_jpeg)
 
 
 # -- the camera's noise ------------------------------------------------------------------------------------------------

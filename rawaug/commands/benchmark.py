@@ -57,8 +57,9 @@ def run(
         json: write the result as JSON to this file.
         report: write an HTML page with tables and crops to this file.
     """
-    for path in filter(None, (json, report)):
-        require_writable(path)
+    for option, path in (("json", json), ("report", report)):
+        if path is not None:
+            require_writable(path, option)
     if is_picture_pairs(data):
         found_on = picture_scores([PictureDenoiser.of(spec, device) for spec in denoisers], open_picture_pairs(data))
         print_pictures(data, found_on)

@@ -57,7 +57,9 @@ def run(
         if unfit := [name for name, value in given.items() if value] + ["noise"] * (noise != "auto"):
             options = ", ".join(f"--{name.replace('_', '-')}" for name in unfit)
             raise ValueError(f"{source}: is a developed picture; {options} is for RAW")
-        denoise_all(source, out, PictureDenoiser.of(denoiser or PICTURES, device, strength), overwrite)
+        denoise_all(
+            source, out, PictureDenoiser.of(PICTURES if denoiser is None else denoiser, device, strength), overwrite
+        )
         return
     made = chosen(denoiser, classical, self_ensemble, device, linear, strength)
     if not Path(source).is_dir():

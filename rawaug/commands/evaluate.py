@@ -69,8 +69,9 @@ def run(
     Returns:
         What ``--json`` writes.
     """
-    for path in filter(None, (json, report)):
-        require_writable(path)
+    for option, path in (("json", json), ("report", report)):
+        if path is not None:
+            require_writable(path, option)
     require_classical(classical or ())
     if is_picture_pairs(data):
         if self_ensemble or views or noise is not None or bin != 1 or report:

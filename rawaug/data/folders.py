@@ -281,7 +281,7 @@ class RawFolder(LazyPairs):
 def _names(files: Sequence[Path]) -> list[str]:
     names = [file.stem for file in files]
     if len(set(names)) < len(names):
-        paths = [Path(os.path.abspath(file)) for file in files]
+        paths = [file.absolute() for file in files]
         above = os.path.commonpath([path.parent for path in paths])
         names = [path.relative_to(above).as_posix() for path in paths]
     return names

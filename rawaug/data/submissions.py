@@ -32,6 +32,7 @@ from rawaug.data.development import gains_from_neutral, srgb_from_camera
 from rawaug.data.mat import normalised, read_array, read_value
 from rawaug.data.pairs import Lazy, Pair
 from rawaug.data.sidd import BLOCKS, HELD_BACK, Once, blocks_of_scenes, find_file, noise_level_functions, phone_of
+from rawaug.files import require_file
 from rawaug.io import RawFrame
 from rawaug.registry import DATASETS
 

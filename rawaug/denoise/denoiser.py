@@ -291,7 +291,7 @@ def _found(spec: Any, name: str | None) -> RawDenoiser:
 
 
 def _hashed(path: Path) -> dict[str, Any]:
-    return {"denoiser_sha256": sha256(path)}
+    return {"denoiser": path.stem, "denoiser_sha256": sha256(path)}
 
 
 def _of_weights(path: Path) -> RawDenoiser:

@@ -60,7 +60,7 @@ def find_levels(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, s
             raise UnknownNoise(f"{frame.name}: no other file is of {frame.camera} at its ISO")
         return *noise[shot], f"other files of {frame.camera} at ISO {frame.iso:g}"
     if not isinstance(noise, str):
-        fixed = FixedLevels(*noise)
+        fixed = FixedLevels.of(noise)
         return fixed.shot_var, fixed.read_var, "given"
     if noise == "auto":
         return _automatic(frame)

@@ -331,7 +331,7 @@ def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None
         return _by_iso()[spec](iso)
     if isinstance(spec, str) and spec not in load_presets()["presets"]:
         return _of_profile(spec, iso)
-    if not isinstance(spec, str) and spec and all(isinstance(name, str) for name in spec):
+    if isinstance(spec, Sequence) and not isinstance(spec, str) and spec and all(isinstance(v, str) for v in spec):
         return MixedLevels([noise_levels(str(name), iso=iso) for name in spec])
     if iso is not None:
         raise ValueError(
@@ -339,12 +339,10 @@ def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None
         )
     if isinstance(spec, str):
         return Preset(spec)
-    if not isinstance(spec, Sequence) or len(spec) != 2:
-        raise ValueError(f"fixed noise must be a pair (shot_var, read_var), got {spec}")
-    shot_var, read_var = (float(value) for value in spec)
-    if 0 < shot_var < read_var:
-        warn_of_swapped_levels(shot_var, read_var)
-    return FixedLevels(shot_var, read_var)
+    fixed = FixedLevels.of(spec)
+    if 0 < fixed.shot_var < fixed.read_var:
+        warn_of_swapped_levels(fixed.shot_var, fixed.read_var)
+    return fixed
 
 
 @cache

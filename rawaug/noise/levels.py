@@ -22,6 +22,7 @@ import math
 from collections.abc import Sequence
 from functools import cache
 from importlib import resources
+from numbers import Real
 from typing import Any, Protocol
 
 import torch
@@ -74,6 +75,13 @@ class FixedLevels:
                 f"noise variances must be finite and not negative, got shot_var={shot_var}, read_var={read_var}"
             )
         self.shot_var, self.read_var = float(shot_var), float(read_var)
+
+    @classmethod
+    def of(cls, pair: Any) -> FixedLevels:
+        """The levels that ``(shot_var, read_var)`` gives; ValueError if it is not a pair of such numbers."""
+        if not isinstance(pair, Sequence) or len(pair) != 2 or not all(isinstance(v, Real) for v in pair):
+            raise ValueError(f"noise must be a name or a pair (shot_var, read_var) of variances, got {pair!r:.100}")
+        return cls(*pair)
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Repeat both levels for each picture, ``(batch,)``."""

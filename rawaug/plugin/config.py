@@ -42,6 +42,10 @@ class AugmentConfig:
     burst: int | Burst | None = None
     cfa: str | None = None
 
+    def __post_init__(self) -> None:
+        if self.noise is None:
+            raise ValueError("noise must be a name or a pair (shot_var, read_var) of variances, got None")
+
     def make(self) -> RawAugment:
         """The augmentation of these settings; it raises what :meth:`rawaug.RawAugment.from_pretrained` raises."""
         return RawAugment.from_pretrained(**vars(self))

@@ -7,9 +7,10 @@ the gains of the forward direction by :math:`2^e`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from numbers import Real
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -56,10 +57,15 @@ class Draw:
             raise ValueError(f"sampling {self.sampling!r} is unknown; use one of {', '.join(get_args(Sampling))}")
         if not self.strength >= 0:
             raise ValueError(f"strength must be at least 0, got {self.strength}")
-        if isinstance(self.exposure, Sequence) and not (
-            len(self.exposure) == 2 and self.exposure[0] <= self.exposure[1]
-        ):
-            raise ValueError(f"exposure must be (lowest, highest) in stops, got {self.exposure}")
+        if self.exposure is not None:
+            require_range("exposure", self.exposure)
+
+
+def require_range(key: str, given: Any) -> None:
+    """Refuse what is neither a finite number nor (lowest, highest)."""
+    ends = given if isinstance(given, (list, tuple)) else (given, given)
+    if len(ends) != 2 or not all(isinstance(end, Real) and math.isfinite(end) for end in ends) or ends[0] > ends[1]:
+        raise ValueError(f"{key} must be (lowest, highest) in stops or one number, got {given!r:.100}")
 
 
 class SettingSampler:

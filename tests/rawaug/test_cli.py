@@ -183,6 +183,8 @@ def test_evaluate_finds_what_is_wrong_before_it_reads(
     assert "bm3d is not installed; licensed for non" in refused(*evaluate, "--classical", "[BM3D]")
     for option in ("--json", "--report"):
         assert "cannot be written: is a folder" in refused(*evaluate, option, tmp_path)
+        for command in (evaluate, ["benchmark", "rawaug-small", "--data", unread]):
+            assert f"{option}: needs the name of a file" in refused(*command, option, "")
 
 
 @pytest.mark.usefixtures("tiny")
@@ -191,6 +193,8 @@ def test_bad_input_is_one_line(tmp_path: Path, refused: Callable[..., str], baye
     (tmp_path / "bad.safetensors").write_bytes(b"not weights")
     whole = bayer_dng(tmp_path / "cut.dng", np.full((64, 64), 500, np.uint16))
     whole.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    picture = tmp_path / "a.png"
+    write_picture(picture, demo_pictures(1)[0])
     for words, said in (
         (("fit", tmp_path / "nowhere", "--out", "x.safetensors"), "nowhere"),
         (("fit", tmp_path / "empty", "--out", "x.safetensors"), "no RAW file"),
@@ -200,6 +204,10 @@ def test_bad_input_is_one_line(tmp_path: Path, refused: Callable[..., str], baye
         (("run", "fewshot", *QUICK_RUN, "--out", tmp_path, "--data.pictures", tmp_path / "empty"), "no picture"),
         (("evaluate", tmp_path / "bad.safetensors", "--data", "demo:test"), "bad.safetensors"),
         (("info", tmp_path / "gone.safetensors"), "gone.safetensors"),
+        (("fit", "demo:train", "--out", "x.safetensors", "--noise", "off", "--dark", "gone"), "dark gone: is for"),
+        *((("denoise", file, f"out{file.suffix}", "--denoiser", ""), "no such denoiser") for file in (whole, picture)),
+        *((("synth", picture, "out", "--noise", noise), "noise") for noise in ("null", "true", "[[1,2],[3,4]]")),
+        (("denoise", "a.dng", "b.dng", "--noise", "[nan,1]"), "variances must be finite"),
     ):
         assert said in refused(*words)
 

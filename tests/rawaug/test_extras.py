@@ -49,7 +49,7 @@ def test_a_missing_library_is_one_line(
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, library, None)
     said = refused("preview", tmp_path / "a.png", "--out", tmp_path / "figure.png")
-    assert said == f"rawaug: {library} is not installed; run: pip install 'rawaug[{name}]'"
+    assert said == f"rawaug: {library} is not installed; run: pip install '{ROOT}[{name}]'"
 
 
 def test_other_errors_of_an_import_pass() -> None:

@@ -10,7 +10,10 @@ from threading import Thread
 import pytest
 import torch
 
+from rawaug.data.mat import mat_version
+from rawaug.experiment.recipe import read_recipe
 from rawaug.files import (
+    MOST_BYTES,
     WEIGHTS,
     digest,
     find_weights,
@@ -19,11 +22,13 @@ from rawaug.files import (
     read_header,
     read_tensors,
     replacing,
+    require_file,
     require_writable,
     sha256,
     write_json,
     write_tensors,
 )
+from rawaug.io import read_picture, read_raw
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -137,3 +142,21 @@ def test_what_cannot_be_read_is_named_with_what_to_do(tmp_path: Path) -> None:
     write_tensors({"a": torch.tensor([1.0, torch.nan])}, {"format": "rawaug", "kind": "x"}, bad)
     with pytest.raises(ValueError, match="tensor a has values that are not finite; copy it again"):
         read_tensors(bad, "copy it again")
+
+
+@pytest.mark.parametrize("kind", ["fifo", "endless", "itself", "folder", "large"])
+def test_only_regular_files_of_bounded_size_are_read(kind: str, tmp_path: Path) -> None:
+    """A pipe is not waited for, and a device not read without end."""
+    path = tmp_path / "a.png"
+    if kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "large":
+        path.touch()
+        os.truncate(path, MOST_BYTES + 1)
+    else:
+        path.symlink_to("/dev/zero" if kind == "endless" else path)
+    for read in (require_file, sha256, read_picture, read_raw, mat_version, read_recipe):
+        with pytest.raises(OSError, match=r"a\.png: (is a pipe|cannot be opened|has \d+ bytes)"):
+            read(path)

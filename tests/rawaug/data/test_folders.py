@@ -19,7 +19,8 @@ from torch.utils.data import DataLoader
 
 from rawaug.bayer import CFA, turn
 from rawaug.data import PictureFolder, RawFolder, open_pairs, open_pictures
-from rawaug.data.folders import Cached
+from rawaug.data.folders import Cached, Readable
+from rawaug.data.pair_folder import require_no_pairs
 from rawaug.io import develop, read_raw, write_picture
 
 
@@ -229,6 +230,14 @@ def test_a_folder_a_file_and_a_list(shots: Path) -> None:
     assert pairs[-1].name == "c" and pairs[0] is pairs[-2] and len(open_pairs(str(shots))) == 2
     with pytest.raises(IndexError):
         pairs[2]
+
+
+def test_a_link_to_itself_is_one_unreadable_frame_of_a_folder(shots: Path) -> None:
+    (shots / "sub" / "b.dng").symlink_to(shots / "sub" / "b.dng")
+    pairs = Readable(RawFolder(shots))
+    assert [pair.name for pair in pairs] == ["b.dng", "sub/c.DNG"]
+    assert pairs.reasons() == [f"{shots}/sub/b.dng: cannot be opened (Too many levels of symbolic links)"]
+    require_no_pairs(RawFolder(shots), str(shots), as_clean=True)
 
 
 def test_a_pair_is_the_mosaic_and_libraws_rendering(shots: Path) -> None:

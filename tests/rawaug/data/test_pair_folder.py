@@ -213,3 +213,21 @@ def test_data_check_finds_pairs_and_takes_their_settings(tmp_path: Path, capsys:
     (part,) = check(tmp_path).parts  # found by the names; what they lack is listed
     assert part.what == "noisy/clean pairs" and "does not state its CFA" in part.broken[0]
     assert main(["data", "check", str(tmp_path), "--cfa", "GRBG"]) == 2
+
+
+def test_damage_by_others_is_a_line_and_the_rest_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "0")
+    for name in ("noisy", "clean"):
+        tifffile.imwrite(tmp_path / f"deep_{name}.tif", CLEAN.astype(np.float32), description='{"a":' * 50_000)
+    np.savez(tmp_path / "empty.npz", noisy=CLEAN, clean=CLEAN, cfa=np.zeros(0, "U4"))
+    (tmp_path / "loop_noisy.tif").symlink_to(tmp_path / "loop_noisy.tif")
+    (tmp_path / "loop_clean.tif").symlink_to(tmp_path / "loop_clean.tif")
+    np.savez(tmp_path / "whole.npz", noisy=CLEAN, clean=CLEAN, cfa="GRBG", black=BLACK, white=WHITE)
+    (part,) = check(tmp_path).parts
+    assert part.counts["cfas"] == {"GRBG": 1}
+    for said in (
+        "deep_noisy.tif: its description is nested too deeply",
+        "empty.npz: cfa is not valid",
+        "loop_noisy.tif",
+    ):
+        assert sum(said in line for line in part.broken) == 1

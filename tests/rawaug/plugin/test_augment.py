@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,12 @@ def test_wrong_settings_are_refused(isp: DictionaryISP) -> None:
         Draw(sampling="random")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"\(lowest, highest\) in stops"):
         Draw(exposure=(1.0, -1.0))
+    for exposure in (math.nan, (0.0, math.inf), "1", (1, 2, 3)):
+        with pytest.raises(ValueError, match="exposure must be"):
+            Draw(exposure=exposure)  # type: ignore[arg-type]
+    for noise in (5, 0.01, math.nan, True, [[1, 2], [3, 4]], [math.nan, 1]):
+        with pytest.raises(ValueError, match=r"must be a name or a pair|variances must be finite"):
+            RawAugment.from_pretrained("universal", noise=noise)
 
 
 def test_raw_is_developed_by_the_setting_that_made_it(isp: DictionaryISP) -> None:
