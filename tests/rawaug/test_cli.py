@@ -193,6 +193,7 @@ def test_bad_input_is_one_line(tmp_path: Path, refused: Callable[..., str], baye
     (tmp_path / "bad.safetensors").write_bytes(b"not weights")
     whole = bayer_dng(tmp_path / "cut.dng", np.full((64, 64), 500, np.uint16))
     whole.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    sound = bayer_dng(tmp_path / "sound.dng", np.full((64, 64), 500, np.uint16))
     picture = tmp_path / "a.png"
     write_picture(picture, demo_pictures(1)[0])
     for words, said in (
@@ -207,7 +208,7 @@ def test_bad_input_is_one_line(tmp_path: Path, refused: Callable[..., str], baye
         (("fit", "demo:train", "--out", "x.safetensors", "--noise", "off", "--dark", "gone"), "dark gone: is for"),
         *((("denoise", file, f"out{file.suffix}", "--denoiser", ""), "no such denoiser") for file in (whole, picture)),
         *((("synth", picture, "out", "--noise", noise), "noise") for noise in ("null", "true", "[[1,2],[3,4]]")),
-        (("denoise", "a.dng", "b.dng", "--noise", "[nan,1]"), "variances must be finite"),
+        (("denoise", sound, "b.dng", "--noise", "[nan,1]"), "variances must be finite"),
     ):
         assert said in refused(*words)
 
