@@ -90,10 +90,10 @@ class RawDenoiser:
     """
 
     name: str
-    model: Callable[[Levels | None], Model]
+    model: Callable[[Levels | None], Model] = field(repr=False)
     cfa: CFA | None = None
     of_any: MosaicDRUNet | None = None
-    info: Mapping[str, Any] = field(default_factory=dict)
+    info: Mapping[str, Any] = field(default_factory=dict, repr=False)
     reads_levels: bool = True
     upscale: int = 1
     tiles: tuple[int, int | None] | None = (1536, None)
@@ -103,7 +103,7 @@ class RawDenoiser:
     mixed: bool = False
     around: Callable[[Model], Model] | None = None
     checked: bool = True
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict, repr=False)
 
     takes: ClassVar[str] = "raw"
 

@@ -40,6 +40,15 @@ class DictionaryISP(StagedISP):
         torch.Size([2, 1, 64, 96])
     """
 
+    def __repr__(self) -> str:
+        """Tell the pattern, the stages and the sizes of the dictionaries in a line."""
+        config = self.config
+        known = f" of {config.cameras} published cameras" if config.cameras else ""
+        atoms = (
+            f"{config.colour_atoms} colour atoms{known}, {config.gain_atoms} gain and {config.tone_atoms} tone atoms"
+        )
+        return f"DictionaryISP, {self.cfa}, stages {' '.join(self.stages)}: {atoms}"
+
     # -- settings ---------------------------------------------------------------------------------------------------
 
     def params_from_weights(

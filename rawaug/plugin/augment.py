@@ -273,10 +273,9 @@ class RawAugment(nn.Module):
     def __repr__(self) -> str:
         """Tell in three lines what is drawn: the camera, the noise and the target."""
         frames = "" if self.burst is None else f", bursts of {self.burst.frames} frames"
+        target = self.target if self.srgb in (None, Srgb()) else self.srgb
         return (
-            f"RawAugment, camera: {self.settings!r}\n"
-            f"  noise: {self.noise_name}\n"
-            f"  target: {self.target}, {self.cfa}{frames}"
+            f"RawAugment, camera: {self.settings!r}\n  noise: {self.noise_name}\n  target: {target}, {self.cfa}{frames}"
         )
 
     def _clean(self, srgb: Tensor, params: AugmentParams) -> Tensor:

@@ -87,7 +87,7 @@ class _Pairs(Dataset[Any]):
     def __repr__(self) -> str:
         """The pictures, the crop and the seed in a line, then what the augmentation draws."""
         count = f"{len(self.dataset)} pictures" if isinstance(self.dataset, Sized) else type(self.dataset).__name__
-        crop = "whole" if self.crop is None else f"crops of {self.crop[0]} x {self.crop[1]}"
+        crop = "uncropped" if self.crop is None else f"crops of {self.crop[0]} x {self.crop[1]}"
         return f"{type(self).__name__} of {count}, {crop}, seed {self.seed}\n{self.augment!r}"
 
     def _generator(self, epoch: int, *names: int | str) -> torch.Generator:

@@ -117,8 +117,14 @@ class SettingSampler:
 
     def __repr__(self) -> str:
         """The camera, the sampling, the light and the exposure in a line."""
-        names = self.isp.info.get("cameras", [])
-        camera = names[0] if len(names) == 1 else f"one of {len(names)} published" if names else "the fitted one"
+        known = self.isp.config.cameras
+        camera = (
+            self.isp.info["cameras"][0]
+            if known == 1
+            else f"mixtures of {known} published"
+            if known
+            else "the fitted one"
+        )
         light = "" if self.draw.light is None else f", light {self.draw.light}"
         return f"{camera}, {self.draw.sampling}{light}, exposure {self.exposure[0]:g} to {self.exposure[1]:g} stops"
 

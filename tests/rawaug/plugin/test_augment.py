@@ -133,7 +133,7 @@ def test_printed_it_says_what_is_drawn(isp: DictionaryISP) -> None:
         "universal", noise=("upi", "rawir"), draw=Draw(light=5500.0), target="srgb"
     )
     assert re.fullmatch(
-        r"RawAugment, camera: one of \d+ published, convex, light 5500.0, exposure -0.5 to 1 stops\n"
+        r"RawAugment, camera: mixtures of 630 published, convex, light 5500.0, exposure -0.5 to 1 stops\n"
         r"  noise: \('upi', 'rawir'\)\n  target: srgb, RGGB",
         repr(any_of_them),
     )

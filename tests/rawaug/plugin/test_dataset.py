@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import os
 import subprocess
@@ -260,6 +261,23 @@ def test_an_iterable_needs_a_stream_which_forwards_the_epoch_to_it(augment: RawA
         len(stream)
     with pytest.raises(ValueError, match="identity='name'"):
         next(iter(RawPairStream(Shards(pictures), augment, crop=16, key="jpg", identity="name")))
+
+
+def test_a_dataset_and_a_stream_show_the_same_parameters_and_what_they_draw(
+    augment: RawAugment, pictures: list[Tensor]
+) -> None:
+    of_dataset, of_stream, of_loader = (
+        list(inspect.signature(made).parameters) for made in (RawPairs, RawPairStream, wrap)
+    )
+    assert of_dataset[:4] == ["dataset", "augment", "crop", "seed"]
+    assert of_stream[: len(of_dataset)] == of_dataset
+    assert of_loader[1:] == [name for name in of_dataset[1:] if name in of_loader] + ["device"]
+    pairs, stream = (
+        RawPairs(pictures, augment, crop=(16, 12)),
+        RawPairStream(iter(pictures), augment, crop=None, seed=3),
+    )
+    assert repr(pairs).splitlines()[0] == f"RawPairs of {COUNT} pictures, crops of 16 x 12, seed 0"
+    assert repr(stream) == f"RawPairStream of list_iterator, uncropped, seed 3\n{augment!r}"
 
 
 FORKED_AFTER_LIBRAW = """
