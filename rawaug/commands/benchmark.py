@@ -15,7 +15,7 @@ from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
 from rawaug.denoise.denoiser import RawDenoiser, shipped_of_mosaics
 from rawaug.denoise.pictures import PictureDenoiser
 from rawaug.evaluation.benchmark import TOLD, benchmark, costs_of, crops, display_strength, strengths_of, tables, trials
-from rawaug.evaluation.page import Figure, Page, Part, plot_costs
+from rawaug.evaluation.page import Figure, Page, plot_costs
 from rawaug.evaluation.picture_trials import picture_scores, print_pictures
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Measured, own_noise_note
@@ -87,13 +87,15 @@ def run(
     if json:
         write_json(result, json)
     if report:
-        page = Page(f"Denoisers on {data}", [Part(texts=notes)])
-        page.parts += [Part(title, head=["", *head], rows=cells) for title, head, cells in tables(result)]
+        page = Page(f"Denoisers on {data}")
+        page.add(texts=notes)
+        for title, head, cells in tables(result):
+            page.add(title, head=["", *head], rows=cells)
         chart = Figure(
             plot_costs(costs_of(result)), "PSNR over GMAC", "curve", f"{display_strength(strengths)}, levels told"
         )
-        page.parts.append(Part("Quality and cost", figures=[chart]))
-        page.parts.append(Part("Pictures", texts=[f"Noise: {display_strength(strengths)}, levels told; PSNR of RAW."]))
+        page.add("Quality and cost", figures=[chart])
+        page.add("Pictures", texts=[f"Noise: {display_strength(strengths)}, levels told; PSNR of RAW."])
         for panels in crops(everyone, found, ON_PAGE):
             page.add_frame(panels)
         settings = {"denoisers": denoisers, "data": data, "bin": bin, "count": count, "crop": crop, "seed": seed}

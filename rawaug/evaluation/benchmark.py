@@ -23,11 +23,10 @@ from rawaug.data.pairs import Pair, centre
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.evaluation.scores import METRICS, NOISY, Panels, group_rows, panels_of, score, summary
 from rawaug.evaluation.tables import join_figures
-from rawaug.evaluation.trials import Trial, raw_trial
+from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise, raw_trial
 from rawaug.files import digest
 from rawaug.noise import FixedLevels, NoiseLevels, SensorNoise, ShotReadNoise, estimate_noise, noise_levels
 from rawaug.progress import progress
-from rawaug.seeding import keyed_generator
 
 STRENGTHS = {
     "base ISO": (2.3e-4, 2e-6),
@@ -109,10 +108,10 @@ def noisy_frame(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real
         real: whether what sensors add, :data:`SENSOR`, is added.
     """
     noise = SensorNoise(levels, **SENSOR) if real else ShotReadNoise(levels)
-    key = ("benchmark", strength) if strength in STRENGTHS else ("test noise",)
-    params = noise.sample(1, keyed_generator(seed, *key, frame.name))
-    noisy = noise.apply(bayer.pack(frame.raw[None], frame.cfa), params)
-    return Noisy.of(noisy, (params["shot_var"].item(), params["read_var"].item()), frame.cfa)
+    key = ("benchmark", strength) if strength in STRENGTHS else (TEST_NOISE,)
+    noisy, _, told = freeze_noise(bayer.pack(frame.raw[None], frame.cfa), noise, seed, *key, frame.name)
+    assert told is not None
+    return Noisy.of(noisy, told, frame.cfa)
 
 
 def _middle(given: Noisy, frame: Pair, crop: int, condition: str, strength: str) -> Trial:

@@ -12,8 +12,7 @@ import io
 import json
 import shlex
 import sys
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -68,36 +67,27 @@ class Figure(NamedTuple):
     caption: str = ""
 
 
-@dataclass
-class Part:
-    """What stands under a heading; what is empty is left out.
+class Page:
+    """A page, to which parts are added from top to bottom; frames are encoded as they come and not kept.
 
-    Attributes:
-        heading: of a chapter.
-        name: a heading below it.
-        texts: paragraphs.
-        terms: terms and their explanations.
-        head: of a table, the names of its columns.
-        rows: of the table, cells by name.
-        best: row and column of the cells in bold.
-        figures: beside each other.
+    Args:
+        title: of the page.
     """
 
-    heading: str = ""
-    name: str = ""
-    texts: Sequence[str] = ()
-    terms: Mapping[str, str] = field(default_factory=dict)
-    head: Sequence[str] = ()
-    rows: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    best: Collection[tuple[str, int]] = ()
-    figures: Sequence[Figure] = ()
+    def __init__(self, title: str) -> None:
+        self.title, self.lead = title, ""
+        self.parts: list[dict[str, Any]] = []
 
+    def add(self, heading: str = "", **content: Any) -> None:
+        """Add a part.
 
-class Page:
-    """The parts of a page, to which more are added; frames are encoded as they come and not kept."""
-
-    def __init__(self, title: str, parts: Sequence[Part] = (), lead: str = "") -> None:
-        self.title, self.parts, self.lead = title, list(parts), lead
+        Args:
+            heading: of a chapter; without one the part belongs to the chapter before.
+            content: what stands below it, as far as there is any: ``name``, a smaller heading; ``texts``, paragraphs;
+                ``terms``, explanations by term; ``head`` and ``rows`` of a table, the names of columns and the cells by
+                name, with the set ``best`` of (row, column) in bold; ``figures``, :class:`Figure` beside each other.
+        """
+        self.parts.append({"heading": heading, "best": (), **content})
 
     @classmethod
     def of_scores(
@@ -122,26 +112,27 @@ class Page:
         if noise := about.pop("Noise", None):
             named = noise if isinstance(noise, str) else json.dumps(noise)
             about["Noise"] = f"as captured with the frames, else {named}; {levels_range(first)}".rstrip("; ")
-        page = cls(title, [Part(terms={name: text for name, text in about.items() if text})])
-        page.parts += [Part("Methods", terms=arms)] if arms else []
+        page = cls(title)
         _, page.lead = verdict(results, others)
+        page.add(terms={name: text for name, text in about.items() if text})
+        if arms:
+            page.add("Methods", terms=arms)
         note = levels_note(first)
         for heading, columns in (("Scores", PLAIN), ("Self-ensemble", ENSEMBLE), ("Worst and best frames", QUARTERS)):
             table = table_of(results, others, columns)
             texts = [note] if note and columns is PLAIN else []
             if table.rows:
-                head = ["", *table.columns]
-                page.parts.append(Part(heading, texts=texts, head=head, rows=table.rows, best=table.best))
-        page.parts.append(_every_image(first_runs(results, others)))
+                page.add(heading, texts=texts, head=["", *table.columns], rows=table.rows, best=table.best)
+        page.add("Every image", **_every_image(first_runs(results, others)))
         return page
 
     def add_curves(self, pngs: Mapping[str, bytes], heading: str = "Training") -> None:
         """Add pictures of curves, by title, under a heading."""
-        self.parts.append(Part(heading, figures=[Figure(png, title, "curve") for title, png in pngs.items()]))
+        self.add(heading, figures=[Figure(png, title, "curve") for title, png in pngs.items()])
 
     def add_frame(self, row: Panels) -> None:
         """Add a frame: its most detailed window in every image, and the whole of the clean one."""
-        first = not any(part.heading == "Pictures" for part in self.parts)
+        first = not any(part["heading"] == "Pictures" for part in self.parts)
         clean = row.trial.clean
         side = WINDOW if clean.shape[1] == PACKED else 2 * WINDOW
         top, left = find_detail(clean, side)
@@ -155,7 +146,7 @@ class Page:
             whole = F.interpolate(whole[None], scale_factor=scale, mode="area")[0]
         caption = f"whole frame, clean; window at row {pixels * top}, column {pixels * left}"
         figures.append(Figure(encode_png(whole), "whole frame", caption=caption))
-        self.parts.append(Part("Pictures" if first else "", row.trial.frame, figures=figures))
+        self.add("Pictures" if first else "", name=row.trial.frame, figures=figures)
 
     def write(self, path: Path, settings: Mapping[str, Any]) -> Path:
         """Write the page, which ends with the settings of the run; the path."""
@@ -269,11 +260,11 @@ def _png(figure: Any) -> bytes:
     return file.getvalue()
 
 
-def _every_image(summaries: Mapping[str, Mapping[str, Any]]) -> Part:
+def _every_image(summaries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """PSNR / SSIM of every image by every method, on the mosaic."""
     rows: dict[str, list[str]] = {}
     for summary in summaries.values():
         for image in summary["images"]:
             cells = rows.setdefault(image["name"], [join_figures(image, "psnr_noisy", "ssim_noisy")])
             cells.append(join_figures(image, "psnr", "ssim"))
-    return Part("Every image", head=["image: PSNR (dB) / SSIM", "noisy input", *summaries], rows=rows)
+    return {"head": ["image: PSNR (dB) / SSIM", "noisy input", *summaries], "rows": rows}

@@ -32,6 +32,8 @@ Domain = Literal["raw", "rgb", "srgb"]
 """What a result is compared in: packed RAW ``(1, 4, h, w)``, linear camera RGB or developed sRGB ``(1, 3, H, W)``."""
 KEPT = 1024
 """Megabytes of trials that stay in memory; others are made again for each pass."""
+TEST_NOISE = "test noise"
+"""Keys the noise of test frames."""
 Case = TypeVar("Case")
 
 
@@ -105,24 +107,24 @@ def trial_of(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: 
         )
         noisy, variance, levels, _ = captured
     else:
-        noisy, variance, levels = freeze_noise(clean, noise, pair.name, seed)
+        noisy, variance, levels = freeze_noise(clean, noise, seed, TEST_NOISE, pair.name)
     assert variance is not None
     return raw_trial(pair, noisy, clean, variance, levels, cfa, levels_from_clean=pair.levels_from_clean, **about)
 
 
-def freeze_noise(clean: Tensor, noise: NoiseModel, name: str, seed: int = 0) -> tuple[Tensor, Tensor, Levels | None]:
-    """Noise on a clean frame, the same for the same seed and name.
+def freeze_noise(clean: Tensor, noise: NoiseModel, seed: int, *key: str) -> tuple[Tensor, Tensor, Levels | None]:
+    """Noise on a clean frame, the same for the same seed and key.
 
     Args:
         clean: packed RAW ``(1, 4, h, w)``.
         noise: what is drawn.
-        name: of the frame.
         seed: of the test.
+        key: what the noise is for, and the name of the frame.
 
     Returns:
         Noisy RAW and the variance of its noise, both ``(1, 4, h, w)``, and (shot_var, read_var) if the noise has any.
     """
-    params = noise.sample(1, keyed_generator(seed, "test noise", name))
+    params = noise.sample(1, keyed_generator(seed, *key))
     noisy = noise.apply(clean, params)
     levels = (params["shot_var"].item(), params["read_var"].item()) if "shot_var" in params else None
     return noisy, noise.variance(noisy, params), levels

@@ -38,7 +38,7 @@ from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.errors import extra
 from rawaug.evaluation.scores import NOISY, group_rows, require_numbers, score, summary
 from rawaug.evaluation.tables import print_table
-from rawaug.evaluation.trials import Trial, freeze_noise, make_trials
+from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise, make_trials
 from rawaug.experiment.denoising import Results, TrainingRun
 from rawaug.experiment.recipe import Recipe
 from rawaug.files import fingerprint, write_json
@@ -81,7 +81,7 @@ def rgb_trial(
     """
     rgb = full_colour(pair)
     squares = bayer.pack(bayer.pattern(cfa).mosaic(rgb), CFA.RGGB)
-    noisy, variance, levels = freeze_noise(squares, noise, pair.name)
+    noisy, variance, levels = freeze_noise(squares, noise, 0, TEST_NOISE, pair.name)
     if cfa != CFA.RGGB:
         mosaics = (bayer.unpack(image, CFA.RGGB) for image in (noisy, variance))
         noisy, variance = (bayer.pack(x, cfa) if cfa in CFA.__members__ else x for x in mosaics)

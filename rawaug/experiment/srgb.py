@@ -27,7 +27,7 @@ from rawaug.bayer import noise_variance
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import Levels, Noisy, RawDenoiser
 from rawaug.denoise.pictures import PictureDenoiser
-from rawaug.evaluation.page import Figure, Page, Part, find_detail
+from rawaug.evaluation.page import Figure, Page, find_detail
 from rawaug.evaluation.scores import NoisyInput, Panels, Row, panels_of, score
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial
@@ -162,9 +162,9 @@ class SrgbRun(TrainingRun):
         title = f"{self.recipe.name} on {self.data.test}, steps: {self.recipe.train.steps}, seeds: {len(self.seeds)}"
         page = Page(title)
         page.add_curves(self.curves())
-        page.parts.append(Part("Scores", head=head, rows=table))
+        page.add("Scores", head=head, rows=table)
         caption = f"crops at 100 %, a level in each row: {', '.join(firsts[0].images)}"
-        page.parts.append(Part("Pictures", figures=[Figure(encode_png(picture), "crops", caption=caption)]))
+        page.add("Pictures", figures=[Figure(encode_png(picture), "crops", caption=caption)])
         page.write(self.folder / "report.html", asdict(self.recipe))
         print_rows(title, head, [[name, *row] for name, row in table.items()])
         print(f"table: {self.folder / 'results.json'}\npicture: {self.folder / 'picture.png'}")

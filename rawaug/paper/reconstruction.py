@@ -189,12 +189,12 @@ class Comparison:
 def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[str, Any]]:
     """Run a comparison and return its rows as in ``table.json``; ``overwrite`` replaces another run of its name."""
     require_free(comparison, overwrite)
-    table = Table(comparison)
+    run = ComparisonRun(comparison)
     claim(comparison, overwrite)
-    return table.fill()
+    return run.all_rows()
 
 
-class Table:
+class ComparisonRun:
     """A comparison whose data are open and checked."""
 
     def __init__(self, settings: Comparison) -> None:
@@ -211,7 +211,7 @@ class Table:
         pictures = open_pictures(settings.pictures, min_side=side)
         self.pictures = [trim_to_even(pictures[k]) for k in range(len(pictures))]
 
-    def fill(self) -> dict[str, dict[str, Any]]:
+    def all_rows(self) -> dict[str, dict[str, Any]]:
         """All rows by name, which are printed, and written with every single figure."""
         settings, rows = self.settings, dict[str, dict[str, Any]]()
         for family in settings.methods:

@@ -158,13 +158,14 @@ def train(
         if looks or saves:
             state.losses = fabric.all_reduce(state.losses, reduce_op="mean")
         if looks:
-            scores = validate(estimator.correct_network(state.average_network), validation, fabric.device)
+            net = estimator.correct_network(state.average_network)
+            scores = validate(net, validation, fabric.device)
             state.keep_average(scores["psnr"], choose)
             row = {"loss": state.mean_loss(), **scores, "learning_rate": learning_rate}
             row["samples_per_second"] = (step - start) * stream.batch / (time.perf_counter() - began)
             if journal is not None:
                 journal.log(step, **row)
-                journal.show(step, config.steps, estimator.correct_network(state.average_network), validation)
+                journal.show(step, config.steps, net, validation)
             bar.set_postfix_str(_status(row, state.best["step"]), refresh=False)
         if saves and journal is not None:
             state.save(folder / "last.pt", key)
