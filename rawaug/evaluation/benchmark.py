@@ -34,7 +34,7 @@ STRENGTHS = {
     "strong": (7e-3, 1.8e-4),
     "very strong": (2.8e-2, 2.5e-3),
 }
-"""(shot_var, read_var): of Google's Pixel at ISO 100, 800 and 3200 by its tags, and two stops more."""
+"""(shot_var, read_var) of Google's Pixel at ISO 100, 800 and 3200 by its tags, and of noise two stops stronger."""
 SENSOR: dict[str, Any] = {
     "row_var": 2e-6,
     "black_offset_sd": 5e-4,
@@ -197,7 +197,7 @@ def display_strength(strengths: Collection[str]) -> str:
 
 
 def crops(denoisers: Sequence[RawDenoiser], found: Iterable[Trial], most: int) -> Iterator[Panels]:
-    """Pictures for the page, by every denoiser: of the first ``most`` frames with noise of :func:`display_strength`."""
+    """Pictures for the page: the first ``most`` frames with noise of :func:`display_strength`, by every denoiser."""
     told = [trial for trial in found if trial.condition == TOLD]
     shown = display_strength(dict.fromkeys(trial.strength for trial in told))
     return (panels_of(denoisers, trial) for trial in [t for t in told if t.strength == shown][:most])

@@ -21,7 +21,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from denoisers.network import PACKED
-from rawaug.errors import extra
 from rawaug.evaluation.scores import Panels
 from rawaug.evaluation.tables import (
     ENSEMBLE,
@@ -31,6 +30,7 @@ from rawaug.evaluation.tables import (
     first_runs,
     join_figures,
     levels_note,
+    new_figure,
     table_of,
     verdict,
 )
@@ -47,8 +47,9 @@ ON_PAGE = 12
 """Largest number of frames on the page."""
 
 CURVES = {"loss": "loss", "psnr": "validation PSNR, RAW (dB)", "psnr_srgb": "validation PSNR, sRGB (dB)"}
-"""Columns of a log that are drawn, with what they are."""
+"""Columns of a log that are plotted, with the titles of their plots."""
 LINES = {"": "-", "_low": ":", "_middle": "--", "_high": "-."}
+"""Styles of lines by the third of the validation frames."""
 
 
 class Figure(NamedTuple):
@@ -215,10 +216,7 @@ def read_log(path: Path) -> Log:
 
 
 def _plot_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colours: Mapping[str, str]) -> bytes:
-    with extra("train"):
-        from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.2, 3.6), layout="constrained")
+    figure = new_figure(5.2, 3.6)
     axis = figure.subplots()
     for ((arm, k), rows), (part, line) in product(logs.items(), LINES.items()):
         points = [(int(row["step"]), float(row[key + part])) for row in rows if row.get(key + part)]
@@ -238,10 +236,7 @@ def plot_costs(rows: Mapping[str, tuple[float | None, float, float]]) -> bytes:
 
     ``rows`` has GMAC and the two PSNR by the name of a denoiser.
     """
-    with extra("train"):
-        from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.4, 3.6), layout="constrained")
+    figure = new_figure(8.4, 3.6)
     for k, (axis, title) in enumerate(zip(figure.subplots(1, 2), ("RAW", "developed sRGB"), strict=True)):
         for colour, (name, (gmac, *psnr)) in enumerate(rows.items()):
             style: dict[str, Any] = {"color": f"C{colour % 10}", "label": name}

@@ -25,7 +25,7 @@ ACROSS = 4
 WIDTH = 140
 """Columns of a printed table where stdout is no terminal."""
 MATTERS = 0.05
-"""dB; a smaller gain is no reason to prefer an arm."""
+"""The gain in dB below which an arm is not preferred to a denoiser that needs no training."""
 
 FIGURES = {
     "psnr": "PSNR (dB)",
@@ -34,12 +34,12 @@ FIGURES = {
     "ssim_srgb": "SSIM, sRGB",
     "own_noise": "own noise",
 }
-"""Of an image, on the mosaic and developed; the last one is the references' share of the squared error."""
+"""Headings by figure: of the mosaic, of its development, and the references' own share of the squared error."""
 
 Runs = Mapping[str, Sequence[Mapping[str, Any]]]
-"""By arm, one entry a seed: summaries by kind."""
+"""For each arm a list with one entry a seed: summaries by kind, ``plain`` and ``self_ensemble``."""
 Columns = Mapping[str, tuple[str, str]]
-"""Of a table: which summary and which figure of it."""
+"""For each heading of a table the kind of summary, and the figure in it, that the column shows."""
 PLAIN: Columns = {name: ("plain", key) for key, name in FIGURES.items()}
 ENSEMBLE: Columns = {name: ("self_ensemble", key) for key, name in FIGURES.items()}
 QUARTERS: Columns = {
@@ -53,14 +53,19 @@ PRINTED: Columns = {
 }
 
 
-def save_picture(rows: Sequence[Panels], path: Path) -> Path:
-    """Write the panels of each row as a picture, at most :data:`ACROSS` side by side; the path."""
+def new_figure(width: float, height: float) -> Any:
+    """An empty figure of matplotlib's, its sides in inches; no display is needed."""
     with extra("train"):
         from matplotlib.figure import Figure
 
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save_picture(rows: Sequence[Panels], path: Path) -> Path:
+    """Write the panels of each row as a picture, at most :data:`ACROSS` side by side; the path."""
     columns = min(ACROSS, max(len(row.images) for row in rows))
     lines = [-(-len(row.images) // columns) for row in rows]
-    figure = Figure(figsize=(2.1 * columns, 2.5 * sum(lines)), layout="constrained")
+    figure = new_figure(2.1 * columns, 2.5 * sum(lines))
     axes = figure.subplots(sum(lines), columns, squeeze=False)
     for axis in axes.flat:
         axis.set_axis_off()

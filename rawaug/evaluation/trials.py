@@ -33,7 +33,7 @@ Domain = Literal["raw", "rgb", "srgb"]
 KEPT = 1024
 """Megabytes of trials that stay in memory; others are made again for each pass."""
 TEST_NOISE = "test noise"
-"""Keys the noise of test frames."""
+"""The part of the key of test frames' noise that is the same for all of them."""
 Case = TypeVar("Case")
 
 

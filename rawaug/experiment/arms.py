@@ -26,7 +26,7 @@ from rawaug.training.stream import WATCHED, PictureCrops, RealCrops, Source, Tra
 
 
 def methods_of(recipe: Recipe) -> dict[str, str]:
-    """By row of the table what it is, in a line."""
+    """What each row of the table is, in a line, by its name."""
     filters = {spec_label(spec): "a filter, nothing is trained" for spec in recipe.classical}
     unchanged = {Path(name).stem: "trained weights as they are" for name in recipe.untouched}
     return {**filters, **unchanged, **{label: _explain(recipe, label) for label in recipe.arms}}
@@ -118,7 +118,7 @@ def validation_samples(
 
 
 def rank_candidates(candidates: Mapping[str, str], folders: Sequence[Path], best: bool) -> dict[str, dict[str, float]]:
-    """By arm with a search its candidates, with their mean validation PSNR over the runs, the highest first.
+    """For each arm with a search its candidates by their mean validation PSNR over the runs, the highest first.
 
     ``candidates`` maps a candidate to its arm. ``best`` says whether the best validation counts, or else the last. No
     test frame has a say.

@@ -149,7 +149,7 @@ def libraw_demosaic(mosaic: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB
 
 
 def _repeat_cells(side: int, period: int) -> Tensor:
-    """Lines of a side; where LibRaw would find it too small, its whole cells again."""
+    """Numbers of the lines of a side, which go on with its whole cells if LibRaw would find it too small."""
     lines = torch.arange(side if period == 2 else max(side, LEAST))
     return torch.where(lines < side, lines, lines % (side // period * period))
 
@@ -243,7 +243,7 @@ class JointRun(FullColourRun):
         return make_trials(self.test, lambda pair: rgb_trial(pair, self.test_noise, ways))
 
     def scores_key(self, digest: str) -> str:
-        """As of the kind ``training``, and the noise of the test."""
+        """The key of the kind ``training`` together with the noise of the test."""
         return fingerprint(super().scores_key(digest), self.recipe.test_noise)
 
 
@@ -279,7 +279,7 @@ def run_mosaics(recipe: MosaicRecipe, overwrite: bool = False, **given: Sequence
 
 
 def mosaic_trial(pair: Pair, cfa: str, noise: NoiseModel) -> Trial:
-    """A frame as a test case of a pattern, in the domain ``rgb``: RAW is packed of Bayer's patterns, else a mosaic."""
+    """A frame as a test case of a pattern, in the domain ``rgb``: packed RAW of Bayer's patterns, a mosaic of others."""
     method = "bilinear" if cfa.startswith("QUAD") else "AHD"
     return rgb_trial(pair, noise, {"demosaiced": method}, cfa, condition=cfa)
 
@@ -315,7 +315,7 @@ class MosaicRun(FullColourRun):
         return make_trials(cases, lambda case: mosaic_trial(self.test[case[1]], case[0], self.test_noise))
 
     def weights_key(self, arm: str, seed: int) -> str:
-        """As of the kind ``training``, and the patterns."""
+        """The key of the kind ``training`` together with the patterns."""
         return fingerprint(super().weights_key(arm, seed), self.recipe.patterns, self.recipe.test_patterns)
 
     def evaluate(self, arm: str, seed: int) -> dict[str, Any]:

@@ -99,7 +99,7 @@ class TrainingRun:
     input: Any = NOISY
     """What stands for the noisy input in tables."""
     compared_in: ClassVar[str] = ""
-    """What the images are that are compared, for the table's title, if they are not RAW."""
+    """Ends the table's title with what is compared, if it is not RAW."""
     isp: DictionaryISP
     noise: NoiseModel
     frames: Mapping[str, Sequence[Any]]
@@ -156,7 +156,7 @@ class TrainingRun:
         return self.results
 
     def _add_noise(self) -> None:
-        """The noise of the seed's ISP, and the frames with it."""
+        """Set the noise of this seed, and the frames and trials that have it."""
         self.noise = noise_for(self.isp, self.recipe.noise)
         self.trials, self._noisy = self.test_trials(), list[Row]()
         parts = {"pairs": self.pairs, "validation": self.validation}

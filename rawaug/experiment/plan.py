@@ -70,7 +70,7 @@ class Plan:
     held_out: bool
 
     def lines(self, recipe: Recipe) -> list[str]:
-        """By part of the run the number and the names of its frames, a line each, for the user to check."""
+        """The number and the names of the frames of each part of the run, a line each, for the user to check."""
         data, (pairs, validation, test) = recipe.data, self.available
         part = f"{data.pairs}, held out" if self.held_out else data.validation
         fitted = f"fitted to {len(self.pairs)} frame{'s' * (len(self.pairs) != 1)}"
@@ -188,7 +188,7 @@ def _opened(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, cle
 
 
 def listing(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
-    """``"2 of 8 of demo:train: a, b"``.
+    """What is used of a dataset, such as ``"2 of 8 of demo:train: a, b"``.
 
     Args:
         frames: what is used.

@@ -29,8 +29,7 @@ from rawaug.data import DemoCamera, PictureFolder, open_pairs, open_pictures
 from rawaug.data.demo import FRAME
 from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair
-from rawaug.errors import extra
-from rawaug.evaluation.tables import mean_and_spread, print_rows
+from rawaug.evaluation.tables import mean_and_spread, new_figure, print_rows
 from rawaug.experiment.plan import claim, require_free
 from rawaug.files import fingerprint, write_json
 from rawaug.isp import staged
@@ -49,12 +48,12 @@ from rawaug.registry import EXPERIMENTS, check_settings
 from rawaug.seeding import keyed_generator
 
 YUV = ((0.299, 0.587, 0.114), (-0.14713, -0.28886, 0.436), (0.615, -0.51499, -0.10001))
-"""RGB to YUV, ITU-R BT.601."""
+"""The matrix from RGB to YUV of ITU-R BT.601."""
 TITLES = ("x", "x1 tone", "x2 gamma", "x3 colour", "x4 gains", "x5 shading")
 SPACES = ("RGB", "Y", "UV")
 LEFT_OUT = ("tone", "colour", "gains", "shading")
 STRIDE = 4
-"""Every so many pixels of a registered frame are compared."""
+"""Of a registered frame every fourth pixel in both directions is compared."""
 
 
 @dataclass
@@ -84,7 +83,9 @@ class Ablation:
 
 @EXPERIMENTS.register("ablation")
 def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
-    """Run it: a table, ``ablation.json`` and ``ablation.png``; ``overwrite`` replaces another run of its name.
+    """Measure what each stage contributes; print a table, and write ``ablation.json`` and ``ablation.png``.
+
+    ``overwrite`` replaces another run of its name.
 
     Returns:
         ``settings``; ``stages``, PSNR in dB of :data:`TITLES` by :data:`SPACES`; and ``without``, PSNR_r by stage.
@@ -165,10 +166,7 @@ def _decibels(difference: Tensor) -> float:
 
 
 def _draw(result: dict[str, Any], path: Path, title: str) -> None:
-    with extra("train"):
-        from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13, 4), layout="constrained")
+    figure = new_figure(13, 4)
     axes = figure.subplots(1, 3, width_ratios=(2, 2, 1.3))
     for axis, (given, rows) in zip(axes, result["stages"].items(), strict=False):
         for k, space in enumerate(SPACES):
@@ -192,7 +190,7 @@ CAMERAS = (
 )
 LIGHTS_TRIED = 32
 PIXELS = 8192
-"""Of a frame on which the forward pass is scored."""
+"""Number of pixels of a frame on which the forward pass is scored."""
 COLUMNS = {
     "psnr_r": "PSNR_r", "worst25": "worst 25%", "as_shot": "as-shot gains", "forward": "RAW to sRGB", "cycle": "cycle",
 }  # fmt: skip
@@ -244,7 +242,9 @@ class ComponentAblation:
 
 @EXPERIMENTS.register("learned")
 def ablate_components(learned: ComponentAblation, overwrite: bool = False) -> dict[str, dict[str, Any]]:
-    """Run it: a table, and ``table.json`` with every figure; ``overwrite`` replaces another run of its name.
+    """Measure what each learned part contributes; print a table, and write ``table.json`` with every figure.
+
+    ``overwrite`` replaces another run of its name.
 
     Returns:
         By variant the figures of ``COLUMNS``, means over frames in dB, one a seed.

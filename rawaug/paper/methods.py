@@ -166,7 +166,7 @@ def balanced_rows(fitted: Fitted, pair: Pair) -> dict[str, float]:
 
 
 def _makers(model: Method, pair: Pair) -> dict[str, Callable[[Tensor, Tensor], Tensor]]:
-    """Row to the function from an sRGB patch and its coordinates to a mosaic."""
+    """By row the function from an sRGB patch and its coordinates to a mosaic."""
 
     def maker(given: Any) -> Callable[[Tensor, Tensor], Tensor]:
         if isinstance(model, DictionaryISP):
@@ -273,7 +273,7 @@ PIXELS = 16384
 STEPS = 300
 RATE = 0.1
 LOG_RATE = 0.01
-"""Of log gains, which start near their end."""
+"""Learning rate of the log gains, which start near their end."""
 EPS = 1e-9
 FLOOR = 1e-3
 """Added to weights before their logarithm, or an atom that starts at 0 stays there."""
@@ -302,7 +302,7 @@ def squared_error(isp: DictionaryISP, pixels: PixelSamples, setting: ISPParams) 
 
 @torch.enable_grad()
 def _descend(isp: DictionaryISP, pixels: PixelSamples, start: ISPParams | None) -> ISPParams:
-    """From ``start``, with free gains; or from uniform weights of all atoms, those of the gains among them."""
+    """Descend from ``start``, with free gains; or from uniform weights of all atoms, those of the gains among them."""
     config = isp.config
     if start is None:
         logits = [torch.zeros(1, n) for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]

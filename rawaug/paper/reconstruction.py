@@ -86,7 +86,7 @@ def print_methods(title: str, rows: Mapping[str, Mapping[str, Any]], balanced: b
 
 STOPS, CONTRAST, SATURATION = 1.0, 0.5, 1.3
 LUMA = (0.2126, 0.7152, 0.0722)
-"""Of ITU-R BT.709."""
+"""Weights of R, G and B in the luma of ITU-R BT.709."""
 
 
 def overexpose(pair: Pair) -> Pair:
@@ -179,7 +179,7 @@ class Comparison:
             raise ValueError("noise: only the dictionary ISP can be fitted to noisy frames; remove the other methods")
 
     def shortest(self) -> Comparison:
-        """One step of every method, on the first frames."""
+        """The comparison with one step of every method, on the first frames."""
         few: dict[str, Any] = {"count": 2, "test_count": 1, "patches": 1, "seeds": 1, "seconds": 0.1}
         downstream = self.downstream and self.downstream.shortest()
         return replace(self, **few, select="first", fit=self.fit.shortest(), downstream=downstream)

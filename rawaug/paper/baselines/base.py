@@ -32,7 +32,7 @@ from rawaug.progress import progress as progress_bar
 from rawaug.seeding import keyed_generator
 
 CLIP_NORM = 1.0
-"""The gradient's largest norm: short fits need high rates, at which the U-Net blows up without."""
+"""The gradient's largest norm. Short fits need high rates, at which the U-Net diverges without this limit."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class CropTrainedISP(BaselineISP):
 
     reverse_network: nn.Module
     learning_rate: ClassVar[float]
-    """For Adam, at the start."""
+    """Adam's learning rate at the start."""
 
     def unprocess(self, srgb: Tensor, setting: Any = None) -> Tensor:
         """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape, by ``reverse_network``."""

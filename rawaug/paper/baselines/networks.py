@@ -52,10 +52,10 @@ from rawaug.seeding import derive_seed, initialise_from
 
 BLUR_SIZE, BLUR_SIGMA = 21, 12.0
 LOG_FLOOR = 1e-3
-"""Below it CycleISP's log loss is flat: at 12 bits it is four levels above black."""
+"""The value below which CycleISP's log loss is flat: at 12 bits it is four levels above black."""
 SCALE_CLAMP = 0.8
 GAMMA = 2.2
-"""RAW is compressed before InvISP's network, as published, for its dynamic range."""
+"""The power by which RAW is compressed before InvISP's network, as published, for its dynamic range."""
 Balance = Tensor | tuple[float, ...] | None
 
 
@@ -309,7 +309,7 @@ class InvertibleBlock(nn.Module):
 
 
 class Flow(nn.Module):
-    """The blocks in a row; untrained, their exchanges of channels undo each other and the flow is the identity."""
+    """The blocks in a row. Before training their exchanges of channels undo each other, so that it is the identity."""
 
     def __init__(self, blocks: int, growth: int) -> None:
         super().__init__()

@@ -38,10 +38,11 @@ XYZ_TO_CAMERA = (
     ((0.8380, -0.2630, -0.0639), (-0.2887, 1.0725, 0.2496), (-0.0627, 0.1427, 0.5438)),
     ((0.6596, -0.2079, -0.0562), (-0.4782, 1.3016, 0.1933), (-0.0970, 0.1581, 0.5181)),
 )
-"""Of the four cameras of the Darmstadt Noise Dataset, as published with UPI."""
+"""Matrices of the four cameras of the Darmstadt Noise Dataset, as published with UPI."""
 INVERSE_DIGITAL = (0.8, 0.1)
 """Mean and standard deviation of 1 / digital gain."""
 RED, BLUE = (1.9, 2.4), (1.5, 1.9)
+"""Lowest and highest gain of a colour in units of that of green."""
 
 
 class UPIParams(NamedTuple):
@@ -65,7 +66,7 @@ def camera_matrix(weights: Tensor) -> Tensor:
 
 
 class SmoothstepISP(BaselineISP):
-    """UPI's stages with a matrix and gains from wherever: the setting of a pass is :class:`UPIParams`."""
+    """UPI's stages. The setting of a pass is :class:`UPIParams`; subclasses say what it is if none is given."""
 
     @abstractmethod
     def default_params(self, batch: int) -> UPIParams:
@@ -129,12 +130,12 @@ LOG_MSE_EPS = 1e-5
 """Added to a frame's MSE under the logarithm: frames beyond 50 dB count no more."""
 ROUNDS = 100
 PIXELS = 32768
-"""Drawn of each frame."""
+"""Number of pixels drawn from each frame."""
 
 
 @BASELINES.register("upi-tuned")
 class TunedUPI(SmoothstepISP):
-    """UPI's stages with a fitted camera's matrix and gains; identity until tuned."""
+    """UPI's stages with the matrix and gains of a fitted camera; both are the identity before the fit."""
 
     name = "upi-tuned"
 
@@ -148,7 +149,7 @@ class TunedUPI(SmoothstepISP):
         return UPIParams(self.matrix.expand(batch, 3, 3), self.gains.expand(batch, 3))
 
     def learn(self, pairs: Sequence[FramePair], training: Training) -> tuple[int, float]:
-        """Pairs of any CFA, registered or not; ValueError if what fits best turns white black."""
+        """Fit to pairs of any CFA, registered or not; ValueError if the best matrix turns white black."""
         moments = Moments.of(sample_pixels(pairs, PIXELS, training.seed).pixels)
         product = moments.solve(torch.ones(len(moments.energy)).double())
         for _ in range(ROUNDS):
