@@ -279,7 +279,7 @@ def run_mosaics(recipe: MosaicRecipe, overwrite: bool = False, **given: Sequence
 
 
 def mosaic_trial(pair: Pair, cfa: str, noise: NoiseModel) -> Trial:
-    """A frame as a test case of a pattern, in the domain ``rgb``: packed RAW of Bayer's patterns, a mosaic of others."""
+    """A frame as a test case of a pattern, in the domain ``rgb``: packed RAW if it is Bayer's, else a mosaic."""
     method = "bilinear" if cfa.startswith("QUAD") else "AHD"
     return rgb_trial(pair, noise, {"demosaiced": method}, cfa, condition=cfa)
 
