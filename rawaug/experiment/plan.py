@@ -133,13 +133,13 @@ def plan_data(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
         ValueError: if they are not what the recipe needs, or a test frame is also among the others.
     """
     data, clean = recipe.data, not recipe.self_supervised
-    test = _opened(data, given.get("test", data.test), "test", True)
-    pairs = _opened(data, given.get("pairs", data.pairs), "train", clean)
+    test = _open(data, given.get("test", data.test), "test", True)
+    pairs = _open(data, given.get("pairs", data.pairs), "train", clean)
     named = given.get("validation", data.validation)
     held_out = isinstance(named, str) and named == HELD_OUT
     count = min(max(1, len(pairs) // 5), MOST_HELD_OUT) if held_out and len(pairs) > 1 else 0
     kept = len(pairs) - count
-    validation = SomePairs(pairs, range(kept, len(pairs))) if held_out else _opened(data, named, "validation", clean)
+    validation = SomePairs(pairs, range(kept, len(pairs))) if held_out else _open(data, named, "validation", clean)
     for part, frames in {"pairs": pairs, "validation": [] if held_out else validation}.items():
         if (seen := shared_frame(test, frames)) is not None:
             raise ValueError(f"data.test: {seen} is also in data.{part}; test on unseen frames")
@@ -147,43 +147,27 @@ def plan_data(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
     pictures: Any = PairPictures(chosen) if data.pictures == OWN_PICTURES else None
     if pictures is None:
         pictures = open_pictures(data.pictures, recipe.train.crop + 6, data.max_pixels)
-    together = recipe.together
     return Plan(
         pairs=chosen,
-        validation=select_pairs(validation, data.validation_count, data.validation_crop, data.bin, together),
-        test=select_pairs(test, data.test_count, data.test_crop, data.bin, together, measure=True),
+        validation=_part_in_use(recipe, "validation", validation),
+        test=_part_in_use(recipe, "test", test),
         pictures=Cached(pictures, data.memory_mb) if data.memory_mb else pictures,
         available=(len(pairs), len(pairs) if held_out else len(validation), len(test)),
         held_out=held_out,
     )
 
 
-def select_pairs(
-    pairs: Sequence[Pair],
-    count: int | None,
-    crop: int | None,
-    factor: int = 1,
-    together: bool = False,
-    measure: bool = False,
-) -> Sequence[Pair]:
-    """Pairs for a test or a validation, each of which is read once.
-
-    Args:
-        pairs: frames to take them from.
-        count: how many, the first ones; None takes all.
-        crop: side of the middle of each frame that is used, in pixels; None uses whole frames.
-        factor: K bins them K x K by colour site.
-        together: whether the sites of a cell are brought to one centre even if ``factor`` is 1, as a truth of full
-            colour needs.
-        measure: whether the frames' own noise is measured before they are binned.
-    """
+def _part_in_use(recipe: Recipe, part: str, pairs: Sequence[Pair]) -> Sequence[Pair]:
+    """The pairs of a part, "validation" or "test", as the recipe counts, bins and crops them; each is read once."""
+    data = recipe.data
+    count, crop = getattr(data, f"{part}_count"), getattr(data, f"{part}_crop")
     chosen = pairs if count is None else SomePairs(pairs, range(len(pairs))[:count])
-    measured = Measured(chosen) if measure else chosen
-    binned = Binned(measured, factor, together) if factor > 1 or together else measured
+    measured = Measured(chosen) if part == "test" else chosen  # whole frames: binning takes most of their noise
+    binned = Binned(measured, data.bin, recipe.together) if data.bin > 1 or recipe.together else measured
     return Kept(binned if crop is None else Middles(binned, crop))
 
 
-def _opened(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Pair]:
+def _open(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Pair]:
     return [] if spec is None else open_pairs(spec, split, clean, data.max_pixels, **data.settings_of(spec))
 
 
