@@ -263,9 +263,9 @@ class RawAugment(nn.Module):
         bayer.require_method(demosaicing)
         mosaic, methods = bayer.unpack(raw.float(), self.isp.cfa), [demosaicing] * len(raw)
         with _float32(raw):
-            return self._forward().develop([mosaic], methods, keep_white(params.isp), params.crop)[0]
+            return self._forward_pass().develop([mosaic], methods, keep_white(params.isp), params.crop)[0]
 
-    def _forward(self) -> FastForward:
+    def _forward_pass(self) -> FastForward:
         if self.display is None:  # tables that only developing needs
             self.display = freeze(FastForward(self.isp))
         return self.display
@@ -295,7 +295,7 @@ class RawAugment(nn.Module):
             raw = self.noise.apply(planes, params.noise)
             _require_finite(raw)
             noisy, clean = (bayer.unpack(x, self.isp.cfa) for x in (raw, planes))
-            noisy, clean = self.srgb.develop(self._forward(), noisy, clean, params)
+            noisy, clean = self.srgb.develop(self._forward_pass(), noisy, clean, params)
             return noisy, clean, noisy.new_empty(len(noisy), 0)
         noisy, variance = self.noise.apply_with_variance(planes, params.noise)
         _require_finite(noisy)

@@ -48,7 +48,7 @@ def to_rgb_tensor(picture: Any) -> Tensor:
     if image.ndim == 2:
         image = image[None]
     if image.ndim != 3:
-        raise ValueError(f"a picture must be (3, H, W), (H, W, 3), grey or RGBA, got {_described(picture)}")
+        raise ValueError(f"a picture must be (3, H, W), (H, W, 3), grey or RGBA, got {_describe(picture)}")
     return _rgb(image, picture)
 
 
@@ -60,7 +60,7 @@ def to_rgb_batch(pictures: Any) -> Tensor:
         return stack_pictures([to_rgb_tensor(picture) for picture in pictures])
     image = _as_tensor(pictures)
     if image.ndim != 4:
-        raise ValueError(f"a batch must be (B, 3, H, W), (B, H, W, 3) or a list, got {_described(pictures)}")
+        raise ValueError(f"a batch must be (B, 3, H, W), (B, H, W, 3) or a list, got {_describe(pictures)}")
     return _rgb(image, pictures)
 
 
@@ -118,7 +118,7 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
             raise ValueError(f"key={key!r}: samples are tuples of {len(sample)}; give the index of the picture")
         return where % len(sample)
     if key is not None:
-        raise ValueError(f"key={key!r}: samples are neither mappings nor tuples but {_described(sample)}; omit key")
+        raise ValueError(f"key={key!r}: samples are neither mappings nor tuples but {_describe(sample)}; omit key")
     return None
 
 
@@ -174,7 +174,7 @@ def _as_tensor(picture: Any) -> Tensor:
         picture = picture.convert("RGB") if picture.mode in _PIL_AS_RGB else picture
     array = np.array(picture)
     if array.dtype.kind not in "uif" or array.dtype.itemsize > 8:
-        raise ValueError(f"a picture must be a tensor, a NumPy array or a PIL image, got {_described(picture)}")
+        raise ValueError(f"a picture must be a tensor, a NumPy array or a PIL image, got {_describe(picture)}")
     return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
 
 
@@ -182,12 +182,12 @@ def _rgb(image: Tensor, original: Any) -> Tensor:
     """``(..., C, H, W)`` or ``(..., H, W, C)`` to ``(..., 3, H, W)``, uint8 or float32."""
     first, last = (image.shape[axis] in _CHANNELS for axis in (-3, -1))
     if not (first or last):
-        raise ValueError(f"a picture must be (3, H, W), (H, W, 3), grey or RGBA, got {_described(original)}")
+        raise ValueError(f"a picture must be (3, H, W), (H, W, 3), grey or RGBA, got {_describe(original)}")
     trailing = last and not (first and isinstance(original, Tensor))
     image = image.movedim(-1, -3) if trailing else image
     if image.shape[-3] == 4 and image.is_floating_point() and not (trailing and isinstance(original, np.ndarray)):
         raise ValueError(
-            f"{_described(original)} has four channels: is this packed RAW? It needs sRGB; of RGBA pass the first three"
+            f"{_describe(original)} has four channels: is this packed RAW? It needs sRGB; of RGBA pass the first three"
         )
     image = image.expand(*image.shape[:-3], 3, -1, -1) if image.shape[-3] == 1 else image[..., :3, :, :]
     if image.dtype == torch.uint8:
@@ -200,7 +200,7 @@ def _rgb(image: Tensor, original: Any) -> Tensor:
     return image.float()
 
 
-def _described(value: Any) -> str:
+def _describe(value: Any) -> str:
     if isinstance(value, (Tensor, np.ndarray)):
         return f"{type(value).__name__} of shape {tuple(value.shape)}, {value.dtype}"
     return type(value).__name__
