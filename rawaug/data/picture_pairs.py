@@ -11,7 +11,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from rawaug.data.mat import read_array
 from rawaug.data.pair_folder import clean_pattern, pairs_by_pattern
+from rawaug.data.pairs import LazyPairs, centre
 from rawaug.data.sidd import find_file
 from rawaug.files import files_below
 from rawaug.io.pictures import read_picture
@@ -39,17 +40,26 @@ class PicturePair(NamedTuple):
     noisy: Tensor
     clean: Tensor
 
+    def middle(self, crop: int) -> PicturePair:
+        return PicturePair(self.name, *(centre(x, crop, crop, step=1) for x in self[1:]))
 
-class PicturePairs(Sequence[PicturePair]):
+
+class PicturePairs(LazyPairs):
     """Pairs that are read when they are asked for."""
 
-    def __init__(self, names: Sequence[str], read: Callable[[int], tuple[Tensor, Tensor]]) -> None:
-        self.names, self._read = list(names), read
+    def __init__(
+        self, names: Sequence[str], files: Sequence[Sequence[Path]], read: Callable[[int], tuple[Tensor, Tensor]]
+    ) -> None:
+        super().__init__(names)
+        self._files, self._read = files, read
 
-    def __len__(self) -> int:
-        return len(self.names)
+    def __iter__(self) -> Iterator[PicturePair]:  # type: ignore[override]
+        return map(self.read, range(len(self)))
 
-    def __getitem__(self, index: int) -> PicturePair:  # type: ignore[override]
+    def files_of(self, index: int) -> Sequence[Path]:
+        return self._files[index]
+
+    def read(self, index: int) -> PicturePair:  # type: ignore[override]
         name = self.names[index]
         noisy, clean = self._read(index)
         if noisy.shape != clean.shape:
@@ -88,8 +98,9 @@ def open_picture_pairs(spec: str, noisy: str | None = None, clean: str | None = 
     if not found:
         raise ValueError(f"{folder}: has no pictures named {first} and {second}")
     found.sort(key=lambda pair: pair.noisy)
+    files = [(pair.noisy, pair.clean) for pair in found]
     return PicturePairs(
-        [pair.name for pair in found], lambda k: (read_picture(found[k].noisy), read_picture(found[k].clean))
+        [pair.name for pair in found], files, lambda k: (read_picture(files[k][0]), read_picture(files[k][1]))
     )
 
 
@@ -105,4 +116,4 @@ def _blocks(folder: Path) -> PicturePairs:
         arrays.append(torch.from_numpy(array).flatten(0, 1).movedim(-1, 1))
     noisy, clean = arrays
     names = [f"block {number:04d}" for number in range(len(noisy))]
-    return PicturePairs(names, lambda k: (noisy[k].contiguous(), clean[k].contiguous()))
+    return PicturePairs(names, [()] * len(names), lambda k: (noisy[k].contiguous(), clean[k].contiguous()))

@@ -17,11 +17,10 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
-from rawaug.registry import ESTIMATORS, SRGB_NOISE, spec_label
+from rawaug.registry import ESTIMATORS, spec_label
 from rawaug.seeding import derive_seed
 from rawaug.training.estimators import SelfSupervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, noisy_frame, r2r_trials
-from rawaug.training.srgb_noise import NoisyPictures
 from rawaug.training.stream import WATCHED, PictureCrops, RealCrops, Source, TrainingStream, freeze_samples
 
 
@@ -82,9 +81,7 @@ def training_stream(
     augment: RawAugment | None = None
     if arm.augmented:
         augment = RawAugment(isp, noise, draw=arm.draw, target=arm.srgb or recipe.target)
-    if arm.srgb_noise is not None:
-        made = NoisyPictures(pictures, SRGB_NOISE.make(arm.srgb_noise), crop, arm.zoom)
-    elif isinstance(estimator, SelfSupervised):
+    if isinstance(estimator, SelfSupervised):
         if frames and arm.augmented < 1.0:
             real = NoisyCrops(frames, estimator, crop, isp.cfa)
         if augment:

@@ -29,6 +29,7 @@ from rawaug.data.pairs import (
     selected,
     shared_frame,
 )
+from rawaug.data.picture_pairs import PicturePairs, is_picture_pairs, open_picture_pairs
 from rawaug.evaluation.trials import Measured
 from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
 from rawaug.files import LOCK, find_weights, require_writable, write_json
@@ -133,6 +134,8 @@ def plan_data(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
         ValueError: if they are not what the recipe needs, or a test frame is also among the others.
     """
     data, clean = recipe.data, not recipe.self_supervised
+    if recipe.target != "srgb" and (wrong := next(filter(is_picture_pairs, (data.validation or "", data.test)), "")):
+        raise ValueError(f"data: {wrong} is pairs of developed pictures, for rawaug run srgb; give RAW frames")
     test = _open(data, given.get("test", data.test), "test", True)
     pairs = _open(data, given.get("pairs", data.pairs), "train", clean)
     named = given.get("validation", data.validation)
@@ -162,12 +165,16 @@ def _part_in_use(recipe: Recipe, part: str, pairs: Sequence[Pair]) -> Sequence[P
     data = recipe.data
     count, crop = getattr(data, f"{part}_count"), getattr(data, f"{part}_crop")
     chosen = pairs if count is None else SomePairs(pairs, range(len(pairs))[:count])
+    if isinstance(pairs, PicturePairs):  # neither measured nor binned
+        return Kept(chosen if crop is None else Middles(chosen, crop))
     measured = Measured(chosen) if part == "test" else chosen  # whole frames: binning takes most of their noise
     binned = Binned(measured, data.bin, recipe.together) if data.bin > 1 or recipe.together else measured
     return Kept(binned if crop is None else Middles(binned, crop))
 
 
 def _open(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Pair]:
+    if isinstance(spec, str) and is_picture_pairs(spec):
+        return open_picture_pairs(spec)
     return [] if spec is None else open_pairs(spec, split, clean, data.max_pixels, **data.settings_of(spec))
 
 

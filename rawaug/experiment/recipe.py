@@ -17,6 +17,7 @@ from rawaug.plugin.draw import Draw
 from rawaug.plugin.targets import Srgb, Target
 from rawaug.registry import ESTIMATORS, EXPERIMENTS, SRGB_NOISE, require_between, split_spec, suggest
 from rawaug.training.config import MOST, DenoiserConfig, TrainConfig, Weighing
+from rawaug.training.srgb_noise import Told
 
 SHORT_CROP = 256
 """Side in pixels of the middles of frames that a dry run uses."""
@@ -106,7 +107,9 @@ class ArmConfig:
         zoom: of supervised arms: half of the crops of pictures are enlarged by up to this factor, see
             :class:`rawaug.RawPairs`; 1 for none.
         srgb_noise: of sRGB targets: noise drawn on the pictures themselves, in place of the camera's: Gaussian, BSRGAN,
-            or {name, settings}, see :mod:`rawaug.training.srgb_noise`.
+            Coloured, or {name, settings}, see :mod:`rawaug.training.srgb_noise`.
+        srgb_share: share of the samples that have ``srgb_noise``; the rest have the camera's.
+        told: of sRGB targets: what a network that reads a level of noise is told of it; null for nothing.
         estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
             and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
         search: a setting of the estimator to choose on validation, such as ``{gamma: [2, 8, 16]}``: an arm is trained
@@ -123,6 +126,8 @@ class ArmConfig:
     srgb: Srgb | None = None
     zoom: float = 1.0
     srgb_noise: str | dict[str, Any] | None = None
+    srgb_share: float = 1.0
+    told: Told | None = None
     estimator: str | dict[str, Any] = "supervised"
     search: dict[str, list[float]] | None = None
     candidate_of: str | None = None
@@ -132,7 +137,8 @@ class ArmConfig:
     steps: int | None = None
 
     def __post_init__(self) -> None:
-        require_between("augmented", self.augmented, 0.0, 1.0)
+        for key in ("augmented", "srgb_share"):
+            require_between(key, getattr(self, key), 0.0, 1.0)
         if self.steps is not None:
             require_between("steps", self.steps, 1, MOST)
         try:
@@ -233,7 +239,7 @@ class Recipe:
             try:
                 if arm.srgb_noise is not None:
                     SRGB_NOISE.make(arm.srgb_noise)
-                for key in ("srgb", "srgb_noise"):
+                for key in ("srgb", "srgb_noise", "told"):
                     if getattr(arm, key) is not None and self.target != "srgb":
                         raise ValueError(f"{key} is for target 'srgb', not {self.target!r}; omit it")
                 name, _ = split_spec(arm.estimator)

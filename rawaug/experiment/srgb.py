@@ -1,4 +1,5 @@
-r"""Denoisers of developed pictures: trained on sRGB, tested on camera frames with noise in RAW that LibRaw develops.
+r"""Denoisers of developed pictures: trained on sRGB, tested on camera frames with noise in RAW that LibRaw develops,
+or on real pairs (``cc15:DIR``, see :mod:`rawaug.data.picture_pairs`).
 
 .. math:: x = L(y + n), \qquad \operatorname{var}(n) = \mathrm{shot\_var} \cdot y + \mathrm{read\_var}
 
@@ -25,9 +26,11 @@ from denoisers.files import DEFAULT
 from rawaug import bayer
 from rawaug.bayer import noise_variance
 from rawaug.data.pairs import Pair
+from rawaug.data.picture_pairs import PicturePair
 from rawaug.denoise.denoiser import Levels, Noisy, RawDenoiser
 from rawaug.denoise.pictures import PictureDenoiser
 from rawaug.evaluation.page import Figure, Page, find_detail
+from rawaug.evaluation.picture_trials import picture_trials
 from rawaug.evaluation.scores import NoisyInput, Panels, Row, panels_of, score
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial
@@ -38,10 +41,14 @@ from rawaug.io import RawFrame, develop, write_dng
 from rawaug.io.pictures import encode_png, write_picture
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.targets import Target
 from rawaug.progress import progress
-from rawaug.registry import EXPERIMENTS, Spec, spec_label, split_spec
-from rawaug.seeding import keyed_generator
+from rawaug.registry import EXPERIMENTS, SRGB_NOISE, Spec, spec_label, split_spec
+from rawaug.seeding import derive_seed, keyed_generator
+from rawaug.training.srgb_noise import NoisyPictures, SrgbSamples
+from rawaug.training.stream import PictureCrops, TrainingStream
 
 BLACK, WHITE = 8192.0, 65535.0
 """Of the DNG: room for noise below black."""
@@ -49,6 +56,8 @@ DEVIATIONS = (0.01, 0.015, 0.022, 0.033, 0.05, 0.075, 0.11, 0.16)
 """Of the white noise that a filter is told, to choose from."""
 PANEL = 192
 """Side of the crops of the picture."""
+REAL = "real"
+"""What stands for a level in the tables of real pairs."""
 _WITHOUT_PLANES = ("NonLocalMeans", "TotalVariation", "Wavelet")
 
 Scores = dict[str, dict[str, float]]
@@ -60,10 +69,11 @@ class SrgbRecipe(Recipe):
     """A comparison of blind denoisers of sRGB by what they are trained on.
 
     Of the keys ``noise`` is that of training; ``views`` and ``self_ensemble``, which are for RAW, change nothing.
+    ``data.validation`` and ``data.test`` may be real pairs of developed pictures, too; networks are told no level.
 
     Args:
         rivals: denoisers of RAW to compare with, by name or file, in place of ``untouched``.
-        levels: (shot_var, read_var) of the RAW noise of validation and test, a row of the table each.
+        levels: (shot_var, read_var) of the RAW noise of validation and test frames, a row of the table each.
     """
 
     target: ClassVar[Target] = "srgb"
@@ -77,10 +87,11 @@ class SrgbRecipe(Recipe):
         if self.untouched:
             raise ValueError("untouched: denoisers to compare with are named in rivals")
         for label in self.arms:
-            network = self.network_of(label)
-            given = network.settings.get("channels"), network.settings.get("variance_map")
-            if network.start is None and given != (3, False):
-                raise ValueError("denoiser.settings: a blind network of sRGB has channels: 3, variance_map: false")
+            network, told = self.network_of(label), self.arms[label].told is not None
+            given = network.settings.get("channels"), network.settings.get("variance_map", True)
+            if network.start is None and given != (3, told):
+                wanted = f"channels: 3, variance_map: {str(told).lower()}"
+                raise ValueError(f"denoiser.settings: the network of arms.{label} has {wanted}, as told says")
         for spec in self.classical:
             if (name := split_spec(spec)[0]) not in _WITHOUT_PLANES:
                 raise ValueError(f"classical: {name} is for RAW; on sRGB use one of {', '.join(_WITHOUT_PLANES)}")
@@ -116,6 +127,17 @@ class SrgbRun(TrainingRun):
         """The validation frames at every level."""
         return srgb_trials(self.validation, self.recipe.levels, "develop validation")
 
+    def stream(self, arm: str, isp: DictionaryISP, seed: int) -> TrainingStream:
+        recipe, own = self.recipe, self.recipe.arms[arm]
+        camera = drawn = None
+        if own.srgb_noise is None or own.srgb_share < 1.0:
+            augment = RawAugment(isp, self.noise, draw=own.draw, target=own.srgb or "srgb")
+            camera = PictureCrops(RawPairs(self.pictures, augment, recipe.train.crop, zoom=own.zoom))
+        if own.srgb_noise is not None:
+            drawn = NoisyPictures(self.pictures, SRGB_NOISE.make(own.srgb_noise), recipe.train.crop, own.zoom)
+        samples = SrgbSamples(camera, drawn, own.srgb_share, own.told)
+        return TrainingStream(None, samples, recipe.train.batch, 1.0, derive_seed(seed, "stream"))
+
     def test_trials(self) -> Sequence[Trial]:
         """The test frames at every level."""
         return self.tests
@@ -137,18 +159,19 @@ class SrgbRun(TrainingRun):
     @cached_property
     def methods(self) -> dict[str, list[Any]]:
         """What the arms are compared with, by level: the noisy picture, filters on sRGB, RAW denoisers."""
-        chosen = {
-            level: [best_filter(spec, at_level(self.validations, level)) for spec in self.recipe.classical]
-            for level in map(key_of, self.recipe.levels)
-        }
-        return {level: [NoisyInput("noisy"), *filters, *self.rivals] for level, filters in chosen.items()}
+        found: dict[str, list[Any]] = {}
+        for level in dict.fromkeys(trial.strength for trial in self.tests):
+            like = at_level(self.validations, level) or self.validations
+            filters = [best_filter(spec, like) for spec in self.recipe.classical]
+            found[level] = [NoisyInput("noisy"), *filters, *(self.rivals if level != REAL else [])]
+        return found
 
     def report(self) -> None:
         """Write ``results.json``, the table, crops at 100 % and the page."""
         results = self.results
         rows = [row for level, some in self.methods.items() for row in score(some, at_level(self.tests, level), level)]
         scores = means(rows)
-        known = [(p.name, noise_variance(p.raw, *p.own_noise)) for p in self.test if p.own_noise is not None]
+        known = [(p.name, noise_variance(p.raw, *p.own_noise)) for p in self.test if getattr(p, "own_noise", None)]
         own = {name: variance.mean().item() for name, variance in known}
         content = {"recipe": asdict(self.recipe), "results": results, "others": scores, "own_noise": own}
         write_json(content, self.folder / "results.json")
@@ -199,9 +222,14 @@ def _cell(runs: Sequence[Scores], level: str) -> str:
 
 
 def srgb_trials(pairs: Sequence[Pair], levels: Sequence[Levels], label: str) -> list[Trial]:
-    """Every frame at every level as LibRaw develops it, in the domain ``srgb``, with the RAW before."""
+    """Every frame at every level as LibRaw develops it, in the domain ``srgb``, with the RAW before; a pair of pictures
+    as it is.
+    """
     found: list[Trial] = []
     for pair in progress(pairs, label=label, unit="frame"):
+        if isinstance(pair, PicturePair):
+            found.append(replace(picture_trials([pair])[0], condition="", strength=REAL))
+            continue
         packed, clean = bayer.pack(pair.raw[None], pair.cfa), developed(pair.raw, pair)
         ways = {"then LibRaw": partial(_unpacked_and_developed, pair=pair)}
         for level in levels:

@@ -49,6 +49,20 @@ class Charbonnier(nn.Module):
         return ((a - b) ** 2 + self.epsilon**2).sqrt().mean()
 
 
+@LOSSES.register("rms")
+class RootMeanSquare(nn.Module):
+    """The mean over pictures of ``sqrt(mean (a - b)^2 + epsilon^2)``: l2 in which hard pictures do not outweigh the
+    rest; what it is least for is the same. With ``weigh: relative`` it is the share of the noise that is left.
+    """
+
+    def __init__(self, epsilon: float = 1e-2) -> None:
+        super().__init__()
+        self.epsilon = epsilon
+
+    def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        return ((a - b).square().flatten(1).mean(1) + self.epsilon**2).sqrt().mean()
+
+
 def _normalised(loss: Criterion, sample: Sample) -> Criterion:
     deviation = sample.variance.sqrt().clamp_min(1e-6)
     return lambda denoised, clean: loss(denoised / deviation, clean / deviation)

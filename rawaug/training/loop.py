@@ -197,8 +197,7 @@ def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> d
     net.eval()
     raw, srgb = [], []
     for frame in frames:
-        variance = None if frame.variance is None else frame.variance.to(device)
-        denoised = denoisers.tiled(net, frame.noisy.to(device), variance).cpu()
+        denoised = denoisers.tiled(net, frame.noisy.to(device), _told(frame).to(device)).cpu()
         raw.append(psnr(denoised, frame.clean).mean().item())
         if frame.develop is not None and frame.domain != "srgb":
             srgb.append(psnr(*(frame.develop(x)[None] for x in (denoised, frame.clean))).item())
@@ -208,6 +207,11 @@ def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> d
     for kind in dict.fromkeys(frame.condition for frame in frames if frame.condition):
         scores[f"psnr_{kind}"] = fmean(x for x, frame in zip(raw, frames, strict=True) if frame.condition == kind)
     return scores | (_by_thirds("psnr_srgb", srgb, noise) if len(srgb) == len(frames) else {})
+
+
+def _told(frame: Trial) -> Tensor:
+    """The variance, 0 where it is not known."""
+    return torch.zeros_like(frame.noisy) if frame.variance is None else frame.variance
 
 
 def _by_thirds(name: str, scores: Sequence[float], noise: Sequence[float]) -> dict[str, float]:
@@ -228,7 +232,7 @@ def panels(net: nn.Module, frame: Trial) -> Tensor:
     scale = frame.clean.shape[-1] // frame.noisy.shape[-1]  # 2 where packed RAW becomes full colour
     noisy, clean = centre(frame.noisy, PANEL, PANEL, 1), centre(frame.clean, scale * PANEL, scale * PANEL, scale)
     device = next((weights.device for weights in net.parameters()), noisy.device)
-    variance = None if frame.variance is None else centre(frame.variance, PANEL, PANEL, 1).to(device)
+    variance = centre(_told(frame), PANEL, PANEL, 1).to(device)
     net.eval()
     denoised = net(noisy.to(device), variance).cpu().nan_to_num()  # black where the training has diverged
     net.train()

@@ -29,7 +29,7 @@ WATCHED = 16
 
 
 class Source(Protocol):
-    """Where samples come from."""
+    """Where samples come from; one with a ``draw_batch(generators)`` makes those of a step together."""
 
     def draw(self, generator: torch.Generator) -> Any:
         """A training sample, a named tuple of tensors ``(C, h, w)``, that depends on ``generator`` alone."""
@@ -187,8 +187,9 @@ class TrainingStream(Dataset[Any]):
 
     def __getitems__(self, indices: Sequence[int]) -> list[Any]:
         made: dict[int, Any] = {}
-        if isinstance(self.pictures, PictureCrops) and (numbers := [*filter(self._is_made, indices)]):
-            made = dict(zip(numbers, self.pictures.draw_batch([*map(self._generator, numbers)]), strict=True))
+        together = getattr(self.pictures, "draw_batch", None)
+        if together is not None and (numbers := [*filter(self._is_made, indices)]):
+            made = dict(zip(numbers, together([*map(self._generator, numbers)]), strict=True))
         return [made[index] if index in made else self[index] for index in indices]
 
     def _is_made(self, index: int) -> bool:

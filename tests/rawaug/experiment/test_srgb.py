@@ -26,7 +26,7 @@ LEVELS = [(1e-9, 1e-12), (2e-3, 1e-5)]
 SMALL = [
     "--data.pictures", "tiny:", "--data.validation", "tiny:validation", "--data.test", "tiny:test", "--device", "cpu",
     "--levels", "[[2.0e-3, 1.0e-5], [8.0e-3, 1.0e-4]]", "--rivals", "[]", "--train.precision", "32-true",
-    "--denoiser.settings", '{"width": 4, "scales": 2, "channels": 3, "variance_map": false}', "--steps", "2",
+    "--denoiser.settings", '{"width": 4, "scales": 2, "channels": 3}', "--steps", "2",
     "--train.crop", "32", "--train.batch", "4", "--train.validate-every", "1",
 ]  # fmt: skip
 """The recipe in seconds."""
@@ -93,7 +93,7 @@ def test_the_recipe_scores_every_arm_and_method_at_every_level(
     assert not list(tmp_path.iterdir())
     assert main(["run", "srgb", *SMALL, "--out", str(tmp_path), "--seeds", "2"]) == 0
     results = json.loads((tmp_path / "srgb" / "results.json").read_text())
-    assert set(results["results"]) == {"gaussian", "bsrgan", "camera"}
+    assert set(results["results"]) == {"gaussian", "bsrgan", "camera", "camera without finishing"}
     assert set(results["others"]) == {"noisy", "NonLocalMeans"}
     for runs in (*results["results"].values(), [results["others"]["noisy"]] * 2):
         assert len(runs) == 2
@@ -105,7 +105,25 @@ def test_the_recipe_scores_every_arm_and_method_at_every_level(
     said = capsys.readouterr().out
     assert "0.002, 1e-05" in said and (tmp_path / "srgb" / "picture.png").is_file()
     assert main(["run", "srgb", *SMALL, "--out", str(tmp_path), "--seeds", "2"]) == 0
-    assert capsys.readouterr().out.count("already trained") == 6
+    assert capsys.readouterr().out.count("already trained") == 8
+
+
+@pytest.mark.usefixtures("tiny")
+def test_real_pairs_choose_the_weights_and_are_scored(tmp_path: Path) -> None:
+    folder, generator = tmp_path / "pairs", torch.Generator().manual_seed(0)
+    for name in "ab":
+        clean = torch.rand(3, 8, 10, generator=generator).repeat_interleave(8, 1).repeat_interleave(8, 2)
+        noisy = clean + 0.05 * torch.randn(clean.shape, generator=generator)
+        for kind, picture in (("real", noisy), ("mean", clean)):
+            write_picture(folder / f"{name}_{kind}.png", picture.clamp(0.0, 1.0))
+    given = [*SMALL, "--data.validation", f"cc15:{folder}", "--data.test", f"cc15:{folder}"]
+    with pytest.raises(ValueError, match="also in data.validation"):
+        run_recipe(["run", "srgb", *given, "--out", str(tmp_path)])
+    given[-1] = "tiny:test"
+    run_recipe(["run", "srgb", *given, "--out", str(tmp_path)])
+    (log,) = (tmp_path / "srgb" / "seed0" / "camera").glob("log.csv")
+    assert "psnr" in log.read_text()
+    given[given.index("--data.validation") + 1 :: 2] = ["tiny:validation", f"cc15:{folder}"]
 
 
 @pytest.mark.usefixtures("tiny")

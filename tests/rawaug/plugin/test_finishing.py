@@ -6,18 +6,20 @@ import math
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
+from rawaug.plugin import finishing
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.finishing import Finish, blurred
+from rawaug.plugin.finishing import Finish, blur, box_mean
 from rawaug.plugin.targets import Srgb
 
 SIDE = 96
 
 
-def setting(blur: float = 0.0, threshold: float = math.inf, chroma: float = 0.0, mix: float = 0.0) -> Tensor:
-    """``(1, 6)`` parameters without sharpening."""
-    return torch.tensor([[blur, threshold, chroma, mix, 0.0, 1.0]])
+def setting(softness: float = 0.0, luma: float = 0.0, edge: float = 1e9, chroma: float = 0.0) -> Tensor:
+    """``(1, 8)`` parameters without sharpening; nothing is an edge by default."""
+    return torch.tensor([[softness, 4.0, luma, edge, 3.0, chroma, 0.0, 1.0]])
 
 
 def step_and_noise(seed: int = 0, deviation: float = 0.02) -> tuple[Tensor, Tensor]:
@@ -30,26 +32,47 @@ def step_and_noise(seed: int = 0, deviation: float = 0.02) -> tuple[Tensor, Tens
 @pytest.mark.parametrize("deviation", [1.0, 2.5])
 def test_blur_divides_the_variance_of_white_noise_by_4_pi_s_squared(deviation: float) -> None:
     noise = torch.randn(8, 1, 128, 128, generator=torch.Generator().manual_seed(0))
-    inner = blurred(noise, deviation)[..., 16:-16, 16:-16]
-    assert inner.var().item() == pytest.approx(1.0 / (4.0 * math.pi * deviation**2), rel=0.05)
-    assert torch.allclose(blurred(torch.full((1, 2, 20, 20), 0.4), deviation), torch.tensor(0.4))
+    inner = blur(noise, torch.full((8,), deviation))[..., 16:-16, 16:-16]
+    assert inner.var().item() == pytest.approx(1.0 / (4.0 * math.pi * deviation**2), rel=0.06)
+    flat = torch.full((1, 2, 20, 20), 0.4)
+    assert torch.allclose(blur(flat, torch.tensor([deviation])), flat)
+    assert torch.equal(blur(flat, torch.tensor([0.0])), flat)
+
+
+def test_a_window_of_whole_pixels_is_a_mean_and_a_part_of_one_counts_in_part() -> None:
+    image = torch.rand(2, 1, 12, 15, generator=torch.Generator().manual_seed(0))
+    whole = F.avg_pool2d(F.pad(image, (2,) * 4, mode="replicate"), 5, 1)
+    assert torch.allclose(box_mean(image, torch.tensor([2.0, 2.0])), whole, atol=1e-6)
+    row = torch.zeros(1, 1, 1, 9)
+    row[..., 4] = 1.0
+    assert torch.allclose(box_mean(row, torch.tensor([1.5]))[0, 0, 0, 2:7], torch.tensor([0.5, 1, 1, 1, 0.5]) / 4)
+
+
+def test_each_picture_has_its_own_filter_in_pytorch_and_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = torch.rand(3, 2, 21, 40, generator=torch.Generator().manual_seed(0))
+    deviations = torch.tensor([0.0, 0.7, 6.0])
+    together = blur(image, deviations)
+    for k in range(3):
+        assert torch.equal(blur(image[k : k + 1], deviations[k : k + 1])[0], together[k])
+    monkeypatch.setattr(finishing, "fastest", lambda *_, otherwise: otherwise())
+    assert torch.allclose(blur(image, deviations), together, atol=1e-6)
 
 
 def test_noise_reduction_that_spares_edges_leaves_the_noise_there() -> None:
     def ratio(threshold: float) -> float:
-        noisy, clean = (x[0] for x in Finish().apply(*step_and_noise(), setting(1.0, threshold)))
+        noisy, clean = (x[0] for x in Finish().apply(*step_and_noise(), setting(0.0, 1.0, threshold)))
         luma = (noisy - clean).mean(0)
         middle = SIDE // 2
         return (luma[:, middle - 1 : middle + 1].var() / luma[:, 8 : middle - 8].var()).item()
 
-    assert ratio(math.inf) == pytest.approx(1.0, abs=0.35)
+    assert ratio(1e9) == pytest.approx(1.0, abs=0.35)
     assert ratio(2.0) > 2.5
 
 
 def test_the_clean_picture_is_the_mean_of_many_finished_shots() -> None:
     finished, cleans = [], []
     for seed in range(60):
-        noisy, clean = Finish().apply(*step_and_noise(seed), setting(0.8, 2.0, 2.0, 0.9))
+        noisy, clean = Finish().apply(*step_and_noise(seed), setting(0.6, 0.6, 2.0, 0.9))
         finished.append(noisy)
         cleans.append(clean)
     departure = torch.stack(finished).mean(0) - torch.stack(cleans).mean(0)
@@ -60,7 +83,7 @@ def test_the_clean_picture_is_the_mean_of_many_finished_shots() -> None:
 
 def test_chroma_noise_reduction_ties_the_channels_together() -> None:
     def correlation(mix: float) -> float:
-        noisy, clean = Finish().apply(*step_and_noise(), setting(chroma=3.0, mix=mix))
+        noisy, clean = Finish().apply(*step_and_noise(), setting(chroma=mix))
         return torch.corrcoef((noisy - clean)[0].flatten(1))[0, 1].item()
 
     assert abs(correlation(0.0)) < 0.05
@@ -69,7 +92,7 @@ def test_chroma_noise_reduction_ties_the_channels_together() -> None:
 
 def test_sharpening_raises_the_noise_and_keeps_flat_areas() -> None:
     noisy, clean = step_and_noise()
-    sharp = torch.tensor([[0.0, math.inf, 0.0, 0.0, 0.5, 1.0]])
+    sharp = torch.tensor([[0.0, 4.0, 0.0, 1e9, 0.0, 0.0, 0.5, 1.0]])
     after, flat = Finish().apply(noisy, clean, sharp)
     assert (after - flat)[..., 8:40].var() > 1.5 * (noisy - clean)[..., 8:40].mean(1).var()
     assert torch.allclose(flat[..., 8:32], clean[..., 8:32], atol=1e-6)
@@ -83,7 +106,7 @@ def test_pairs_replay_and_do_not_depend_on_their_neighbours() -> None:
     assert torch.equal(pair.noisy, again.noisy) and torch.equal(pair.clean, again.clean)
     alone = augment.apply(pictures[1], pair.params.map(lambda t: t[1]))
     assert torch.equal(alone.noisy, pair.noisy[1])
-    assert pair.params.extras["finish"].shape == (3, 6)
+    assert pair.params.extras["finish"].shape == (3, 8)
 
 
 def test_jpeg_is_on_the_noisy_picture_alone() -> None:
@@ -100,17 +123,19 @@ def test_jpeg_is_on_the_noisy_picture_alone() -> None:
     assert not torch.equal(rough, fine)
 
 
-def test_shares_are_of_pictures() -> None:
-    drawn = Finish(unfinished=0.25, edges=0.5).sample(2000, torch.Generator().manual_seed(0))["finish"]
+def test_ranges_and_shares_are_of_pictures() -> None:
+    drawn = Finish(unfinished=0.25, edge=(2.0, 8.0)).sample(4000, torch.Generator().manual_seed(0))["finish"]
     plain = (drawn == 0.0).all(1)
     assert plain.float().mean().item() == pytest.approx(0.25, abs=0.03)
-    assert drawn[~plain, 1].isinf().float().mean().item() == pytest.approx(0.5, abs=0.04)
+    edge = drawn[~plain, 3]
+    assert 2.0 <= edge.min() < 2.02 and 7.95 < edge.max() <= 8.0
+    assert edge.log().mean().item() == pytest.approx(math.log(4.0), abs=0.03), "drawn by its logarithm"
     noisy, clean = step_and_noise()
-    assert torch.equal(Finish().apply(noisy, clean, torch.zeros(1, 6))[0], noisy)
+    assert torch.equal(Finish().apply(noisy, clean, torch.zeros(1, 8))[0], noisy)
 
 
 def test_ranges_out_of_order_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"finish: luma_blur must be \(lowest, highest\)"):
-        Finish(luma_blur=(1.0, 0.5))
-    with pytest.raises(ValueError, match="finish: edges must be a share"):
-        Finish(edges=1.5)
+    with pytest.raises(ValueError, match=r"finish: radius must be \(lowest, highest\)"):
+        Finish(radius=(1.0, 0.5))
+    with pytest.raises(ValueError, match="finish: unfinished must be a share"):
+        Finish(unfinished=1.5)
