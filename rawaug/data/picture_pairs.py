@@ -12,8 +12,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -33,7 +33,8 @@ KINDS = (*_NAMES, _BLOCKS)
 """Datasets that :func:`open_picture_pairs` knows."""
 
 
-class PicturePair(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class PicturePair:
     """A shot and its noise-free version, uint8 sRGB ``(3, H, W)`` each."""
 
     name: str
@@ -41,7 +42,8 @@ class PicturePair(NamedTuple):
     clean: Tensor
 
     def middle(self, crop: int) -> PicturePair:
-        return PicturePair(self.name, *(centre(x, crop, crop, step=1) for x in self[1:]))
+        """The middle of both, ``crop x crop``."""
+        return PicturePair(self.name, *(centre(x, crop, crop, step=1) for x in (self.noisy, self.clean)))
 
 
 class PicturePairs(LazyPairs):

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug.data.picture_pairs import PicturePair, PicturePairs
+from rawaug.data.picture_pairs import PicturePair
 from rawaug.errors import extra
 from rawaug.evaluation.scores import NOISY, Denoiser, group_rows, score, summary
 from rawaug.evaluation.tables import print_rows
@@ -27,7 +27,7 @@ BORDER = 4
 """Pixels on every side, which a shift may reach."""
 
 
-def picture_trials(pairs: PicturePairs | Sequence[PicturePair], registered: bool = False) -> Sequence[Trial]:
+def picture_trials(pairs: Sequence[Any], registered: bool = False) -> Sequence[Trial]:
     """A trial in the domain ``srgb`` of every pair."""
 
     def make(pair: PicturePair) -> Trial:
@@ -58,7 +58,7 @@ def register(noisy: Tensor, clean: Tensor) -> Tensor:
     return torch.from_numpy(np.stack(planes)).float().clamp(0.0, 1.0)
 
 
-def picture_scores(denoisers: Sequence[Denoiser], pairs: PicturePairs | Sequence[PicturePair]) -> dict[str, Any]:
+def picture_scores(denoisers: Sequence[Denoiser], pairs: Sequence[Any]) -> dict[str, Any]:
     """Every denoiser on pairs of pictures: ``rows`` by its name and by condition, as of ``rawaug evaluate --json``."""
     rows: dict[str, dict[str, Any]] = {}
     for condition in (PUBLISHED, REGISTERED):

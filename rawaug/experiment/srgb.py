@@ -163,7 +163,7 @@ class SrgbRun(TrainingRun):
         for level in dict.fromkeys(trial.strength for trial in self.tests):
             like = at_level(self.validations, level) or self.validations
             filters = [best_filter(spec, like) for spec in self.recipe.classical]
-            found[level] = [NoisyInput("noisy"), *filters, *(self.rivals if level != REAL else [])]
+            found[level] = [NoisyInput("noisy"), *filters] + (self.rivals if level != REAL else [])
         return found
 
     def report(self) -> None:
@@ -171,7 +171,9 @@ class SrgbRun(TrainingRun):
         results = self.results
         rows = [row for level, some in self.methods.items() for row in score(some, at_level(self.tests, level), level)]
         scores = means(rows)
-        known = [(p.name, noise_variance(p.raw, *p.own_noise)) for p in self.test if getattr(p, "own_noise", None)]
+        known = [
+            (p.name, noise_variance(p.raw, *p.own_noise)) for p in self.test if isinstance(p, Pair) and p.own_noise
+        ]
         own = {name: variance.mean().item() for name, variance in known}
         content = {"recipe": asdict(self.recipe), "results": results, "others": scores, "own_noise": own}
         write_json(content, self.folder / "results.json")

@@ -56,13 +56,13 @@ class Finish:
         ValueError: if a range is out of order, or a share leaves [0, 1].
     """
 
-    softness: tuple[float, float] = (0.6, 0.82)
+    softness: tuple[float, float] = (0.59, 0.81)
     window: tuple[float, float] = (6.5, 8.0)
-    luma: tuple[float, float] = (0.37, 0.52)
+    luma: tuple[float, float] = (0.36, 0.51)
     edge: tuple[float, float] = (2.2, 5.2)
     chroma_blur: tuple[float, float] = (1.1, 3.7)
     chroma: tuple[float, float] = (0.62, 0.9)
-    sharpening: tuple[float, float] = (0.2, 1.6)
+    sharpening: tuple[float, float] = (0.25, 1.65)
     radius: tuple[float, float] = (1.0, 1.9)
     quality: tuple[int, int] | None = (90, 99)
     unfinished: float = 0.0

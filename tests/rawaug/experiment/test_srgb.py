@@ -15,12 +15,15 @@ from rawaug.data import demo_pairs
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import RawDenoiser
 from rawaug.denoise.pictures import PictureDenoiser
+from rawaug.evaluation.page import read_log
 from rawaug.evaluation.scores import score, to_domain
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.recipe import ArmConfig, DataConfig
-from rawaug.experiment.srgb import SrgbRecipe, SrgbRun, best_filter, developed, srgb_trials
+from rawaug.experiment.srgb import REAL, SrgbRecipe, SrgbRun, best_filter, developed, srgb_trials
+from rawaug.io.pictures import write_picture
 from rawaug.metrics import psnr
 from rawaug.training.config import DenoiserConfig, TrainConfig
+from rawaug.training.srgb_noise import Told
 
 LEVELS = [(1e-9, 1e-12), (2e-3, 1e-5)]
 SMALL = [
@@ -30,6 +33,20 @@ SMALL = [
     "--train.crop", "32", "--train.batch", "4", "--train.validate-every", "1",
 ]  # fmt: skip
 """The recipe in seconds."""
+
+
+RECIPE = SrgbRecipe(
+    name="a",
+    data=DataConfig(pairs=None, pictures="tiny:"),
+    camera="universal",
+    arms={"gaussian": ArmConfig(1.0, srgb_noise="Gaussian")},
+    denoiser=DenoiserConfig(settings={"width": 4, "scales": 2, "channels": 3, "variance_map": False}),
+    train=TrainConfig(steps=1, batch=1, crop=32),
+    rivals=[],
+    levels=[(8e-3, 1e-4)],
+    device="cpu",
+)
+"""One arm, one step."""
 
 
 @pytest.fixture(scope="module")
@@ -110,20 +127,27 @@ def test_the_recipe_scores_every_arm_and_method_at_every_level(
 
 @pytest.mark.usefixtures("tiny")
 def test_real_pairs_choose_the_weights_and_are_scored(tmp_path: Path) -> None:
-    folder, generator = tmp_path / "pairs", torch.Generator().manual_seed(0)
-    for name in "ab":
+    generator = torch.Generator().manual_seed(0)
+    for part in ("seen", "unseen"):
+        (tmp_path / part).mkdir()
         clean = torch.rand(3, 8, 10, generator=generator).repeat_interleave(8, 1).repeat_interleave(8, 2)
         noisy = clean + 0.05 * torch.randn(clean.shape, generator=generator)
         for kind, picture in (("real", noisy), ("mean", clean)):
-            write_picture(folder / f"{name}_{kind}.png", picture.clamp(0.0, 1.0))
-    given = [*SMALL, "--data.validation", f"cc15:{folder}", "--data.test", f"cc15:{folder}"]
-    with pytest.raises(ValueError, match="also in data.validation"):
-        run_recipe(["run", "srgb", *given, "--out", str(tmp_path)])
-    given[-1] = "tiny:test"
-    run_recipe(["run", "srgb", *given, "--out", str(tmp_path)])
-    (log,) = (tmp_path / "srgb" / "seed0" / "camera").glob("log.csv")
-    assert "psnr" in log.read_text()
-    given[given.index("--data.validation") + 1 :: 2] = ["tiny:validation", f"cc15:{folder}"]
+            write_picture(tmp_path / part / f"a_{kind}.png", picture.clamp(0.0, 1.0))
+    seen, unseen = (f"cc15:{tmp_path / part}" for part in ("seen", "unseen"))
+    recipe = replace(
+        RECIPE, data=DataConfig(pairs=None, pictures="tiny:", validation=seen, test=unseen), out=str(tmp_path)
+    )
+    found = SrgbRun(recipe, True, {}).run_stages()
+    scored = [
+        found["gaussian"][0][REAL],
+        json.loads((tmp_path / "a" / "results.json").read_text())["others"]["noisy"][REAL],
+    ]
+    assert all(20 < one["psnr"] < 40 for one in scored)
+    (row,) = read_log(tmp_path / "a" / "seed0" / "gaussian" / "log.csv")
+    assert 20 < float(row["psnr"]) < 40
+    with pytest.raises(ValueError, match=r"is also in data\.validation"):
+        SrgbRun(replace(recipe, data=replace(recipe.data, test=seen)), True, {})
 
 
 @pytest.mark.usefixtures("tiny")
@@ -134,19 +158,7 @@ def test_the_strength_of_a_filter_is_chosen_on_validation_whatever_the_test_fram
     test = pairs[0]
     flat = replace(test, name="flat", raw=torch.full_like(test.raw, 0.2))
     detailed = replace(test, name="detailed", raw=test.raw.clone())
-    recipe = SrgbRecipe(
-        name="a",
-        data=DataConfig(pairs=None, pictures="tiny:"),
-        camera="universal",
-        arms={"gaussian": ArmConfig(1.0, srgb_noise="Gaussian")},
-        denoiser=DenoiserConfig(settings={"width": 4, "scales": 2, "channels": 3, "variance_map": False}),
-        train=TrainConfig(steps=1, batch=1, crop=32),
-        classical=["NonLocalMeans"],
-        rivals=[],
-        levels=[(8e-3, 1e-4)],
-        device="cpu",
-        out=str(tmp_path),
-    )
+    recipe = replace(RECIPE, classical=["NonLocalMeans"], out=str(tmp_path))
     found = {}
     for frame in (flat, detailed):
         SrgbRun(recipe, True, {"validation": [frame], "test": [test]}).run_stages()
@@ -165,6 +177,7 @@ def test_what_has_no_meaning_is_refused() -> None:
     for given, said in (
         ({"levels": []}, "at least one level"),
         ({"denoiser": DenoiserConfig()}, "channels: 3, variance_map: false"),
+        ({"arms": {"a": ArmConfig(1.0, told=Told())}}, "channels: 3, variance_map: true, as told"),
         ({"classical": ["BM3D"]}, "BM3D is for RAW"),
         ({"data": DataConfig(pairs=None, validation=None)}, r"data\.validation"),
         ({"arms": {"a": ArmConfig(1.0, srgb_noise="Gausian")}}, "Gaussian"),

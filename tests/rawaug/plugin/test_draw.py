@@ -69,7 +69,7 @@ def test_with_other_draws_it_is_what_a_new_one_draws(config: AugmentConfig) -> N
     [
         *CONFIGS,
         AugmentConfig(target=Srgb(demosaicing=("ahd", "malvar"), jpeg=(40, 95), finish=True), burst=2),
-        AugmentConfig(target=Srgb(finish=Finish(edges=0.5)), burst=Burst(3, stops=(0.0, -2.0, 1.0))),
+        AugmentConfig(target=Srgb(finish=Finish(unfinished=0.5)), burst=Burst(3, stops=(0.0, -2.0, 1.0))),
     ],
 )
 def test_settings_go_through_json(config: AugmentConfig) -> None:

@@ -9,7 +9,7 @@ from torch.nn import L1Loss, MSELoss
 
 from denoisers.domains import Anscombe
 from rawaug.data.pairs import Sample
-from rawaug.training.criteria import Charbonnier, weigh_loss
+from rawaug.training.criteria import Charbonnier, RootMeanSquare, weigh_loss
 
 SHOT, READ = 2e-3, 1e-5
 NOISY = torch.rand(2, 4, 8, 8, generator=torch.Generator().manual_seed(0)) * 0.8
@@ -27,6 +27,12 @@ def root(y: float) -> float:
 
 def test_charbonnier_is_its_formula() -> None:
     assert Charbonnier(epsilon=0.4)(level(0.5), level(0.2)).item() == pytest.approx(0.5, rel=1e-3)
+
+
+def test_rms_counts_every_picture_by_its_own_error() -> None:
+    denoised = torch.stack([level(0.5)[0], level(0.2)[0]])
+    assert RootMeanSquare(epsilon=0.0)(denoised, level(0.1)).item() == pytest.approx((0.4 + 0.1) / 2)
+    assert RootMeanSquare(epsilon=0.3)(level(0.5), level(0.1)).item() == pytest.approx(0.5)
 
 
 def test_normalised_is_the_loss_in_units_of_the_noise_of_each_pixel() -> None:

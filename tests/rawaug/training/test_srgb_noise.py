@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+from rawaug.data.pairs import Sample
 from rawaug.registry import SRGB_NOISE
 from rawaug.training import srgb_noise
-from rawaug.training.srgb_noise import BsrganNoise, NoisyPictures, SrgbNoise, WhiteNoise
+from rawaug.training.srgb_noise import (
+    BsrganNoise,
+    ColouredNoise,
+    NoisyPictures,
+    SrgbNoise,
+    SrgbSamples,
+    Told,
+    WhiteNoise,
+)
 
 GREY = torch.full((6, 3, 128, 128), 0.5)
 
@@ -106,3 +117,46 @@ def test_limits_that_nobody_means_are_refused() -> None:
     for model, settings, said in wrong:
         with pytest.raises(ValueError, match=said):
             model(**settings)
+
+
+def test_coloured_noise_has_the_drawn_deviation_and_is_blurred_and_grey_as_drawn() -> None:
+    model = ColouredNoise(sigma=20.0, coloured=0.5)
+    drawn = model.sample(3000, torch.Generator().manual_seed(0))
+    assert drawn["sigma"].max() * 255 <= 20.0
+    assert (drawn["sigma"] * 255).mean().item() == pytest.approx(20.0 / 2.5, rel=0.05), "a share to the power 1.5"
+    assert (drawn["blur"] > 0).float().mean().item() == pytest.approx(0.5, abs=0.03)
+    assert (drawn["quality"] > 0).float().mean().item() == pytest.approx(0.5, abs=0.03)
+    given = {"sigma": torch.full((6,), 0.04), "quality": torch.zeros(6, dtype=torch.long), "grey": torch.zeros(6)}
+    white, soft = (noise_of(model, **given, blur=torch.full((6,), by)) for by in (0.0, 1.2))
+    for noise in (white, soft):
+        assert noise.std((1, 2, 3)).sub(0.04).abs().max() < 1e-3
+    neighbours = [(x[..., 1:] * x[..., :-1]).mean().item() / 0.04**2 for x in (white, soft)]
+    assert abs(neighbours[0]) < 0.02 and neighbours[1] == pytest.approx(math.exp(-0.25 / 1.2**2), abs=0.05)
+    grey = noise_of(model, **given | {"grey": torch.ones(6)}, blur=torch.zeros(6))
+    assert grey.std(1).max() < 1e-6
+
+
+def test_a_network_is_told_nothing_the_deviation_or_a_wrong_one() -> None:
+    told, generator = Told(unknown=0.3, exact=0.5, factor=2.0), torch.Generator().manual_seed(0)
+    times = torch.tensor([told.sample(generator) for _ in range(4000)])
+    assert (times == 0).float().mean().item() == pytest.approx(0.3, abs=0.03)
+    assert (times == 1).float().mean().item() == pytest.approx(0.5, abs=0.03)
+    wrong = times[(times != 0) & (times != 1)]
+    assert 0.5 <= wrong.min() < 0.51 and 1.98 < wrong.max() <= 2.0 and abs(wrong.log().mean()) < 0.05
+    sample = Sample(torch.full((3, 4, 4), 0.6), torch.full((3, 4, 4), 0.5), torch.zeros(3, 4, 4))
+    assert torch.allclose(told.apply(sample, 2.0).variance, torch.full((3, 4, 4), 0.04))
+
+
+def test_a_share_of_the_samples_has_noise_drawn_on_srgb_and_each_depends_on_its_generator_alone() -> None:
+    class Camera:
+        def draw_batch(self, generators: Sequence[torch.Generator]) -> list[Sample]:
+            return [Sample(*torch.rand(3, 3, 8, 8, generator=one)) for one in generators]
+
+    grey = NoisyPictures([torch.full((3, 40, 40), 99, dtype=torch.uint8)], WhiteNoise(), 8)
+    mixed = SrgbSamples(Camera(), grey, 0.25, Told())  # type: ignore[arg-type]
+    samples = mixed.draw_batch([torch.Generator().manual_seed(k) for k in range(400)])
+    share = sum(bool((one.clean == 99 / 255).all()) for one in samples) / 400
+    assert share == pytest.approx(0.25, abs=0.06)
+    for k in (0, 7, 8, 9):
+        again = mixed.draw(torch.Generator().manual_seed(k))
+        assert all(map(torch.equal, again, samples[k]))
