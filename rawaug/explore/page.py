@@ -15,64 +15,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment
+from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 
 from rawaug.bayer import PATTERNS
 from rawaug.errors import MissingExtra, escape, extra
-from rawaug.explore.views import (
-    VIEWS,
-    Look,
-    Panel,
-    command,
-    denoise,
-    drop_inapplicable,
-    iso_range,
-    load_isp,
-    noise_choices,
-    python,
-    tone_names,
-    with_tab,
-)
+from rawaug.explore import views
+from rawaug.explore.views import VIEWS, Look, Panel
 from rawaug.files import WEIGHTS
 from rawaug.isp.cameras import LAMPS, load_cameras
 from rawaug.plugin.config import AugmentConfig
 from rawaug.plugin.draw import Draw
 
-STYLE = """
-.panels {display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 240px), 1fr)); gap: 12px}
-.panels figure {margin: 0; min-width: 0}
-.panels img {width: 100%; height: auto; display: block; border-radius: 4px}
-.panels figcaption {font-size: 13px; line-height: 1.4; padding: 4px 0; overflow-wrap: anywhere}
-.panels .number {white-space: nowrap}
-#message:not(:has(.message)) {display: none}
-.message {border: 1px solid #c0392b; border-radius: 4px; padding: 8px 12px; overflow-wrap: anywhere}
-#controls {max-width: 420px}
-#views {min-width: 0 !important}
-@media (max-width: 768px) {
-  #layout {flex-direction: column-reverse; align-items: stretch}
-  #controls, #views {max-width: none; width: 100%; flex: none}
-}
-"""
-
-
-_PANELS = """
-<div class="panels">
-{%- for panel in panels %}
-<figure><img src="{{ panel.image|data_url }}" alt="{{ panel.title }}"><figcaption>
-{%- for word in panel.title.split() %}{% if "e-" in word %}<span class="number">{{ word }}</span>{% else %}{{ word }}
-{%- endif %} {% endfor %}</figcaption></figure>
-{%- endfor %}
-</div>
-"""
-"""Pictures with their titles; numbers such as 2.9e-03 stay on one line."""
-
 
 def as_html(panels: Sequence[Panel]) -> str:
     """A grid of pictures with their titles, as HTML."""
-    templates = Environment(autoescape=True)
+    templates = Environment(loader=PackageLoader(__package__, ""), autoescape=True)
     templates.filters["data_url"] = data_url
-    return templates.from_string(_PANELS).render(panels=panels)
+    return templates.get_template("panels.html").render(panels=panels)
 
 
 def message(text: str) -> str:
@@ -115,7 +75,7 @@ def parse_look(values: Mapping[str, Any]) -> Look:
         ),
         cfa=None if values["cfa"] == OWN else values["cfa"],
     )
-    return Look(str(picture), drop_inapplicable(config), int(values["seed"] or 0))
+    return Look(str(picture), views.drop_inapplicable(config), int(values["seed"] or 0))
 
 
 def _given(choice: str) -> str | None:
@@ -133,9 +93,9 @@ def show(tab: str, values: Mapping[str, Any]) -> dict[str, Any]:
         What changes on the page: ``message``, ``python``, ``command``, and the content of the tab by its name.
     """
     try:
-        look = with_tab(tab, parse_look(values))
+        look = views.with_tab(tab, parse_look(values))
         if tab == DENOISE:
-            before, after = denoise(look)
+            before, after = views.denoise(look)
             images = (before.image, after.image)
             return {"message": "", tab: images, "compared": f"{before.title} | {after.title}", **_code(look)}
         return {"message": "", tab: as_html(VIEWS[tab](look)), **_code(look)}
@@ -145,7 +105,7 @@ def show(tab: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _code(look: Look) -> dict[str, str]:
-    return {"python": python(look), "command": command(look)}
+    return {"python": views.python(look), "command": views.command(look)}
 
 
 def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
@@ -189,11 +149,11 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
         made["isp"] = gr.Dropdown(isps, value=usual.isp, label="ISP")
         made["camera"] = gr.Dropdown([ANY, *cameras], value=ANY, label="Camera", **whole)
         made["light"] = gr.Dropdown([ANY, *(f"{k} K" for k in KELVINS), *LAMPS], value=ANY, label="Light", **whole)
-        made["tone"] = gr.Dropdown([ANY, *tone_names(usual.isp)], value=ANY, label="Tone curve", **whole)
+        made["tone"] = gr.Dropdown([ANY, *views.tone_names(usual.isp)], value=ANY, label="Tone curve", **whole)
         made["draw_exposure"] = gr.Checkbox(True, label="Draw the exposure at random")
         made["exposure"] = gr.Slider(-4, 1, value=0, step=0.25, label="Exposure (stops)", interactive=False)
     with gr.Group():
-        made["noise"] = gr.Dropdown(noise_choices(usual.isp), value=usual.noise, label="Noise", **whole)
+        made["noise"] = gr.Dropdown(views.noise_choices(usual.isp), value=usual.noise, label="Noise", **whole)
         made["iso"] = gr.Number(0, label="ISO", info=_about_iso(str(usual.noise)), interactive=False)
         made["cfa"] = gr.Dropdown([OWN, *PATTERNS], value=OWN, label="CFA")
         made["seed"] = gr.Number(FIRST_SEED, label="Seed", precision=0, minimum=0)
@@ -210,7 +170,7 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
 
 
 def _tab(gr: Any, name: str, outputs: dict[str, Any]) -> Any:
-    view = VIEWS.get(name, denoise)
+    view = VIEWS.get(name, views.denoise)
     with gr.Tab(name) as tab:
         gr.Markdown(str(view.__doc__).partition("\n")[0])  # what it shows
         if name == DENOISE:
@@ -241,7 +201,7 @@ def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, An
     fitting = [controls[name] for name in ("camera", "light", "tone", "noise")]
     isp.change(partial(_update_choices, gr), [isp, controls["tone"], noise], fitting, **quiet)
     noise.change(
-        lambda name: gr.update(interactive=iso_range(name) is not None, info=_about_iso(name)),
+        lambda name: gr.update(interactive=views.iso_range(name) is not None, info=_about_iso(name)),
         noise,
         controls["iso"],
         **quiet,
@@ -251,7 +211,8 @@ def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, An
 
 def _update_choices(gr: Any, isp: str, tone: str, noise: str) -> list[Any]:
     """Offer cameras, lights and tones of published cameras alone, and an ISP's own noise with this ISP alone."""
-    published, tones, noises = bool(load_isp(isp).config.cameras), [ANY, *tone_names(isp)], noise_choices(isp)
+    published, tones = bool(views.load_isp(isp).config.cameras), [ANY, *views.tone_names(isp)]
+    noises = views.noise_choices(isp)
     toned = gr.update(interactive=published, choices=tones, **({} if tone in tones else {"value": ANY}))
     usual = AugmentConfig().noise
     noised = gr.update(choices=noises, **({} if noise in noises else {"value": usual}))
@@ -259,7 +220,7 @@ def _update_choices(gr: Any, isp: str, tone: str, noise: str) -> list[Any]:
 
 
 def _about_iso(noise: str) -> str:
-    measured = iso_range(noise)
+    measured = views.iso_range(noise)
     return f"0: drawn from {measured[0]:g} to {measured[1]:g}" if measured else "this noise model has no ISO"
 
 
@@ -271,7 +232,8 @@ def make_server(page: Any) -> Any:
         import uvicorn
 
     theme = gr.themes.Base(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
-    app = gr.mount_gradio_app(fastapi.FastAPI(), page, "/", footer_links=[], ssr_mode=False, theme=theme, css=STYLE)
+    form = {"theme": theme, "css_paths": Path(__file__).with_name("page.css"), "footer_links": []}
+    app = gr.mount_gradio_app(fastapi.FastAPI(), page, "/", ssr_mode=False, **form)
     return uvicorn.Server(uvicorn.Config(app, log_level="error"))
 
 

@@ -26,7 +26,6 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.files import digest, parse_object, replacing, write_json
-from rawaug.plugin.config import AugmentConfig
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.targets import Burst
 from rawaug.synthesis.files import Origin, PairMaker, Settings, pair_levels, replay_pair
@@ -191,54 +190,21 @@ def write_index(out: Path, count: int, settings: Settings) -> None:
         partial.write_text(dataset_card(shards, settings), encoding="utf-8")
 
 
-def _form(config: AugmentConfig) -> str:
-    raw = "packed float32 RAW `(4, h, w)` in the order R, Gr, Gb, B"
-    if config.cfa is not None and config.cfa not in CFA.__members__:
-        raw = f"float32 RAW mosaics `(1, H, W)` of the pattern {config.cfa}"
-    raw += ", black 0, white 1, not clipped at black"
-    forms = {
-        "rgb": f"clean linear camera RGB, float32 `(3, H, W)`, and noisy {raw}",
-        "srgb": "developed sRGB, float32 `(3, H, W)` in [0, 1]",
-    }
-    form, burst = forms.get(config.target_name, raw), config.burst
-    frames = burst.frames if isinstance(burst, Burst) else burst
-    return form if frames is None else f"{form}; noisy has an axis of {frames} frames before these"
-
-
 def dataset_card(shards: Sequence[Mapping[str, Any]], settings: Settings) -> str:
     """Write the text of the dataset card, with the header that Hugging Face reads."""
+    from jinja2 import Environment, PackageLoader
+
     pairs, size = (sum(shard[key] for shard in shards) for key in ("nsamples", "filesize"))
-    config = settings.config
-    others = {key: value for key, value in config.to_json().items() if key not in ("isp", "noise")}
-    rows = "".join(
-        f"\n| {key} | {value if isinstance(value, str) else json.dumps(value)} |" for key, value in others.items()
+    config, burst = settings.config, settings.config.burst
+    rows = settings.to_json() | {"isp": f"{Path(config.isp).name} (SHA-256 {settings.isp_sha256})"}
+    templates = Environment(loader=PackageLoader(__package__, ""), trim_blocks=True, keep_trailing_newline=True)
+    return templates.get_template("card.md").render(
+        category=next((name for limit, name in _SIZES if pairs < limit), "n>10M"),
+        pairs=pairs,
+        shards=len(shards),
+        gigabytes=f"{size / 1e9:.3g}",
+        rows={key: rows[key] for key in rows if key not in ("format", "isp_sha256")},
+        target=config.target_name,
+        cfa=None if (config.cfa or "RGGB") in CFA.__members__ else config.cfa,
+        frames=burst.frames if isinstance(burst, Burst) else burst,
     )
-    category = next((name for limit, name in _SIZES if pairs < limit), "n>10M")
-    return f"""---
-configs:
-- config_name: default
-  data_files: "shard-*.tar"
-size_categories:
-- {category}
-task_categories:
-- image-to-image
-tags:
-- raw
-- denoising
-- webdataset
----
-
-# RAW pairs
-
-{pairs} noisy/clean RAW pairs in {len(shards)} WebDataset shards, {size / 1e9:.3g} GB, made of sRGB pictures by rawaug.
-
-| setting | value |
-|---|---|
-| ISP | {Path(config.isp).name} (SHA-256 {settings.isp_sha256}) |
-| noise | {config.noise} |
-| seed | {settings.seed} |{rows}
-
-Each sample has `clean.npy` and `noisy.npy`, {_form(config)};
-and `json`: the picture and its SHA-256, `cfa`, `height` and `width` of the mosaic, the noise levels
-and the parameters that replay the pair. The pictures' licences apply to the pairs: name them here.
-"""
