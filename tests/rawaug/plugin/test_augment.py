@@ -94,7 +94,7 @@ def test_wrong_settings_are_refused(isp: DictionaryISP) -> None:
             Draw(exposure=exposure)  # type: ignore[arg-type]
     for noise in (5, 0.01, math.nan, True, [[1, 2], [3, 4]], [math.nan, 1]):
         with pytest.raises(ValueError, match=r"must be a name or a pair|variances must be finite"):
-            RawAugment.from_pretrained("universal", noise=noise)
+            RawAugment.from_pretrained("universal", noise=noise)  # type: ignore[arg-type]
 
 
 def test_raw_is_developed_by_the_setting_that_made_it(isp: DictionaryISP) -> None:
