@@ -208,7 +208,7 @@ def test_bad_input_is_one_line(tmp_path: Path, refused: Callable[..., str], baye
         (("fit", "demo:train", "--out", "x.safetensors", "--noise", "off", "--dark", "gone"), "dark gone: is for"),
         *((("denoise", file, f"out{file.suffix}", "--denoiser", ""), "no such denoiser") for file in (whole, picture)),
         *((("synth", picture, "out", "--noise", noise), "noise") for noise in ("null", "true", "[[1,2],[3,4]]")),
-        (("denoise", sound, "b.dng", "--noise", "[nan,1]"), "variances must be finite"),
+        (("denoise", sound, "b.dng", "--noise", "[nan,1]"), "must be a name or a pair"),
     ):
         assert said in refused(*words)
 
