@@ -89,8 +89,8 @@ def pad_to_multiple(image: Tensor, stride: int) -> Tensor:
     for axis in (-2, -1):
         size = image.shape[axis]
         padding = -size % stride
-        if torch.compiler.is_compiling() or padding:  # an exported network pads whatever size it is given
-            period = torch.scalar_tensor(2 * (size - 1), dtype=torch.int64, device=image.device)
+        if torch.compiler.is_compiling() or torch.jit.is_tracing() or padding:  # exported, it pads any size
+            period = 2 * (size - 1)
             place = torch.remainder(torch.arange(size + padding, device=image.device), period)
             image = image.index_select(axis, torch.minimum(place, period - place))
     return image
@@ -136,7 +136,7 @@ def halve(picture: Tensor) -> Tensor:
     """
     if picture.shape[1] != PACKED:
         return F.avg_pool2d(picture, 2)
-    return bayer.pack(bayer.bin_mosaic(bayer.unpack(picture, bayer.CFA.RGGB), bayer.CFA.RGGB, 2), bayer.CFA.RGGB)
+    return bayer.bin_packed(picture, 2)
 
 
 def double(picture: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ from rawaug.bayer.cfa import (
     N_VIEWS,
     bin_mosaic,
     bin_mosaic_variance,
+    bin_packed,
     crop,
     crop_to_cfa,
     mosaic,
@@ -23,7 +24,7 @@ from rawaug.bayer.transforms import Pack, RandomCrop, RandomTurn
 
 __all__ = [
     "CFA", "DIRECTIONAL", "METHODS", "N_VIEWS", "PATTERNS", "STENCILS", "Halving", "Pack", "Pattern", "RandomCrop",
-    "RandomTurn", "bin_mosaic", "bin_mosaic_variance", "canonical_cfa", "crop", "crop_to_cfa", "demosaic",
+    "RandomTurn", "bin_mosaic", "bin_mosaic_variance", "bin_packed", "canonical_cfa", "crop", "crop_to_cfa", "demosaic",
     "demosaicing_stencils", "mosaic", "noise_variance", "pack", "pack_rgb", "pattern", "pattern_name",
     "plane_indices", "require_method", "to_bayer", "to_bayer_variance", "turn", "turn_back", "turn_keeping_cfa",
     "unpack",

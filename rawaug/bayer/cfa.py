@@ -192,10 +192,15 @@ def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False)
     if factor < 1 or any(side % (2 * factor) for side in raw.shape[-2:]):
         raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} cannot be binned by {factor}; use multiples of 2 factor")
     CFA(cfa)  # whatever the pattern of 2 x 2 sites, each is averaged with its own kind
+    return unpack(bin_packed(pack(raw, CFA.RGGB), factor, together), CFA.RGGB)
+
+
+def bin_packed(packed: Tensor, factor: int, together: bool = False) -> Tensor:
+    """Bin as :func:`bin_mosaic` does: packed RGGB ``(..., 4, h, w)`` to ``(..., 4, h / factor, w / factor)``."""
     moves = [(2 * i - 1) * (-1 if together else factor - 1) / 4 for i in (0, 1)]
-    rows = [_window_means(raw[..., i::2, :], -2, factor, moves[i]) for i in (0, 1)]
-    sites = [[_window_means(row[..., j::2], -1, factor, moves[j]) for j in (0, 1)] for row in rows]
-    return torch.stack([torch.stack(pair, -1).flatten(-2) for pair in sites], -2).flatten(-3, -2)
+    planes = zip(packed.unbind(-3), CFA.RGGB.sites, strict=True)
+    rows = ((_window_means(plane, -2, factor, moves[i]), moves[j]) for plane, (i, j) in planes)
+    return torch.stack([_window_means(row, -1, factor, move) for row, move in rows], -3)
 
 
 def bin_mosaic_variance(factor: int, together: bool = False) -> float:
@@ -207,10 +212,11 @@ def bin_mosaic_variance(factor: int, together: bool = False) -> float:
 def _window_means(plane: Tensor, axis: int, factor: int, move: float) -> Tensor:
     """Average windows of ``factor`` sites of one colour, moved by ``move`` of its sites."""
     first, part = math.floor(move), move % 1
-    size = plane.shape[axis]  # not len(), which an exported network would keep
-    sites = torch.arange(size, device=plane.device)
+    axis %= plane.ndim  # from here on nothing takes a size as a number, which an exported network would keep
+    sites = torch.arange(plane.shape[axis], device=plane.device)
+    windows = (*plane.shape[:axis], -1, factor, *plane.shape[axis + 1 :])
     near, far = (
-        plane.index_select(axis, (sites + k).clamp(0, size - 1)).unflatten(axis, (-1, factor)).mean(axis)
+        plane.index_select(axis, torch.minimum((sites + k).clamp_min(0), sites[-1:])).reshape(windows).mean(axis + 1)
         for k in (first, first + 1)
     )
     return torch.lerp(near, far, part)

@@ -1,20 +1,18 @@
 """``rawaug export``: a denoiser as an ONNX file, an ISP as JSON, .cube and ONNX, for programs without PyTorch.
 
-A denoiser maps ``noisy`` and, where the network reads it, its ``variance`` to ``denoised``: float32 packed RAW of any
-size. An ISP becomes JSON (``rawaug info --json`` and the table of the .cube), a .cube (Adobe's format, 33 nodes along
-each axis: sRGB to linear camera RGB, up to lens shading and mosaic), and ONNX: ``srgb (1, 3, h, w)`` of even sides in
-[0, 1], ``matrix (1, 3, 3)`` from linear sRGB to camera RGB and ``gains (1, 3)`` to ``raw (1, 4, h/2, w/2)``. An ONNX
-file is run by ONNX Runtime and compared with PyTorch before it is left there.
+A denoiser maps ``noisy`` and, where the network reads it, its ``variance`` to ``denoised``: float32 packed RAW, any
+number of pictures of any size. An ISP becomes JSON (``rawaug info --json`` and the table of the .cube), a .cube (Adobe's
+format, 33 nodes along each axis: sRGB to linear camera RGB, up to lens shading and mosaic), and ONNX: ``srgb (1, 3, h,
+w)`` of even sides in [0, 1], ``matrix (1, 3, 3)`` from linear sRGB to camera RGB and ``gains (1, 3)`` to ``raw (1, 4,
+h/2, w/2)``. An ONNX file is run by ONNX Runtime and compared with PyTorch before it is left there.
 """
 
 from __future__ import annotations
 
 import json
-import logging
 import timeit
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,6 +36,8 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.seeding import keyed_generator
 
+OPSET = 18
+"""The version of ONNX's operators that a graph is written in."""
 TOLERANCE = 1e-4
 """Largest difference between ONNX Runtime and PyTorch, white at 1."""
 NODES = 33
@@ -51,33 +51,28 @@ def write_onnx(
 ) -> Any:
     """Write ``model(*inputs)`` as ONNX of float32, with metadata; the ONNX Runtime session of it.
 
-    Height and width of four-dimensional inputs are free.
+    Batch, height and width of four-dimensional inputs are free.
     """
     with extra("export"):
-        import onnx  # noqa: F401
-        import onnxscript  # noqa: F401
-    free = {2: torch.export.Dim.DYNAMIC, 3: torch.export.Dim.DYNAMIC}
-    with warnings.catch_warnings(), errors_only("torch.onnx"):  # not the exporter's own, as of torchvision's absence
-        warnings.simplefilter("ignore")
-        shapes = tuple(free if value.ndim == 4 else None for value in inputs.values())
-        program = torch.export.export(model, tuple(inputs.values()), dynamic_shapes=shapes)
-        made = torch.onnx.export(program, input_names=list(inputs), output_names=[output], dynamo=True, verbose=False)
-        assert made is not None
-        made.model.metadata_props.update(stated or {})
-        made.save(str(path), external_data=False)
+        import onnx
+    free = {name: {0: "batch", 2: "h", 3: "w"} for name, value in inputs.items() if value.ndim == 4}
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")  # the exporter's own: checks of shapes are no part of the graph
+        torch.onnx.export(
+            model,
+            tuple(inputs.values()),
+            str(path),
+            input_names=list(inputs),
+            output_names=[output],
+            dynamic_axes=free | {output: {0: "batch", 2: f"{output}_h", 3: f"{output}_w"}},
+            opset_version=OPSET,
+            dynamo=False,  # whose graph of a pyramid takes minutes
+        )
+    if stated:
+        made = onnx.load(str(path))
+        onnx.helper.set_model_props(made, dict(stated))
+        onnx.save(made, str(path))
     return session_of(path)
-
-
-@contextmanager
-def errors_only(name: str) -> Iterator[None]:
-    """A logger and those below it say nothing less than an error."""
-    logger = logging.getLogger(name)
-    before = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)
 
 
 def difference_from(expected: Tensor, session: Any, inputs: Mapping[str, Tensor], path: Path) -> float:
@@ -200,7 +195,7 @@ def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = Non
     model, info = denoisers.load(find(denoiser))
     names = ["noisy", "variance"][: 1 + model.reads_variance]
     inputs = dict(zip(names, comparison_frame(frame), strict=False))
-    example = torch.rand(1, model.channels, 70, 90)
+    example = torch.rand(2, model.channels, 70, 90)
     examples = dict(zip(names, (example, 1e-3 * example + 1e-5), strict=False))
     stated = {"stride": str(model.stride), "upscale": str(model.upscale), "info": json.dumps(info)}
     with replacing(out) as partial:
@@ -211,7 +206,7 @@ def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = Non
         difference = difference_from(expected, session, inputs, out)
         values = feeds(names, list(inputs.values()))
         seconds_onnx = 0.0 if not time else min(timeit.repeat(lambda: session.run(None, values), number=1, repeat=3))
-    size = f"{out}: {out.stat().st_size / 1e6:.1f} MB, of any height and width, a batch of 1"
+    size = f"{out}: {out.stat().st_size / 1e6:.1f} MB, of any batch, height and width"
     line = f"{size}; largest difference from PyTorch {difference:.1e}"
     if not time:
         return line

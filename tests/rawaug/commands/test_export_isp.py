@@ -66,7 +66,7 @@ def test_json_holds_the_curve_and_the_same_table(isp: DictionaryISP, tmp_path: P
 
 
 def test_onnx_gives_pytorch_s_numbers_at_any_size(tmp_path: Path) -> None:
-    for library in ("onnx", "onnxscript", "onnxruntime"):
+    for library in ("onnx", "onnxruntime"):
         pytest.importorskip(library, reason="pip install rawaug[export]")
     isp = DictionaryISP.from_pretrained("gopro-hero")
     (path,) = export_isp(isp, tmp_path / "camera.onnx")
