@@ -1,7 +1,7 @@
 """``rawaug export``: a denoiser as an ONNX file, an ISP as JSON, .cube and ONNX, for programs without PyTorch.
 
 A denoiser maps ``noisy`` and, where the network reads it, its ``variance`` to ``denoised``: float32 packed RAW, any
-number of pictures of any size. An ISP becomes JSON (``rawaug info --json`` and the table of the .cube), a .cube (Adobe's
+number of pictures of any size. An ISP becomes JSON (``rawaug info --json`` and the .cube's table), a .cube (Adobe's
 format, 33 nodes along each axis: sRGB to linear camera RGB, up to lens shading and mosaic), and ONNX: ``srgb (1, 3, h,
 w)`` of even sides in [0, 1], ``matrix (1, 3, 3)`` from linear sRGB to camera RGB and ``gains (1, 3)`` to ``raw (1, 4,
 h/2, w/2)``. An ONNX file is run by ONNX Runtime and compared with PyTorch before it is left there.
