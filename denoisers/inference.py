@@ -14,6 +14,11 @@ from denoisers.domains import fit_levels
 from denoisers.network import PACKED
 from rawaug import bayer
 
+Run = Callable[[Tensor, Tensor | None], Tensor]
+"""``run(noisy, variance) -> denoised``: a network, or anything that is called like one."""
+Each = Callable[[Sequence[Any]], Iterable[Any]]
+"""Iterates over pieces of work, and may show progress, as ``tqdm`` does."""
+
 OVERLAP = 96
 """Packed pixels by which tiles overlap where nothing else is said."""
 
@@ -29,12 +34,12 @@ def _pieces(size: int, tile: int, overlap: int, stride: int) -> tuple[list[int],
 
 @torch.no_grad()
 def tiled(
-    model: Callable[[Tensor, Tensor | None], Tensor],
+    model: Run,
     noisy: Tensor,
     variance: Tensor | None = None,
     tile: int = 1536,
     overlap: int | None = None,
-    each: Callable[[Sequence[Any]], Iterable[Any]] = iter,
+    each: Each = iter,
 ) -> Tensor:
     """Denoise a picture of any size piece by piece, without gradients: ``f(y)[core] = f(y[core + overlap])[core]``.
 
@@ -130,13 +135,7 @@ class SelfEnsemble(nn.Module):
         True
     """
 
-    def __init__(
-        self,
-        model: Callable[[Tensor, Tensor | None], Tensor],
-        cfa: bayer.CFA | str,
-        views: int = 8,
-        each: Callable[[Sequence[Any]], Iterable[Any]] = iter,
-    ) -> None:
+    def __init__(self, model: Run, cfa: bayer.CFA | str, views: int = 8, each: Each = iter) -> None:
         super().__init__()
         if views not in VIEWS:
             raise ValueError(f"views must be 4 (flips) or 8 (flips and quarter turns), got {views}")
@@ -178,9 +177,7 @@ class Recorrupted(nn.Module):
         seed: the added noise is drawn from it.
     """
 
-    def __init__(
-        self, model: Callable[[Tensor, Tensor | None], Tensor], alpha: float, draws: int, seed: int = 0
-    ) -> None:
+    def __init__(self, model: Run, alpha: float, draws: int, seed: int = 0) -> None:
         super().__init__()
         if draws < 1 or not alpha > 0:
             raise ValueError(f"draws must be at least 1 and alpha positive, got {draws} and {alpha}")

@@ -79,8 +79,7 @@ class JointDRUNet(DRUNet):
         self.refine = nn.Sequential(*(ResidualBlock(width) for _ in range(refine)))
         self.detail = conv(width, RGB * PACKED, bias=False)
         self.register_buffer("stencils", _stencils(), persistent=False)
-        ends = [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
-        self.initialise(seed, self.tail, self.detail, *ends, gain=1.0)
+        self.initialise(seed, self.tail, self.detail, *self.block_ends(), gain=1.0)
 
     def residual(self, features: Tensor) -> Tensor:
         """Compute the correction of full colour ``(B, 3, 2h, 2w)`` from features ``(B, inputs, h, w)``."""

@@ -22,8 +22,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from denoisers.domains import DOMAINS, fit_levels
-from denoisers.network import BLIND, DEFECT, NEAR, PACKED, Denoiser, conv, pad_to_multiple
-from denoisers.networks import CONTEXT, DRUNet, ResidualBlock
+from denoisers.network import DEFECT, PACKED, Denoiser, conv, pad_to_multiple, smooth_correction
+from denoisers.networks import CONTEXT, DRUNet
 from rawaug import bayer
 from rawaug.registry import DENOISERS
 
@@ -145,8 +145,7 @@ class MosaicDRUNet(DRUNet):
         self.head = conv(SPREAD * (2 + 2 * limits), width, bias=False)
         self.coarse = conv(RGB, self.coarse.out_channels, bias=False)
         self.tail = conv(width, SPREAD, bias=False)
-        ends = [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
-        self.initialise(seed, self.tail, *ends, gain=1.0)
+        self.initialise(seed, self.tail, *self.block_ends(), gain=1.0)
 
     @torch.no_grad()
     def start_from(self, model: Denoiser) -> None:
@@ -187,21 +186,15 @@ class MosaicDRUNet(DRUNet):
         shot, read = (F.pixel_shuffle(halving.variance(_padded(level)), 2) for level in levels)
         colours = bayer.pattern("RGGB").planes(*half.shape[-2:]).to(half).expand(len(half), -1, -1, -1)
         found = self._at_halves(half, colours, (shot, read), clipped, halvings - 1)
-        wide, near = (
-            F.avg_pool2d(x, 3, 1, 1, count_include_pad=False) for x in (F.pixel_unshuffle(found, 2) - seen, share)
-        )
         height, width = raw.shape[-2:]
-        added = halving.back((1.0 - near / BLIND).clamp_min(0.0) * wide)[..., :height, :width]
+        added = halving.back(smooth_correction(F.pixel_unshuffle(found, 2) - seen, share))[..., :height, :width]
         return denoised + (added * planes).sum(1, keepdim=True)
 
     def _of_mosaic(self, raw: Tensor, planes: Tensor, levels: Levels) -> Tensor:
         domain = DOMAINS[self.domain]
         signal = domain.forward(raw.float(), *levels)
-        maps = [signal]
-        if self.limits:
-            white = domain.forward(torch.ones_like(levels[0]), *levels).expand_as(signal)
-            maps += [signal.clamp_max(NEAR), (white - signal).clamp_max(NEAR)]
-        features = pad_to_multiple(torch.cat([planes, *maps], dim=1).to(self._dtype), self.multiple)
+        maps = [planes, signal, *self._distances(signal, levels)]
+        features = pad_to_multiple(torch.cat(maps, dim=1).to(self._dtype), self.multiple)
         correction = self.residual(features)[..., : raw.shape[-2], : raw.shape[-1]]
         return domain.inverse(signal + correction, *levels).to(raw.dtype)
 

@@ -78,10 +78,8 @@ def conv(
         groups: parts of the channels that do not see each other; as many as there are inputs for a depthwise layer.
         padding: zeros around the picture, half of ``size`` by default.
     """
-    settings = {"stride": stride, "groups": groups, "padding": size // 2 if padding is None else padding}
-    return nn.utils.skip_init(
-        nn.Conv2d, inputs, outputs, size, bias=bias, device=torch.get_default_device(), **settings
-    )
+    settings = {"stride": stride, "groups": groups, "padding": size // 2 if padding is None else padding, "bias": bias}
+    return nn.utils.skip_init(nn.Conv2d, inputs, outputs, size, device=torch.get_default_device(), **settings)
 
 
 def pad_to_multiple(image: Tensor, stride: int) -> Tensor:
@@ -152,6 +150,16 @@ def double(picture: Tensor) -> Tensor:
     return F.conv_transpose2d(padded, kernels.to(picture.dtype), stride=2, padding=3, groups=PACKED)
 
 
+def smooth_correction(difference: Tensor, clipped: Tensor) -> Tensor:
+    """Smooth what a picture at half the sides corrects, ``(B, C, h, w)``, and fade it out where values are clipped.
+
+    ``clipped`` is the share of clipped values, of the same shape. Near its own limit of resolution the half picture
+    knows less than the whole one.
+    """
+    wide, near = (F.avg_pool2d(x, 3, 1, 1, count_include_pad=False) for x in (difference, clipped))
+    return (1.0 - near / BLIND).clamp_min(0.0) * wide
+
+
 class Shared(TypedDict, total=False):
     """The settings that every network takes besides its own; :class:`Denoiser` explains them."""
 
@@ -187,13 +195,7 @@ class Denoiser(nn.Module, ABC):
         ValueError: if there is no such domain, it does not go with the rest, or a number is out of range.
     """
 
-    defaults: ClassVar[Shared] = {
-        "channels": PACKED,
-        "variance_map": True,
-        "deviation": True,
-        "domain": "linear",
-        "seed": 0,
-    }
+    defaults: ClassVar[Shared] = Shared(channels=PACKED, variance_map=True, deviation=True, domain="linear", seed=0)
     """What the shared settings are where a call leaves them out."""
     __signature__: ClassVar[inspect.Signature]
 
@@ -303,10 +305,7 @@ class Denoiser(nn.Module, ABC):
         domain, levels = DOMAINS[self.domain], fit_levels(noisy.float(), variance.float())
         signal = domain.forward(noisy.float(), *levels)
         maps = [domain.relative_deviation(noisy.float(), variance.float(), *levels)] if self.variance_map else []
-        if self.limits:
-            white = domain.forward(torch.ones_like(levels[0]), *levels)
-            maps += [signal.clamp_max(NEAR), (white - signal).clamp_max(NEAR)]
-        correction = self._correction(signal, *maps)
+        correction = self._correction(signal, *maps, *self._distances(signal, levels))
         correction = maps[0] * correction if self.variance_map else correction
         return domain.inverse(self.base_image(signal) + correction, *levels).to(noisy.dtype)
 
@@ -324,13 +323,14 @@ class Denoiser(nn.Module, ABC):
         small, seen, share = (halve(pad_to_multiple(x, 4)) for x in (noisy, denoised, clipped))
         part = bayer.bin_mosaic_variance(2) if self.channels == PACKED else 0.25
         told = None if variance is None else part * halve(pad_to_multiple(variance, 4))
-        # Near its own limit of resolution the half picture knows less than the whole one.
-        wide, near = (
-            F.avg_pool2d(x, 3, 1, 1, count_include_pad=False)
-            for x in (self._at_scales(small, told, share, halvings - 1) - seen, share)
-        )
+        wide = smooth_correction(self._at_scales(small, told, share, halvings - 1) - seen, share)
         height, width = noisy.shape[-2:]
-        return denoised + double((1.0 - near / BLIND).clamp_min(0.0) * wide)[..., :height, :width]
+        return denoised + double(wide)[..., :height, :width]
+
+    def _distances(self, signal: Tensor, levels: tuple[Tensor, Tensor]) -> list[Tensor]:
+        """How far a transformed signal is from black and from white, up to :data:`NEAR`, if the network is told."""
+        white = DOMAINS[self.domain].forward(torch.ones_like(levels[0]), *levels)
+        return [signal.clamp_max(NEAR), (white - signal).clamp_max(NEAR)] if self.limits else []
 
     def _correction(self, signal: Tensor, *maps: Tensor) -> Tensor:
         features = torch.cat([signal, *maps], dim=1) if maps else signal

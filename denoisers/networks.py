@@ -419,9 +419,11 @@ class DRUNet(Denoiser):
         self.decoder = nn.ModuleList(_residuals(size, blocks) for size in reversed(sizes[:-1]))
         self.coarse = conv(planes, sizes[-1], bias=False)
         self.tail = conv(width, planes, bias=False)
-        # As in DHDN: residual blocks one after another stay tame when each starts as the identity.
-        ends = [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
-        self.initialise(self.seed, self.tail, *ends, gain=1.0)
+        self.initialise(self.seed, self.tail, *self.block_ends(), gain=1.0)
+
+    def block_ends(self) -> list[nn.Conv2d]:
+        """The last layers of all blocks: as in DHDN, blocks stay tame when each starts as the identity."""
+        return [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
 
     def residual(self, features: Tensor) -> Tensor:
         """Compute the correction ``(B, channels, h, w)`` from features ``(B, inputs, h, w)``."""

@@ -49,11 +49,11 @@ class Pattern:
             >>> pattern("QUAD-RGGB").shift(1, 3).name, pattern("RGGB").shift(0, 1).name
             ('QUAD-RGGB+1+3', 'GRBG')
         """
-        size = self.period
-        moved = tuple(
-            "".join(self.rows[(i + rows) % size][(j + columns) % size] for j in range(size)) for i in range(size)
-        )
-        return _BY_ROWS[moved]
+        return _BY_ROWS[self._rows_from(rows, columns)]
+
+    def _rows_from(self, top: int, left: int) -> tuple[str, ...]:
+        lines = [self.rows[(i + top) % self.period] for i in range(self.period)]
+        return tuple("".join(line[(j + left) % self.period] for j in range(self.period)) for line in lines)
 
     def channels(self, height: int, width: int) -> Tensor:
         """The colour of each site as an index into RGB, int64 ``(H, W)``."""
@@ -162,9 +162,7 @@ def _phases() -> Iterator[Pattern]:
     yield from PATTERNS.values()
     for known in PATTERNS.values():
         for i, j in product(range(known.period), repeat=2):
-            size = known.period
-            rows = tuple("".join(known.rows[(i + k) % size][(j + m) % size] for m in range(size)) for k in range(size))
-            yield Pattern(f"{known.name}+{i}+{j}", rows)
+            yield Pattern(f"{known.name}+{i}+{j}", known._rows_from(i, j))
 
 
 _BY_ROWS: dict[tuple[str, ...], Pattern] = {}

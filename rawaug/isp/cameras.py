@@ -89,6 +89,11 @@ def gains_in_light(xyz_to_camera: Tensor, light: Tensor) -> Tensor:
     return response[..., 1:2] / response
 
 
+def daylight_gains(xyz_to_camera: Tensor) -> Tensor:
+    """Compute the gains ``(..., 3)`` in D65, the light that the matrices ``(..., 3, 3)`` are made for."""
+    return gains_in_light(xyz_to_camera, white_point(D65))
+
+
 LAMPS: dict[str, tuple[float, float]] = {
     "FL1": (0.31310, 0.33727), "FL2": (0.37208, 0.37529), "FL3": (0.40910, 0.39430), "FL4": (0.44018, 0.40329),
     "FL5": (0.31379, 0.34531), "FL6": (0.37790, 0.38835), "FL7": (0.31292, 0.32933), "FL8": (0.34588, 0.35875),

@@ -23,17 +23,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rawaug.isp.cameras import (
-    D65,
-    PHOTOGRAPHS,
-    XYZ_TO_SRGB,
-    Array,
-    LightRange,
-    camera_from_srgb,
-    gains_in_light,
-    sample_lights,
-    white_point,
-)
+from rawaug.isp.cameras import XYZ_TO_SRGB, Array, LightRange, camera_from_srgb, daylight_gains, sample_lights
 from rawaug.isp.config import ISPParams
 
 PLAUSIBLE_GAINS = (0.4, 6.0)
@@ -114,7 +104,7 @@ class CameraDictionary(ColourDictionary):
     def set_cameras(self, xyz_to_camera: Tensor, known: Tensor) -> None:
         """Set the atoms from matrices ``(N, 3, 3)`` from XYZ to camera, and the known cameras by weights ``(P, N)``."""
         self.matrices.copy_(camera_from_srgb(xyz_to_camera))
-        self.light.copy_(log_light(gains_in_light(xyz_to_camera, white_point(D65))))
+        self.light.copy_(log_light(daylight_gains(xyz_to_camera)))
         self.known.copy_(known)
 
     def atoms(self) -> Tensor:
@@ -239,9 +229,7 @@ class CameraSampler:
         consistent: whether colour and gains are of one camera in one light; if not, the gains are drawn apart.
     """
 
-    def __init__(
-        self, cameras: CameraDictionary, tone_atoms: int, lights: LightRange = PHOTOGRAPHS, consistent: bool = True
-    ) -> None:
+    def __init__(self, cameras: CameraDictionary, tone_atoms: int, lights: LightRange, consistent: bool = True) -> None:
         self.known, self.atoms, self.responses = (
             tensor.detach().to("cpu", torch.float64).numpy()
             for tensor in (cameras.known, cameras.atoms().flatten(1), cameras.responses())
@@ -258,9 +246,8 @@ class CameraSampler:
             _, balance = self._cameras_in_light(batch, generator)
         matrix = (weights @ self.atoms).reshape(-1, 3, 3)
         gains = balance / balance.min(axis=1, keepdims=True)
-        colour_weights, matrices, channel_gains = (
-            torch.from_numpy(drawn).to(device, torch.float32) for drawn in (weights, matrix, gains)
-        )
+        drawn = (weights, matrix, gains)
+        colour_weights, matrices, channel_gains = (torch.from_numpy(x).to(device, torch.float32) for x in drawn)
         tones = none = channel_gains[:, :0]
         if self.tone_atoms:
             atoms, shares = sparse_shares(batch, self.tone_atoms, TONES_MIXED, generator)
@@ -279,9 +266,7 @@ class CameraSampler:
             open_ = open_[~is_plausible(balance[open_])]
             if not len(open_):
                 return weights, balance
-        raise ValueError(
-            f"no light of {self.lights.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}; take other lights"
-        )
+        raise ValueError(f"no light of {self.lights.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}")
 
     def balance(self, weights: Array, light: Array) -> Array:
         """Compute the white balance ``(B, 3)``, green 1, of mixtures ``(B, N)`` in light of white points ``(B, 3)``."""

@@ -118,7 +118,5 @@ def _require_bracket(pictures: Sequence[Tensor], ev: Sequence[float]) -> None:
         raise ValueError(f"one exposure for each picture is needed, got {len(ev)} for {len(pictures)}")
     if len(set(ev)) != len(ev):
         raise ValueError(f"exposures must differ, got {' '.join(f'{stops:+g}' for stops in ev)} EV")
-    for k, picture in enumerate(pictures):
-        if picture.shape != pictures[0].shape:
-            shapes = f"{tuple(picture.shape)} and {tuple(pictures[0].shape)}"
-            raise ValueError(f"pictures must have one shape, got {shapes} (the first and number {k + 1})")
+    if len(shapes := {tuple(picture.shape): None for picture in pictures}) > 1:
+        raise ValueError(f"pictures must have one shape, got {' and '.join(map(str, shapes))}")

@@ -344,9 +344,7 @@ def _nearest(target: Tensor, makes: Tensor, typical: Tensor) -> Tensor:
 
 def _require_places(raw_samples: Tensor, x: Tensor) -> None:
     if raw_samples.ndim != 3 or len(raw_samples) != len(x) or raw_samples.shape[2] != 3 or not raw_samples.shape[1]:
-        raise ValueError(
-            f"raw_samples must be ({len(x)}, K, 3) of (row, column, value), got {tuple(raw_samples.shape)}"
-        )
+        raise ValueError(f"raw_samples are ({len(x)}, K, 3) of (row, column, value), got {tuple(raw_samples.shape)}")
     if not raw_samples.isfinite().all():
         raise ValueError("raw_samples: a value is NaN; remove such readings")
     sides = torch.tensor(x.shape[-2:], device=raw_samples.device)

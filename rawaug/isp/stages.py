@@ -69,12 +69,9 @@ def require_display_range(image: Tensor) -> None:
     low, high = (float(value) for value in torch.aminmax(image.detach()))
     if not (low >= -_HALF_LEVEL and high <= 1 + _HALF_LEVEL):
         if missing := int(image.isnan().sum()):
-            raise ValueError(
-                f"a float picture is in [0, 1], got NaN in {missing} of {image.numel()} values; correct it first"
-            )
-        raise ValueError(
-            f"a float picture must be in [0, 1], got {low:.4g} to {high:.4g}; scale it, and normalise after rawaug"
-        )
+            raise ValueError(f"a float picture is in [0, 1], got NaN in {missing} of {image.numel()} values")
+        advice = "scale it, and normalise after rawaug"
+        raise ValueError(f"a float picture must be in [0, 1], got {low:.4g} to {high:.4g}; {advice}")
 
 
 def _colourwise(hidden: int, outputs: int) -> nn.Sequential:

@@ -56,8 +56,6 @@ def try_kernel(kernel: Callable[[], R], otherwise: Callable[[], R]) -> R:
         raise
     except Exception as error:  # whatever a compiler, its driver or its cache may raise
         _failed.append(type(error).__name__)
-        reason = (str(error).splitlines() or [""])[-1]
-        warnings.warn(
-            f"rawaug's GPU kernel is unavailable, using PyTorch instead: {type(error).__name__}: {reason}", stacklevel=3
-        )
+        reason = f"{type(error).__name__}: {(str(error).splitlines() or [''])[-1]}"
+        warnings.warn(f"rawaug's GPU kernel is unavailable, using PyTorch instead: {reason}", stacklevel=3)
         return otherwise()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -66,7 +66,7 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     knee, ceiling = np.float32(camera.knee), np.float32(white)
 
     settings = (scale, table, codes, curves, attention, colour, knee, frame, shading, sites, ceiling)
-    run_over_rows(batch * height, width, lambda start, stop: _raw_rows(picture, *settings, out, start, stop))
+    run_over_rows(batch * height, width, partial(_raw_rows, picture, *settings, out))
     return raw
 
 
@@ -104,9 +104,8 @@ def _render_rows(
     pixels, out = source.numpy(), srgb.numpy()
     # Absent parts are None, so that no code is compiled for them.
     settings = tuple(value.detach().contiguous().numpy() if value.numel() else None for value in display)
-    run_over_rows(
-        batch * height, 3 * width, lambda start, stop: _srgb_rows(pixels, weights, methods, *settings, out, start, stop)
-    )
+    run = partial(_srgb_rows, pixels, weights, methods, *settings, out)
+    run_over_rows(batch * height, 3 * width, run)
     return srgb
 
 
@@ -389,9 +388,8 @@ def _srgb_rows(  # type: ignore[no-untyped-def]
                     for j in range(n):
                         x[c, j] /= mask[j]
             if attention is not None:
-                _look_up(
-                    x[0, :n], x[1, :n], x[2, :n], np.float32(len(attention) - 1), attention, nodes, shares, 0, found
-                )
+                scale = np.float32(len(attention) - 1)
+                _look_up(x[0, :n], x[1, :n], x[2, :n], scale, attention, nodes, shares, 0, found)
                 for c in range(3):
                     for j in range(n):
                         x[c, j] *= found[0, 0, j]
@@ -416,9 +414,7 @@ def _srgb_rows(  # type: ignore[no-untyped-def]
                         srgb[b, c, i, first + j] = y if y < _ONE else _ONE
 
 
-def shot_read(
-    clean: Tensor, levels: Tensor, keys: list[int], white: float, with_variance: bool
-) -> tuple[Tensor, Tensor]:
+def shot_read(clean: Tensor, levels: Tensor, keys: list[int], white: float, mapped: bool) -> tuple[Tensor, Tensor]:
     """Add shot and read noise to clean RAW.
 
     Args:
@@ -426,22 +422,22 @@ def shot_read(
         levels: ``(B, 2)``, shot_var and read_var of each picture.
         keys: one number below 2^64 for each picture.
         white: the value to clip at.
-        with_variance: whether to compute the variance map of the noisy signal.
+        mapped: whether to compute the variance map of the noisy signal.
 
     Returns:
         Noisy RAW and its variance map, both ``(B, 4, h, w)``; the map is empty if it was not asked for.
     """
     noisy = torch.empty_like(clean, memory_format=torch.contiguous_format)
-    variance = torch.empty_like(noisy if with_variance else noisy[:, :, :0])
+    variance = torch.empty_like(noisy if mapped else noisy[:, :, :0])
     signal, out = clean.detach().contiguous().numpy(), noisy.numpy()
     if not noisy.numel():
         return noisy, variance
-    var = variance.numpy() if with_variance else None  # then no code is compiled for it
+    var = variance.numpy() if mapped else None  # then no code is compiled for it
     variances = levels.detach().to("cpu", torch.float32).numpy()
     key = np.array([(k & 0xFFFFFFFF, k >> 32) for k in keys], dtype=np.uint32)
     ceiling = np.float32(white)
     batch, _, height, width = clean.shape
-    run_over_rows(batch * height, 4 * width, lambda a, b: _noise_rows(signal, variances, key, ceiling, out, var, a, b))
+    run_over_rows(batch * height, 4 * width, partial(_noise_rows, signal, variances, key, ceiling, out, var))
     return noisy, variance
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -18,11 +20,9 @@ def demosaic_directional(raw: Tensor, cfa: CFA, method: str) -> Tensor:
     """Demosaic ``(B, 1, H, W)``, float32 on the CPU, to ``(B, 3, H, W)`` by ``adams`` or ``ahd``."""
     batch, _, height, width = raw.shape
     rgb = torch.empty(batch, 3, height, width)
-    ends = ((_MARGIN, _MARGIN), (_MARGIN, _MARGIN))
     for mosaic, out in zip(raw.detach().numpy()[:, 0], rgb.numpy(), strict=True):
-        padded = np.pad(mosaic, ends, mode="reflect")
-        settings = (padded, *cfa.sites[0], method == "ahd", out)
-        run_over_rows(height, width, lambda start, stop, given=settings: _rows(*given, start, stop))  # type: ignore[misc]
+        padded = np.pad(mosaic, _MARGIN, mode="reflect")
+        run_over_rows(height, width, partial(_rows, padded, *cfa.sites[0], method == "ahd", out))
     return rgb
 
 
@@ -105,14 +105,12 @@ def _leads(pictures, lead):  # type: ignore[no-untyped-def]
                     light = green[i, j] - green[i2, j2]
                     warm, cold = red[i, j] - red[i2, j2] - light, blue[i, j] - blue[i2, j2] - light
                     steps[d, down, 0, i, j], steps[d, down, 1, i, j] = light * light, warm * warm + cold * cold
+    # The picture along rows is judged by its steps along rows, that along columns by its steps along columns.
+    of_rows, of_columns = steps[0, 0], steps[1, 1]
     for i in range(4, rows - 4):
         for j in range(4, width - 4):
-            light = min(
-                max(steps[0, 0, 0, i, j - 1], steps[0, 0, 0, i, j]), max(steps[1, 1, 0, i - 1, j], steps[1, 1, 0, i, j])
-            )
-            colour = min(
-                max(steps[0, 0, 1, i, j - 1], steps[0, 0, 1, i, j]), max(steps[1, 1, 1, i - 1, j], steps[1, 1, 1, i, j])
-            )
+            light = min(max(of_rows[0, i, j - 1], of_rows[0, i, j]), max(of_columns[0, i - 1, j], of_columns[0, i, j]))
+            colour = min(max(of_rows[1, i, j - 1], of_rows[1, i, j]), max(of_columns[1, i - 1, j], of_columns[1, i, j]))
             found = 0
             for d in range(2):
                 across, down = steps[d, 0], steps[d, 1]

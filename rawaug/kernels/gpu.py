@@ -143,9 +143,7 @@ def _raw_cells(  # type: ignore[no-untyped-def]
           S3, NODES, ENTRIES, ATTENDS, SHADES)  # fmt: skip
 
 
-def shot_read(
-    clean: Tensor, levels: Tensor, keys: list[int], white: float, with_variance: bool
-) -> tuple[Tensor, Tensor]:
+def shot_read(clean: Tensor, levels: Tensor, keys: list[int], white: float, mapped: bool) -> tuple[Tensor, Tensor]:
     """Add shot and read noise to clean RAW, as :func:`rawaug.kernels.cpu.shot_read` does, on a GPU.
 
     Args:
@@ -153,18 +151,18 @@ def shot_read(
         levels: ``(B, 2)``, shot_var and read_var of each picture.
         keys: one number below 2^64 for each picture.
         white: the value to clip at.
-        with_variance: whether to compute the variance map; it is empty otherwise.
+        mapped: whether to compute the variance map; it is empty otherwise.
     """
     clean = clean.detach().contiguous()
     batch, _, height, width = clean.shape
     noisy = torch.empty_like(clean)
-    variance = torch.empty_like(noisy if with_variance else noisy[:, :, :0])
+    variance = torch.empty_like(noisy if mapped else noisy[:, :, :0])
     signed = torch.tensor([key - 2**64 if key >= 2**63 else key for key in keys], device=clean.device)
     variances = levels.to(clean.device, torch.float32).contiguous()
     grid = (triton.cdiv(height * width, _NOISE_BLOCK), batch)
     with torch.cuda.device_of(clean):  # which need not be the current one
         _noise_cells[grid](
-            clean, variances, signed, noisy, variance, height * width, white, with_variance,
+            clean, variances, signed, noisy, variance, height * width, white, mapped,
             BLOCK=_NOISE_BLOCK, enable_fp_fusion=True,
         )  # fmt: skip
     return noisy, variance

@@ -334,9 +334,7 @@ def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None
     if isinstance(spec, Sequence) and not isinstance(spec, str) and spec and all(isinstance(v, str) for v in spec):
         return MixedLevels([noise_levels(str(name), iso=iso) for name in spec])
     if iso is not None:
-        raise ValueError(
-            f"noise {spec!r} does not depend on ISO; omit iso, or use one of the cameras {', '.join(camera_names())}"
-        )
+        raise ValueError(f"noise {spec!r} does not depend on ISO; omit iso, or use one of {', '.join(camera_names())}")
     if isinstance(spec, str):
         return Preset(spec)
     fixed = FixedLevels.of(spec)
@@ -411,9 +409,7 @@ def _has_law(name: str) -> bool:
     return name in known or camera_key(name) in map(camera_key, (ANY_CAMERA, *load_profiles().names))
 
 
-def _shot_read(
-    spec: str | Sequence[float] | Sequence[str], iso: Iso = None, poisson: bool = False
-) -> PoissonGaussianNoise | ShotReadNoise:
+def _shot_read(spec: str | Sequence[float] | Sequence[str], iso: Iso = None, poisson: bool = False) -> NoiseModel:
     levels = noise_levels(spec, iso=iso)
     return PoissonGaussianNoise(levels) if poisson else ShotReadNoise(levels)
 

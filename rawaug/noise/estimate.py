@@ -229,9 +229,7 @@ def _points(levels: list[_Blocks], shot_var: float, read_var: float) -> NoisePoi
         # The median is taken of the ratio to the line, so that a wide level is not skewed by its spread of signals.
         chosen.append((flat, (flat.high / expected).median() / _MEDIAN * expected.mean()))
     if not chosen:
-        raise ValueError(
-            "no flat regions found to estimate noise from; give frames with uniform areas, such as sky or a chart"
-        )
+        raise ValueError("no flat regions found to estimate noise from; give frames with sky, walls or a chart")
     return _gather(chosen)
 
 
@@ -252,9 +250,7 @@ def _fit(points: NoisePoints, known_read_var: float | None) -> tuple[float, floa
     used = points.used
     x, y, n = points.signal, points.variance, points.blocks.double()
     if int(used.sum()) < _MIN_POINTS or x[used].max() < 1.5 * x[used].min().clamp(min=1e-6):
-        raise ValueError(
-            "too few flat regions, or all of the same brightness, to fit noise; give more frames, or charts"
-        )
+        raise ValueError("too few flat regions, or all of one brightness, to fit noise; give more frames, or charts")
     variance, trust = y, used
     for _ in range(_ROUNDS):
         weight = trust * n / variance.square()

@@ -71,9 +71,7 @@ class FixedLevels:
 
     def __init__(self, shot_var: float, read_var: float) -> None:
         if not (0 <= shot_var < math.inf and 0 <= read_var < math.inf):
-            raise ValueError(
-                f"noise variances must be finite and not negative, got shot_var={shot_var}, read_var={read_var}"
-            )
+            raise ValueError(f"noise variances must be finite and not negative, got {shot_var} and {read_var}")
         self.shot_var, self.read_var = float(shot_var), float(read_var)
 
     @classmethod

@@ -99,9 +99,7 @@ def require_batch(clean: Tensor, params: Params) -> None:
         raise ValueError(f"noise needs packed float32 RAW (B, 4, h, w), got {tuple(clean.shape)} {clean.dtype}")
     for name, value in params.items():
         if value.shape[:1] != clean.shape[:1]:
-            raise ValueError(
-                f"noise parameter {name!r} has shape {tuple(value.shape)}, but the batch has {len(clean)} pictures"
-            )
+            raise ValueError(f"noise parameter {name!r} is {tuple(value.shape)}, but the batch has {len(clean)}")
 
 
 def draw_seeds(batch: int, generator: torch.Generator) -> Tensor:
@@ -163,7 +161,7 @@ class ShotReadNoise(ShotReadModel):
     def apply_with_variance(self, clean: Tensor, params: Params) -> tuple[Tensor, Tensor]:
         """Make noisy RAW and its variance map, both ``(B, 4, h, w)``, in one pass over the pixels."""
         require_batch(clean, params)
-        return self._add_noise(clean, params, white=1.0, with_variance=True)
+        return self._add_noise(clean, params, white=1.0, mapped=True)
 
     @torch.no_grad()
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
@@ -171,14 +169,12 @@ class ShotReadNoise(ShotReadModel):
         noisy, _ = self._add_noise(clean, params, white=math.inf)
         return noisy if out is None else out.copy_(noisy)
 
-    def _add_noise(
-        self, clean: Tensor, params: Params, white: float, with_variance: bool = False
-    ) -> tuple[Tensor, Tensor]:
-        in_pytorch = partial(self._in_pytorch, clean, params, white, with_variance)
+    def _add_noise(self, clean: Tensor, params: Params, white: float, mapped: bool = False) -> tuple[Tensor, Tensor]:
+        in_pytorch = partial(self._in_pytorch, clean, params, white, mapped)
         if clean.dtype != torch.float32:
             return in_pytorch()
         levels = torch.stack([params["shot_var"], params["read_var"]], dim=1)
-        return fastest("shot_read", clean, levels, self._keys(params), white, with_variance, otherwise=in_pytorch)
+        return fastest("shot_read", clean, levels, self._keys(params), white, mapped, otherwise=in_pytorch)
 
     def _in_pytorch(self, clean: Tensor, params: Params, white: float, with_variance: bool) -> tuple[Tensor, Tensor]:
         deviation = self.variance(clean, params).sqrt_()

@@ -20,6 +20,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -239,6 +240,22 @@ def gain_left_out(frames: FitFrames, folds: int, gain: Callable[[FitFrames, FitF
         kept = frames.some([k for k in every if k not in out])
         total += len(out) * gain(frames.some(out), kept, f" without part {fold + 1} of {folds}")
     return total / len(every)
+
+
+def with_better_tone(frames: FitFrames, config: FitConfig, refit: Refit) -> tuple[FitConfig, float | None]:
+    """Decide the setting ``tone``; the gain of the curve in dB comes with it if both were compared."""
+    if config.tone != "auto":
+        return config, None
+    if len(frames.shots) < 2:
+        return replace(config, tone="learned"), None
+
+    def better(out: FitFrames, kept: FitFrames, part: str) -> float:
+        learned = refit(kept, f", learned{part}", replace(config, tone="learned"))
+        curve = refit(kept, f", curve{part}", replace(config, tone="curve"))
+        return mean_psnr(curve, out, True) - mean_psnr(learned, out, True)
+
+    gain = gain_left_out(frames, min(FOLDS, len(frames.shots)), better)
+    return replace(config, tone="curve" if gain > 0 else "learned"), gain
 
 
 def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent, refit: Refit) -> None:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,50 +27,14 @@ from rawaug.files import digest
 from rawaug.isp import stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.descent import (
-    FOLDS,
-    Descent,
-    Refit,
-    cycle_error,
-    gain_left_out,
-    mean_psnr,
-    reading_error,
-    train_encoders,
-    train_jointly,
-)
+from rawaug.isp.fit.descent import Descent, cycle_error, reading_error, train_encoders, train_jointly, with_better_tone
 from rawaug.isp.fit.samples import FitFrames, FramePair, FrameSummary, PixelSamples, sample_pixels
-from rawaug.isp.fit.start import (
-    REACH_ATOMS,
-    FrameColour,
-    Tie,
-    fit_fall_off,
-    least_squares,
-    set_atoms,
-    set_knee,
-    set_priors,
-)
+from rawaug.isp.fit.start import REACH_ATOMS, FrameColour, Tie, fit_fall_off, least_squares, set_dictionaries
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading, Stage
 from rawaug.kernels.runtime import one_thread
 from rawaug.progress import progress as progress_of
 from rawaug.seeding import derive_seed
-
-
-def with_better_tone(frames: FitFrames, config: FitConfig, refit: Refit) -> tuple[FitConfig, float | None]:
-    """Decide the setting ``tone``; the gain of the curve in dB comes with it if both were compared."""
-    if config.tone != "auto":
-        return config, None
-    if len(frames.shots) < 2:
-        return replace(config, tone="learned"), None
-
-    def better(out: FitFrames, kept: FitFrames, part: str) -> float:
-        learned = refit(kept, f", learned{part}", replace(config, tone="learned"))
-        curve = refit(kept, f", curve{part}", replace(config, tone="curve"))
-        return mean_psnr(curve, out, True) - mean_psnr(learned, out, True)
-
-    gain = gain_left_out(frames, min(FOLDS, len(frames.shots)), better)
-    return replace(config, tone="curve" if gain > 0 else "learned"), gain
-
 
 STANDARD_CURVES = ((2.2, 0.0), (2.4, 0.055 / 1.055), (1.0 / 0.45, 0.099 / 1.099))
 """gamma and toe a of a plain gamma camera, of sRGB (IEC 61966-2-1) and of ITU-R BT.709."""
@@ -282,9 +245,7 @@ class _Fit:
 
     def atoms(self, isp: DictionaryISP) -> None:
         """Run stage 3: make the frames' colours the atoms of ``isp``."""
-        set_knee(isp, self.colour, self.samples)
-        set_atoms(isp, self.colour, self.shots, self.config)
-        set_priors(isp, self.samples, self.config)
+        set_dictionaries(isp, self.colour, self.samples, self.shots, self.config)
 
     # -- stage 5 ----------------------------------------------------------------------------------------------------
 

@@ -153,10 +153,7 @@ def sample_pixels(pairs: Iterable[FramePair], pixels: int, seed: int, noisy: boo
 
 def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple[PixelSamples, FrameSummary]:
     if not pair.color_known:
-        raise ValueError(
-            f"{pair.name}: its white balance and colour matrix are unknown, so no ISP can be fitted to it; "
-            "use a shipped one, such as universal"
-        )
+        raise ValueError(f"{pair.name}: its white balance and colour matrix are unknown; use an ISP such as universal")
     raw = pair.noisy if noisy else pair.raw
     if raw is None:
         raise ValueError(f"{pair.name}: has no noisy RAW; fit on clean frames or add noise first")
@@ -167,10 +164,8 @@ def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple
     except ValueError as error:
         raise ValueError(f"{pair.name}: {error}") from None
     small_srgb, small_raw = thumbnail(as_float(pair.srgb[None])), thumbnail(_colours(raw, pair.cfa)[None])
-    shot = FrameSummary(
-        pair.name, pair.camera, CFA(pair.cfa), pair.white_balance, small_srgb, small_raw, pair.registered
-    )
-    return drawn, shot
+    stated = (pair.name, pair.camera, CFA(pair.cfa), pair.white_balance)
+    return drawn, FrameSummary(*stated, small_srgb, small_raw, pair.registered)
 
 
 def _sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:

@@ -134,6 +134,23 @@ KNEES = (0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
 REACH_ATOMS = 8
 
 
+def set_dictionaries(
+    isp: DictionaryISP, colour: FrameColour, samples: PixelSamples, shots: Sequence[FrameSummary], config: FitConfig
+) -> None:
+    """Set the knee, the atoms and the constant weights of an ISP from the frames.
+
+    Args:
+        isp: whose dictionaries are set.
+        colour: the colour of each frame.
+        samples: the pixels of the frames.
+        shots: the summaries of the frames.
+        config: the settings of the fit.
+    """
+    set_knee(isp, colour, samples)
+    set_atoms(isp, colour, shots, config)
+    set_priors(isp, samples, config)
+
+
 @torch.no_grad()
 def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSummary], config: FitConfig) -> None:
     """Make the frames' matrices and gains the atoms, or clusters of them where there are more frames than atoms.

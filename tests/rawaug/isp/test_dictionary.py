@@ -195,4 +195,4 @@ def test_what_cannot_be_drawn_is_refused() -> None:
     green_only = CameraDictionary(1, 1)
     green_only.set_cameras(torch.tensor([[[0.01, 0, 0], [0, 1.0, 0], [0, 0, 0.01]]]), torch.ones(1, 1))
     with pytest.raises(ValueError, match="gains within"):
-        CameraSampler(green_only, 0).sample(1, generator())
+        CameraSampler(green_only, 0, LightRange()).sample(1, generator())

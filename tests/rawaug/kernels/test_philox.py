@@ -18,7 +18,7 @@ KEY = 0x299F31D0A4093822
 def drawn(key: int, height: int, width: int) -> Tensor:
     """The compiled normals ``(4, height, width)``."""
     zero = torch.zeros(1, 4, height, width)
-    return cpu.shot_read(zero, torch.tensor([[0.0, 1.0]]), [key], math.inf, with_variance=False)[0][0]
+    return cpu.shot_read(zero, torch.tensor([[0.0, 1.0]]), [key], math.inf, mapped=False)[0][0]
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,7 @@ import torch
 from rawaug.data.pairs import Pair
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.descent import Descent
-from rawaug.isp.fit.pipeline import with_better_tone
+from rawaug.isp.fit.descent import Descent, with_better_tone
 from rawaug.isp.fit.samples import FitFrames, sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
