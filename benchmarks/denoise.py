@@ -36,7 +36,7 @@ def frame(megapixels: float, device: torch.device) -> Tensor:
 def measure(model: denoisers.Denoiser, noisy: Tensor, repeats: int) -> dict[str, dict[str, float]]:
     """Seconds, Mpix/s and peak MiB of each form; nothing for one that the GPU's memory does not hold."""
     variance, rows = 1e-3 * noisy + 1e-5, dict[str, dict[str, float]]()
-    forms: dict[str, Callable[..., Tensor]] = {"whole": model, "tiles": partial(denoisers.tiled, model)}
+    forms: dict[str, Callable[..., Tensor]] = {"whole": model, "tiles": partial(denoisers.denoise_tiles, model)}
     for form, run in forms.items():
         for precision in (torch.float32, torch.bfloat16):
             label = f"{form}, {str(precision).removeprefix('torch.')}"

@@ -6,7 +6,7 @@ Every one is called as ``model(noisy, variance=None) -> denoised``, all ``(B, 4,
 from denoisers.classical import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
 from denoisers.cycleisp import CycleISPDenoiser
 from denoisers.files import build, from_pretrained, load, save
-from denoisers.inference import SelfEnsemble, tiled
+from denoisers.inference import SelfEnsemble, denoise_tiles
 from denoisers.joint import JointDRUNet
 from denoisers.mosaic import MosaicDRUNet
 from denoisers.network import Denoiser
@@ -15,7 +15,7 @@ from denoisers.pmrid import PMRID
 from rawaug.registry import DENOISERS
 
 __all__ = [
-    "BM3D", "DENOISERS", "DHDN", "PMRID", "CycleISPDenoiser", "DRUNet", "Denoiser", "DnCNN", "FFDNet", "JointDRUNet",
-    "MosaicDRUNet", "NAFNet", "NonLocalMeans", "SelfEnsemble", "Stabilised", "TotalVariation", "UNet", "Wavelet",
-    "build", "from_pretrained", "load", "save", "tiled",
+    "BM3D", "DENOISERS", "DHDN", "PMRID", "CycleISPDenoiser", "DRUNet", "Denoiser", "DnCNN", "FFDNet",
+    "JointDRUNet", "MosaicDRUNet", "NAFNet", "NonLocalMeans", "SelfEnsemble", "Stabilised", "TotalVariation",
+    "UNet", "Wavelet", "build", "denoise_tiles", "from_pretrained", "load", "save",
 ]  # fmt: skip

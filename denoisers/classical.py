@@ -36,7 +36,7 @@ class Classical(ABC):
     needs: ClassVar[tuple[str, ...]] = ()
     """Libraries that not every installation has."""
     advice: ClassVar[str] = "run: pip install 'rawaug[train]'"
-    """What to do where one of them is missing."""
+    """The advice where one of them is missing."""
 
     @classmethod
     def missing(cls) -> str | None:

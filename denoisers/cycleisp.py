@@ -19,9 +19,9 @@ from denoisers.network import Denoiser, Shared, conv, require_bounded, require_w
 from rawaug.registry import DENOISERS
 
 RENAMED = (("head.0.", "head."), ("SA.spatial.conv.", "spatial."), ("CA.conv_du.", "channel."), ("conv1x1.", "merge."))
-"""Names of layers in the published checkpoints, and here."""
+"""Parts of the names of layers in the published checkpoints, and what they are called here."""
 UNUSED = ("blur.", "merge.0.")
-"""Published, after renaming, but constant or without use in the published pass."""
+"""Layers, renamed, that the checkpoints hold though the published pass does not use them."""
 
 
 class DualAttentionBlock(nn.Module):

@@ -50,15 +50,15 @@ class Domain(ABC):
 
     def forward(self, y: Tensor, shot: Tensor, read: Tensor) -> Tensor:
         """Transform RAW ``(B, C, h, w)`` to the signal that the network sees."""
-        shot = self.bounded(shot, read)
+        shot = self.bound(shot, read)
         return self.encode(y / shot + read / shot.square())
 
     def inverse(self, z: Tensor, shot: Tensor, read: Tensor) -> Tensor:
         """Transform a network's clean signal ``(B, C, h, w)`` back to RAW."""
-        shot = self.bounded(shot, read)
+        shot = self.bound(shot, read)
         return shot * (self.decode(z) - read / shot.square())
 
-    def bounded(self, shot: Tensor, read: Tensor) -> Tensor:
+    def bound(self, shot: Tensor, read: Tensor) -> Tensor:
         """The shot_var ``(B, 1, 1, 1)`` that photons are counted with: at least :attr:`least_shot`."""
         return torch.maximum(shot.clamp_min(self.least_shot), _LEAST_RATIO * read.sqrt())
 
@@ -72,7 +72,7 @@ class Domain(ABC):
             variance: the noise variance of each value, of the same shape.
             shot, read: the levels ``(B, 1, 1, 1)``.
         """
-        expected = noise_variance(y, self.bounded(shot, read), read)
+        expected = noise_variance(y, self.bound(shot, read), read)
         return (variance / expected.clamp_min(1e-20)).sqrt().clamp_max(1.0)
 
     @abstractmethod

@@ -21,17 +21,17 @@ from rawaug.registry import DENOISERS
 
 FORMAT, KIND = "rawaug", "denoiser"
 MOST_WEIGHTS = 2**30
-"""Of a network: 4 GiB. Larger ones are refused before they take memory."""
+"""The weights of a network of 4 GiB; larger ones are refused before they take memory."""
 FOLDER = Path(__file__).parent / "weights"
-"""Of the shipped weights and their cards."""
+"""The folder of the shipped weights and their cards."""
 DEFAULT = "rawaug-small"
-"""What denoises where no denoiser is named."""
+"""The denoiser where none is named."""
 JOINT = "rawaug-joint"
-"""What demosaics and denoises where no network is named."""
+"""The network that demosaics and denoises where none is named."""
 
 
 def build(name: str, **config: Any) -> Denoiser:
-    """A new network of the class ``name``, with ``config`` as its constructor's arguments.
+    """Make a network of the class ``name`` with ``config`` as its constructor's arguments.
 
     Raises:
         ValueError: if the name or a key is unknown, a value is of the wrong type or out of range, or the network has
@@ -47,7 +47,7 @@ def build(name: str, **config: Any) -> Denoiser:
 
 
 def outline(name: str, config: dict[str, Any]) -> Denoiser:
-    """The network of :func:`build` on the meta device, where its weights take no memory."""
+    """Make the network of :func:`build` on the meta device, where its weights take no memory."""
     DENOISERS[name]  # imports the module that has it, which may make tensors, while they are real
     with torch.device("meta"):
         network: Denoiser = DENOISERS.make({"name": name, "settings": config})
@@ -117,12 +117,12 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
 
 
 def list_shipped() -> list[str]:
-    """The names that :func:`from_pretrained` knows."""
+    """List the names that :func:`from_pretrained` knows."""
     return sorted(file.stem for file in FOLDER.glob("*.safetensors"))
 
 
-def find(name: str | Path) -> Path:
-    """The file of a denoiser: a path to a ``.safetensors`` file, or the name of a shipped one."""
+def find_denoiser(name: str | Path) -> Path:
+    """Find the file of a denoiser by its path or by the name of a shipped one; FileNotFoundError if there is none."""
     path = Path(name) if Path(name).suffix else FOLDER / f"{name}.safetensors"
     if not path.is_file():
         known = ", ".join(list_shipped()) or "none in this installation"
@@ -131,7 +131,7 @@ def find(name: str | Path) -> Path:
 
 
 def from_pretrained(name: str | Path = DEFAULT) -> Denoiser:
-    """A trained denoiser by the name of a shipped one or a path, on the CPU in eval mode.
+    """Load a trained denoiser by the name of a shipped one or from a path, on the CPU in eval mode.
 
     Raises:
         FileNotFoundError: if there is no such denoiser.
@@ -141,4 +141,4 @@ def from_pretrained(name: str | Path = DEFAULT) -> Denoiser:
         >>> denoiser = from_pretrained("rawaug-small")  # doctest: +SKIP
         >>> clean = denoiser(noisy, variance)  # both (B, 4, h, w) packed RAW; variance of each value  # doctest: +SKIP
     """
-    return load(find(name))[0]
+    return load(find_denoiser(name))[0]

@@ -33,7 +33,7 @@ def _pieces(size: int, tile: int, overlap: int, stride: int) -> tuple[list[int],
 
 
 @torch.no_grad()
-def tiled(
+def denoise_tiles(
     model: Run,
     noisy: Tensor,
     variance: Tensor | None = None,
@@ -63,7 +63,8 @@ def tiled(
 
     Example:
         >>> from denoisers import DnCNN
-        >>> tiled(DnCNN(width=8, depth=4, variance_map=False), torch.rand(1, 4, 300, 90), tile=64, overlap=8).shape
+        >>> net = DnCNN(width=8, depth=4, variance_map=False)
+        >>> denoise_tiles(net, torch.rand(1, 4, 300, 90), tile=64, overlap=8).shape
         torch.Size([1, 4, 300, 90])
     """
     stride, scale = (getattr(model, name, 1) for name in ("stride", "upscale"))
@@ -123,7 +124,7 @@ class SelfEnsemble(nn.Module):
         views: 4, the flips, or 8, the flips with and without a quarter turn (the full set).
         each: iterates over the groups of views of one shape; may show progress, as ``tqdm`` does.
 
-    Views of one shape share a batch. Large pictures: ``SelfEnsemble(partial(tiled, model), cfa)`` tiles every view.
+    Views of one shape share a batch. ``SelfEnsemble(partial(denoise_tiles, model), cfa)`` is for large pictures.
 
     Raises:
         ValueError: if ``views`` is neither 4 nor 8, or the CFA is unknown.

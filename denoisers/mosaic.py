@@ -175,7 +175,7 @@ class MosaicDRUNet(DRUNet):
         return torch.where(variance > 0, denoised, raw)
 
     def _at_halves(self, raw: Tensor, planes: Tensor, levels: Levels, clipped: Tensor, halvings: int) -> Tensor:
-        """As a network of packed RAW has it: ``g(y) = f(y) + U k(g(B y) - B f(y))``; B y is a mosaic of RGGB."""
+        """The recursion ``g(y) = f(y) + U k(g(B y) - B f(y))`` of :class:`Denoiser`; B y is a mosaic of RGGB."""
         denoised = self._of_mosaic(raw, planes, levels)
         if not halvings:
             return denoised

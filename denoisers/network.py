@@ -40,20 +40,20 @@ MOST_FEATURES, MOST_LAYERS, MOST_SCALES = 2**16, 1000, 12
 
 MOST_HALVINGS = 4
 BLIND = 0.25
-"""Share of clipped values from which on a picture of half the sides is not asked."""
+"""Share of clipped values from which on the picture at half the sides is ignored."""
 
 NEAR = 8.0
-"""Deviations of the noise within which a network is told of the limits of the signal."""
+"""A network that is told its limits sees them up to this distance, in deviations of the noise."""
 
 DEFECT = (5.0, 0.15)
-"""How far a defect pixel is beyond its neighbours at least: deviations of the noise, and a share of their value."""
+"""A defect is beyond its neighbours by so many deviations of the noise and by this share of their value."""
 
 LEAK = 0.2
 """Negative slope of the leaky ReLUs."""
 HE_GAIN = math.sqrt(2.0 / (1.0 + LEAK**2))
 """Keeps the deviation of features through a convolution and its leaky ReLU."""
 RESIDUAL_GAIN = math.sqrt(1.0 / 3.0)
-"""For deep sums of residuals of separable convolutions, whose deviation HE_GAIN would multiply at each of dozens."""
+"""Gain of networks that add up dozens of residuals of separable convolutions, which HE_GAIN would let grow."""
 
 
 def conv(
@@ -196,7 +196,7 @@ class Denoiser(nn.Module, ABC):
     """
 
     defaults: ClassVar[Shared] = Shared(channels=PACKED, variance_map=True, deviation=True, domain="linear", seed=0)
-    """What the shared settings are where a call leaves them out."""
+    """The shared settings where a call leaves them out."""
     __signature__: ClassVar[inspect.Signature]
 
     tiny: ClassVar[dict[str, Any]] = {}
@@ -328,7 +328,7 @@ class Denoiser(nn.Module, ABC):
         return denoised + double(wide)[..., :height, :width]
 
     def _distances(self, signal: Tensor, levels: tuple[Tensor, Tensor]) -> list[Tensor]:
-        """How far a transformed signal is from black and from white, up to :data:`NEAR`, if the network is told."""
+        """The distances of a signal from black and from white, up to :data:`NEAR`, if the network takes them."""
         white = DOMAINS[self.domain].forward(torch.ones_like(levels[0]), *levels)
         return [signal.clamp_max(NEAR), (white - signal).clamp_max(NEAR)] if self.limits else []
 

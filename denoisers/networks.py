@@ -69,7 +69,7 @@ class UNet(Denoiser):
 
 
 LEVELS = 4
-"""Of DHDN's pyramid."""
+"""The levels of DHDN's pyramid."""
 
 
 class DCRBlock(nn.Module):

@@ -80,7 +80,7 @@ class _Lines(terminal_tqdm):
 def time_stage(stage: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """Decorator: add the seconds that a method takes to ``self.seconds[stage]``."""
 
-    def decorated(method: Callable[..., T]) -> Callable[..., T]:
+    def decorate(method: Callable[..., T]) -> Callable[..., T]:
         @wraps(method)
         def run(self: Any, *arguments: Any) -> T:
             start = time.perf_counter()
@@ -91,4 +91,4 @@ def time_stage(stage: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
 
         return run
 
-    return decorated
+    return decorate

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 import denoisers
-from denoisers.files import FOLDER, find
+from denoisers.files import FOLDER, find_denoiser
 from rawaug import bayer
 from rawaug.bayer import pack_rgb
 from rawaug.commands import YAML
@@ -192,7 +192,7 @@ def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = Non
     out = Path(out)
     if out.suffix != ".onnx":
         raise ValueError(f"{out}: give a name that ends in .onnx")
-    model, info = denoisers.load(find(denoiser))
+    model, info = denoisers.load(find_denoiser(denoiser))
     names = ["noisy", "variance"][: 1 + model.reads_variance]
     inputs = dict(zip(names, comparison_frame(frame), strict=False))
     example = torch.rand(2, model.channels, 70, 90)

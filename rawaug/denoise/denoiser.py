@@ -22,7 +22,7 @@ from torch.nn import functional as F
 
 import denoisers
 from denoisers.classical import Stabilised
-from denoisers.files import find, list_shipped
+from denoisers.files import find_denoiser, list_shipped
 from denoisers.mosaic import BayerAdapter, MosaicDRUNet, denoise_mosaic
 from denoisers.network import PACKED
 from rawaug import bayer
@@ -78,8 +78,8 @@ class RawDenoiser:
         info: what its file says of its training.
         reads_levels: whether noise levels make a difference.
         upscale: 2 if it demosaics as well: the result is linear camera RGB ``(1, 3, 2h, 2w)``.
-        tiles: side and overlap of the pieces, in packed pixels, None being the default of :func:`denoisers.tiled`;
-            None alone denoises a frame in one piece.
+        tiles: side and overlap of the pieces, in packed pixels, None being the default of
+            :func:`denoisers.denoise_tiles`; None alone denoises a frame in one piece.
         views: 1, or 4 or 8 of a self-ensemble, at that many times the work.
         strength: s in [0, 1]; ``(1 - s)^2`` of the noise's variance is left.
         device: where it runs.
@@ -190,7 +190,7 @@ class RawDenoiser:
             )
         if given.variance is None:
             raise ValueError(f"{self.name}: needs the variance of the noise")
-        pieces = partial(denoisers.tiled, self.of_any, tile=2 * self.tiles[0], each=progress_by("tile"))
+        pieces = partial(denoisers.denoise_tiles, self.of_any, tile=2 * self.tiles[0], each=progress_by("tile"))
         return self._run(partial(denoise_mosaic, pieces, cfa=given.cfa), given.image, given.variance, given.image.shape)
 
     def _run(self, run: Model, image: Tensor, variance: Tensor | None, expected: Sequence[int]) -> Tensor:
@@ -206,7 +206,8 @@ class RawDenoiser:
         """The model in tiles, within what its training puts around it, within the self-ensemble."""
         run = model
         if self.tiles is not None:
-            run = partial(denoisers.tiled, model, tile=self.tiles[0], overlap=self.tiles[1], each=progress_by("tile"))
+            tile, overlap = self.tiles
+            run = partial(denoisers.denoise_tiles, model, tile=tile, overlap=overlap, each=progress_by("tile"))
         if self.around is not None:
             run = self.around(run)
         if self.views > 1:
@@ -253,7 +254,7 @@ def _crop(image: Tensor, own: CFA, cfa: CFA) -> Tensor:
 
 def shipped_of_mosaics() -> list[str]:
     """Names of the shipped networks that denoise the mosaic and leave demosaicing to others."""
-    return [name for name in list_shipped() if _denoises_mosaics(read_header(find(name)))]
+    return [name for name in list_shipped() if _denoises_mosaics(read_header(find_denoiser(name)))]
 
 
 def _denoises_mosaics(header: Mapping[str, str]) -> bool:
@@ -281,7 +282,7 @@ def _found(spec: Any, name: str | None) -> RawDenoiser:
         network = OnnxNetwork(path)
         return replace(_of_network(path.stem, network, network.info), settings=_hashed(path))
     if path.suffix or str(spec) in list_shipped():
-        return replace(_of_weights(find(spec)), settings=_hashed(find(spec)))
+        return replace(_of_weights(find_denoiser(spec)), settings=_hashed(find_denoiser(spec)))
     if str(spec) in FILTERS:
         return _of_filter(str(spec))
     known = [*list_shipped(), *FILTERS]

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 import denoisers
-from denoisers.files import find, list_shipped
+from denoisers.files import find_denoiser, list_shipped
 from rawaug.denoise.denoiser import CPU, Noisy, progress_by
 from rawaug.denoise.foreign import AGAIN, load_published
 from rawaug.errors import extra
@@ -96,7 +96,7 @@ class PictureDenoiser:
 
         def run(srgb: Tensor) -> Tensor:
             if not getattr(network, "reads_variance", False):
-                return denoisers.tiled(network, srgb, each=progress_by("tile"))
+                return denoisers.denoise_tiles(network, srgb, each=progress_by("tile"))
             return _told(network, srgb, strength * estimated_level(network, srgb)) if strength else srgb
 
         return cls(name, run, where)
@@ -124,7 +124,7 @@ def _network(spec: str) -> tuple[str, nn.Module]:
             f"{spec}: no such denoiser of pictures{suggest(spec, list_shipped())}; give one of {PICTURES}, or "
             "a .safetensors of rawaug run srgb or of FFDNet's authors"
         )
-    path = find(spec)
+    path = find_denoiser(spec)
     metadata, tensors = read_tensors(path, AGAIN)
     if "conv00.weight" in tensors and metadata.get("format") != "rawaug":
         return "FFDNet, published weights", load_published("FFDNet", path)
@@ -138,7 +138,7 @@ def _network(spec: str) -> tuple[str, nn.Module]:
 def _told(network: Any, srgb: Tensor, level: float) -> Tensor:
     """The picture denoised by a network that is told the deviation of its noise, 0 for unknown."""
     variance = srgb.new_full((1, 1, 1, 1), level**2).expand_as(srgb)
-    return denoisers.tiled(network, srgb, variance, each=progress_by("tile"))
+    return denoisers.denoise_tiles(network, srgb, variance, each=progress_by("tile"))
 
 
 def estimated_level(network: Any, srgb: Tensor) -> float:

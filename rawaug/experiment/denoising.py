@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import denoisers
-from denoisers.files import find
+from denoisers.files import find_denoiser
 from denoisers.network import Denoiser
 from rawaug.bayer import CFA
 from rawaug.camera.fit import fit
@@ -123,7 +123,8 @@ class TrainingRun:
                 gives = "full colour: rawaug run demosaic trains it" if network.upscale > 1 else "no full colour"
                 raise ValueError(f"denoiser: {named} gives {gives}; take another network")
         self.starts = {arm: start_of(recipe.network_of(arm)) for arm in recipe.arms}
-        untouched = [RawDenoiser.of(find(name), recipe.device, name=Path(name).stem) for name in recipe.untouched]
+        files = [find_denoiser(name) for name in recipe.untouched]
+        untouched = [RawDenoiser.of(file, recipe.device, name=file.stem) for file in files]
         self.others = [one.require_mosaic() for one in (*map(RawDenoiser.of, self.classical), *untouched)]
         plan = plan_data(recipe, given)
         _say(*plan.lines(recipe))

@@ -266,7 +266,7 @@ def _as_table(values: Tensor, nodes: int) -> Tensor:
 
 
 class _Chooser(nn.Module):
-    """What :meth:`rawaug.isp.model.DictionaryISP.choose` does, for an ISP as it is now."""
+    """Chooses settings as :meth:`rawaug.isp.model.DictionaryISP.choose` does, by encoders of fewer maps."""
 
     tone_weights: Tensor
 
@@ -302,12 +302,12 @@ class _Chooser(nn.Module):
 
 @one_thread()
 def _small(srgb: Tensor, table: Tensor) -> Tensor:
-    """x2 of the thumbnail that the encoders look at, ``(B, 3, h, w)``."""
+    """Compute x2 of the thumbnail that the encoders look at, ``(B, 3, h, w)``."""
     return look_up(table, thumbnail(as_float(srgb)))[:, :3]
 
 
 def _fold_encoder(encoder: Encoder, maps: list[Tensor]) -> Encoder:
-    """The encoder for K maps of 3 channels; ``maps``, K times ``(N, 3, 3)``, make its N images of them."""
+    """Fold K maps of 3 channels into an encoder's first layer; ``maps``, K times ``(N, 3, 3)``, make its N images."""
     encoder = deepcopy(encoder)
     if encoder.layers is None:
         return encoder

@@ -192,7 +192,7 @@ class DictionaryISP(StagedISP):
             ValueError: if ``raw`` is no such mosaic or not finite, or what is given is for another number of pictures.
         """
         with self._float32(raw):
-            x5 = bayer.demosaic(_scene_referred(raw), self.cfa)
+            x5 = bayer.demosaic(_require_mosaic(raw), self.cfa)
             if params is None:
                 params = self.choose_forward(self.remove_shading(x5, coordinates))
             params = staged.with_white_balance(self, params, white_balance, None)
@@ -313,7 +313,7 @@ def _of_colour(key: str) -> bool:
     return key.startswith("colour.") or ("_encoders." in key and ".gain.prior" not in key)
 
 
-def _scene_referred(raw: Tensor) -> Tensor:
+def _require_mosaic(raw: Tensor) -> Tensor:
     """RAW as float32; ValueError unless it is a floating-point mosaic ``(B, 1, H, W)`` of finite values."""
     if raw.ndim != 4 or raw.shape[1] != 1 or not raw.is_floating_point():
         raise ValueError(f"RAW must be a floating-point mosaic (B, 1, H, W), got {tuple(raw.shape)} {raw.dtype}")

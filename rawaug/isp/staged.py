@@ -106,7 +106,7 @@ class StagedISP(nn.Module):
     def __init__(self, config: ISPConfig | None = None, seed: int = 0) -> None:
         super().__init__()
         self.info: dict[str, Any] = {}
-        """What a fit recorded, as plain values by name."""
+        """The record of the fit, as plain values by name."""
         self.config = config or ISPConfig()
         """The parts that it is made of; :meth:`configure` and :meth:`use_encoders` change them."""
         with initialise_from(seed):

@@ -259,7 +259,7 @@ class Stage(nn.Module, ABC):
     """
 
     name: ClassVar[str]
-    """In ``ISPConfig.stages`` and in files."""
+    """The name of the stage in ``ISPConfig.stages`` and in files."""
     makes: ClassVar[int]
     """k of ``x_k``, the image that the reverse pass makes: the stage's position in the usual order."""
 

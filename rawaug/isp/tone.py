@@ -72,11 +72,11 @@ class ToneDictionary(nn.Module):
     def combine(self, weights: Tensor) -> Tensor:
         """Mix the curves by weights ``(B, K)`` into tables ``(B, 1021)``: the same bits in a batch of any size."""
         table = weights.new_zeros(len(weights), self.curves.shape[1])
-        for weight, curve in self._weighed(weights):
+        for weight, curve in self._pair_weights(weights):
             table += weight[:, None] * curve
         return table
 
-    def _weighed(self, weights: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    def _pair_weights(self, weights: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """Pair weights ``(B,)`` with one curve ``(1021,)`` or one for each picture ``(B, 1021)``, in order of atoms."""
         # Weights of 0 are skipped on a CPU, unless they are being fitted; on a GPU looking for them would stall it, and
         # an exported pass has no values to look at.

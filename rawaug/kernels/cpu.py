@@ -327,13 +327,13 @@ def _demosaic(mosaic, row, first, weights, sums, out):  # type: ignore[no-untype
     _pairs(own, own[4:], sums[4, :n])
     _pairs(mosaic[row, first + 2 :], mosaic[row + 4, first + 2 :], sums[5, :n])
     for c in range(3):
-        _weighted(weights[c, 0], own[2:], weights[c, 1], sums[1], False, out[c])
+        _add_weighted(weights[c, 0], own[2:], weights[c, 1], sums[1], False, out[c])
         for k in (2, 4):
-            _weighted(weights[c, k], sums[k], weights[c, k + 1], sums[k + 1], True, out[c])
+            _add_weighted(weights[c, k], sums[k], weights[c, k + 1], sums[k + 1], True, out[c])
 
 
 @compile_part
-def _weighted(a, x, b, y, more, out):  # type: ignore[no-untyped-def]
+def _add_weighted(a, x, b, y, more, out):  # type: ignore[no-untyped-def]
     for j in range(len(out)):
         out[j] = (out[j] if more else _ZERO) + (a[j] * x[j] + b[j] * y[j])
 

@@ -197,7 +197,7 @@ def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> d
     net.eval()
     raw, srgb = [], []
     for frame in frames:
-        denoised = denoisers.tiled(net, frame.noisy.to(device), _told(frame).to(device)).cpu()
+        denoised = denoisers.denoise_tiles(net, frame.noisy.to(device), _told(frame).to(device)).cpu()
         raw.append(psnr(denoised, frame.clean).mean().item())
         if frame.develop is not None and frame.domain != "srgb":
             srgb.append(psnr(*(frame.develop(x)[None] for x in (denoised, frame.clean))).item())

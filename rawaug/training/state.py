@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 import denoisers
-from denoisers.files import find
+from denoisers.files import find_denoiser
 from denoisers.network import Denoiser
 from rawaug.bayer import CFA
 from rawaug.files import replacing, sha256
@@ -40,7 +40,7 @@ def start_of(config: DenoiserConfig) -> Start | None:
     """
     if config.start is None:
         return None
-    path = find(config.start)
+    path = find_denoiser(config.start)
     return Start(sha256(path), CFA(denoisers.load(path)[1].get("cfa", "RGGB")))
 
 
@@ -53,7 +53,7 @@ def first_network(config: DenoiserConfig, seed: int) -> Denoiser:
     drawn = {"seed": derive_seed(seed, "network") % 2**31, **config.settings}
     if config.start is None:
         return denoisers.build(config.name, **drawn)
-    model, _ = denoisers.load(find(config.start))
+    model, _ = denoisers.load(find_denoiser(config.start))
     if config == DenoiserConfig(start=config.start):
         return model.train()
     wanted = denoisers.build(config.name, **drawn)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from denoisers import DnCNN, SelfEnsemble, UNet, tiled
+from denoisers import DnCNN, SelfEnsemble, UNet, denoise_tiles
 from denoisers.inference import Recorrupted, from_view, to_view
 from rawaug import bayer
 
@@ -28,8 +28,8 @@ def test_convolutions_are_seamless(size: tuple[int, int]) -> None:
     model = awake(DnCNN(width=6, depth=5, batch_norm=False))
     noisy, variance = pair(2, 4, *size)
     whole = model(noisy, variance)
-    assert (tiled(model, noisy, variance, tile=24, overlap=5) - whole).abs().max() < 1e-5
-    assert min(size) < 24 or (tiled(model, noisy, variance, tile=24, overlap=2) - whole).abs().max() > 1e-4
+    assert (denoise_tiles(model, noisy, variance, tile=24, overlap=5) - whole).abs().max() < 1e-5
+    assert min(size) < 24 or (denoise_tiles(model, noisy, variance, tile=24, overlap=2) - whole).abs().max() > 1e-4
 
 
 def test_no_seam_at_any_size_around_that_of_a_tile() -> None:
@@ -39,7 +39,7 @@ def test_no_seam_at_any_size_around_that_of_a_tile() -> None:
             noisy, variance = pair(1, 4, side, 5)
             for turned in (lambda x: x, lambda x: x.transpose(-1, -2)):
                 whole = model(turned(noisy), turned(variance))
-                pieces = tiled(model, turned(noisy), turned(variance), tile=16, overlap=3)
+                pieces = denoise_tiles(model, turned(noisy), turned(variance), tile=16, overlap=3)
                 assert (pieces - whole).abs().max() < 1e-5, f"a seam at a side of {side}"
 
 
@@ -48,7 +48,7 @@ def test_pooling_grids_fall_together(size: tuple[int, int]) -> None:
     model = awake(UNet(width=4, scales=2))  # receptive radius below 24
     noisy, variance = pair(1, 4, *size)
     whole = model(noisy, variance)
-    assert (tiled(model, noisy, variance, tile=64, overlap=24) - whole).abs().max() < 1e-5
+    assert (denoise_tiles(model, noisy, variance, tile=64, overlap=24) - whole).abs().max() < 1e-5
 
 
 def test_every_piece_is_at_most_a_tile_and_no_gradient_is_kept() -> None:
@@ -61,16 +61,16 @@ def test_every_piece_is_at_most_a_tile_and_no_gradient_is_kept() -> None:
             return noisy
 
     noisy, _ = pair(1, 4, 300, 130)
-    assert torch.equal(tiled(Note(), noisy.requires_grad_(), tile=64, overlap=8), noisy)
+    assert torch.equal(denoise_tiles(Note(), noisy.requires_grad_(), tile=64, overlap=8), noisy)
     assert set(sizes) == {(64, 54)}  # seven equal tiles by three
 
 
 def test_tiles_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match="tile must be at least 16"):
-        tiled(UNet(width=4, scales=4), torch.zeros(1, 4, 17, 17), tile=8, overlap=0)
+        denoise_tiles(UNet(width=4, scales=4), torch.zeros(1, 4, 17, 17), tile=8, overlap=0)
     for overlap in (-1, 16, 20):
         with pytest.raises(ValueError, match="less than half the tile"):
-            tiled(nn.Identity(), torch.zeros(1, 4, 8, 8), tile=32, overlap=overlap)
+            denoise_tiles(nn.Identity(), torch.zeros(1, 4, 8, 8), tile=32, overlap=overlap)
 
 
 CFAS = list(bayer.CFA)
@@ -198,4 +198,4 @@ def test_it_is_the_same_in_every_call_and_refuses_nonsense() -> None:
 
 def test_a_model_that_changes_the_size_is_refused() -> None:
     with pytest.raises(ValueError, match=r"the model made \(1, 4, 16, 16\) of \(1, 4, 32, 32\)"):
-        tiled(lambda noisy, variance: noisy[..., ::2, ::2], torch.zeros(1, 4, 32, 32))
+        denoise_tiles(lambda noisy, variance: noisy[..., ::2, ::2], torch.zeros(1, 4, 32, 32))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import denoisers
-from denoisers import DRUNet, JointDRUNet, SelfEnsemble, tiled
+from denoisers import DRUNet, JointDRUNet, SelfEnsemble, denoise_tiles
 from denoisers.domains import DOMAINS, fit_levels
 from rawaug import bayer
 from rawaug.bayer import CFA
@@ -73,7 +73,7 @@ def test_tiles_of_full_colour_join() -> None:
     net, (noisy, variance) = trained(), noisy_raw(120, 90)
     with torch.no_grad():
         whole = net(noisy, variance)
-    torch.testing.assert_close(tiled(net, noisy, variance, tile=80, overlap=32), whole, rtol=0, atol=1e-4)
+    torch.testing.assert_close(denoise_tiles(net, noisy, variance, tile=80, overlap=32), whole, rtol=0, atol=1e-4)
 
 
 def test_views_are_turned_back() -> None:

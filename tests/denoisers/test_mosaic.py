@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from denoisers import DRUNet, MosaicDRUNet, tiled
+from denoisers import DRUNet, MosaicDRUNet, denoise_tiles
 from denoisers.mosaic import BayerAdapter, denoise_mosaic, entry_pattern, mend_mosaic, with_planes
 from rawaug import bayer
 from rawaug.bayer import pattern
@@ -78,7 +78,7 @@ def test_tiles_are_the_whole_mosaic(name: str) -> None:
     noisy, variance = noisy_mosaic(name, 160, 96)
     given = with_planes(noisy, pattern(name))
     whole = net(given, variance)
-    torch.testing.assert_close(tiled(net, given, variance, tile=64, overlap=16), whole, rtol=0, atol=2e-5)
+    torch.testing.assert_close(denoise_tiles(net, given, variance, tile=64, overlap=16), whole, rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("name", [*bayer.PATTERNS, "XTRANS+1+0", "XTRANS+2+5", "QUAD-RGGB+1+2"])

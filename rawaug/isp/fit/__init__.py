@@ -1,4 +1,4 @@
-"""From RAW-sRGB pairs to a :class:`rawaug.isp.model.DictionaryISP`, in seconds, from one frame upwards."""
+"""The fit of a :class:`rawaug.isp.model.DictionaryISP` to RAW-sRGB pairs: seconds, from one frame upwards."""
 
 from __future__ import annotations
 

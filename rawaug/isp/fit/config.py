@@ -9,7 +9,7 @@ from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.registry import STAGES, require_between
 
 MOST = 2**31
-"""Of steps and pixels."""
+"""The most steps or pixels that a setting may ask for."""
 
 _SWITCH = ("auto", "on", "off")
 

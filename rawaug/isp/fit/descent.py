@@ -224,7 +224,7 @@ class Descent:
 FRAMES_A_STEP = 4
 ENCODER_PIXELS, ENCODER_RATE = 1024, 1e-3
 FEWEST_FRAMES, FOLDS = 12, 4
-"""From so many frames on "auto" trains encoders; and parts that are left out in turn to judge them."""
+"""With "auto", encoders are trained from so many frames on, and judged on so many parts left out in turn."""
 MANY_FRAMES, STEPS, LEARNING_RATE, CONSISTENCY = 50, 1000, 2e-4, 0.01
 """End-to-end training: frames from which on it is the default, its steps, its rate, and the weight of consistency."""
 

@@ -1,4 +1,4 @@
-"""From the frames to dictionaries: every frame's own colour, the atoms, and the constant weights.
+"""The start of a fit: every frame's own colour, the atoms of the dictionaries, and the constant weights.
 
 A frame's colour is ``M_f = diag(1 / g_f) C_f`` (sRGB to RAW), rows of ``C_f`` l1-normalised. Frames of one camera share
 ``M_f`` divided by its row sums ``s_f``, and ``k_f = s_f wb_f``, which is 1 where the metadata are exact. Both are drawn
