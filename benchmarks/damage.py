@@ -7,6 +7,7 @@ that are right all the same.
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import struct
@@ -31,15 +32,39 @@ NUMBERS = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF,
 """Lengths, counts and offsets that are seldom right."""
 
 
+IMPORTED = "this"
+"""A harmless module that nothing imports: a recipe that names it must not either."""
+
+
+def fifo(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def itself(path: Path) -> None:
+    path.symlink_to(path)
+
+
+def endless(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+IRREGULAR: tuple[Callable[[Path], None], ...] = (fifo, itself, endless)
+"""What has the name of a file, and is none that ends."""
+
+
 def make_originals(folder: Path) -> dict[str, list[Path]]:
     """Whole files by kind; the list of an unavailable kind is empty."""
     shared = Path(os.environ.get("RAWAUG_SHARED", Path(__file__).parents[1].parent / "shared" / "data"))
-    made = {"picture": _make_pictures, "mat5": _make_mat5, "mat73": _make_mat73, "safetensors": _make_safetensors}
+    made = {"picture": _make_pictures, "mat5": _make_mat5, "mat73": _make_mat73, "safetensors": _make_safetensors,
+            "npy": _make_npy, "pair": _make_pairs, "recipe": _make_recipes}  # fmt: skip
     return {
         "raw": sorted(shared.glob("raw/canon/*.crw"))[:3],
         "dng": _make_dngs(folder, sorted(shared.glob("raw/*/*.dng"))[:1]),
         "jpeg": _make_jpegs(folder, sorted(shared.glob("raw_jpeg/*/*.jpg"))[:1]),
-        **{kind: make(folder) for kind, make in {**made, "npy": _make_npy, "recipe": _make_recipes}.items()},
+        **{
+            kind: make(folder)
+            for kind, make in {**made, "npy": _make_npy, "pair": _make_pairs, "recipe": _make_recipes}.items()
+        },
     }
 
 
@@ -140,6 +165,17 @@ def _make_npy(folder: Path) -> list[Path]:
     np.save(folder / "packed.npy", _numbers(0, (6, 8, 4)).astype(np.uint16))
     Image.fromarray(_numbers(0, (12, 16, 3))).save(folder / "packed.png")
     return [folder / "packed.npy"]
+
+
+def _make_pairs(folder: Path) -> list[Path]:
+    """Mosaics that state their CFA and levels, as ``rawaug synth`` writes them."""
+    from rawaug.data.formats import write_npz, write_tiff
+
+    packed = torch.rand(4, 8, 8, generator=torch.Generator().manual_seed(0))
+    stated = {"cfa": "RGGB", "shot_var": 1e-3, "read_var": 1e-5}
+    write_npz(folder / "pair.npz", packed, packed, stated)
+    write_tiff(folder / "pair.pair.tif", torch.nn.functional.pixel_shuffle(packed, 2), stated)
+    return [folder / "pair.npz", folder / "pair.pair.tif"]
 
 
 def _make_recipes(folder: Path) -> list[Path]:
@@ -432,14 +468,44 @@ def jpeg(whole: bytes, rng: np.random.Generator) -> bytes:
     return whole[:2] + b"".join(segments) + whole[at:]
 
 
+# -- pairs -------------------------------------------------------------------------------------------------------------
+
+
+def tiff_pair(whole: bytes, rng: np.random.Generator) -> bytes:
+    """A description nested without end, a value of it exchanged, or damage to the directory."""
+    import tifffile
+
+    if rng.random() < 0.5:
+        return tiff(whole, rng)
+    with tifffile.TiffFile(io.BytesIO(whole)) as file:
+        text, numbers = _changed_text(file.pages[0].description, rng), file.pages[0].asarray()
+    made = io.BytesIO()
+    tifffile.imwrite(made, numbers, description=text.encode("ascii", "replace"), metadata=None)
+    return made.getvalue()
+
+
+def npz(whole: bytes, rng: np.random.Generator) -> bytes:
+    """An array that is empty, has another type, or is missing."""
+    with np.load(io.BytesIO(whole)) as file:
+        arrays = dict(file)
+    name, made = _pick(rng, sorted(arrays)), io.BytesIO()
+    values = [np.zeros(0), np.zeros(0, "U4"), np.full(3, np.nan), np.array("x"), np.array([["RGGB"] * 2]), None]
+    changed = _pick(rng, values)
+    arrays |= {} if changed is None else {name: changed}
+    np.savez(made, **{key: value for key, value in arrays.items() if changed is not None or key != name})
+    return made.getvalue()
+
+
 # -- recipes -----------------------------------------------------------------------------------------------------------
 
 _LAUGHS = "laugh0: &l0 [ha, ha]\n" + "".join(f"laugh{k}: &l{k} [*l{k - 1}, *l{k - 1}]\n" for k in range(1, 60))
 
 
 def recipe(whole: bytes, rng: np.random.Generator) -> bytes:
-    """A value of a recipe exchanged, at any depth; or aliases of aliases."""
+    """A value of a recipe exchanged, at any depth; aliases of aliases; or ``module:function`` in every text."""
     content = yaml.safe_load(whole)
+    if rng.random() < 0.15:
+        return yaml.safe_dump(_with_texts(content, f"{IMPORTED}:s")).encode()
     node, depth = content, 0
     while True:
         key = _pick(rng, sorted(node) if isinstance(node, dict) else list(range(len(node))))
@@ -454,7 +520,17 @@ def recipe(whole: bytes, rng: np.random.Generator) -> bytes:
     return text.replace("'@'", "[" * 3000 + "]" * 3000).encode()
 
 
+def _with_texts(content: Any, text: str) -> Any:
+    """The content of a recipe with ``text`` in the place of every text but the experiment's name."""
+    if isinstance(content, dict):
+        return {key: value if key == "experiment" else _with_texts(value, text) for key, value in content.items()}
+    if isinstance(content, list):
+        return [_with_texts(value, text) for value in content]
+    return text if isinstance(content, str) else content
+
+
 MUTATIONS: dict[str, Mutation] = {
+    ".pair.tif": tiff_pair, ".npz": npz,
     ".crw": crw, ".dng": tiff, ".tif": tiff, ".jpg": jpeg, ".png": png, ".mat5.mat": mat5, ".mat73.mat": hdf5,
     ".safetensors": safetensors, ".yaml": recipe,
 }  # fmt: skip

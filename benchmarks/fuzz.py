@@ -36,12 +36,13 @@ import numpy as np
 import torch
 
 import denoisers
-from benchmarks.damage import MUTATIONS, make_originals, mutated
+from benchmarks.damage import IMPORTED, IRREGULAR, MUTATIONS, make_originals, mutated
 from benchmarks.measure import parser
 from rawaug import DictionaryISP
 from rawaug.cli import main as rawaug
 from rawaug.commands.info import describe
 from rawaug.commands.run import with_values
+from rawaug.data.formats import read_mosaic
 from rawaug.data.mat import read_value
 from rawaug.data.published import read_packed
 from rawaug.data.sidd import colour_of, mosaic_of
@@ -57,10 +58,12 @@ WAITING_SECONDS = 240
 """For a file, which may have to wait for a processor."""
 DECODERS = {
     "picture": "OpenImageIO", "jpeg": "OpenImageIO", "npy": "NumPy", "mat5": "SciPy", "mat73": "HDF5",
-    "safetensors": "safetensors", "recipe": "PyYAML", "dng": "LibRaw", "raw": "LibRaw",
+    "pair": "tifffile", "safetensors": "safetensors", "recipe": "PyYAML", "dng": "LibRaw", "raw": "LibRaw",
 }  # fmt: skip
 """What reads each kind for us, the cheapest first."""
 
+IRREGULAR_SHARE = 0.05
+"""Of the files, those in whose place a pipe, a link to itself or an endless device lies."""
 BY_COMMANDS = 8
 """Of so many files one is read by the commands as well."""
 OUTCOMES = ("read", "refused", "crashed", "fault", "hung", "memory")
@@ -99,6 +102,8 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
         return [lambda: read_picture(path)]
     if kind == "recipe":
         return [lambda: _set_up(path)]
+    if kind == "pair":
+        return [lambda: read_mosaic(path, "noisy", {}, path.suffix == ".npz")]
     if kind == "npy":
         return [lambda: read_packed(path, path.with_suffix(".png"), None)]
     if kind != "safetensors":
@@ -135,7 +140,7 @@ def read(kind: str, path: Path) -> tuple[str, str]:
             outcome = "refused", text
         except Exception as error:
             return "fault", _described(error)
-    return outcome
+    return ("fault", "a name in the file was imported") if IMPORTED in sys.modules else outcome
 
 
 def _described(error: Exception) -> str:
@@ -272,13 +277,16 @@ def _fuzz_kind(
         rng = np.random.default_rng(derive_seed(seed, kind, number))
         original = originals[number % len(originals)]
         path = _placed(original, folder, str(number), _damaged(original, rng))
+        if rng.random() < IRREGULAR_SHARE:
+            path.unlink()
+            IRREGULAR[int(rng.integers(len(IRREGULAR)))](path)
         start = time.perf_counter()
         outcome, why = judged(kind, path, by_commands=number % BY_COMMANDS == 0)
         slowest = max(slowest, time.perf_counter() - start)
         outcomes[outcome] += 1
         if outcome not in OUTCOMES[:2]:
             reasons.append(f"{number}: {outcome}: {why}")
-            if keep is not None:
+            if keep is not None and path.is_file():
                 keep.mkdir(parents=True, exist_ok=True)
                 shutil.copy(path, keep / f"{kind}-{path.name}")
         _empty(folder)

@@ -205,7 +205,7 @@ def test_a_picture_that_vanishes_is_named_and_the_rest_is_made(tmp_path: Path, m
     assert result.made == 2 and list(result.broken) == ["1.png"] and "1.png" in result.broken["1.png"]
 
 
-# -- workers, descriptors, shared memory ------------------------------------------------------------------------------
+# -- workers, shared memory -------------------------------------------------------------------------------------------
 
 
 class Deadly(PictureFolder):
