@@ -25,7 +25,7 @@ class AugmentParams(NamedTuple):
             which is how the picture was turned after the crop (see :func:`rawaug.bayer.turn`). With a zoom it is
             ``(B, 6)``, and the last is the number of rows that were enlarged to the crop.
         extras: with the target ``"srgb"`` ``demosaicing`` (its number), with JPEG ``quality``, with finishing
-            ``chroma_420``, each ``(B,)``, and ``finish`` ``(B, 6)``; with bursts ``motion`` ``(B, N, 3)`` and
+            ``chroma_420``, each ``(B,)``, and ``finish`` ``(B, 8)``; with bursts ``motion`` ``(B, N, 3)`` and
             ``frame_seed`` ``(B, N)``. Else it is empty.
     """
 
