@@ -113,24 +113,21 @@ class Table(NamedTuple):
 
 def table_of(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, columns: Columns) -> Table:
     """The noisy input, other denoisers and the arms, without columns and rows that have no figure."""
-    noisy = {
-        key.replace("_noisy", ""): x for key, x in next(iter(results.values()))[0]["plain"].items() if "_noisy" in key
-    }
+    plain = next(iter(results.values()))[0]["plain"]
+    noisy = {key.replace("_noisy", ""): value for key, value in plain.items() if "_noisy" in key}
     single = {"noisy input": noisy, **(others or {})}
     methods: Runs = {**{name: [{"plain": scores}] for name, scores in single.items()}, **results}
-    values = {name: [_values(runs, *column) for column in columns.values()] for name, runs in methods.items()}
-    values = {name: row for name, row in values.items() if any(row)}
-    shown = {head: key for k, (head, (_, key)) in enumerate(columns.items()) if any(row[k] for row in values.values())}
+    found = {head: {name: _values(runs, *of) for name, runs in methods.items()} for head, of in columns.items()}
+    found = {head: column for head, column in found.items() if any(column.values())}
     best: set[tuple[str, int]] = set()
-    rows: dict[str, list[str]] = {name: [] for name in values}
-    for k, (head, key) in enumerate(shown.items()):
-        column = {name: row[list(columns).index(head)] for name, row in values.items()}
-        means = {name: round(statistics.fmean(found), _digits(key)) for name, found in column.items() if found}
+    for k, (head, column) in enumerate(found.items()):
+        key = columns[head][1]
+        means = {name: round(statistics.fmean(values), _digits(key)) for name, values in column.items() if values}
         if len(means) > 1 and key != "own_noise":
             best |= {(name, k) for name, mean in means.items() if mean == max(means.values())}
-        for name, found in column.items():
-            rows[name].append(_cell(key, found))
-    return Table(list(shown), rows, best)
+    named = [name for name in methods if any(column[name] for column in found.values())]
+    rows = {name: [_cell(columns[head][1], column[name]) for head, column in found.items()] for name in named}
+    return Table(list(found), rows, best)
 
 
 def first_runs(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
