@@ -228,10 +228,13 @@ class CycleISP(CropTrainedISP):
         seed: int = 0,
     ) -> None:
         super().__init__(cfa)
-        with initialise_from(derive_seed(seed, "baseline")):
-            self.rgb2raw = RGB2RAW(features, groups, blocks, reduction)
-            self.raw2rgb = RAW2RGB(features, groups, blocks, reduction)
-            self.ccm = ColourBranch(features, reduction)
+        self.rgb2raw = RGB2RAW(features, groups, blocks, reduction)
+        self.raw2rgb = RAW2RGB(features, groups, blocks, reduction)
+        self.ccm = ColourBranch(features, reduction)
+        with initialise_from(derive_seed(seed, "baseline")):  # a trunk leaves its weights as they are in memory
+            for layer in self.modules():
+                if isinstance(layer, nn.Conv2d):
+                    layer.reset_parameters()
 
     @property
     def reverse_network(self) -> nn.Module:  # type: ignore[override]
