@@ -228,10 +228,12 @@ class CycleISP(CropTrainedISP):
         seed: int = 0,
     ) -> None:
         super().__init__(cfa)
-        self.rgb2raw = RGB2RAW(features, groups, blocks, reduction)
-        self.raw2rgb = RAW2RGB(features, groups, blocks, reduction)
-        self.ccm = ColourBranch(features, reduction)
-        with initialise_from(derive_seed(seed, "baseline")):  # a trunk leaves its weights as they are in memory
+        start = derive_seed(seed, "baseline")
+        with initialise_from(start):
+            self.rgb2raw = RGB2RAW(features, groups, blocks, reduction)
+            self.raw2rgb = RAW2RGB(features, groups, blocks, reduction)
+            self.ccm = ColourBranch(features, reduction)
+        with initialise_from(start):  # a trunk leaves its weights as they are in memory
             for layer in self.modules():
                 if isinstance(layer, nn.Conv2d):
                     layer.reset_parameters()
