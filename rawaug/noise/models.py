@@ -99,7 +99,7 @@ def require_batch(clean: Tensor, params: Params) -> None:
         raise ValueError(f"noise needs packed float32 RAW (B, 4, h, w), got {tuple(clean.shape)} {clean.dtype}")
     for name, value in params.items():
         if value.shape[:1] != clean.shape[:1]:
-            raise ValueError(f"noise parameter {name!r} is {tuple(value.shape)}, but the batch has {len(clean)}")
+            raise ValueError(f"noise parameter {name!r}: {tuple(value.shape)}, but the batch has {len(clean)} pictures")
 
 
 def draw_seeds(batch: int, generator: torch.Generator) -> Tensor:
