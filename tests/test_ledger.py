@@ -1,0 +1,35 @@
+"""Every decibel of the README and of the model cards stands in the ledger, docs/results.md."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+LEDGER = (ROOT / "docs" / "results.md").read_text()
+CARDS = sorted([*(ROOT / "denoisers" / "weights").glob("*.md"), *(ROOT / "rawaug" / "weights").glob("*.md")])
+DECIMALS = re.compile(r"(?<![\w.])\d+\.\d\d(?![\w.])(?!e-)")
+"""Figures are given to two decimals; an exponent makes it a noise level, which is a setting."""
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *CARDS], ids=lambda page: page.stem)
+def test_every_figure_stands_in_the_ledger(page: Path) -> None:
+    claimed = set(DECIMALS.findall(re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)))
+    missing = sorted(figure for figure in claimed if not re.search(rf"(?<![\d.]){re.escape(figure)}(?!\d)", LEDGER))
+    assert not missing, f"{page.name} has figures that docs/results.md does not: {', '.join(missing)}"
+
+
+def test_the_pages_have_figures_to_look_for() -> None:
+    assert len(DECIMALS.findall((ROOT / "README.md").read_text())) > 40
+    assert len(CARDS) >= 8
+
+
+def test_the_readme_is_read_in_two_minutes() -> None:
+    words = [word for word in re.split(r"[\s|]+", (ROOT / "README.md").read_text()) if re.search(r"\w", word)]
+    assert len(words) <= 700
+
+
+def test_the_ledger_is_short_enough_to_be_read() -> None:
+    assert len(LEDGER.splitlines()) <= 700
