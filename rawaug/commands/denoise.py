@@ -53,13 +53,12 @@ def run(
         overwrite: replace existing results.
     """
     if is_picture(source):
-        given = {"classical": classical, "self_ensemble": self_ensemble, "linear": linear, "preview": preview}
+        given = {"classical": classical, "linear": linear, "preview": preview}
         if unfit := [name for name, value in given.items() if value] + ["noise"] * (noise != "auto"):
             options = ", ".join(f"--{name.replace('_', '-')}" for name in unfit)
             raise ValueError(f"{source}: is a developed picture; {options} is for RAW")
-        denoise_all(
-            source, out, PictureDenoiser.of(PICTURES if denoiser is None else denoiser, device, strength), overwrite
-        )
+        spec = PICTURES if denoiser is None else denoiser
+        denoise_all(source, out, PictureDenoiser.of(spec, device, strength, 8 if self_ensemble else 1), overwrite)
         return
     made = chosen(denoiser, classical, self_ensemble, device, linear, strength)
     if not Path(source).is_dir():

@@ -74,10 +74,10 @@ def run(
             require_writable(path, option)
     require_classical(classical or ())
     if is_picture_pairs(data):
-        if self_ensemble or views or noise is not None or bin != 1 or report:
-            options = "--self-ensemble, --views, --noise, --bin and --report"
-            raise ValueError(f"{data}: has developed pictures; {options} are for RAW")
-        return _pictures(weights, data, [str(spec) for spec in classical or ()], device, json, settings)
+        if noise is not None or bin != 1 or report:
+            raise ValueError(f"{data}: has developed pictures; --noise, --bin and --report are for RAW")
+        made = PictureDenoiser.of(weights, device, views=views or (8 if self_ensemble else 1))
+        return _pictures(made, data, [str(spec) for spec in classical or ()], json, settings)
     file = find_weights(weights, FOLDER)
     kind = read_header(file)["kind"]
     if kind == "isp" and (self_ensemble or views or noise is not None or bin != 1 or classical or report):
@@ -112,16 +112,24 @@ def run(
 
 
 def _pictures(
-    weights: str, data: str, classical: Sequence[str], device: str, json: str | None, settings: PairSettings | None
+    denoiser: PictureDenoiser, data: str, classical: Sequence[str], json: str | None, settings: PairSettings | None
 ) -> dict[str, Any]:
-    """The result of a denoiser of pictures, beside classical filters, as published and registered."""
+    """The result of a denoiser of pictures, beside classical filters, as published and registered.
+
+    That of a self-ensemble has the single pass under ``plain``.
+    """
     given = settings or PairSettings()
-    denoisers = [PictureDenoiser.of(spec, device) for spec in (weights, *classical)]
-    result = picture_scores(denoisers, open_picture_pairs(data, given.noisy, given.clean))
+    plain, ensemble = replace(denoiser, views=1), replace(denoiser, name=f"{denoiser.name}, {denoiser.views} views")
+    filters = [PictureDenoiser.of(spec) for spec in classical]
+    tested = [plain, *([ensemble] if denoiser.views > 1 else []), *filters]
+    result = picture_scores(tested, open_picture_pairs(data, given.noisy, given.clean))
     print_pictures(data, result)
-    own = result["rows"][denoisers[0].name]
+    rows = result["rows"]
+    own = rows[tested[denoiser.views > 1].name]
     found = {"kind": "denoiser", "data": data, "version": __version__, **own[PUBLISHED], "registered": own[REGISTERED]}
-    found |= {"classical": {one.name: result["rows"][one.name] for one in denoisers[1:]}} if classical else {}
+    if denoiser.views > 1:
+        found |= {"self_ensemble": True, "views": denoiser.views, "plain": rows[plain.name][PUBLISHED]}
+    found |= {"classical": {one.name: rows[one.name] for one in filters}} if classical else {}
     if json:
         write_json(found, json)
     return found

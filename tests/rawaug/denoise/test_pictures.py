@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import denoisers
+from rawaug import bayer
 from rawaug.commands.denoise import is_picture
 from rawaug.commands.denoise import run as denoise
 from rawaug.data.picture_pairs import open_picture_pairs
@@ -60,6 +61,15 @@ def test_the_estimated_level_grows_with_the_noise() -> None:
         weak, strong = (estimated_level(network, noisy(deviation)[None]) for deviation in (0.01, 0.05))
     assert 0.01 < strong < 0.2
     assert weak < 0.5 * strong
+
+
+def test_a_self_ensemble_denoises_a_turned_picture_to_the_turned_result() -> None:
+    denoiser = PictureDenoiser.of("rawaug-srgb@10", views=8)
+    upright, turned = (denoiser(Noisy(bayer.turn(noisy()[None], view))) for view in (0, 5))
+    assert torch.allclose(bayer.turn(upright, 5), turned, atol=1e-4)
+    plain = PictureDenoiser.of("rawaug-srgb@10")
+    assert (plain(Noisy(noisy()[None])) - upright).abs().max() > 1e-3
+    assert error(upright[0]) < error(plain(Noisy(noisy()[None]))[0])
 
 
 def test_ffdnet_is_told_the_deviation_of_its_noise() -> None:
