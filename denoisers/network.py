@@ -87,7 +87,7 @@ def pad_to_multiple(image: Tensor, stride: int) -> Tensor:
     for axis in (-2, -1):
         size = image.shape[axis]
         padding = -size % stride
-        if torch.compiler.is_compiling() or torch.jit.is_tracing() or padding:  # exported, it pads any size
+        if torch.compiler.is_compiling() or torch.onnx.is_in_onnx_export() or padding:  # exported, it pads any size
             period = 2 * (size - 1)
             place = torch.remainder(torch.arange(size + padding, device=image.device), period)
             image = image.index_select(axis, torch.minimum(place, period - place))

@@ -120,8 +120,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, MissingExtra, CycloptsError) as error:
         said = _one_line(error)
     except (RuntimeError, MemoryError) as error:
-        if (said := resource_error(error)) is None:
+        if (lacking := resource_error(error)) is None:
             raise
+        said = lacking
     except KeyboardInterrupt:
         print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
         return 130
