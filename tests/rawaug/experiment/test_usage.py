@@ -73,7 +73,7 @@ def test_another_network_has_its_own_settings(given: list[Any], capsys: pytest.C
     run("fewshot", "--denoiser.name", "UNet", dry_run=True)
     assert given[-1].denoiser.settings == {"width": 16, "scales": 4}
     run("srgb", "--denoiser.name", "DnCNN", dry_run=True)
-    assert given[-1].denoiser.settings == {"channels": 3, "variance_map": False}
+    assert given[-1].denoiser.settings == {"channels": 3, "deviation": True}
 
 
 def test_an_unknown_network_is_refused_with_the_nearest_name() -> None:
