@@ -274,7 +274,7 @@ def stop_at_work(folder: Path, child: Child) -> None:
     """Stop a command once it has the lock of its output folder."""
     while time.monotonic() - child.start < PATIENCE and not any(folder.rglob("[!.]*.lock")):  # not a file's
         time.sleep(0.002)
-    time.sleep(0.01)  # from the file's being there to its being locked
+    time.sleep(0.1)  # from the file's being there to its being locked
     child.send(signal.SIGSTOP)
 
 

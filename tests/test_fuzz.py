@@ -30,8 +30,8 @@ def test_damaged_files_are_read_or_refused_in_one_line(
     assert fuzz.main(["--quick", "--json", str(figures)]) == 0, capsys.readouterr().out
     kinds = json.loads(figures.read_text())["kinds"]
     assert {"dng", "jpeg", "picture", "mat5", "mat73", "safetensors", "npy", "pair", "recipe"} <= set(kinds)
-    assert sum(row["mutated"] for row in kinds.values()) == 100
-    assert all(row["refused"] for row in kinds.values()) and sum(row["read"] for row in kinds.values()) > 5
+    assert sum(row["mutated"] for row in kinds.values()) == 40
+    assert all(row["refused"] for row in kinds.values()) and sum(row["read"] for row in kinds.values()) > 2
 
 
 @pytest.mark.long

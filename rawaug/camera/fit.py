@@ -72,7 +72,7 @@ def fit(
             is also fitted.
 
     Example:
-        >>> isp = fit("demo:train", steps=2, pixels=512, progress=False)
+        >>> isp = fit("demo:train", steps=2, curve_steps=2, pixels=512, noise="off", progress=False)
         >>> isp.info["frames"][0]
         'train_00_astronaut'
     """

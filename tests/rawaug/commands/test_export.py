@@ -23,7 +23,7 @@ from rawaug.io import RawFrame
     ("name", "config", "linear"),
     [
         ("PMRID", {"width": 4, "variance_map": True}, False),
-        ("DRUNet", {"width": 4, "scales": 1, "variance_map": False, "domain": "anscombe", "pyramid": 2}, False),
+        ("DRUNet", {"width": 4, "scales": 1, "variance_map": False, "domain": "anscombe", "pyramid": 1}, False),
         ("JointDRUNet", {"width": 4, "scales": 2}, True),
     ],
 )
@@ -44,7 +44,9 @@ def test_any_size_gives_pytorch_s_numbers(
     said = capsys.readouterr().out
     assert "any batch, height and width; largest difference from PyTorch" in said and "megapixel" not in said
     frame = RawFrame(torch.rand(1, 130, 94, generator=torch.Generator().manual_seed(1)), CFA.GBRG)
-    both = [RawDenoiser.of(file, views=8).frame(frame, (1e-3, 1e-5)) for file in (weights, out)]
+    both = [
+        RawDenoiser.of(file, views=8 if name == "PMRID" else 1).frame(frame, (1e-3, 1e-5)) for file in (weights, out)
+    ]
     assert both[0].shape == (3 if linear else 1, 130, 94) and (both[0] - frame.mosaic).abs().max() > 1e-3
     assert (both[0] - both[1]).abs().max() < 1e-4
     session = session_of(out)

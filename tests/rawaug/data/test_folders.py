@@ -145,7 +145,7 @@ def test_an_epoch_over_a_damaged_folder_completes_and_names_every_file(
         batch_size=None,
         shuffle=True,
         generator=torch.Generator().manual_seed(0),
-        num_workers=2 if context else 0,
+        num_workers=1 if context else 0,
         multiprocessing_context=context,
     )
     assert sum(1 for _ in loader) == len(pictures)

@@ -52,7 +52,7 @@ def expected(augment: RawAugment, pictures: list[Tensor]) -> Tensor:
         (0, 1, None, 0),
         (0, 5, None, 5),
         (3, 2, "fork", 0),
-        (2, 5, "forkserver", 7),
+        (1, 5, "forkserver", 7),
     ],
 )
 def test_pairs_are_the_same_however_they_are_loaded(
