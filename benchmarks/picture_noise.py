@@ -121,6 +121,8 @@ def draw(table: dict[str, Tensor], path: Path) -> None:
     axes[0].set(xlabel="distance (pixels)", ylabel="autocorrelation of G")
     axes[1].set(xlabel="distance (pixels)", ylabel="autocorrelation of R")
     axes[2].set(xlabel="cycles a pixel", ylabel="power of luma, 1 at .25")
+    axes[2].set_xticks([0.03, 0.06, 0.125, 0.25, 0.5], [".03", ".06", ".125", ".25", ".5"], minor=False)
+    axes[2].minorticks_off()
     axes[0].legend(fontsize=7)
     for axis in axes:
         axis.grid(color="0.92")
