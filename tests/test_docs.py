@@ -45,7 +45,8 @@ def imported(code: str) -> set[str]:
 def test_snippet_runs(name: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for library in sorted(imported(code) & OPTIONAL.keys()):
         pytest.importorskip(library, reason=f"shows rawaug with {library}: {OPTIONAL[library]}")
-    monkeypatch.chdir(tmp_path)
+    (folder := tmp_path / "pictures").mkdir()  # what a snippet writes beside it is its own, too
+    monkeypatch.chdir(folder)
     exec(compile(code, name, "exec"), {"__name__": "__main__"})
 
 
