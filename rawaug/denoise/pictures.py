@@ -1,12 +1,14 @@
 r"""What denoises developed pictures, sRGB ``(1, 3, H, W)`` in [0, 1], beside :class:`rawaug.RawDenoiser` for RAW.
 
-    d = f(x, sigma),    sigma = s sqrt(K rms(x - f(x, 0)))
+.. math:: d = f(x, \sigma), \qquad \sigma = s \sqrt{K r} / (1 + (D / r)^6)
 
-A network f that is told the level of the noise, its standard deviation sigma, also works where it is not known, sigma
-being 0. What it takes away then is an estimate of the level, but on real pictures, where noise and detail are alike, an
-unsure one: the network does best when it is told the geometric mean of the estimate and a usual level K, which is
-chosen on validation pictures. The strength s is 1 unless the user says otherwise. FFDNet, which needs a level, is told
-scikit-image's estimate. The self-ensemble is the mean of eight turns of the picture, as for RAW.
+A network f that is told the level of the noise, its standard deviation :math:`\sigma`, also works where it is unknown,
+the level being 0. What it takes away then, x - f(x, 0), tells the level: r is the lower quartile of its deviation over
+squares of 16 x 16, which texture hardly moves. The estimate is unsure, since noise and detail are alike, so that the
+network does best when it is told the geometric mean of it and a usual level K; and a picture of which no more than D is
+taken away is clean. K and D are chosen on validation pictures. The strength s is 1 unless the user says otherwise.
+FFDNet, which needs a level, is told scikit-image's estimate. The self-ensemble is the mean of eight turns of the
+picture, as for RAW.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 import denoisers
 from denoisers.files import find_denoiser, list_shipped
@@ -34,10 +37,10 @@ from rawaug.registry import FILTERS, Spec, spec_label, suggest
 
 PICTURES = "rawaug-srgb"
 """What denoises pictures where no denoiser is named."""
-USUAL = 15.0 / 255.0
-"""K, as found on CC15."""
-_SAMPLED, _SIDE = 3, 256
-"""The level is estimated on this many squares of this side in both directions."""
+USUAL, CLEAN = 20.0 / 255.0, 1.0 / 255.0
+"""K, as found on CC15, and D, on clean photographs."""
+_SAMPLED, _SIDE, _SQUARE = 3, 256, 16
+"""The level is estimated on this many parts of this side in both directions, in squares of the last side."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,7 @@ class PictureDenoiser:
         def run(srgb: Tensor) -> Tensor:
             if not getattr(network, "reads_variance", False):
                 return denoisers.denoise_tiles(network, srgb, each=progress_by("tile"))
-            return _told(network, srgb, strength * estimated_level(network, srgb)) if strength else srgb
+            return _told(network, srgb, strength * estimate_level(network, srgb)) if strength else srgb
 
         return cls(name, run, where)
 
@@ -148,12 +151,14 @@ def _told(network: Any, srgb: Tensor, level: float) -> Tensor:
     return denoisers.denoise_tiles(network, srgb, variance, each=progress_by("tile"))
 
 
-def estimated_level(network: Any, srgb: Tensor) -> float:
+def estimate_level(network: Any, srgb: Tensor) -> float:
     """The deviation that a network of pictures is told for ``(1, 3, H, W)``: see the module."""
     if not getattr(network, "light", False):  # it cannot do without a level
         return _white_level(srgb)
-    removed = [(part - network(part, torch.zeros_like(part))).square().mean() for part in _sampled(srgb)]
-    return float((USUAL * torch.stack(removed).mean().sqrt()).sqrt())
+    removed = [(part - network(part, torch.zeros_like(part))).square().mean(1) for part in _sampled(srgb)]
+    side = min(_SQUARE, *srgb.shape[-2:])
+    local = torch.cat([F.avg_pool2d(power, side).flatten() for power in removed]).sqrt().quantile(0.25)
+    return float((USUAL * local).sqrt() / (1.0 + (CLEAN / local.clamp_min(1e-6)) ** 6))
 
 
 def _white_level(srgb: Tensor) -> float:

@@ -14,7 +14,7 @@ from rawaug.commands.denoise import is_picture
 from rawaug.commands.denoise import run as denoise
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoise.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
-from rawaug.denoise.pictures import PictureDenoiser, denoise_pictures, estimated_level
+from rawaug.denoise.pictures import PictureDenoiser, denoise_pictures, estimate_level
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, register
 from rawaug.io.pictures import read_picture, write_picture
 
@@ -58,9 +58,16 @@ def test_a_level_that_is_told_and_the_strength_say_how_much_is_removed() -> None
 def test_the_estimated_level_grows_with_the_noise() -> None:
     network = denoisers.from_pretrained("rawaug-srgb")
     with torch.inference_mode():
-        weak, strong = (estimated_level(network, noisy(deviation)[None]) for deviation in (0.01, 0.05))
+        weak, strong = (estimate_level(network, noisy(deviation)[None]) for deviation in (0.01, 0.05))
     assert 0.01 < strong < 0.2
     assert weak < 0.5 * strong
+
+
+def test_a_clean_picture_is_left_alone() -> None:
+    denoiser, clean = PictureDenoiser.of("rawaug-srgb"), smooth()[None]
+    assert (denoiser(Noisy(clean)) - clean).square().mean().sqrt() < 0.5 / 255
+    with torch.inference_mode():
+        assert estimate_level(denoisers.from_pretrained("rawaug-srgb"), clean) < 0.5 / 255
 
 
 def test_a_self_ensemble_denoises_a_turned_picture_to_the_turned_result() -> None:
