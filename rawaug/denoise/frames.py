@@ -26,7 +26,7 @@ from denoisers.files import DEFAULT
 from rawaug import bayer
 from rawaug.denoise.denoiser import Levels, RawDenoiser
 from rawaug.denoise.levels import Noise, Shots, UnknownNoise, as_json, find_levels, load_noise
-from rawaug.files import files_below, files_in, one_at_a_time, require_same_settings, require_writable
+from rawaug.files import files_below, files_in, one_at_a_time, require_file, require_same_settings, require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
 from rawaug.io.dng import LINEAR_WHITE
 from rawaug.io.isolated import isolated
@@ -133,6 +133,7 @@ def denoise_file(
             there already.
     """
     source, out = Path(source), Path(out)
+    require_file(source, "RAW file")
     if out.resolve() == source.resolve():
         raise ValueError(f"{out}: is the input file; give another name")
     _require_new(out, overwrite)

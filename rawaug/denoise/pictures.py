@@ -29,7 +29,7 @@ from rawaug import bayer
 from rawaug.denoise.denoiser import CPU, Noisy, progress_by
 from rawaug.denoise.foreign import AGAIN, load_published
 from rawaug.errors import extra
-from rawaug.files import files_in, read_tensors, require_writable
+from rawaug.files import files_in, read_tensors, require_file, require_writable
 from rawaug.io.picture_files import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
 from rawaug.kernels.runtime import find_device
 from rawaug.progress import progress
@@ -201,6 +201,7 @@ def denoise_picture(
     source, out = Path(source), Path(out)
     if out.suffix.lower() not in PICTURE_FORMATS:
         raise ValueError(f"{out}: {source} is a developed picture; its output is one of {', '.join(PICTURE_FORMATS)}")
+    require_file(source, "picture")
     if out.exists() and out.resolve() == source.resolve():
         raise ValueError(f"{out}: is the input file; give another name")
     if out.exists() and not overwrite:

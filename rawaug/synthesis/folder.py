@@ -87,8 +87,8 @@ def synth(
         OSError: if a worker dies, or the output folder is removed meanwhile.
     """
     start = time.perf_counter()
-    source, out = Path(source).resolve(), Path(out)
-    if source.is_dir() and out.resolve().is_relative_to(source):
+    source, out = Path(source), Path(out)
+    if source.is_dir() and out.resolve().is_relative_to(source := source.resolve()):
         raise ValueError(f"{out}: is inside the picture folder {source}; choose an output folder outside it")
     pictures = files_in(source, "picture", PICTURE_EXTENSIONS)
     source = source.parent if source.is_file() else source

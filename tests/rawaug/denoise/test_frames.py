@@ -346,3 +346,10 @@ def test_linear_dngs_have_the_colours_of_the_scene(tmp_path: Path, bayer_dng: Dn
     assert developed.mean((0, 1)) == pytest.approx(signal.mean((0, 1)), rel=1e-3), "LibRaw shows it as bright"
     for colour, expected in enumerate((x, y, (x + y) / 2)):
         assert abs((signal[..., colour] - expected)[8:-8, 8:-8].mean()) < 1e-3, "no shift, no cast"
+
+
+@pytest.mark.parametrize("name", ["loop.dng", "loop.jpg"])
+def test_a_link_to_itself_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).symlink_to(tmp_path / name)
+    with pytest.raises(OSError, match=rf"{name}: cannot be opened"):
+        run(str(tmp_path / name), str(tmp_path / f"out-{name}"))
