@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from rawaug.files import replacing
-from rawaug.io.pictures import MAX_PIXELS, decode_file, require_written
+from rawaug.io.pictures import MAX_PIXELS, decode_file, require_srgb, require_written
 
 QUALITY = 97
 """Of a JPEG that is written, with chroma at full size."""
@@ -49,6 +49,7 @@ def read_stored(path: str | Path, max_pixels: int = MAX_PIXELS) -> StoredPicture
     path = Path(path)
 
     def kind(spec: Any) -> Any:
+        require_srgb(spec, path)
         if str(spec.format) not in ("uint8", "uint16"):
             raise ValueError(f"{path}: holds {spec.format} numbers; a picture to denoise has 8 or 16 bits")
         return spec.format

@@ -124,7 +124,7 @@ def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:
     """Pixels uint8 ``(H, W, 3)`` as stored, and the EXIF orientation."""
 
     def kind(spec: Any) -> str:
-        _require_srgb(spec, path)
+        require_srgb(spec, path)
         floats = _oiio().HALF, _oiio().FLOAT, _oiio().DOUBLE
         return "float" if spec.format.basetype in floats else "uint8"
 
@@ -191,7 +191,7 @@ def _require_size(spec: Any, path: Path, max_pixels: int) -> None:
         raise ValueError(f"{path}: declares {size}, above the limit of {max_pixels}; split it, or raise max_pixels")
 
 
-def _require_srgb(spec: Any, path: Path) -> None:
+def require_srgb(spec: Any, path: Path) -> None:
     """Raise ValueError if a conversion to sRGB would need a profile or a choice of channels."""
     stored = spec.get_string_attribute("tiff:ColorSpace") or spec.get_string_attribute("jpeg:ColorSpace")
     if any(name in stored for name in ("CMYK", "YCCK", "LAB", "separated")):

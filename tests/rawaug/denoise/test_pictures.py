@@ -120,3 +120,11 @@ def test_pairs_of_pictures_are_scored_as_published_and_registered(tmp_path: Path
         open_picture_pairs("cc16:x")
     with pytest.raises(FileNotFoundError, match="no such folder"):
         open_picture_pairs("polyu:nowhere")
+
+
+def test_a_cmyk_picture_is_refused_in_one_line(tmp_path: Path) -> None:
+    image = pytest.importorskip("PIL.Image")
+    image.new("CMYK", (32, 32), (10, 20, 30, 0)).save(tmp_path / "print.jpg")
+    with pytest.raises(ValueError, match=r"print.jpg: is CMYK; convert it to sRGB first"):
+        denoise(str(tmp_path / "print.jpg"), str(tmp_path / "out.jpg"))
+    assert not (tmp_path / "out.jpg").exists()
