@@ -81,7 +81,7 @@ class PictureDenoiser:
             return replace(cls.of_filter(path, level, strength), views=views)
         name, network = _network(path)
         made = cls.of_network(f"{name}, told {told}" if at else name, network, device, strength)
-        made = made if level is None else replace(made, run=lambda srgb: _told(network, srgb, level))
+        made = made if level is None else replace(made, run=lambda srgb: _denoise_at(network, srgb, level))
         return replace(made, views=views)
 
     @classmethod
@@ -105,7 +105,7 @@ class PictureDenoiser:
         def run(srgb: Tensor) -> Tensor:
             if not getattr(network, "reads_variance", False):
                 return denoisers.denoise_tiles(network, srgb, each=progress_by("tile"))
-            return _told(network, srgb, strength * estimate_level(network, srgb)) if strength else srgb
+            return _denoise_at(network, srgb, strength * estimate_level(network, srgb)) if strength else srgb
 
         return cls(name, run, where)
 
@@ -145,7 +145,7 @@ def _network(spec: str) -> tuple[str, nn.Module]:
     return arm if path.stem == "denoiser" else path.stem, network
 
 
-def _told(network: Any, srgb: Tensor, level: float) -> Tensor:
+def _denoise_at(network: Any, srgb: Tensor, level: float) -> Tensor:
     """The picture denoised by a network that is told the deviation of its noise, 0 for unknown."""
     variance = srgb.new_full((1, 1, 1, 1), level**2).expand_as(srgb)
     return denoisers.denoise_tiles(network, srgb, variance, each=progress_by("tile"))
@@ -155,7 +155,7 @@ def estimate_level(network: Any, srgb: Tensor) -> float:
     """The deviation that a network of pictures is told for ``(1, 3, H, W)``: see the module."""
     if not getattr(network, "light", False):  # it cannot do without a level
         return _white_level(srgb)
-    removed = [(part - network(part, torch.zeros_like(part))).square().mean(1) for part in _sampled(srgb)]
+    removed = [(part - network(part, torch.zeros_like(part))).square().mean(1) for part in _spread_parts(srgb)]
     side = min(_SQUARE, *srgb.shape[-2:])
     local = torch.cat([F.avg_pool2d(power, side).flatten() for power in removed]).sqrt().quantile(0.25)
     return float((USUAL * local).sqrt() / (1.0 + (CLEAN / local.clamp_min(1e-6)) ** 6))
@@ -168,7 +168,7 @@ def _white_level(srgb: Tensor) -> float:
     return float(estimate_sigma(srgb[0].cpu().numpy(), channel_axis=0, average_sigmas=True))
 
 
-def _sampled(srgb: Tensor) -> Iterator[Tensor]:
+def _spread_parts(srgb: Tensor) -> Iterator[Tensor]:
     """Squares that are spread over a picture, or the whole of a small one."""
     height, width = srgb.shape[-2:]
     tops, lefts = (sorted({(side - _SIDE) * k // (_SAMPLED - 1) for k in range(_SAMPLED)}) if side > _SIDE else [0]
