@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +24,7 @@ from denoisers.files import DEFAULT
 from denoisers.network import PACKED
 from rawaug.bayer import CFA, pattern
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
+from rawaug.denoise.pictures import PICTURES, PictureDenoiser
 from rawaug.explore import figures
 from rawaug.explore.figures import Example
 from rawaug.io import encode_srgb, read_picture
@@ -37,6 +38,7 @@ from rawaug.plugin.augment import RawAugment, with_iso
 from rawaug.plugin.config import AugmentConfig, pair_generator
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.pictures import trim_to_even
+from rawaug.plugin.targets import Srgb
 from rawaug.registry import NOISE
 
 DRAWS = 8
@@ -133,11 +135,13 @@ def command(look: Look, out: str = "pairs") -> str:
         'rawaug synth cat.png pairs --format npz --exposure=-0.5 --light 5500 --seed 3'
     """
     words = ["rawaug", "synth", look.picture, out, "--format", "npz"]
-    given = changes(look.config)
-    draw = given.pop("draw", None)
-    for name, value in {**given, **(changes(draw) if draw else {})}.items():
-        text = _text(value)
-        words += [f"--{name}={text}"] if text.startswith("-") else [f"--{name}", text]
+    options: dict[str, Any] = {}
+    for name, value in changes(look.config).items():
+        prefix = "" if isinstance(value, Draw) else f"{name}."
+        options |= {prefix + key: one for key, one in changes(value).items()} if is_dataclass(value) else {name: value}
+    for name, value in options.items():
+        text = "" if value is True else _text(value)
+        words += [f"--{name}={text}"] if text.startswith("-") else [f"--{name}", text] if text else [f"--{name}"]
     return shlex.join([*words, "--seed", str(look.seed)])
 
 
@@ -164,15 +168,15 @@ def python(look: Look) -> str:
     )
 
 
-def changes(settings: AugmentConfig | Draw) -> dict[str, Any]:
+def changes(settings: Any) -> dict[str, Any]:
     """The fields of a dataclass that differ from their defaults."""
     return {f.name: value for f in fields(settings) if (value := getattr(settings, f.name)) != f.default}
 
 
 def _as_code(value: object) -> str:
-    if not isinstance(value, Draw):
+    if not is_dataclass(value):
         return repr(value)
-    return f"rawaug.Draw({', '.join(f'{name}={one!r}' for name, one in changes(value).items())})"
+    return f"rawaug.{type(value).__name__}({', '.join(f'{name}={one!r}' for name, one in changes(value).items())})"
 
 
 def _text(value: object) -> str:
@@ -299,14 +303,17 @@ def denoise(look: Look) -> list[Panel]:
 
 
 def srgb(look: Look) -> list[Panel]:
-    """Noisy and clean as sRGB: noise in RAW, demosaiced and developed by the camera that made the RAW."""
+    """Noisy and clean as a camera's JPEG, developed and finished by the camera that made the RAW; denoised, too."""
     made = make_example(look)
     noisy, clean = (_crop(image) for image in (made.pair.noisy, made.pair.clean))
     quality = psnr(noisy[None], clean[None]).item()
     assert made.augment.srgb is not None
     method = made.augment.srgb.methods[int(made.pair.params.extras["demosaicing"])]
     title = f"noisy: {_levels(made)}, demosaicing {method}; {quality:.1f} dB"
-    return [Panel(title, _to_uint8(noisy)), Panel("clean: developed alike", _to_uint8(clean))]
+    denoised = _picture_network()(Noisy(noisy[None]))
+    after = f"denoised by {PICTURES}, told no level; {psnr(denoised, clean[None]).item():.1f} dB"
+    shown = {title: noisy, after: denoised[0], "clean: developed and finished alike": clean}
+    return [Panel(name, _to_uint8(image)) for name, image in shown.items()]
 
 
 def burst(look: Look) -> list[Panel]:
@@ -330,7 +337,7 @@ VIEWS: dict[str, Callable[[Look], list[Panel]]] = {
     "Burst": burst,
 }
 """The tabs; beside them there is the one that compares the noisy picture with the denoised one."""
-FORMS: dict[str, dict[str, Any]] = {"sRGB": {"target": "srgb"}, "Burst": {"burst": 4}}
+FORMS: dict[str, dict[str, Any]] = {"sRGB": {"target": Srgb(finish=True)}, "Burst": {"burst": 4}}
 """Target and burst of the pairs that a tab shows, if not those of the others."""
 
 
@@ -342,6 +349,11 @@ def with_tab(tab: str, look: Look) -> Look:
 @lru_cache(maxsize=1)
 def _network() -> RawDenoiser:
     return RawDenoiser.of(DEFAULT)
+
+
+@lru_cache(maxsize=1)
+def _picture_network() -> PictureDenoiser:
+    return PictureDenoiser.of(PICTURES)
 
 
 def _half(made: Example) -> Tensor:

@@ -20,6 +20,7 @@ from rawaug.explore.views import Look, command, drop_inapplicable, iso_range, ma
 from rawaug.io import read_picture, write_picture
 from rawaug.plugin.config import AugmentConfig
 from rawaug.plugin.draw import Draw
+from rawaug.plugin.targets import Srgb
 
 LEVELS = (1e-4, 1e-6)
 
@@ -45,6 +46,7 @@ def picture(tmp_path_factory: pytest.TempPathFactory) -> str:
         AugmentConfig(noise=LEVELS, draw=Draw(light="LED-B3"), cfa="XTRANS"),
         AugmentConfig("canon-powershot", noise="any camera", draw=Draw(exposure=0.25)),
         AugmentConfig(target="srgb"),
+        AugmentConfig(target=Srgb(finish=True)),
         AugmentConfig(burst=3),
     ],
 )
@@ -75,7 +77,7 @@ def test_every_view_has_titled_pictures_and_the_draws_differ(picture: str) -> No
     look = Look(picture, AugmentConfig(noise=LEVELS))
     panels = {name: view(views.with_tab(name, look)) for name, view in views.VIEWS.items()}
     assert {name: len(found) for name, found in panels.items()} == {
-        "Pair": 2, "Stages": 5, "RAW": 6, "Camera": 2, "Noise": 1, "Eight draws": 8, "sRGB": 2, "Burst": 4
+        "Pair": 2, "Stages": 5, "RAW": 6, "Camera": 2, "Noise": 1, "Eight draws": 8, "sRGB": 3, "Burst": 4
     }  # fmt: skip
     for panel in (panel for found in panels.values() for panel in found):
         assert panel.title and panel.image.dtype == np.uint8 and panel.image.shape[2] == 3 and panel.image.std() > 3
