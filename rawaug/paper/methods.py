@@ -11,14 +11,6 @@ over the weights of the atoms and, for an ISP of published cameras, the gains. D
 squares end (:mod:`rawaug.isp.staged`), with all P pixels for readings; of a fitted ISP, whose gains stay within
 the hull of its own, from the middle of the hulls. The settings of rows that know less are compared as well.
 
-InvISP's figure on MIT-Adobe FiveK is the PSNR of demosaiced, white-balanced and gamma-compressed RAW,
-
-.. math:: z(y) = \left(\frac{w}{\max w} \, \mathrm{demosaic}(y)\right)^{1/2.2}, \qquad
-    \mathrm{PSNR} = -10 \log_{10} \mathrm{mean} (z(\hat y) - z(y))^2
-
-with the as-shot white balance w, bilinear interpolation and :math:`\hat y` within [0, 1]: the mean over a frame's 3 x 3
-equal pieces, which begin at even sites here. Source: Xing et al., CVPR 2021, and the authors' published scripts.
-
 PSNR_d is that of a denoiser trained on the RAW that a method makes of sRGB pictures, on real RAW. Pictures, network,
 steps and noise are the same for every method. The dictionary ISP draws camera settings from its hull, UPI from its
 published distributions; a network has one answer.
@@ -30,7 +22,6 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise, product
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -54,7 +45,7 @@ from rawaug.isp.config import ISPParams
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import PixelSamples, block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import as_float, coordinates_or_full, frame_coordinates
+from rawaug.isp.stages import as_float, coordinates_or_full
 from rawaug.metrics import PATCH, psnr
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.paper.baselines import BASELINES, Training, fit_baseline
@@ -150,7 +141,7 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any
     model = fitted.model
     if not pair.registered:
         return {"rows": _block_rows(model, pair), "mpix_s": None}
-    makers = _makers(model, pair)
+    makers = {row: _maker(model, given) for row, given in settings(model, pair).items()}
     start = time.perf_counter()
     rows = {row: windows_psnr(make, pair, patches) for row, make in makers.items()}
     if "oracle" in rows:  # chosen by the error on some pixels of the frame, which is not the mean of the patches' PSNR
@@ -160,20 +151,11 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any
     return {"rows": rows, "mpix_s": pixels / (time.perf_counter() - start) / 1e6}
 
 
-def balanced_rows(fitted: Fitted, pair: Pair) -> dict[str, float]:
-    """InvISP's PSNR in dB (:func:`balanced_psnr`) of every row that the family fills."""
-    return {row: balanced_psnr(make, pair) for row, make in _makers(fitted.model, pair).items()}
-
-
-def _makers(model: Method, pair: Pair) -> dict[str, Callable[[Tensor, Tensor], Tensor]]:
-    """By row the function from an sRGB patch and its coordinates to a mosaic."""
-
-    def maker(given: Any) -> Callable[[Tensor, Tensor], Tensor]:
-        if isinstance(model, DictionaryISP):
-            return lambda patch, coordinates: model.reverse(patch, given, coordinates=coordinates).raw
-        return lambda patch, _: model.reverse(patch, given)
-
-    return {row: maker(given) for row, given in settings(model, pair).items()}
+def _maker(model: Method, given: Any) -> Callable[[Tensor, Tensor], Tensor]:
+    """The function from an sRGB patch and its coordinates to a mosaic under a setting."""
+    if isinstance(model, DictionaryISP):
+        return lambda patch, coordinates: model.reverse(patch, given, coordinates=coordinates).raw
+    return lambda patch, _: model.reverse(patch, given)
 
 
 def settings(model: Method, pair: Pair) -> dict[str, Any]:
@@ -237,36 +219,6 @@ def mosaic_only_psnr(pictures: Sequence[Tensor], cfa: CFA | str = "RGGB") -> flo
     """Mean PSNR in dB of pictures ``(3, H, W)`` after a mosaic and bilinear interpolation: the ceiling of a cycle."""
     values = [as_float(p[None]) for p in pictures]
     return fmean(psnr(bayer.demosaic(bayer.mosaic(x, cfa), cfa).clamp(0.0, 1.0), x).item() for x in values)
-
-
-GAMMA = 2.2
-PARTS = 3
-
-
-@torch.no_grad()
-def balanced_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair) -> float:
-    """InvISP's PSNR in dB, the mean over nine pieces; ValueError if the pair is not registered.
-
-    ``make`` maps sRGB ``(1, 3, h, w)`` and its coordinates in the frame ``(1, 2, h, w)`` to RAW ``(1, 1, h, w)``.
-    """
-    if not pair.registered:
-        raise ValueError(f"{pair.name}: is not registered pixel by pixel, so it has no balanced PSNR")
-    height, width = pair.raw.shape[-2:]
-    edges = ([k * side // PARTS // 2 * 2 for k in range(PARTS)] + [side] for side in (height, width))
-    values = []
-    for (top, bottom), (left, right) in product(*map(pairwise, edges)):
-        piece = (None, slice(None), slice(top, bottom), slice(left, right))
-        coordinates = frame_coordinates(bottom - top, right - left, (top, left), (height, width))
-        made = make(pair.srgb[piece], coordinates).clamp(0.0, 1.0)
-        values.append(psnr(_balanced(made, pair), _balanced(pair.raw[piece], pair)).item())
-    return fmean(values)
-
-
-def _balanced(raw: Tensor, pair: Pair) -> Tensor:
-    """z of a mosaic ``(1, 1, h, w)``, of shape ``(1, 3, h, w)``."""
-    gains = torch.tensor(pair.white_balance)
-    balanced = bayer.demosaic(raw, pair.cfa) * (gains / gains.max()).reshape(3, 1, 1)
-    return balanced.clamp_min(0.0) ** (1.0 / GAMMA)
 
 
 PIXELS = 16384

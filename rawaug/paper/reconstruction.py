@@ -9,7 +9,7 @@ stopped run can resume.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -17,7 +17,6 @@ from statistics import fmean, median
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
@@ -28,7 +27,6 @@ from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.plan import claim, require_free, run_folder
 from rawaug.files import fingerprint, write_json
-from rawaug.io import decode_srgb, encode_srgb
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
 from rawaug.noise import noise_model
@@ -38,7 +36,6 @@ from rawaug.paper.methods import (
     ROWS,
     DownstreamConfig,
     Fitted,
-    balanced_rows,
     cycle_psnr,
     fit_family,
     is_method,
@@ -55,60 +52,31 @@ from rawaug.training.config import weights_key
 from rawaug.training.loop import require_trainable
 
 COLUMNS = {
-    "psnr_r": "PSNR_r", "worst25": "worst 25%", "best25": "best 25%", "balanced": "balanced", "cycle": "cycle",
+    "psnr_r": "PSNR_r", "worst25": "worst 25%", "best25": "best 25%", "cycle": "cycle",
     "cycle_without_mosaic": "no mosaic", "psnr_d": "PSNR_d",
 }  # fmt: skip
 
 
-def print_methods(title: str, rows: Mapping[str, Mapping[str, Any]], balanced: bool, ceiling: float) -> None:
+def print_methods(title: str, rows: Mapping[str, Mapping[str, Any]], ceiling: float) -> None:
     """Print the rows of a comparison.
 
     Args:
         title: of the table.
         rows: by name, as in ``table.json``.
-        balanced: whether there is a column with InvISP's figure.
         ceiling: PSNR in dB that the mosaic alone leaves of a cycle.
     """
-    columns = {key: head for key, head in COLUMNS.items() if key != "balanced" or balanced}
 
     def cells(row: Mapping[str, Any]) -> Iterator[str]:
-        for value in map(row.get, columns):
+        for value in map(row.get, COLUMNS):
             yield "" if value is None else mean_and_spread(value if isinstance(value, list) else [value], 2)
         yield f"{row['parameters'] / 1e6:.3f}"
         yield f"{row['seconds']:.1f}"
         yield "" if row["mpix_s"] is None else f"{row['mpix_s']:.3g}"
 
-    heads = ["method", *columns.values(), "M par.", "s to fit", "Mpix/s"]
+    heads = ["method", *COLUMNS.values(), "M par.", "s to fit", "Mpix/s"]
     print_rows(title, heads, [[name, *cells(row)] for name, row in rows.items()])
     threads = torch.get_num_threads()
     print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); threads: {threads}")
-
-
-STOPS, CONTRAST, SATURATION = 1.0, 0.5, 1.3
-LUMA = (0.2126, 0.7152, 0.0722)
-"""Weights of R, G and B in the luma of ITU-R BT.709."""
-
-
-def overexpose(pair: Pair) -> Pair:
-    """The shot with a stop more light, RAW and picture clipped at white."""
-    factor = 2.0**STOPS
-    picture = encode_srgb((factor * decode_srgb(pair.srgb.float() / 255.0)).clamp(max=1.0))
-    return replace(pair, srgb=_as_8_bits(picture), raw=(factor * pair.raw).clamp(max=1.0))
-
-
-def retouch(pair: Pair) -> Pair:
-    """The pair with an S curve and more saturated colour in its picture; the RAW stays."""
-    x = pair.srgb.float() / 255.0
-    x = x + CONTRAST * (3.0 * x**2 - 2.0 * x**3 - x)
-    luma = (torch.tensor(LUMA).reshape(3, 1, 1) * x).sum(0, keepdim=True)
-    return replace(pair, srgb=_as_8_bits((luma + SATURATION * (x - luma)).clamp(0.0, 1.0)))
-
-
-PERTURBED: dict[str, Callable[[Pair], Pair]] = {"overexposed": overexpose, "retouched": retouch}
-
-
-def _as_8_bits(picture: Tensor) -> Tensor:
-    return (255.0 * picture).round().to(torch.uint8)
 
 
 @dataclass
@@ -131,10 +99,6 @@ class Comparison:
         crop: side of the crops that these methods train on: small ones give more steps to a short budget.
         batch: crops in a step of them.
         patches: random patches of each left-out frame that are scored; null scores all.
-        balanced: a column with InvISP's figure as well, on whole frames: PSNR of demosaiced, white-balanced and
-            gamma-compressed RAW.
-        perturbed: more rows, of frames that are "overexposed" by a stop, or whose picture was "retouched" with an S
-            curve and more saturated colour; methods are fitted to frames as they are.
         pictures: sRGB pictures for the cycle and for PSNR_d.
         fit: of the dictionary ISP.
         downstream: how PSNR_d is measured; null skips it.
@@ -155,8 +119,6 @@ class Comparison:
     crop: int = 64
     batch: int = 2
     patches: int | None = 8
-    balanced: bool = False
-    perturbed: list[str] = field(default_factory=list)
     pictures: str = "demo:"
     fit: FitConfig = field(default_factory=FitConfig)
     downstream: DownstreamConfig | None = None
@@ -173,8 +135,6 @@ class Comparison:
             raise ValueError(f"seeds must be at least 1, got {self.seeds}")
         if self.patches is not None and self.patches < 1:
             raise ValueError(f"patches must be at least 1, or null for all, got {self.patches}")
-        if unknown := [kind for kind in self.perturbed if kind not in PERTURBED]:
-            raise ValueError(f"perturbed: {unknown}; choose from {', '.join(PERTURBED)}")
         if self.noise and any(not method.startswith("dictionary") for method in self.methods):
             raise ValueError("noise: only the dictionary ISP can be fitted to noisy frames; remove the other methods")
 
@@ -221,7 +181,7 @@ class ComparisonRun:
         frames = len(self.scored)
         on = f"one of {frames} frames left out" if settings.test is None else f"{frames} frames of {settings.test}"
         title = f"{settings.name}: {on}, seeds: {settings.seeds}, {settings.data}"
-        print_methods(title, rows, settings.balanced, ceiling)
+        print_methods(title, rows, ceiling)
         return rows
 
     def _rows(self, family: str) -> dict[str, dict[str, Any]]:
@@ -231,16 +191,12 @@ class ComparisonRun:
         speeds = [fold["mpix_s"] for fold in folds if fold["mpix_s"] is not None]
         whole = self._all_frames(family)
 
-        def by_seed(kind: str, row: str) -> list[list[float]]:
-            values = [fold[kind][row] for fold in folds]
-            return [values[k : k + len(names)] for k in range(0, len(values), len(names))]
-
         rows = {}
         for row in folds[0]["rows"]:
-            values = by_seed("rows", row)
+            found = [fold["rows"][row] for fold in folds]
+            values = [found[k : k + len(names)] for k in range(0, len(found), len(names))]  # by seed
             worst, best = zip(*map(worst_and_best_quarter, values), strict=True)
-            setting, _, kind = row.partition(", ")
-            name = ", ".join([family, *([] if setting == "blind" else [ROWS[setting]]), *([kind] if kind else [])])
+            name = family if row == "blind" else f"{family}, {ROWS[row]}"
             rows[name] = {
                 "psnr_r": [fmean(of_seed) for of_seed in values],
                 "frames": {
@@ -253,15 +209,12 @@ class ComparisonRun:
                 "parameters": folds[0]["parameters"],
                 **(whole if row == "blind" else {}),
             }
-            if row in folds[0].get("balanced", {}):
-                rows[name]["balanced"] = [fmean(of_seed) for of_seed in by_seed("balanced", row)]
         return rows
 
     def _fold(self, family: str, seed: int, frame: int) -> dict[str, Any]:
         """The figures of a fit without one frame, scored on it; or of a fit to all, scored on a test frame."""
         settings, training = self.settings, self._training(seed)
-        measured = settings.patches, settings.balanced, settings.perturbed
-        key = fingerprint(family, asdict(training), *measured, *self._frames())
+        key = fingerprint(family, asdict(training), settings.patches, *self._frames())
         name = names_of(self.scored)[frame]
         path = self._path(f"{family}-{'on' if settings.test else 'without'}-{name}-seed{seed}")
 
@@ -273,11 +226,6 @@ class ComparisonRun:
             fitted = self._fitted[key] if settings.test else fit_family(family, others, self.fit, training)
             pair = pair.in_pattern(self.pairs[0].cfa) if settings.test else pair
             result = score_rows(fitted, pair, settings.patches)
-            for kind in settings.perturbed:
-                found = score_rows(fitted, PERTURBED[kind](pair), settings.patches)["rows"]
-                result["rows"] |= {f"{row}, {kind}": value for row, value in found.items()}
-            if settings.balanced:
-                result["balanced"] = balanced_rows(fitted, pair)
             return result | {**fitted.model.info, "seconds": fitted.seconds, "parameters": fitted.parameters}
 
         return resume(path, key, measure)

@@ -6,20 +6,19 @@ name        source                                       parameters   fitted    
 upi         Brooks et al., CVPR 2019                     0            no        exact inverse
 upi-tuned   the same, matrix and gains from pairs        12           at once   exact inverse
 unet        Ronneberger et al., MICCAI 2015              11.77 M      descent   none
-cycleisp    Zamir et al., CVPR 2020                      3.14 M       descent   with a reference picture
+cycleisp    Zamir et al., CVPR 2020                      3.14 M       descent   none
 invisp      Xing et al., CVPR 2021                       1.41 M       descent   exact inverse
-invgrey     Xia et al., TOG 2018, as InvISP compares it  0.74 M       descent   a network of its own
 =========== ============================================ ============ ========= =================================
 
 Parameters are those of the reverse pass at the default, published size.
 """
 
 from rawaug.paper.baselines.base import BaselineISP, Training, fit_baseline
-from rawaug.paper.baselines.networks import CycleISP, InvertibleGrey, InvISP, UNetISP
+from rawaug.paper.baselines.networks import CycleISP, InvISP, UNetISP
 from rawaug.paper.baselines.upi import UPI, TunedUPI
 from rawaug.registry import BASELINES
 
 __all__ = [
-    "BASELINES", "UPI", "BaselineISP", "CycleISP", "InvISP", "InvertibleGrey", "Training", "TunedUPI", "UNetISP",
+    "BASELINES", "UPI", "BaselineISP", "CycleISP", "InvISP", "Training", "TunedUPI", "UNetISP",
     "fit_baseline",
 ]  # fmt: skip

@@ -140,9 +140,8 @@ class CropTrainedISP(BaselineISP):
         """Set from the pairs what descent does not learn; called once, before training."""
 
     def loss(self, crops: Crops) -> Tensor:
-        """The scalar that training lowers: :meth:`raw_error`, and l1 on the sRGB of methods that render RAW."""
-        error = self.raw_error(bayer.mosaic(self.unprocess(crops.srgb), self.cfa), crops.raw)
-        return error + F.l1_loss(self.render(crops.raw, crops.srgb), crops.srgb) if self.bidirectional else error
+        """The scalar that training lowers: by default :meth:`raw_error`."""
+        return self.raw_error(bayer.mosaic(self.unprocess(crops.srgb), self.cfa), crops.raw)
 
     def raw_error(self, predicted: Tensor, raw: Tensor) -> Tensor:
         """The error of predicted mosaics ``(B, 1, H, W)``, a scalar: by default l1."""

@@ -1,56 +1,40 @@
-r"""The networks: a plain U-Net, invertible greyscale, CycleISP and InvISP.
+r"""The networks: a plain U-Net, CycleISP and InvISP.
 
 *The U-Net*, ``y = mosaic(x + U(x))``, is trained end to end with l1. The published size is 11.77 M parameters. That is
 UPI's U-Net with three channels in and out (five scales of three convolutions, 32 to 512 features, bilinear
 interpolation up: 11,774,979 parameters), so the one in :mod:`denoisers.networks` is used. That the paper's U-Net is
 this one is concluded from the number of parameters. Source: Ronneberger et al., MICCAI 2015; Conde et al., AAAI 2022.
 
-*Invertible greyscale*, ``x = E(demosaic(y))``, ``y = mosaic(D(x))``: Xia et al. hide a colour picture in a grey one by
-an encoder E and restore it by a decoder D. In InvISP's comparison the hidden picture is the RAW and the visible one the
-sRGB. E is a residual encoder-decoder of 64, 128 and 256 features with 2, 4 and 2 residual blocks, strides of 2 down,
-nearest neighbours up, and the finer features added; D has 64 features and 8 residual blocks, then 256 features and a
-1 x 1 convolution. Two things differ here, and are assumptions: the outputs are linear, since most of RAW is near black,
-where the published tanh is flat; and the losses are l1 of the two directions, as for InvISP, since there is no grey
-picture to resemble. Source: Xia et al., "Invertible Grayscale", ACM TOG 37(6), 2018; Xing et al., CVPR 2021.
-
-*CycleISP*, ``y = mosaic(N_rgb2raw(x))`` and ``x = N_raw2rgb(pack(y), a(x'))``: three groups of five dual-attention
-blocks (:mod:`denoisers.cycleisp`) of 96 features a network. RAW has no trace of how its picture was coloured, so a
-colour branch a guides the way to sRGB: a blurred sRGB picture x' becomes a map in (0, 1) that re-weights the features.
-Loss: ``|y - y^|_1 + |log y - log y^|_1`` to RAW, ``|x - x^|_1`` to sRGB. Source: Zamir et al., CVPR 2020; sizes that
-the text leaves open (colour branch: two groups of two blocks; blur: 21 x 21, sigma 12) follow the published
-checkpoints.
+*CycleISP*, ``y = mosaic(N_rgb2raw(x))``: three groups of five dual-attention blocks (:mod:`denoisers.cycleisp`) of 96
+features. Its other network, from RAW to sRGB, shares no weight with this one and is left out. Loss: ``|y - y^|_1 + |log
+y - log y^|_1``. Source: Zamir et al., CVPR 2020, and the published checkpoints.
 
 *InvISP*, ``x = f(r)``, ``r = f^-1(x)``, ``r = (w demosaic(y))^(1/2.2)`` with the as-shot white balance w of largest
 entry 1. f is eight blocks ``u = W v``, ``p = u_1 + F(u_23)``, ``q = u_23 exp(s(p)) + G(p)`` with the log-scale
-``s = 0.8 (2 sigmoid(H(p)) - 1)``, each of which is undone exactly. Loss: ``|f(r) - x|_1 + |f^-1(x) - r|_1``; with JPEG
-between, the second term is ``|f^-1(jpeg(f(r))) - r|_1``. Source: Xing et al., "Invertible Image Signal Processing",
-CVPR 2021; couplings of Dinh et al. (Real NVP), 1 x 1 convolutions of Kingma and Dhariwal (Glow), dense blocks of
-growth 32.
+``s = 0.8 (2 sigmoid(H(p)) - 1)``, each of which is undone exactly. Loss: ``|f(r) - x|_1 + |f^-1(x) - r|_1``. Source:
+Xing et al., "Invertible Image Signal Processing", CVPR 2021; couplings of Dinh et al. (Real NVP), 1 x 1 convolutions of
+Kingma and Dhariwal (Glow), dense blocks of growth 32.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from denoisers import cycleisp
-from denoisers.network import pad_to_multiple
 from denoisers.networks import PUBLISHED_WIDTH, UNet
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp import stages
 from rawaug.isp.fit.samples import FramePair
-from rawaug.isp.stages import as_float
 from rawaug.paper.baselines.base import Crops, CropTrainedISP
 from rawaug.registry import BASELINES
 from rawaug.seeding import derive_seed, initialise_from
 
-BLUR_SIZE, BLUR_SIGMA = 21, 12.0
 LOG_FLOOR = 1e-3
 """The value below which CycleISP's log loss is flat: at 12 bits it is four levels above black."""
 SCALE_CLAMP = 0.8
@@ -82,78 +66,6 @@ class UNetISP(CropTrainedISP):
         self.reverse_network = UNet(width, channels=3, variance_map=False, seed=seed)
 
 
-# -- invertible greyscale ---------------------------------------------------------------------------------------------
-
-
-class ResidualBlock(nn.Sequential):
-    """``x + conv(relu(conv(x)))`` of features ``(B, C, H, W)``."""
-
-    def __init__(self, features: int) -> None:
-        super().__init__(_conv(features, features), nn.ReLU(), _conv(features, features))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Features ``(B, C, H, W)`` to features of the same shape."""
-        return x + super().forward(x)
-
-
-def _blocks(features: int, count: int) -> nn.Sequential:
-    return nn.Sequential(*(ResidualBlock(features) for _ in range(count)))
-
-
-def _scale(inputs: int, outputs: int, stride: int) -> nn.Sequential:
-    """A change of size and of the number of features."""
-    return nn.Sequential(_conv(inputs, outputs, stride), _conv(outputs, outputs), nn.ReLU())
-
-
-class Encoder(nn.Module):
-    """E, demosaiced RAW to sRGB, with ``features``, twice and four times as many in its three scales."""
-
-    def __init__(self, features: int) -> None:
-        super().__init__()
-        fine, middle, coarse = features, 2 * features, 4 * features
-        self.first = nn.Sequential(_conv(3, fine), _blocks(fine, 2))
-        self.down = nn.ModuleList([_scale(fine, middle, 2), _scale(middle, coarse, 2)])
-        self.centre = _blocks(coarse, 4)
-        self.up = nn.ModuleList([_scale(coarse, middle, 1), _scale(middle, fine, 1)])
-        self.last = nn.Sequential(_blocks(fine, 2), _conv(fine, 3))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """``(B, 3, H, W)`` to ``(B, 3, H, W)``; sides are padded to multiples of 4 inside."""
-        fine = self.first(pad_to_multiple(x, 4))
-        middle = self.down[0](fine)
-        features = self.centre(self.down[1](middle))
-        for up, skip in zip(self.up, (middle, fine), strict=True):
-            features = up(F.interpolate(features, scale_factor=2.0, mode="nearest")) + skip
-        return self.last(features)[..., : x.shape[-2], : x.shape[-1]]
-
-
-@BASELINES.register("invgrey")
-class InvertibleGrey(CropTrainedISP):
-    """The invertible-greyscale network, one network a direction.
-
-    Args:
-        cfa: the pattern of the RAW that it makes and takes.
-        features: in the finest scale of either direction.
-        blocks: number of residual blocks of the decoder, from sRGB to RAW.
-        seed: decides the initial weights.
-    """
-
-    name = "invgrey"
-    learning_rate = 1e-3
-
-    def __init__(self, cfa: CFA | str = "RGGB", features: int = 64, blocks: int = 8, seed: int = 0) -> None:
-        super().__init__(cfa)
-        with initialise_from(derive_seed(seed, "baseline")):
-            self.encoder = Encoder(features)
-            last = nn.Conv2d(4 * features, 3, 1)
-            body = (_conv(3, features), _blocks(features, blocks), _conv(features, 4 * features))
-            self.reverse_network = nn.Sequential(*body, last)
-
-    def render(self, raw: Tensor, setting: Any = None) -> Tensor:
-        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``; there are no settings."""
-        return self.encoder(bayer.demosaic(raw, self.cfa))
-
-
 # -- CycleISP ---------------------------------------------------------------------------------------------------------
 
 
@@ -169,53 +81,21 @@ class RGB2RAW(cycleisp.Trunk):
         return self.tail(self.body(self.head(srgb)))
 
 
-class ColourBranch(cycleisp.Trunk):
-    """The branch that guides the way to sRGB by the colours of a picture."""
-
-    def __init__(self, features: int, reduction: int) -> None:
-        super().__init__(3, features, groups=2, blocks=2, reduction=reduction)
-        self.tail = nn.Sequential(_conv(features, features), nn.Sigmoid())
-
-    def forward(self, srgb: Tensor) -> Tensor:
-        """A picture ``(B, 3, H, W)`` to weights of features in (0, 1), ``(B, features, H/2, W/2)``."""
-        from kornia.filters import gaussian_blur2d
-
-        if min(srgb.shape[-2:]) <= BLUR_SIZE // 2:
-            sides = "x".join(map(str, srgb.shape[-2:]))
-            raise ValueError(f"the colour branch needs sides larger than {BLUR_SIZE // 2} pixels, got {sides}")
-        blurred = gaussian_blur2d(srgb, BLUR_SIZE, (BLUR_SIGMA, BLUR_SIGMA), border_type="reflect")
-        return self.tail(self.body(F.max_pool2d(self.head(blurred), 2)))
-
-
-class RAW2RGB(cycleisp.Trunk):
-    """The network from packed RAW to sRGB, with the ``sizes`` features, groups, blocks and reduction."""
-
-    def __init__(self, *sizes: int) -> None:
-        super().__init__(4, *sizes)
-        self.tail = nn.Sequential(_conv(sizes[0], sizes[0]), self.body[-1])
-        self.tail_rgb = nn.Sequential(nn.Conv2d(sizes[0], 12, 1))
-
-    def forward(self, packed: Tensor, colour: Tensor) -> Tensor:
-        """RAW ``(B, 4, H/2, W/2)`` and weights ``(B, features, H/2, W/2)`` of the branch to sRGB ``(B, 3, H, W)``."""
-        features = self.body[:-1](self.head(packed))
-        features = self.body[-1](features + features * colour)
-        return F.pixel_shuffle(self.tail_rgb(self.tail(features)), 2)
-
-
 @BASELINES.register("cycleisp")
 class CycleISP(CropTrainedISP):
-    """CycleISP. To render RAW it needs a picture of the same scene whose colours it takes: ``model(raw, srgb)``.
+    """CycleISP's network from sRGB to RAW, which has no forward pass.
 
     Args:
-        cfa: the pattern of the RAW that it makes and takes.
+        cfa: the pattern of the RAW that it makes.
         features: in every layer.
-        groups: of dual-attention blocks, in each network.
+        groups: of dual-attention blocks.
         blocks: in each group.
         reduction: of the features in channel attention.
         seed: decides the initial weights.
     """
 
     name = "cycleisp"
+    bidirectional = False
     learning_rate = 3e-4
 
     def __init__(
@@ -228,42 +108,20 @@ class CycleISP(CropTrainedISP):
         seed: int = 0,
     ) -> None:
         super().__init__(cfa)
-        start = derive_seed(seed, "baseline")
-        with initialise_from(start):
-            self.rgb2raw = RGB2RAW(features, groups, blocks, reduction)
-            self.raw2rgb = RAW2RGB(features, groups, blocks, reduction)
-            self.ccm = ColourBranch(features, reduction)
-        with initialise_from(start):  # a trunk leaves its weights as they are in memory
-            for layer in self.modules():
+        with initialise_from(derive_seed(seed, "baseline")):
+            self.reverse_network = RGB2RAW(features, groups, blocks, reduction)
+            for layer in self.modules():  # a trunk leaves its weights as they are in memory
                 if isinstance(layer, nn.Conv2d):
                     layer.reset_parameters()
-
-    @property
-    def reverse_network(self) -> nn.Module:  # type: ignore[override]
-        """The network from sRGB to RAW, under its published name."""
-        return self.rgb2raw
-
-    def render(self, raw: Tensor, setting: Tensor | None = None) -> Tensor:
-        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``; the setting is an sRGB picture of the same scene."""
-        if setting is None:
-            raise ValueError("cycleisp renders RAW in the colours of a picture: pass the sRGB of the same scene")
-        return self.raw2rgb(bayer.pack(raw, self.cfa), self.ccm(as_float(setting)))
-
-    def cycle(self, srgb: Tensor) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to RAW and back, in its own colours."""
-        return self.forward(self.reverse(srgb), srgb)
 
     def raw_error(self, predicted: Tensor, raw: Tensor) -> Tensor:
         """l1 of mosaics ``(B, 1, H, W)`` and of their logarithms, a scalar."""
         log_predicted, log_raw = (image.clamp_min(LOG_FLOOR).log() for image in (predicted, raw))
         return F.l1_loss(predicted, raw) + F.l1_loss(log_predicted, log_raw)
 
-    def load_published(self, path: str | os.PathLike[str], part: str = "rgb2raw") -> None:
-        """Take the RGGB weights of a published checkpoint for a part: "rgb2raw", "raw2rgb" or "ccm", the colour branch.
-
-        Nothing in the file is run as code; errors are those of :func:`denoisers.cycleisp.load_published`.
-        """
-        cycleisp.load_published(getattr(self, part), path, part)
+    def load_published(self, path: str | os.PathLike[str]) -> None:
+        """Take the RGGB weights of a published checkpoint, as :func:`denoisers.cycleisp.load_published` does."""
+        cycleisp.load_published(self.reverse_network, path, "rgb2raw")
 
 
 # -- InvISP -----------------------------------------------------------------------------------------------------------
@@ -344,19 +202,14 @@ class InvISP(CropTrainedISP):
         cfa: the pattern of the RAW that it makes and takes.
         blocks: number of invertible blocks.
         growth: features that each layer of a dense block adds.
-        jpeg_quality: from 1 to 100: the way back is trained through a differentiable JPEG of the network's own
-            rendering. None leaves that out.
         seed: decides the initial weights.
     """
 
     name = "invisp"
     learning_rate = 3e-4
 
-    def __init__(
-        self, cfa: CFA | str = "RGGB", blocks: int = 8, growth: int = 32, jpeg_quality: int | None = None, seed: int = 0
-    ) -> None:
+    def __init__(self, cfa: CFA | str = "RGGB", blocks: int = 8, growth: int = 32, seed: int = 0) -> None:
         super().__init__(cfa)
-        self.jpeg_quality = jpeg_quality
         with initialise_from(derive_seed(seed, "baseline")):
             self.flow = Flow(blocks, growth)
         self.balance: Tensor
@@ -385,16 +238,9 @@ class InvISP(CropTrainedISP):
         return stages.gamma_compress(balanced, GAMMA)
 
     def loss(self, crops: Crops) -> Tensor:
-        """l1 of both passes, a scalar; the way back starts from the rendering as a JPEG if ``jpeg_quality`` is set."""
+        """l1 of both passes, a scalar."""
         raw = self.compress(crops.raw, crops.white_balance)
-        rendered = self.flow(raw)
-        picture = crops.srgb if self.jpeg_quality is None else self._jpeg(rendered.clamp(0.0, 1.0))
-        return F.l1_loss(rendered, crops.srgb) + F.l1_loss(self.flow.inverse(picture), raw)
-
-    def _jpeg(self, srgb: Tensor) -> Tensor:
-        from kornia.enhance import jpeg_codec_differentiable
-
-        return jpeg_codec_differentiable(srgb, srgb.new_tensor([float(self.jpeg_quality or 100)]))
+        return F.l1_loss(self.flow(raw), crops.srgb) + F.l1_loss(self.flow.inverse(crops.srgb), raw)
 
     def _gains(self, setting: Balance, batch: int) -> Tensor:
         given = self.balance if setting is None else setting

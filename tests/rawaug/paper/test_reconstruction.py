@@ -35,7 +35,7 @@ class Laboratory:
         self.denoisers: list[Path] = []
         self.stop_after = 10**6
         self.cameras = self.min_side = 0
-        stands_in = ("open_pairs", "open_pictures", "fit_family", "score_rows", "balanced_rows", "cycle_psnr", "psnr_d")
+        stands_in = ("open_pairs", "open_pictures", "fit_family", "score_rows", "cycle_psnr", "psnr_d")
         for name in stands_in:
             monkeypatch.setattr(reconstruction, name, getattr(self, name))
 
@@ -66,9 +66,6 @@ class Laboratory:
     def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
         value = 10.0 * (int(pair.name[1:]) + 1) + fitted.seed
         return {"rows": {"blind": value, "as-shot": value + 1}, "mpix_s": 2.0 ** int(pair.name[1:])}
-
-    def balanced_rows(self, fitted: Any, pair: Pair) -> dict[str, float]:
-        return {"blind": 30.0 + int(pair.name[1:])}
 
     def cycle_psnr(self, fitted: Any, pictures: Sequence[torch.Tensor]) -> dict[str, float]:
         return {"cycle": 33.0}
@@ -126,31 +123,6 @@ def test_a_published_split_is_fitted_once_and_scored_on_every_test_frame(
     assert "3 frames of blocks" in capsys.readouterr().out
     with pytest.raises(ValueError, match="test: f0 is also in data; score on unseen frames"):
         compare(settings(tmp_path, test="known", name="other"))
-
-
-def test_perturbed_frames_and_invisps_figure_have_rows_and_a_column(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    class Altered(Laboratory):
-        def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
-            bright = 0.0 if pair is clean[pair.name] else 7.0
-            return {"rows": {"blind": 40.0 - bright, "as-shot": 50.0 - bright}, "mpix_s": 1.0}
-
-    laboratory = Altered(monkeypatch)
-    laboratory.frames = 3
-    pairs = laboratory.pairs = laboratory.open_pairs("", "")
-    clean = {pair.name: pair for pair in pairs}
-    rows = compare(settings(tmp_path, balanced=True, perturbed=["overexposed", "retouched"]))
-    bare = ["dictionary", "dictionary, as-shot gains"]
-    assert list(rows) == [*bare, *(f"{row}, {kind}" for kind in ("overexposed", "retouched") for row in bare)]
-    assert rows["dictionary, as-shot gains, overexposed"]["psnr_r"] == [43.0, 43.0]
-    assert rows["dictionary"]["balanced"] == [31.0, 31.0] and "balanced" not in rows["dictionary, retouched"]
-    said = capsys.readouterr().out
-    assert "balanced" in said and "31.00" in said
-    plain = compare(settings(tmp_path, name="plain"))
-    assert list(plain) == bare and "balanced" not in capsys.readouterr().out
-    with pytest.raises(ValueError, match=r"perturbed: \['blurred'\]; choose from overexposed, retouched"):
-        settings(tmp_path, perturbed=["blurred"])
 
 
 def test_a_stopped_run_goes_on_from_its_files(laboratory: Laboratory, tmp_path: Path) -> None:
