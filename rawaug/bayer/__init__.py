@@ -19,13 +19,14 @@ from rawaug.bayer.cfa import (
     unpack,
 )
 from rawaug.bayer.demosaicing import DIRECTIONAL, METHODS, STENCILS, demosaic, demosaicing_stencils, require_method
+from rawaug.bayer.greens import GreenDifference, balance_greens, measure_greens
 from rawaug.bayer.patterns import PATTERNS, Pattern, canonical_cfa, pattern, pattern_name, plane_indices
 from rawaug.bayer.transforms import Pack, RandomCrop, RandomTurn
 
 __all__ = [
-    "CFA", "DIRECTIONAL", "METHODS", "N_VIEWS", "PATTERNS", "STENCILS", "Halving", "Pack", "Pattern", "RandomCrop",
-    "RandomTurn", "bin_mosaic", "bin_mosaic_variance", "bin_packed", "canonical_cfa", "crop", "crop_to_cfa", "demosaic",
-    "demosaicing_stencils", "mosaic", "noise_variance", "pack", "pack_rgb", "pattern", "pattern_name",
-    "plane_indices", "require_method", "to_bayer", "to_bayer_variance", "turn", "turn_back", "turn_keeping_cfa",
-    "unpack",
+    "CFA", "DIRECTIONAL", "METHODS", "N_VIEWS", "PATTERNS", "STENCILS", "GreenDifference", "Halving", "Pack",
+    "Pattern", "RandomCrop", "RandomTurn", "balance_greens", "bin_mosaic", "bin_mosaic_variance", "bin_packed",
+    "canonical_cfa", "crop", "crop_to_cfa", "demosaic", "demosaicing_stencils", "measure_greens", "mosaic",
+    "noise_variance", "pack", "pack_rgb", "pattern", "pattern_name", "plane_indices", "require_method", "to_bayer",
+    "to_bayer_variance", "turn", "turn_back", "turn_keeping_cfa", "unpack",
 ]  # fmt: skip

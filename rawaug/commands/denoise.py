@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 from denoisers.files import DEFAULT, JOINT
 from rawaug.commands import YAML
 from rawaug.denoise.denoiser import RawDenoiser, require_classical
-from rawaug.denoise.frames import DenoisedFolder, denoise_file, denoise_folder
+from rawaug.denoise.frames import Denoised, DenoisedFolder, Greens, denoise_file, denoise_folder
 from rawaug.denoise.pictures import PICTURES, PictureDenoiser, denoise_picture, denoise_pictures
 from rawaug.errors import escape
-from rawaug.files import files_below
+from rawaug.files import files_below, require_writable, write_json
 from rawaug.io.picture_files import PICTURE_FORMATS
 from rawaug.io.raw import RAW_EXTENSIONS
 from rawaug.registry import Spec
@@ -28,8 +29,10 @@ def run(
     strength: float = 1.0,
     linear: bool = False,
     self_ensemble: bool = False,
+    greens: Greens = "auto",
     device: str = "auto",
     preview: str | None = None,
+    json: str | None = None,
     overwrite: bool = False,
 ) -> None:
     """Denoise a RAW file to DNG, a JPEG, PNG or TIFF to another, or a folder of either.
@@ -48,29 +51,35 @@ def run(
             the estimated level of the noise: 2 removes more, 0.5 less.
         linear: demosaic too, to a linear DNG of full colour; by default with rawaug-joint.
         self_ensemble: average eight views of a network, at eight times the cost.
+        greens: auto makes the two greens of a Bayer sensor agree where they clearly differ, since demosaicing makes a
+            maze of the difference; keep leaves them.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         preview: also write the result, developed by LibRaw, as this .jpg or .png.
+        json: write to this file what was done to each RAW file: noise levels, greens, seconds.
         overwrite: replace existing results.
     """
     if is_picture(source):
         given = {"classical": classical, "linear": linear, "preview": preview}
+        given |= {"greens": greens != "auto", "json": json}
         if unfit := [name for name, value in given.items() if value] + ["noise"] * (noise != "auto"):
             options = ", ".join(f"--{name.replace('_', '-')}" for name in unfit)
             raise ValueError(f"{source}: is a developed picture; {options} is for RAW")
         spec = PICTURES if denoiser is None else denoiser
         denoise_all(source, out, PictureDenoiser.of(spec, device, strength, 8 if self_ensemble else 1), overwrite)
         return
+    if json:
+        require_writable(Path(json))
     made = chosen(denoiser, classical, self_ensemble, device, linear, strength)
     if not Path(source).is_dir():
-        done = denoise_file(source, out, made, noise, preview=preview, overwrite=overwrite)
-        print_denoised(DenoisedFolder([done]))
+        done = denoise_file(source, out, made, noise, greens=greens, preview=preview, overwrite=overwrite)
+        print_denoised(DenoisedFolder([done]), json)
         return
     if preview is not None:
         raise ValueError(f"--preview {preview}: is for one file, and {source} is a folder")
     if Path(out).suffix.lower() == ".dng" and not Path(out).is_dir():
         raise ValueError(f"{out}: {source} is a folder, and so is its output; give a name without .dng")
-    result = denoise_folder(source, out, made, noise, overwrite=overwrite)
-    print_denoised(result)
+    result = denoise_folder(source, out, made, noise, greens=greens, overwrite=overwrite)
+    print_denoised(result, json)
     if result.broken:
         raise ValueError(f"{source}: {len(result.broken)} of its files could not be denoised, listed above")
 
@@ -122,14 +131,24 @@ def chosen(
     return made
 
 
-def print_denoised(result: DenoisedFolder) -> None:
+def print_denoised(result: DenoisedFolder, json: str | None = None) -> None:
+    """Print what was done, and write it to ``json``."""
+    if json:
+        files = [asdict(done) | {"source": str(done.source), "out": str(done.out)} for done in result.files]
+        write_json({"files": files, "broken": result.broken}, json)
     for done in result.files:
         levels = f"shot_var {done.shot_var:.3g}, read_var {done.read_var:.3g} ({done.noise_source})"
         clipped = f"; {done.below_zero:.2%} below digital number 0, written as 0" if done.below_zero else ""
-        print(f"{escape(done.out)}: {levels}, {done.seconds:.1f} s{clipped}")
+        print(f"{escape(done.out)}: {levels}{_greens(done)}, {done.seconds:.1f} s{clipped}")
     if result.existing or result.broken:
         print(f"{len(result.files)} denoised, {result.existing} already existed, {len(result.broken)} failed")
     for reason in result.broken.values():
         print(escape(reason))
     if result.unread:
         print(escape(f"not read, no decoder for these kinds of RAW: {', '.join(result.unread)}"))
+
+
+def _greens(done: Denoised) -> str:
+    if done.greens is None or not done.balanced:
+        return ""
+    return f", greens differed by {done.greens:.2%} +- {done.greens_error:.2%}, balanced"

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import json
 import multiprocessing
 import sys
 from collections.abc import Callable
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 import denoisers
+import rawaug
 from rawaug.bayer import CFA, mosaic, pack, unpack
 from rawaug.cli import main
 from rawaug.commands.denoise import run
@@ -96,6 +98,29 @@ def test_a_denoiser_that_changes_nothing_gives_the_source_back(tmp_path: Path, b
         assert getattr(before, key) == getattr(after, key), key
     assert torch.equal(before.color_matrix, after.color_matrix)
     assert after.noise_profile is None
+
+
+def test_greens_that_differ_are_balanced_and_kept_on_request(
+    tmp_path: Path, bayer_dng: Dng, identity: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    patches = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    raw = mosaic(0.1 + 0.6 * torch.nn.functional.interpolate(patches, (512, 512), mode="bilinear")[0], CFA.RGGB)
+    raw[:, 0::2, 1::2] *= 1.02
+    numbers = (raw[0] * 16000 + 383).round().numpy().astype(np.uint16)
+    source = bayer_dng(tmp_path / "a.dng", numbers, "RGGB", black=(383,), white=16383, noise_profile=LEVELS)
+    command = ["denoise", str(source), "--denoiser", str(identity), "--json", str(tmp_path / "done.json")]
+    gaps = {}
+    for greens in ("auto", "keep"):
+        out = tmp_path / f"{greens}.dng"
+        assert main([*command[:2], str(out), *command[2:], "--greens", greens, "--overwrite"]) == 0
+        (done,) = json.loads((tmp_path / "done.json").read_text())["files"]
+        assert done["balanced"] is (greens == "auto") and done["greens"] == pytest.approx(0.02, rel=0.2)
+        assert ("greens differed by 2" in capsys.readouterr().out) is (greens == "auto")
+        packed = pack(read_raw(out).mosaic, CFA.RGGB)
+        gaps[greens] = float((packed[1] - packed[2]).mean())
+    assert abs(gaps["auto"]) < 0.1 * gaps["keep"]
+    with pytest.raises(ValueError, match="greens: 'off' is unknown; use one of auto, keep"):
+        rawaug.denoise(source, denoiser=identity, greens="off")  # type: ignore[arg-type]
 
 
 def test_below_the_digital_number_0_is_counted(tmp_path: Path, bayer_dng: Dng, adding: Callable[[float], Path]) -> None:
