@@ -19,6 +19,7 @@ from torch import Tensor
 
 from denoisers.domains import fit_levels
 from rawaug.bayer import noise_variance
+from rawaug.errors import how_to_install
 from rawaug.registry import FILTERS
 
 Planes = np.ndarray[Any, np.dtype[np.float32]]
@@ -35,14 +36,16 @@ class Classical(ABC):
     """The shortest side, in packed pixels, that the method takes."""
     needs: ClassVar[tuple[str, ...]] = ()
     """Libraries that not every installation has."""
-    advice: ClassVar[str] = "run: pip install 'rawaug[train]'"
-    """The advice where one of them is missing."""
+    extra: ClassVar[str] = "train"
+    """The extra of rawaug that brings them."""
+    licence: ClassVar[str] = ""
+    """What to know before they are installed."""
 
     @classmethod
     def missing(cls) -> str | None:
         """Say in a line which library is missing and how to install it; None where all are there."""
         name = next((name for name in cls.needs if find_spec(name) is None), None)
-        return name and f"{name} is not installed; {cls.advice}"
+        return name and f"{name} is not installed; {cls.licence}{how_to_install(cls.extra)}"
 
     def __init__(self, strength: float = 1.0) -> None:
         if not strength > 0:
@@ -143,7 +146,8 @@ class BM3D(Classical):
 
     smallest = 16
     needs = ("bm3d",)
-    advice = "licensed for non-commercial use only; run: pip install 'rawaug[bm3d]'"
+    extra = "bm3d"
+    licence = "licensed for non-commercial use only; "
 
     def denoise(self, planes: Planes) -> Planes:
         """Filter ``(h, w, 4)`` in luminance and three differences of colour."""

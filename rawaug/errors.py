@@ -42,9 +42,13 @@ def extra(name: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        checkout = Path(__file__).parents[1]
-        package = f"{checkout}[{name}]" if (checkout / "setup.cfg").is_file() else f"rawaug[{name}]"
-        raise MissingExtra(f"{str(error.name).split('.')[0]} is not installed; run: pip install '{package}'") from None
+        raise MissingExtra(f"{str(error.name).split('.')[0]} is not installed; {how_to_install(name)}") from None
+
+
+def how_to_install(name: str) -> str:
+    """Say in words how the extra ``name`` is installed, from the checkout if this is one."""
+    checkout = Path(__file__).parents[1]
+    return f"run: pip install '{checkout if (checkout / 'setup.cfg').is_file() else 'rawaug'}[{name}]'"
 
 
 _MEMORY = "out of memory; use a smaller batch, crop or tile"

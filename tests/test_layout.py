@@ -27,7 +27,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "progress": set(),
     "registry": set(),
     "seeding": set(),
-    "denoisers": {"bayer", "files", "registry"},
+    "denoisers": {"bayer", "errors", "files", "registry"},
     "kernels": {"bayer", "registry"},
     "noise": BASE | {"kernels"},
     "isp": BASE | {"kernels"},
@@ -119,7 +119,7 @@ FROM_FILE = "from rawaug import DictionaryISP; DictionaryISP.from_pretrained('un
 LOADED: dict[str, set[str]] = {
     "import rawaug": set(),
     "import rawaug.registry": {"registry"},
-    "import denoisers": {"bayer", "files", "registry"},
+    "import denoisers": {"bayer", "errors", "files", "registry"},
     "import rawaug.noise": {"bayer", "camera_names", "seeding", "kernels", "noise", "errors", "registry"},
     "from rawaug import DictionaryISP": {
         "bayer",

@@ -109,10 +109,13 @@ def test_seeds_steps_and_device_work_and_nothing_is_done_twice(
     weights = tmp_path / "synthetic" / "seed3" / "convex" / "denoiser.safetensors"
     before = weights.stat().st_mtime_ns
     same_weights = ["--train.checkpoint-every", "1", "--data.memory-mb", "8", "--device", "auto"]
+    same_weights += ["--self-ensemble", "false"]
     capsys.readouterr()
     assert main([*command, *same_weights]) == 0
     said = capsys.readouterr().out
     assert said.count("already trained") == said.count("already evaluated") == 2
+    results = json.loads((tmp_path / "synthetic" / "results.json").read_text())
+    assert [list(run) for run in results["results"]["convex"]] == [["plain"]] * 2, "what is not asked for is not shown"
     assert main([*command, *same_weights, "--data.test-count", "2", "--overwrite"]) == 0
     said = capsys.readouterr().out
     assert said.count("already trained") == 2 and "already evaluated" not in said

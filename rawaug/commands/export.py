@@ -21,19 +21,17 @@ from torch import Tensor, nn
 
 import denoisers
 from denoisers.files import FOLDER, find_denoiser
-from rawaug import bayer
 from rawaug.bayer import pack_rgb
 from rawaug.commands import YAML
 from rawaug.data import demo_pairs
-from rawaug.data.pairs import centre
 from rawaug.denoise.foreign import feeds, session_of
 from rawaug.errors import extra
 from rawaug.evaluation.trials import trial_of
 from rawaug.files import find_weights, read_header, replacing
-from rawaug.io import read_raw
 from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
+from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
 
 OPSET = 18
@@ -42,8 +40,6 @@ TOLERANCE = 1e-4
 """Largest difference between ONNX Runtime and PyTorch, white at 1."""
 NODES = 33
 """Of a .cube along each axis."""
-SIDE = 512
-"""Mosaic pixels on the longer side of the frame on which both are run and timed."""
 
 
 def write_onnx(
@@ -163,7 +159,6 @@ def run(
     out: str,
     /,
     *,
-    frame: str | None = None,
     time: bool = False,
     white_balance: Annotated[tuple[float, float, float] | None, YAML] = None,
 ) -> None:
@@ -172,57 +167,49 @@ def run(
     Args:
         weights: a .safetensors file written by rawaug run or rawaug fit, or the name of a shipped denoiser or ISP.
         out: the .onnx file of a denoiser; of an ISP .json, .cube, .onnx, or a folder for all three.
-        frame: RAW file whose middle is used to compare a denoiser with its ONNX; by default a generated frame.
-        time: also time a denoiser and its ONNX on that frame.
+        time: also time a denoiser and its ONNX.
         white_balance: as-shot multipliers R, G, B for which an ISP is exported; by default those typical of the fit.
     """
     if read_header(find_weights(weights, FOLDER))["kind"] == "isp":
-        if frame is not None:
-            raise ValueError(f"--frame: is for denoisers, and {weights} is an ISP")
         for path in export_isp(DictionaryISP.from_pretrained(weights), out, white_balance):
             print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
         return
     if white_balance is not None:
         raise ValueError(f"--white-balance: is for ISPs, and {weights} is a denoiser")
-    print(export(weights, out, frame, time))
+    print(export(weights, out, time))
 
 
-def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = None, time: bool = False) -> str:
-    """Write a denoiser as ONNX; what is said of its size, its difference from PyTorch and, with ``time``, its time."""
+def export(denoiser: str | Path, out: str | Path, time: bool = False) -> str:
+    """Write a denoiser as ONNX; the text tells its size, its difference from PyTorch and, with ``time``, its time."""
     out = Path(out)
     if out.suffix != ".onnx":
         raise ValueError(f"{out}: give a name that ends in .onnx")
     model, info = denoisers.load(find_denoiser(denoiser))
     names = ["noisy", "variance"][: 1 + model.reads_variance]
-    inputs = dict(zip(names, comparison_frame(frame), strict=False))
+    inputs = dict(zip(names, _comparison_frame(), strict=False))
     example = torch.rand(2, model.channels, 70, 90)
     examples = dict(zip(names, (example, 1e-3 * example + 1e-5), strict=False))
     stated = {"stride": str(model.stride), "upscale": str(model.upscale), "info": json.dumps(info)}
-    with replacing(out) as partial:
+    steps = progress((), label=f"export {out.name}", unit="step", total=2)
+    with steps, replacing(out) as partial, torch.inference_mode():
         session = write_onnx(model, examples, "denoised", partial, stated)
-        with torch.inference_mode():
-            expected = model(*inputs.values())
-            seconds_torch = 0.0 if not time else min(timeit.repeat(lambda: model(*inputs.values()), number=1, repeat=3))
-        difference = difference_from(expected, session, inputs, out)
-        values = feeds(names, list(inputs.values()))
-        seconds_onnx = 0.0 if not time else min(timeit.repeat(lambda: session.run(None, values), number=1, repeat=3))
+        steps.update()
+        difference = difference_from(model(*inputs.values()), session, inputs, out)
+        steps.update()
     size = f"{out}: {out.stat().st_size / 1e6:.1f} MB, of any batch, height and width"
     line = f"{size}; largest difference from PyTorch {difference:.1e}"
     if not time:
         return line
-    pace = [seconds / inputs["noisy"].numel() * 1e6 for seconds in (seconds_onnx, seconds_torch)]
+    values, megapixels = feeds(names, list(inputs.values())), inputs["noisy"].numel() / 1e6
+    with torch.inference_mode():
+        both = (lambda: session.run(None, values)), (lambda: model(*inputs.values()))
+        onnx, own = (min(timeit.repeat(call, number=1, repeat=3)) / megapixels for call in both)
     threads = torch.get_num_threads()
-    return f"{line}\nnow, on {threads} threads: ONNX Runtime {pace[0]:.2f} s a megapixel, PyTorch {pace[1]:.2f} s"
+    return f"{line}\nnow, on {threads} threads: ONNX Runtime {onnx:.2f} s a megapixel, PyTorch {own:.2f} s"
 
 
-def comparison_frame(frame: str | Path | None) -> tuple[Tensor, Tensor]:
-    """Noisy packed RAW ``(1, 4, h, w)`` and its variance: of the middle of a RAW file, or of a generated one."""
-    if frame is None:
-        pair = demo_pairs("test", count=1)[0]
-        trial = trial_of(pair, noise_model("cycleisp_sidd"))
-        assert trial.variance is not None
-        return trial.noisy, trial.variance
-    raw = read_raw(frame)
-    packed = bayer.pack(centre(raw.mosaic[None], SIDE, SIDE), raw.cfa).contiguous()
-    shot_var, read_var = raw.noise_profile or (1e-3, 1e-5)
-    return packed, bayer.noise_variance(packed, shot_var, read_var)
+def _comparison_frame() -> tuple[Tensor, Tensor]:
+    """Noisy packed RAW ``(1, 4, h, w)`` of a generated scene, and its variance."""
+    trial = trial_of(demo_pairs("test", count=1)[0], noise_model("cycleisp_sidd"))
+    assert trial.variance is not None
+    return trial.noisy, trial.variance

@@ -21,6 +21,8 @@ from rawaug.metrics import psnr, ssim, worst_and_best_quarter
 from rawaug.progress import progress
 
 METRICS = ("psnr", "ssim", "psnr_srgb", "ssim_srgb")
+QUARTER_OF = 4
+"""Images at least, of which the worst and the best quarter are told."""
 SHOWN_FAULTS = 5
 """Scores without a number that an error names."""
 
@@ -225,6 +227,7 @@ def summary(rows: Iterable[Row], noisy: Iterable[Row] = ()) -> dict[str, Any]:
                 wrong.append(f"{row.frame}: {key} is {value}")
         if known:
             result[key] = sum(known) / len(known)
+        if len(known) >= QUARTER_OF:
             result[f"{key}_worst25"], result[f"{key}_best25"] = worst_and_best_quarter(known)
     return result | _own_noise(rows, images) | ({"no_numbers": wrong} if wrong else {})
 

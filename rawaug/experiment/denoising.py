@@ -252,7 +252,8 @@ class TrainingRun:
         known = json.loads(path.read_text()) if path.is_file() else {}
         key = self.scores_key(sha256(path.with_name("denoiser.safetensors")))
         result: dict[str, Any] = known if known.get("key") == key else {"key": key}
-        missing = [kind for kind in KINDS[: 1 + self.recipe.self_ensemble] if kind not in result]
+        kinds = KINDS[: 1 + self.recipe.self_ensemble]
+        missing = [kind for kind in kinds if kind not in result]
         if not missing:
             print(f"already evaluated: {path}")
         for kind in missing:
@@ -261,7 +262,7 @@ class TrainingRun:
             result[kind] = summary(rows, self.noisy_rows())
             write_json(result, path)
             print(f"evaluated {arm}, seed {seed}, {kind}: {result[kind].get('psnr', math.nan):.2f} dB: {path}")
-        return {kind: result[kind] for kind in KINDS if kind in result}
+        return {kind: result[kind] for kind in kinds}
 
     def scores_key(self, digest: str) -> str:
         """What the scores of an arm depend on besides the noise and the arm's own settings, as a short hash.

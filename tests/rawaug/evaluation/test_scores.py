@@ -71,6 +71,8 @@ def test_a_denoiser_that_does_nothing_scores_as_its_input(
     assert result["psnr"] == pytest.approx(result["psnr_noisy"], abs=1e-4)
     assert result["ssim"] == pytest.approx(result["ssim_noisy"], abs=1e-5)
     assert result["psnr_worst25"] < result["psnr"] < result["psnr_best25"]
+    rows = list(score([NOISY], [trial_of(pair, noise_model("upi")) for pair in middles]))
+    assert "psnr_worst25" in summary(rows) and "psnr_worst25" not in summary(rows[:3]), "three have no quarter"
     figures = {"psnr", "ssim", "psnr_srgb", "ssim_srgb"}
     assert set(result["images"][0]) == {"name", "shot_var", "read_var", *figures, *(f"{f}_noisy" for f in figures)}
     assert all(result[f"{key}_worst25"] <= result[key] <= result[f"{key}_best25"] for key in figures)
