@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.domains import fit_levels
 from denoisers.network import PACKED
 from rawaug import bayer
 
@@ -162,39 +161,3 @@ class SelfEnsemble(nn.Module):
                 # A running mean: equal views give their value back to the last bit.
                 mean = mean + (from_view(denoised, self.cfa, view) - mean) / count
         return mean
-
-
-class Recorrupted(nn.Module):
-    """A denoiser averaged over draws of extra noise, ``mean of f(y + alpha m)``: ``draws + 1`` times the work.
-
-    A network that was trained on recorrupted frames gets the input it knows, and the average removes most of what the
-    added noise costs. ``m`` has the noise's variance at ``f(y)``, since at ``y`` it would follow the noise, and is the
-    same in every call. Source: Pang et al., CVPR 2021, section 3.3.
-
-    Args:
-        model: ``model(noisy, variance) -> denoised``, all ``(B, 4, h, w)``.
-        alpha: the deviation of the added noise over that of the frame's own.
-        draws: how many noisier copies are averaged.
-        seed: the added noise is drawn from it.
-    """
-
-    def __init__(self, model: Run, alpha: float, draws: int, seed: int = 0) -> None:
-        super().__init__()
-        if draws < 1 or not alpha > 0:
-            raise ValueError(f"draws must be at least 1 and alpha positive, got {draws} and {alpha}")
-        self.model, self.alpha, self.draws, self.seed = model, alpha, draws, seed
-        self.stride: int = getattr(model, "stride", 1)
-
-    def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
-        """Denoise ``(B, 4, h, w)``; ``variance``: ``shot_var max(noisy, 0) + read_var``, of the same shape."""
-        shot_var, read_var = fit_levels(noisy, variance)
-        signal = self.model(noisy, variance)
-        deviation = self.alpha * bayer.noise_variance(signal, shot_var, read_var).sqrt()
-        generator = torch.Generator().manual_seed(self.seed)
-        total = torch.zeros_like(noisy)
-        for _ in range(self.draws):
-            drawn = torch.randn(noisy.shape, generator=generator).to(noisy)
-            noisier = (noisy + deviation * drawn).clamp(max=1.0)
-            noise_map = (1.0 + self.alpha**2) * bayer.noise_variance(noisier, shot_var, read_var)
-            total += self.model(noisier, noise_map)
-        return total / self.draws

@@ -53,7 +53,7 @@ camera: universal
 data: {pairs: null, pictures: "tiny:", validation: null, test: "tiny:validation", test_count: 1}
 denoiser: {name: Shallow, settings: {width: 4}}
 noise: {name: Banded, settings: {row_var: 1.0e-4}}
-train: {steps: 3, batch: 2, crop: 32, validate_every: 2, checkpoint_every: 2, loss: {name: charbonnier}}
+train: {steps: 3, batch: 2, crop: 32, validate_every: 2, checkpoint_every: 2, loss: {name: rms}}
 arms: {pictures: {augmented: 1.0}}
 classical: []
 untouched: []
@@ -145,7 +145,7 @@ def test_what_is_imported_on_another_device_is_whole(site: Path) -> None:
     [
         (("width: 4", "widht: 4"), "denoiser Shallow has no setting 'widht'; it has width, channels.*nearest: width"),
         (("name: Banded", "name: Bandet"), r"noise 'Bandet' is unknown: .*\(nearest: Banded\)"),
-        (("name: charbonnier", "name: gone"), "loss 'gone': the entry point abroad:Missing cannot be loaded"),
+        (("name: rms", "name: gone"), "loss 'gone': the entry point abroad:Missing cannot be loaded"),
     ],
 )
 def test_what_is_wrong_with_it_is_one_line(

@@ -29,7 +29,7 @@ from rawaug.files import find_weights, read_header, require_writable, sha256, wr
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseSpec, noise_model
 from rawaug.progress import progress
-from rawaug.registry import ESTIMATORS, Spec
+from rawaug.registry import Spec
 
 
 def run(
@@ -139,10 +139,8 @@ class _Test:
     """A denoiser on frames, beside classical filters."""
 
     def __init__(self, weights: Path, noise: NoiseSpec | None, seed: int, device: str, filters: Sequence[Spec]) -> None:
-        found = RawDenoiser.of(weights, device).require_mosaic()
-        around = ESTIMATORS.make(found.info.get("estimator", "supervised")).wrap_for_test
-        self.denoiser = replace(found, around=around, checked=False)
-        self.seed, self.noise = seed, noise or found.info.get("noise", "cycleisp_sidd")
+        self.denoiser = RawDenoiser.of(weights, device, checked=False).require_mosaic()
+        self.seed, self.noise = seed, noise or self.denoiser.info.get("noise", "cycleisp_sidd")
         self.filters = [RawDenoiser.of(spec) for spec in filters]
         self.trials: Sequence[Trial] = []
 

@@ -84,7 +84,6 @@ class RawDenoiser:
         strength: s in [0, 1]; ``(1 - s)^2`` of the noise's variance is left.
         device: where it runs.
         mixed: whether it computes in bfloat16.
-        around: wraps the function that denoises whole frames, as the estimator of its training asks.
         checked: whether a result that is not finite is an error; a training that diverged is scored as it is.
         settings: what its results depend on, as JSON.
     """
@@ -101,7 +100,6 @@ class RawDenoiser:
     strength: float = 1.0
     device: torch.device = CPU
     mixed: bool = False
-    around: Callable[[Model], Model] | None = None
     checked: bool = True
     settings: dict[str, Any] = field(default_factory=dict, repr=False)
 
@@ -179,7 +177,7 @@ class RawDenoiser:
         variance = None if given.variance is None else _continue(given.variance, cfa, own)
         height, width = (self.upscale * side for side in image.shape[-2:])
         expected = (1, PACKED if self.upscale == 1 else 3, height, width)
-        return _crop(self._run(self._around(self.model(given.levels), own), image, variance, expected), own, cfa)
+        return _crop(self._run(self._whole(self.model(given.levels), own), image, variance, expected), own, cfa)
 
     def _of_mosaic(self, given: Noisy) -> Tensor:
         if self.of_any is None or self.views > 1 or self.tiles is None:
@@ -202,14 +200,12 @@ class RawDenoiser:
             raise ValueError(f"{self.name}: the result is not finite, or of another shape: {got}")
         return denoised
 
-    def _around(self, model: Model, cfa: CFA) -> Model:
-        """The model in tiles, within what its training puts around it, within the self-ensemble."""
+    def _whole(self, model: Model, cfa: CFA) -> Model:
+        """The model in tiles, within the self-ensemble."""
         run = model
         if self.tiles is not None:
             tile, overlap = self.tiles
             run = partial(denoisers.denoise_tiles, model, tile=tile, overlap=overlap, each=progress_by("tile"))
-        if self.around is not None:
-            run = self.around(run)
         if self.views > 1:
             run = denoisers.SelfEnsemble(run, cfa, views=self.views, each=progress_by("view group"))
         return run

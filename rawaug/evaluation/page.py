@@ -13,7 +13,6 @@ import json
 import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,8 +47,6 @@ ON_PAGE = 12
 
 CURVES = {"loss": "loss", "psnr": "validation PSNR, RAW (dB)", "psnr_srgb": "validation PSNR, sRGB (dB)"}
 """Columns of a log that are plotted, with the titles of their plots."""
-LINES = {"": "-", "_low": ":", "_middle": "--", "_high": "-."}
-"""Styles of lines by the third of the validation frames."""
 
 
 class Figure(NamedTuple):
@@ -197,8 +194,7 @@ def find_detail(image: Tensor, side: int = WINDOW) -> tuple[int, int]:
 def plot_curves(logs: Mapping[str, Sequence[Path]]) -> dict[str, bytes]:
     """Loss and validation PSNR over the steps as PNG files by title, from the ``log.csv`` of every seed of every arm.
 
-    The loss is the mean since the row before. Thin lines are the thirds of the validation frames with least (dotted),
-    middling (dashed) and most noise (dash-dotted). A curve of one point is a dot. What no log has is left out.
+    The loss is the mean since the row before. A curve of one point is a dot. What no log has is left out.
     """
     rows = {(arm, k): read_log(path) for arm, paths in logs.items() for k, path in enumerate(paths)}
     colours = {arm: f"C{k % 10}" for k, arm in enumerate(logs)}
@@ -218,12 +214,11 @@ def read_log(path: Path) -> Log:
 def _plot_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colours: Mapping[str, str]) -> bytes:
     figure = new_figure(5.2, 3.6)
     axis = figure.subplots()
-    for ((arm, k), rows), (part, line) in product(logs.items(), LINES.items()):
-        points = [(int(row["step"]), float(row[key + part])) for row in rows if row.get(key + part)]
-        width, label = (0.7, None) if part else (1.4, None if k else arm)
-        style: dict[str, Any] = {"color": colours[arm], "linestyle": line, "linewidth": width, "label": label}
+    for (arm, k), rows in logs.items():
+        points = [(int(row["step"]), float(row[key])) for row in rows if row.get(key)]
         if points:
-            axis.plot(*zip(*points, strict=True), marker="o" if len(points) == 1 else "", **style)
+            marker, label = "o" if len(points) == 1 else "", None if k else arm
+            axis.plot(*zip(*points, strict=True), marker=marker, color=colours[arm], linewidth=1.4, label=label)
     axis.set(xlabel="step", ylabel=title, yscale="log" if key == "loss" else "linear")
     axis.locator_params(axis="x", integer=True)
     if axis.get_legend_handles_labels()[0]:

@@ -74,12 +74,6 @@ class Trial:
     levels_from_clean: bool = False
 
     @property
-    def amount(self) -> float:
-        """A number that puts trials in the order of their noise: the mean variance, or else the variance at white."""
-        levels = self.raw.levels if self.levels is None and self.raw is not None else self.levels
-        return sum(levels or ()) if self.variance is None else self.variance.mean().item()
-
-    @property
     def input(self) -> Noisy:
         """The input of a denoiser of this kind of image."""
         return Noisy(self.noisy, self.variance, self.levels, self.cfa)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.page import read_log
 from rawaug.evaluation.trials import Trial, trial_of
 from rawaug.experiment.recipe import ArmConfig, Recipe
 from rawaug.isp.model import DictionaryISP
@@ -112,16 +110,3 @@ def validation_samples(
     if frames:
         return [trial_of(pair, noise, isp.cfa) for pair in frames]
     return freeze_samples(PictureCrops(RawPairs(pictures, augment, recipe.train.crop)), "validation")
-
-
-def rank_candidates(candidates: Mapping[str, str], folders: Sequence[Path], best: bool) -> dict[str, dict[str, float]]:
-    """For each arm with a search its candidates by their mean validation PSNR over the runs, the highest first.
-
-    ``candidates`` maps a candidate to its arm. ``best`` says whether the best validation counts, or else the last. No
-    test frame has a say.
-    """
-    found: dict[str, dict[str, float]] = {}
-    for label, arm in candidates.items():
-        logs = ([float(row["psnr"]) for row in read_log(folder / label / "log.csv")] for folder in folders)
-        found.setdefault(arm, {})[label] = fmean(max(log) if best else log[-1] for log in logs)
-    return {arm: dict(sorted(scores.items(), key=lambda one: -one[1])) for arm, scores in found.items()}

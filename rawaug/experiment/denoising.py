@@ -31,7 +31,6 @@ from rawaug.experiment.arms import (
     change_cfa,
     frames_of,
     methods_of,
-    rank_candidates,
     training_stream,
     validation_samples,
 )
@@ -283,18 +282,14 @@ class TrainingRun:
 
     def denoiser(self, arm: str, views: int = 1) -> RawDenoiser:
         """An arm's network as it is tested; one whose training diverged is scored as it is."""
-        around, cfa = self.estimators[arm].wrap_for_test, self.pattern(arm)
-        made = {"name": arm, "cfa": cfa, "views": views, "around": around, "checked": False}
+        made = {"name": arm, "cfa": self.pattern(arm), "views": views, "checked": False}
         return RawDenoiser.of(self.models[arm], self.recipe.device, **made)
 
     def report(self) -> None:
         """Write ``results.json``, the table, the picture, and the page with all of it."""
         recipe, results = self.recipe, self.results
-        candidates = {label: arm.candidate_of for label, arm in recipe.arms.items() if arm.candidate_of is not None}
-        searches = rank_candidates(candidates, [self.folder / f"seed{s}" for s in self.seeds], bool(self.validation))
         others: dict[str, Any] = {}
         everything: dict[str, Any] = {"recipe": asdict(recipe), "results": results, "others": others}
-        everything |= {"chosen": searches} if searches else {}
         everything |= {"unreadable": self.unreadable} if self.unreadable else {}
         file = self.folder / "results.json"
         write_json(everything, file)
@@ -312,12 +307,8 @@ class TrainingRun:
         print_table(results, title, others)
         _say(page.lead, own_noise_note(first_runs(results, others)))
         print(f"table: {file}\npicture: {picture}\npage: {self.folder / 'report.html'}")
-        searched = [
-            f"{arm}, by validation: " + ", ".join(f"{name} {score:.2f} dB" for name, score in found.items())
-            for arm, found in searches.items()
-        ]
         spent = "time: " + ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in self.seconds.items())
-        _say(*reports(self.pictures), *self.unreadable, *searched, spent, *use)
+        _say(*reports(self.pictures), *self.unreadable, spent, *use)
         require_numbers(
             [*(scores for runs in results.values() for run in runs for scores in run.values()), *others.values()]
         )

@@ -112,9 +112,6 @@ class ArmConfig:
         told: of sRGB targets: what a network that reads a level of noise is told of it; null for nothing.
         estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
             and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
-        search: a setting of the estimator to choose on validation, such as ``{gamma: [2, 8, 16]}``: an arm is trained
-            for each value, and the results name the best.
-        candidate_of: the arm whose search this one is part of.
         denoiser: this arm's network, in place of the recipe's; ``{start: rawaug-small}`` fine-tunes a shipped one.
         learning_rate: in place of ``train.learning_rate``; null takes that one.
         weigh: in place of ``train.weigh``; null takes that one.
@@ -129,8 +126,6 @@ class ArmConfig:
     srgb_share: float = 1.0
     told: Told | None = None
     estimator: str | dict[str, Any] = "supervised"
-    search: dict[str, list[float]] | None = None
-    candidate_of: str | None = None
     denoiser: DenoiserConfig | None = None
     learning_rate: float | None = None
     weigh: Weighing | None = None
@@ -145,20 +140,6 @@ class ArmConfig:
             ESTIMATORS.make(self.estimator)
         except ValueError as error:
             raise ValueError(f"estimator: {error}") from None
-
-    def candidates(self, label: str) -> dict[str, ArmConfig]:
-        """This arm by its name ``label``; with a search an arm for each value, ``LABEL_KEYVALUE``."""
-        if self.search is None:
-            return {label: self}
-        name, settings = split_spec(self.estimator)
-        if len(self.search) != 1 or not all(self.search.values()):
-            raise ValueError(f"arms: {label}: search needs one setting with values, such as {{gamma: [2, 8, 16]}}")
-        key, values = next(iter(self.search.items()))
-        found = {}
-        for value in values:
-            estimator: dict[str, Any] = {"name": name, "settings": {**settings, key: value}}
-            found[f"{label}_{key}{value:g}"] = replace(self, estimator=estimator, search=None, candidate_of=label)
-        return found
 
     @property
     def sees_clean(self) -> bool:
@@ -220,7 +201,6 @@ class Recipe:
     def __post_init__(self) -> None:
         if not self.arms:
             raise ValueError("arms: a recipe needs at least one arm")
-        self.arms = {name: one for label, arm in self.arms.items() for name, one in arm.candidates(label).items()}
         require_between("seed", self.seed, -(2**63), 2**62)
         require_between("seeds", self.seeds, 1, 1000)
         if self.steps is not None:

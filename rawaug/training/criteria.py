@@ -36,19 +36,6 @@ LOSSES.register("l1")(nn.L1Loss)
 LOSSES.register("l2")(nn.MSELoss)
 
 
-@LOSSES.register("charbonnier")
-class Charbonnier(nn.Module):
-    """The mean of ``sqrt((a - b)^2 + epsilon^2)``: l1 without the kink at 0."""
-
-    def __init__(self, epsilon: float = 1e-3) -> None:
-        super().__init__()
-        self.epsilon = epsilon
-
-    def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        """A scalar, of two images of any shape that agree."""
-        return ((a - b) ** 2 + self.epsilon**2).sqrt().mean()
-
-
 @LOSSES.register("rms")
 class RootMeanSquare(nn.Module):
     """The mean over pictures of ``sqrt(mean (a - b)^2 + epsilon^2)``: l2 in which hard pictures do not outweigh the

@@ -25,13 +25,12 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from denoisers.inference import Recorrupted
 from denoisers.network import Denoiser
 from rawaug.bayer import noise_variance
 from rawaug.data.pairs import Sample
@@ -70,10 +69,6 @@ class Supervised:
     def correct_network(self, model: Denoiser) -> Denoiser:
         """The denoiser that a trained network becomes: by default the network itself."""
         return model
-
-    def wrap_for_test(self, run: Callable[..., Tensor]) -> Callable[..., Tensor]:
-        """The function to test in place of ``run(noisy, variance)``, which maps ``(B, 4, h, w)`` to the same shape."""
-        return run
 
 
 class NoisyCrop(NamedTuple):
@@ -127,7 +122,7 @@ class _AddsNoise(SelfSupervised):
 
     adds_noise = True
 
-    def __init__(self, alpha: float) -> None:
+    def __init__(self, alpha: float = 0.5) -> None:
         if not alpha > 0:
             raise ValueError(f"alpha must be positive, got {alpha}")
         self.alpha = alpha
@@ -184,24 +179,12 @@ class R2R(_AddsNoise):
     Args:
         alpha: a above. If it is small, the input is little noisier than the frame, but the target much; if it is 1,
             both have twice the variance.
-        average: at a test, the frame is denoised to know its noise, then so many recorrupted copies of it are denoised
-            and averaged, as published; 0 denoises the frame itself.
     """
-
-    def __init__(self, alpha: float = 0.5, average: int = 0) -> None:
-        super().__init__(alpha)
-        if average < 0:
-            raise ValueError(f"average must be at least 0, got {average}")
-        self.average = average
 
     def apply(self, crop: NoisyCrop, drawn: Tensor) -> Sample:
         """Noisier RAW, a target with the opposite noise, and the variance, each ``(4, h, w)``."""
         noisier, variance = self.recorrupt(crop, drawn)
         return Sample(noisier, crop.shots[0] - crop.deviation * drawn / self.alpha, variance)
-
-    def wrap_for_test(self, run: Callable[..., Tensor]) -> Callable[..., Tensor]:
-        """``run`` of ``(B, 4, h, w)``, or its mean over recorrupted copies if ``average`` is set."""
-        return Recorrupted(run, self.alpha, self.average) if self.average else run
 
 
 @ESTIMATORS.register("noise2noise")

@@ -4,8 +4,7 @@
 weights. Lightning Fabric places model and data: the same code on a CPU, one GPU, or the processes of several nodes, as
 ``torchrun`` or ``fabric run`` start them.
 
-The validation is the PSNR on frozen frames, in RAW and developed to sRGB. The frames are sorted by their mean noise
-variance and split in thirds: *low*, *middle* and *high*.
+The validation is the PSNR on frozen frames, in RAW and developed to sRGB.
 """
 
 from __future__ import annotations
@@ -20,13 +19,11 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from torch import Tensor, nn
-from torch.nn import functional as F
+from torch import nn
 from torch.utils.data import DataLoader
 
 import denoisers
 from denoisers.network import Denoiser
-from rawaug.data.pairs import centre
 from rawaug.errors import extra
 from rawaug.evaluation.trials import Trial
 from rawaug.files import replacing
@@ -40,18 +37,11 @@ from rawaug.training.estimators import Supervised
 from rawaug.training.state import TrainingState, first_network
 from rawaug.training.stream import StepSampler, TrainingStream
 
-SHOWN, SHOWINGS = 3, 20
-"""Validation frames of which TensorBoard shows crops, and how often at most."""
-PANEL = 96
-"""Largest side of these crops, in packed pixels."""
-THIRDS = ("low", "middle", "high")
-
 
 class Journal:
     """The log of a training: ``log.csv``, and TensorBoard's files.
 
     A row has the mean loss since the row before, the validation PSNR, the learning rate of the step and the speed.
-    TensorBoard shows the middles of :data:`SHOWN` validation frames besides.
 
     Args:
         folder: of these files. A training from its first step clears what another one has left there.
@@ -70,7 +60,6 @@ class Journal:
                 partial.write_text("".join([head, *kept]) if kept else "")
         for events in folder.glob("events.out.tfevents.*") if not start else ():
             events.unlink()
-        self.next_shown = 0
         self.writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
 
     def log(self, step: int, **values: float) -> None:
@@ -83,20 +72,6 @@ class Journal:
             rows.writerow([step, *(f"{value:.6g}" for value in values.values())])
         for name, value in values.items():
             self.writer.add_scalar(name, value, step)
-
-    def show(self, step: int, steps: int, net: nn.Module, frames: Sequence[Trial]) -> None:
-        """Write noisy, denoised and clean crops for TensorBoard.
-
-        Args:
-            step: the step at which this is called.
-            steps: of the whole training, during which crops are written :data:`SHOWINGS` times at most.
-            net: denoises the crops.
-            frames: the validation frames.
-        """
-        if self.next_shown <= step:
-            self.next_shown = step + steps // SHOWINGS
-            for k, frame in enumerate(frames[:SHOWN]):
-                self.writer.add_image(f"noisy_denoised_clean/{k}", panels(net, frame), step)
 
     def close(self) -> None:
         """Close TensorBoard's files."""
@@ -165,7 +140,6 @@ def train(
             row["samples_per_second"] = (step - start) * stream.batch / (time.perf_counter() - began)
             if journal is not None:
                 journal.log(step, **row)
-                journal.show(step, config.steps, net, validation)
             bar.set_postfix_str(_status(row, state.best["step"]), refresh=False)
         if saves and journal is not None:
             state.save(folder / "last.pt", key)
@@ -191,60 +165,23 @@ def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> d
     """Mean PSNR in dB of a network, which denoises large frames in tiles.
 
     Returns:
-        ``psnr`` over all frames; of three or more also ``psnr_low``, ``psnr_middle`` and ``psnr_high`` over the thirds;
-        the same as ``psnr_srgb``, ... where every frame can be developed; and ``psnr_CONDITION`` by condition.
+        ``psnr`` over all frames; ``psnr_srgb`` where every frame can be developed; and ``psnr_CONDITION`` by condition.
     """
     net.eval()
     raw, srgb = [], []
     for frame in frames:
-        denoised = denoisers.denoise_tiles(net, frame.noisy.to(device), _told(frame).to(device)).cpu()
+        variance = (
+            torch.zeros_like(frame.noisy) if frame.variance is None else frame.variance
+        )  # 0 where it is not known
+        denoised = denoisers.denoise_tiles(net, frame.noisy.to(device), variance.to(device)).cpu()
         raw.append(psnr(denoised, frame.clean).mean().item())
         if frame.develop is not None and frame.domain != "srgb":
             srgb.append(psnr(*(frame.develop(x)[None] for x in (denoised, frame.clean))).item())
     net.train()
-    noise = [frame.amount for frame in frames]
-    scores = _by_thirds("psnr", raw, noise)
+    scores = {"psnr": fmean(raw)}
     for kind in dict.fromkeys(frame.condition for frame in frames if frame.condition):
         scores[f"psnr_{kind}"] = fmean(x for x, frame in zip(raw, frames, strict=True) if frame.condition == kind)
-    return scores | (_by_thirds("psnr_srgb", srgb, noise) if len(srgb) == len(frames) else {})
-
-
-def _told(frame: Trial) -> Tensor:
-    """The variance, 0 where it is not known."""
-    return torch.zeros_like(frame.noisy) if frame.variance is None else frame.variance
-
-
-def _by_thirds(name: str, scores: Sequence[float], noise: Sequence[float]) -> dict[str, float]:
-    result, count = {name: fmean(scores)}, len(scores)
-    order = sorted(range(count), key=lambda k: noise[k])
-    for part, label in enumerate(THIRDS if count >= len(THIRDS) else ()):
-        third = order[part * count // len(THIRDS) : (part + 1) * count // len(THIRDS)]
-        result[f"{name}_{label}"] = fmean(scores[k] for k in third)
-    return result
-
-
-@torch.no_grad()
-def panels(net: nn.Module, frame: Trial) -> Tensor:
-    """The middle of a frame noisy, denoised and clean, beside each other: sRGB ``(3, h, 3 w)`` in [0, 1].
-
-    Where the camera is not known the mean of the greens is shown, through the power 1/2.2; full colour as it is.
-    """
-    scale = frame.clean.shape[-1] // frame.noisy.shape[-1]  # 2 where packed RAW becomes full colour
-    noisy, clean = centre(frame.noisy, PANEL, PANEL, 1), centre(frame.clean, scale * PANEL, scale * PANEL, scale)
-    device = next((weights.device for weights in net.parameters()), noisy.device)
-    variance = centre(_told(frame), PANEL, PANEL, 1).to(device)
-    net.eval()
-    denoised = net(noisy.to(device), variance).cpu().nan_to_num()  # black where the training has diverged
-    net.train()
-    noisy = noisy[:, :1] if clean.shape[1] == 1 else noisy  # without the planes of its colours
-    images = [(frame.develop or _show)(image) for image in (noisy, denoised, clean)]
-    return torch.cat([F.interpolate(image[None], images[-1].shape[-2:])[0] for image in images], dim=-1)
-
-
-def _show(image: Tensor) -> Tensor:
-    if image.shape[1] == 3:
-        return image[0].clamp(0.0, 1.0)
-    return image[0, image.shape[1] // 4 : 3].mean(0).clamp(0.0, 1.0).pow(1 / 2.2).expand(3, -1, -1)
+    return scores | ({"psnr_srgb": fmean(srgb)} if len(srgb) == len(frames) else {})
 
 
 def require_trainable(device: str, devices: int, precision: str) -> None:
