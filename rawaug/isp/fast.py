@@ -8,22 +8,16 @@ and gains are one matrix and three numbers a picture. Every site computes its ow
 
 The forward pass of demosaiced RAW is ``x = T'(sqrt(pinv(C) min(g x5 / G(p) A', min g)))``, with the forward network
 and gamma in a table over the roots of linear light, or the picture's own tone curve inverted.
-
-The encoders look at the N images that the atoms make of one picture, which are linear in a few maps,
-
-.. math:: D_n x_2 \quad\text{and}\quad x_3 (floor_n + m \, rise_n) = floor_n x_3 + rise_n (m x_3),
-
-and so their first layer is a convolution of 3 maps, or 6, instead of 3 N, with the same result.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 from copy import deepcopy
 from functools import partial
 from itertools import pairwise
-from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -33,8 +27,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA, unpack
 from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.staged import Encoder, thumbnail
-from rawaug.isp.stages import BatchParams, Stage, Tables, as_float, highlight_rise, node_colours
+from rawaug.isp.stages import BatchParams, Stage, Tables, highlight_rise, node_colours
 from rawaug.isp.tone import STEPS, to_code
 from rawaug.kernels import fastest
 from rawaug.kernels.reference import Camera, Display, fall_off, look_up, render, unprocess
@@ -54,16 +47,15 @@ class BakedISP(nn.Module):
 
     def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
         super().__init__()
-        self.config = isp.config
-        self.stages = nn.ModuleList(deepcopy(isp.ordered_stages))
+        self.isp, self.config = deepcopy(isp), isp.config
         for name, table in zip(("table", "attention"), _tables(isp, nodes), strict=True):
             self.register_buffer(name, table)
-        self.chooser = _Chooser(isp)
 
+    @torch.no_grad()
     def choose(self, srgb: Tensor) -> ISPParams:
         """The setting that the encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``, as the ISP would."""
-        chosen: ISPParams = self.chooser(srgb, self.table)
-        return chosen
+        with one_thread() if self.config.encoders else nullcontext():  # the same choice in every process
+            return self.isp.choose(srgb)
 
     @torch.no_grad()
     def forward(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
@@ -117,7 +109,7 @@ class BakedISP(nn.Module):
 
     def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> Camera:
         table = self.table
-        matrix, floor, frame, curves, shading = _batch_params(self.stages, srgb, params, place, table)
+        matrix, floor, frame, curves, shading = _batch_params(self.isp.ordered_stages, srgb, params, place, table)
         if curves.numel():
             table = table[:0]
             curves = curves[:, ::STEPS] if srgb.dtype == torch.uint8 else curves
@@ -135,8 +127,7 @@ class FastForward(nn.Module):
 
     def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
         super().__init__()
-        self.cfa = CFA(isp.cfa)
-        self.stages = nn.ModuleList(deepcopy(isp.ordered_stages)).requires_grad_(False)
+        self.cfa, self.isp = CFA(isp.cfa), deepcopy(isp).requires_grad_(False)
         for name, table in zip(("table", "attention"), _tables(isp, nodes, forward=True), strict=True):
             self.register_buffer(name, table)
 
@@ -203,7 +194,9 @@ class FastForward(nn.Module):
         ).div_(balance)
 
     def _display(self, linear: Tensor, params: ISPParams, place: Tensor | None) -> Display:
-        matrix, floor, frame, curves, shading = _batch_params(self.stages, linear, params, place, self.table)
+        matrix, floor, frame, curves, shading = _batch_params(
+            self.isp.ordered_stages, linear, params, place, self.table
+        )
         table = self.table[:0] if curves.numel() else self.table
         if curves.numel():
             light = torch.linspace(0.0, 1.0, CURVE_NODES).square().to(curves).expand(len(curves), 1, 1, -1)
@@ -230,7 +223,7 @@ def _tables(isp: DictionaryISP, nodes: int, forward: bool = False) -> tuple[Tens
 
 
 def _batch_params(
-    stages: nn.ModuleList, image: Tensor, params: ISPParams, place: Tensor | None, table: Tensor
+    stages: Sequence[Stage], image: Tensor, params: ISPParams, place: Tensor | None, table: Tensor
 ) -> BatchParams:
     batch, _, height, width = image.shape
     made = BatchParams(
@@ -241,7 +234,7 @@ def _batch_params(
         table.new_empty(0),
     )
     for stage in stages:
-        made = cast(Stage, stage).adjust(made, params, place, (height, width))
+        made = stage.adjust(made, params, place, (height, width))
     return made
 
 
@@ -263,59 +256,3 @@ def _as_table(values: Tensor, nodes: int) -> Tensor:
     """Bring values on the cube ``(1, C, N, N * N)`` to ``(N, N, N, 4)``; missing channels are 0."""
     channels_last = values[0].permute(1, 2, 0).reshape(nodes, nodes, nodes, -1)
     return F.pad(channels_last, (0, 4 - channels_last.shape[-1])).contiguous()
-
-
-class _Chooser(nn.Module):
-    """Chooses settings as :meth:`rawaug.isp.model.DictionaryISP.choose` does, by encoders of fewer maps."""
-
-    tone_weights: Tensor
-
-    def __init__(self, isp: DictionaryISP) -> None:
-        super().__init__()
-        self.knee = isp.config.knee or 0.0
-        self.colour, self.gain = deepcopy(isp.colour), deepcopy(isp.gain)
-        self.register_buffer("tone_weights", isp.typical_tones().clone())
-        encoders = isp.reverse_encoders
-        with torch.no_grad():
-            self.colour_encoder = _fold_encoder(encoders.colour, [isp.colour.atoms()])
-            floor = 1.0 / isp.gain.channel_gains()
-            factors = (floor, highlight_rise(floor, isp.config.knee))
-            self.gain_encoder = _fold_encoder(encoders.gain, [torch.diag_embed(factor) for factor in factors])
-
-    @torch.no_grad()
-    def forward(self, srgb: Tensor, table: Tensor) -> ISPParams:
-        """The setting for sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1]; ``table`` gives x2 of sRGB."""
-        images = srgb[:, None]
-        if self.colour_encoder.looks:
-            x2 = _small(srgb, table)
-            images = x2[:, None]
-        colour_weights = self.colour_encoder(images)
-        matrix = self.colour.combine(colour_weights)
-        if self.gain_encoder.looks:
-            x3 = torch.einsum("bij,bjhw->bihw", matrix, x2)
-            m = ((x3.mean(dim=1, keepdim=True) - self.knee) / (1.0 - self.knee)).clamp(0.0, 1.0).square()
-            images = torch.stack([x3, m * x3], dim=1)
-        gain_weights = self.gain_encoder(images)
-        tone_weights = self.tone_weights.expand(len(srgb), -1)
-        return ISPParams(colour_weights, gain_weights, matrix, self.gain.combine(gain_weights), tone_weights)
-
-
-@one_thread()
-def _small(srgb: Tensor, table: Tensor) -> Tensor:
-    """Compute x2 of the thumbnail that the encoders look at, ``(B, 3, h, w)``."""
-    return look_up(table, thumbnail(as_float(srgb)))[:, :3]
-
-
-def _fold_encoder(encoder: Encoder, maps: list[Tensor]) -> Encoder:
-    """Fold K maps of 3 channels into an encoder's first layer; ``maps``, K times ``(N, 3, 3)``, make its N images."""
-    encoder = deepcopy(encoder)
-    if encoder.layers is None:
-        return encoder
-    first = encoder.layers[0]
-    assert isinstance(first, nn.Conv2d) and first.bias is not None
-    weight = first.weight.unflatten(1, (-1, 3))
-    folded = nn.Conv2d(3 * len(maps), first.out_channels, 3, stride=2, padding=1, dtype=weight.dtype)
-    folded.weight.copy_(torch.cat([torch.einsum("onixy,nij->ojxy", weight, atoms) for atoms in maps], dim=1))
-    folded.bias = first.bias
-    encoder.layers[0] = folded
-    return encoder

@@ -92,13 +92,16 @@ class DictionaryISP(StagedISP):
 
     def choose(self, srgb: Tensor) -> ISPParams:
         """Choose the settings of pictures ``(B, 3, H, W)`` by the reverse encoders, or by their constants."""
+        encoders = self.reverse_encoders
+        if not self.config.encoders:
+            return self.params_from_weights(encoders.colour(srgb), encoders.gain(srgb))
         x2 = self.linear(thumbnail(stages.as_float(srgb)))
         candidates = torch.einsum("nij,bjhw->bnihw", self.colour.atoms(), x2)
-        colour_weights = self.reverse_encoders.colour(candidates)
+        colour_weights = encoders.colour(candidates)
         x3 = torch.einsum("bn,bnihw->bihw", colour_weights, candidates)
         gains = self.gain.channel_gains()
         balanced = [stages.inverse_gains(x3, g.expand(len(x3), 3), self.config.knee) for g in gains]
-        return self.params_from_weights(colour_weights, self.reverse_encoders.gain(torch.stack(balanced, dim=1)))
+        return self.params_from_weights(colour_weights, encoders.gain(torch.stack(balanced, dim=1)))
 
     def choose_forward(self, x4: Tensor) -> ISPParams:
         """Choose the settings of linear images before white balance, x4 ``(B, 3, H, W)``, by the forward encoders."""
