@@ -6,6 +6,7 @@ a stopped run resumes.
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import shlex
@@ -27,26 +28,22 @@ from rawaug.evaluation.page import Page, plot_curves, select_for_page
 from rawaug.evaluation.scores import NOISY, Panels, Row, group_rows, panels_of, require_numbers, score, summary
 from rawaug.evaluation.tables import first_runs, print_table, save_picture, verdict
 from rawaug.evaluation.trials import Trial, added_noise_note, make_trials, own_noise_note, trial_of
-from rawaug.experiment.arms import (
-    change_cfa,
-    frames_of,
-    methods_of,
-    training_stream,
-    validation_samples,
-)
 from rawaug.experiment.plan import claim, name_given_pairs, plan_data, require_free, require_usable, run_folder
-from rawaug.experiment.recipe import Recipe
+from rawaug.experiment.recipe import ArmConfig, Recipe
 from rawaug.files import find_weights, fingerprint, one_at_a_time, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, camera_law, noise_model
-from rawaug.plugin.augment import noise_for
+from rawaug.plugin.augment import RawAugment, noise_for
+from rawaug.plugin.dataset import RawPairs
 from rawaug.progress import time_stage
 from rawaug.registry import ESTIMATORS, EXPERIMENTS, FILTERS, Spec, spec_label, split_spec
+from rawaug.seeding import derive_seed
 from rawaug.training.config import weights_key
+from rawaug.training.estimators import SelfSupervised
 from rawaug.training.loop import require_trainable, train
-from rawaug.training.noisy_frames import drop_clean, faintness_note
+from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, drop_clean, faintness_note, noisy_frame, r2r_trials
 from rawaug.training.state import first_network, start_of
-from rawaug.training.stream import TrainingStream
+from rawaug.training.stream import WATCHED, PictureCrops, RealCrops, Source, TrainingStream, freeze_samples
 
 SHOWN = 3
 """Test frames in ``picture.png``."""
@@ -380,3 +377,96 @@ def find_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
         print(f"classical: BM3D is left out: {bm3d['BM3D']}")
     require_classical(kept)
     return kept
+
+
+# -- the arms ----------------------------------------------------------------------------------------------------------
+
+
+def methods_of(recipe: Recipe) -> dict[str, str]:
+    """What each row of the table is, in a line, by its name."""
+    filters = {spec_label(spec): "a filter, nothing is trained" for spec in recipe.classical}
+    unchanged = {Path(name).stem: "trained weights as they are" for name in recipe.untouched}
+    return {**filters, **unchanged, **{label: _explain(recipe, label) for label in recipe.arms}}
+
+
+def _explain(recipe: Recipe, label: str) -> str:
+    arm, network = recipe.arms[label], recipe.network_of(label)
+    begun = f"{network.name} from random weights" if network.start is None else f"{network.start}, trained further"
+    real, made = "real pairs" if arm.sees_clean else "real noisy frames", "RAW made from pictures"
+    mixed = f"{real}, with {made} as {arm.augmented:.0%} of a batch"
+    how = "" if arm.sees_clean else f", by {spec_label(arm.estimator)}"
+    frames = {0.0: real, 1.0: made}.get(arm.augmented, mixed)
+    return f"{begun}, on {frames}{how}"
+
+
+def change_cfa(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
+    """The ISP of the same camera behind a CFA: itself, or a copy if it had another."""
+    if isp.cfa == cfa:
+        return isp
+    other = copy.deepcopy(isp)
+    other.configure(cfa=str(cfa))
+    return other
+
+
+def frames_of(recipe: Recipe, pairs: Sequence[Pair], isp: DictionaryISP) -> Sequence[Any]:
+    """The real frames as the arms take them: pairs, or a :class:`NoisyFrame` of each if no arm sees clean ones."""
+    return [noisy_frame(pair, isp.info.get("noise")) for pair in pairs] if recipe.self_supervised else pairs
+
+
+def training_stream(
+    recipe: Recipe,
+    arm: ArmConfig,
+    frames: Sequence[Any],
+    pictures: Any,
+    isp: DictionaryISP,
+    noise: NoiseModel,
+    seed: int,
+) -> TrainingStream:
+    """The training samples of one arm.
+
+    Args:
+        recipe: the whole recipe.
+        arm: its part on this arm.
+        frames: the real frames, see :func:`frames_of`.
+        pictures: the sRGB pictures.
+        isp: makes RAW of them, in the CFA of the arm's network.
+        noise: added to clean RAW.
+        seed: of the run.
+    """
+    crop, seed, estimator = recipe.train.crop, derive_seed(seed, "stream"), ESTIMATORS.make(arm.estimator)
+    real: Source | None = None
+    made: Source | None = None
+    augment: RawAugment | None = None
+    if arm.augmented:
+        augment = RawAugment(isp, noise, draw=arm.draw, target=arm.srgb or recipe.target)
+    if isinstance(estimator, SelfSupervised):
+        if frames and arm.augmented < 1.0:
+            real = NoisyCrops(frames, estimator, crop, isp.cfa)
+        if augment:
+            frozen = FrozenPictures(pictures, augment, derive_seed(seed, "pictures"), estimator.shots)
+            made = NoisyCrops(frozen, estimator, crop, isp.cfa)
+    else:
+        real = RealCrops(frames, noise, crop, isp.cfa) if frames else None
+        made = PictureCrops(RawPairs(pictures, augment, crop, zoom=arm.zoom)) if augment else None
+    return TrainingStream(real, made, recipe.train.batch, arm.augmented, seed)
+
+
+def validation_samples(
+    recipe: Recipe, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
+) -> list[Trial]:
+    """The frozen samples by which weights are chosen, the same in every arm and run.
+
+    Args:
+        recipe: the whole recipe.
+        frames: the validation frames, see :func:`frames_of`; without any, samples are made from pictures.
+        pictures: the sRGB pictures.
+        isp: makes RAW of them, and says the CFA of all samples.
+        noise: added to clean RAW.
+    """
+    augment = RawAugment(isp, noise, target=recipe.target)
+    if recipe.self_supervised:
+        frozen = frames or FrozenPictures(pictures, augment, derive_seed("validation"))[:WATCHED]
+        return r2r_trials(frozen, isp.cfa)
+    if frames:
+        return [trial_of(pair, noise, isp.cfa) for pair in frames]
+    return freeze_samples(PictureCrops(RawPairs(pictures, augment, recipe.train.crop)), "validation")

@@ -22,10 +22,10 @@ from numba.np.arrayobj import make_array
 from torch import Tensor
 
 from rawaug.bayer import CFA, demosaicing_stencils
-from rawaug.kernels.directions import demosaic_directional as demosaic_directional
+from rawaug.kernels.planes import demosaic_directional as demosaic_directional
+from rawaug.kernels.planes import smooth as smooth
 from rawaug.kernels.reference import INCREMENTS, MULTIPLIERS, ROUNDS, Camera, Display
 from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
-from rawaug.kernels.smoothing import smooth as smooth
 
 _TILE = 256  # cells of RAW in a tile
 _NOISE_TILE = 512  # cells of noise in a tile

@@ -7,7 +7,7 @@ import torch
 
 from rawaug.commands.run import with_values
 from rawaug.data import demo_pictures
-from rawaug.experiment.arms import training_stream, validation_samples
+from rawaug.experiment.denoising import training_stream, validation_samples
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model

@@ -14,7 +14,7 @@ from rawaug.bayer import CFA, noise_variance
 from rawaug.data import demo_pairs, demo_photographs
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.trials import Trial
-from rawaug.experiment.arms import frames_of, training_stream, validation_samples
+from rawaug.experiment.denoising import frames_of, training_stream, validation_samples
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
