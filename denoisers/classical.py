@@ -136,8 +136,11 @@ class TotalVariation(Classical):
         return denoise_tv_chambolle(planes, weight=0.4 * self.strength, channel_axis=-1)
 
 
-_HADAMARD = 0.5 * np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]], np.float32)
-"""R, Gr, Gb, B to luminance and three differences; orthonormal (white noise stays white), its own inverse."""
+_OPPONENT = {
+    4: 0.5 * np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]], np.float32),
+    3: np.array([[2, 2, 2], [6**0.5, 0, -(6**0.5)], [2**0.5, -(8**0.5), 2**0.5]], np.float32) / 12**0.5,
+}
+"""R, Gr, Gb, B, or R, G, B, to luminance and differences; orthonormal, so that white noise stays white."""
 
 
 @FILTERS.register("BM3D")
@@ -150,10 +153,10 @@ class BM3D(Classical):
     licence = "licensed for non-commercial use only; "
 
     def denoise(self, planes: Planes) -> Planes:
-        """Filter ``(h, w, 4)`` in luminance and three differences of colour."""
-        bm3d = self.library("bm3d")
+        """Filter ``(h, w, 4)``, or sRGB ``(h, w, 3)``, in luminance and differences of colour."""
+        bm3d, opponent = self.library("bm3d"), _OPPONENT[planes.shape[-1]]
         # Blocks are matched on the first channel: let that be the luminance, whose noise is lowest.
-        return bm3d.bm3d(planes @ _HADAMARD, sigma_psd=[self.strength] * 4) @ _HADAMARD
+        return bm3d.bm3d(planes @ opponent.T, sigma_psd=[self.strength] * len(opponent)) @ opponent
 
 
 class Transform(Protocol):

@@ -2,7 +2,9 @@
 
 import math
 import sys
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -70,6 +72,19 @@ def test_bm3d_says_how_to_get_it_and_under_which_licence(monkeypatch: pytest.Mon
     monkeypatch.setitem(sys.modules, "bm3d", None)
     with pytest.raises(ImportError, match=r"non-commercial use only; run: pip install '/.*\[bm3d\]'"):  # a checkout
         BM3D()(torch.zeros(1, 4, 16, 16), torch.ones(1))
+
+
+def test_bm3d_filters_luminance_first_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[np.ndarray] = []
+    library = SimpleNamespace(bm3d=lambda planes, sigma_psd: given.append(planes) or planes)
+    monkeypatch.setitem(sys.modules, "bm3d", library)
+    for channels in (3, 4):
+        planes = np.random.default_rng(0).normal(size=(16, 16, channels)).astype(np.float32)
+        method = BM3D()
+        monkeypatch.setattr(method, "library", lambda name: library)
+        assert np.allclose(method.denoise(planes), planes, atol=1e-6)
+        assert np.allclose(given[-1][..., 0], planes.mean(-1) * channels**0.5, atol=1e-5)
+        assert np.allclose(given[-1].std((0, 1)), 1.0, atol=0.15)  # white noise stays white
 
 
 def test_bm3d_where_installed() -> None:
