@@ -2,9 +2,10 @@
 
     python -m benchmarks.sensors rawaug-small rawaug-base NonLocalMeans PMRID.safetensors --data CANON --bin 4
 
-Denoisers are named as for ``rawaug benchmark``. Three tables: defects, offsets, banding and levels that are wrong, at
-:data:`ORDINARY`; what is left of weak noise in flat patches, and the frames' PSNR there; the squared error in cells
-whose two greens are clipped, and within :data:`BESIDE` cells of them.
+Denoisers are named as for ``rawaug benchmark``. Four tables: defects, offsets, banding and levels that are wrong, at
+:data:`ORDINARY`; whole frames, first balanced, whose greens are made to differ; what is left of weak noise in flat
+patches, and the frames' PSNR there; the squared error in cells whose two greens are clipped, and within :data:`BESIDE`
+cells of them.
 """
 
 from __future__ import annotations
@@ -20,9 +21,12 @@ from benchmarks.measure import arguments, finish, start
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
+from rawaug.denoise.corrections import Corrections
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.evaluation.scores import Denoiser, NoisyInput
 from rawaug.evaluation.tables import print_rows
+from rawaug.io import RawFrame
+from rawaug.io.masked import measure_masked
 from rawaug.noise import SensorNoise
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
@@ -34,10 +38,23 @@ SENSORS: dict[str, dict[str, Any]] = {
     "told half the variance": {"told": 0.5},
     "told twice the variance": {"told": 2.0},
     "black offset 2e-3, by colour 1e-3": {"black_offset_sd": 2e-3, "colour_bias_sd": 1e-3},
+    "the same, masked pixels known": {
+        "black_offset_sd": 2e-3,
+        "colour_bias_sd": 1e-3,
+        "correct": Corrections(greens="keep"),
+    },
     "row_var 2e-6": {"row_var": 2e-6},
     "row_var 1e-5": {"row_var": 1e-5},
     "heavy tails (Tukey lambda -0.2)": {"tukey_lambda": -0.2},
 }
+GREENS: dict[str, dict[str, Any]] = {
+    "whole frames": {},
+    "whole frames, balanced": {"correct": Corrections(black="keep")},
+    "greens differ by 1 %": {"green_imbalance": 0.01},
+    "greens differ by 1 %, balanced": {"green_imbalance": 0.01, "correct": Corrections(black="keep")},
+}
+BLACK, WHITE, MASKED = 32, 1023, 52
+"""Digital numbers, and columns of masked pixels, of the Canon files."""
 WEAK = ((2e-5, 1e-8), (1.6e-4, 1e-7), (6e-4, 1e-6))
 BRIGHT = ((2e-3, 1e-5), (1e-2, 1e-4))
 CLIPPED, BESIDE = 0.99, 3
@@ -47,13 +64,33 @@ Shots = Sequence[tuple[str, Tensor]]
 
 
 def noisy_shots(
-    shots: Shots, levels: tuple[float, float], told: float = 1.0, **sensor: Any
+    shots: Shots, levels: tuple[float, float], told: float = 1.0, correct: Corrections | None = None, **sensor: Any
 ) -> Iterator[tuple[Tensor, Noisy]]:
     """Clean RAW, and noisy RAW with the levels that a denoiser is told, a frame; keyed by the frame's name."""
     noise = SensorNoise(levels, **sensor)
     for name, clean in shots:
-        noisy = noise.apply(clean, noise.sample(1, keyed_generator(0, "sensors", name)))
+        params = noise.sample(1, keyed_generator(0, "sensors", name))
+        noisy = noise.apply(clean, params)
+        if correct is not None:
+            dark = noise.apply(torch.zeros(1, 4, clean.shape[-2], MASKED // 2), params)
+            noisy = corrected(noisy, dark, correct)
         yield clean, Noisy.of(noisy, (told * levels[0], told * levels[1]), CFA.RGGB)
+
+
+def corrected(noisy: Tensor, dark: Tensor, correct: Corrections) -> Tensor:
+    """Packed RAW ``(1, 4, h, w)``, masked pixels ``(1, 4, h, m)`` at its left, as ``rawaug denoise`` corrects it."""
+    wide = bayer.unpack(torch.cat([dark, noisy], -1), CFA.RGGB)[0, 0]
+    numbers = (wide * (WHITE - BLACK) + BLACK).round().numpy()
+    masked = measure_masked(numbers, (0, MASKED, numbers.shape[0], numbers.shape[1] - MASKED), CFA.RGGB)
+    frame = RawFrame(wide[None, :, MASKED:], CFA.RGGB, (BLACK,) * 4, WHITE, masked=masked)
+    return bayer.pack(correct(frame)[0].mosaic[None], CFA.RGGB)
+
+
+def balanced(clean: Tensor) -> Tensor:
+    """Packed RAW ``(1, 4, h, w)`` whose greens agree as far as they can be measured."""
+    raw = bayer.unpack(clean, CFA.RGGB)[0]
+    found = bayer.measure_greens(raw, CFA.RGGB)
+    return clean if found is None else bayer.pack(bayer.balance_greens(raw, CFA.RGGB, found)[None], CFA.RGGB)
 
 
 def decibels(error: Tensor) -> float:
@@ -103,12 +140,15 @@ def main() -> None:
     packed = [(p.name, bayer.pack(bayer.crop_to_cfa(p.raw, p.cfa, CFA.RGGB)[None], CFA.RGGB)) for p in pairs]
     side = (96 if args.quick else args.crop) // 2
     middles = [(name, middle(raw, side)) for name, raw in packed]
+    wholes = middles if args.quick else [(name, balanced(raw)) for name, raw in packed]
     lights = [(name, raw) for name, raw in packed if (raw[:, 1:3] >= CLIPPED).all(1).any()]
     everyone: list[Denoiser] = [NoisyInput("noisy"), *map(RawDenoiser.of, args.denoisers)]
     for one in progress(everyone, label="sensors", unit="denoiser"):
         row: dict[str, float] = {}
         for name, sensor in SENSORS.items():
             row[name] = mean_psnr(one, middles, ORDINARY, **sensor)
+        for name, sensor in GREENS.items():
+            row[name] = mean_psnr(one, wholes, ORDINARY, **sensor)
         for levels in WEAK:
             row[f"{levels[0]:g}: left in flat"] = left_in_flat(one, levels)
             row[f"{levels[0]:g}: PSNR"] = mean_psnr(one, middles, levels)

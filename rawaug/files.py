@@ -121,13 +121,17 @@ def one_at_a_time(folder: Callable[..., Path | None]) -> Callable[[Callable[P, R
 
 
 def to_json(value: Any, indent: int | None = None) -> str:
-    """JSON; infinity and NaN, which JSON does not have, become null."""
+    """JSON; paths become text, tensors lists, infinity and NaN, which JSON does not have, null."""
     return json.dumps(_finite(value), indent=indent, allow_nan=False)
 
 
 def _finite(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Tensor):
+        return _finite(value.tolist())
     if isinstance(value, Mapping):
         return {key: _finite(inner) for key, inner in value.items()}
     return [_finite(inner) for inner in value] if isinstance(value, (list, tuple)) else value

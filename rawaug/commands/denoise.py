@@ -8,8 +8,9 @@ from typing import Annotated
 
 from denoisers.files import DEFAULT, JOINT
 from rawaug.commands import YAML
+from rawaug.denoise.corrections import Correction, Corrections
 from rawaug.denoise.denoiser import RawDenoiser, require_classical
-from rawaug.denoise.frames import Denoised, DenoisedFolder, Greens, denoise_file, denoise_folder
+from rawaug.denoise.frames import DenoisedFolder, denoise_file, denoise_folder
 from rawaug.denoise.pictures import PICTURES, PictureDenoiser, denoise_picture, denoise_pictures
 from rawaug.errors import escape
 from rawaug.files import files_below, require_writable, write_json
@@ -29,7 +30,8 @@ def run(
     strength: float = 1.0,
     linear: bool = False,
     self_ensemble: bool = False,
-    greens: Greens = "auto",
+    greens: Correction = "auto",
+    black: Correction = "auto",
     device: str = "auto",
     preview: str | None = None,
     json: str | None = None,
@@ -53,14 +55,16 @@ def run(
         self_ensemble: average eight views of a network, at eight times the cost.
         greens: auto makes the two greens of a Bayer sensor agree where they clearly differ, since demosaicing makes a
             maze of the difference; keep leaves them.
+        black: auto takes the black level from masked pixels, where the file has them, their margins agree and they tell
+            another level than its tags; keep takes that of the tags.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         preview: also write the result, developed by LibRaw, as this .jpg or .png.
-        json: write to this file what was done to each RAW file: noise levels, greens, seconds.
+        json: write to this file what was done to each RAW file: noise levels, corrections, seconds.
         overwrite: replace existing results.
     """
     if is_picture(source):
         given = {"classical": classical, "linear": linear, "preview": preview}
-        given |= {"greens": greens != "auto", "json": json}
+        given |= {"greens": greens != "auto", "black": black != "auto", "json": json}
         if unfit := [name for name, value in given.items() if value] + ["noise"] * (noise != "auto"):
             options = ", ".join(f"--{name.replace('_', '-')}" for name in unfit)
             raise ValueError(f"{source}: is a developed picture; {options} is for RAW")
@@ -69,16 +73,17 @@ def run(
         return
     if json:
         require_writable(Path(json))
+    corrections = Corrections(greens, black)
     made = chosen(denoiser, classical, self_ensemble, device, linear, strength)
     if not Path(source).is_dir():
-        done = denoise_file(source, out, made, noise, greens=greens, preview=preview, overwrite=overwrite)
+        done = denoise_file(source, out, made, noise, corrections=corrections, preview=preview, overwrite=overwrite)
         print_denoised(DenoisedFolder([done]), json)
         return
     if preview is not None:
         raise ValueError(f"--preview {preview}: is for one file, and {source} is a folder")
     if Path(out).suffix.lower() == ".dng" and not Path(out).is_dir():
         raise ValueError(f"{out}: {source} is a folder, and so is its output; give a name without .dng")
-    result = denoise_folder(source, out, made, noise, greens=greens, overwrite=overwrite)
+    result = denoise_folder(source, out, made, noise, corrections=corrections, overwrite=overwrite)
     print_denoised(result, json)
     if result.broken:
         raise ValueError(f"{source}: {len(result.broken)} of its files could not be denoised, listed above")
@@ -134,21 +139,14 @@ def chosen(
 def print_denoised(result: DenoisedFolder, json: str | None = None) -> None:
     """Print what was done, and write it to ``json``."""
     if json:
-        files = [asdict(done) | {"source": str(done.source), "out": str(done.out)} for done in result.files]
-        write_json({"files": files, "broken": result.broken}, json)
+        write_json({"files": [asdict(done) for done in result.files], "broken": result.broken}, json)
     for done in result.files:
         levels = f"shot_var {done.shot_var:.3g}, read_var {done.read_var:.3g} ({done.noise_source})"
         clipped = f"; {done.below_zero:.2%} below digital number 0, written as 0" if done.below_zero else ""
-        print(f"{escape(done.out)}: {levels}{_greens(done)}, {done.seconds:.1f} s{clipped}")
+        print(f"{escape(done.out)}: {levels}{done.corrected}, {done.seconds:.1f} s{clipped}")
     if result.existing or result.broken:
         print(f"{len(result.files)} denoised, {result.existing} already existed, {len(result.broken)} failed")
     for reason in result.broken.values():
         print(escape(reason))
     if result.unread:
         print(escape(f"not read, no decoder for these kinds of RAW: {', '.join(result.unread)}"))
-
-
-def _greens(done: Denoised) -> str:
-    if done.greens is None or not done.balanced:
-        return ""
-    return f", greens differed by {done.greens:.2%} +- {done.greens_error:.2%}, balanced"

@@ -3,7 +3,7 @@ r"""RAW files to denoised DNGs, one or a folder of them, and frames in memory.
     x = f(y, shot_var max(y, 0) + read_var),    d = round(clip(x, 0 <= d, x <= 1) (white - black) + black)
 
 on the mosaic as the sensor gave it, before any gain map. The result has the source's levels, colour, lens corrections,
-orientation and EXIF and differs from it by noise, and by greens that agree (:mod:`rawaug.bayer.greens`); its
+orientation and EXIF and differs from it by noise, and by errors of the sensor (:mod:`rawaug.denoise.corrections`); its
 NoiseProfile tag is gone with the noise, so that a RAW developer does not smooth once more. A network that demosaics as
 well gives camera RGB in a linear DNG. With a strength s below 1 the result is y + s (d - y): (1 - s)^2 of the noise's
 variance is left, and NoiseProfile says so.
@@ -19,12 +19,13 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
 from denoisers.files import DEFAULT
 from rawaug import bayer
+from rawaug.denoise.corrections import Corrected, Correction, Corrections
 from rawaug.denoise.denoiser import Levels, RawDenoiser
 from rawaug.denoise.levels import Noise, Shots, UnknownNoise, as_json, find_levels, load_noise
 from rawaug.files import files_below, files_in, one_at_a_time, require_file, require_same_settings, require_writable
@@ -36,18 +37,12 @@ from rawaug.progress import progress
 
 UNREADABLE = (".braw", ".crm", ".gpr", ".r3d", ".x3f")
 """Extensions of RAW that the decoder does not read."""
-Greens = Literal["auto", "keep"]
-"""Whether the two greens of a Bayer frame are made to agree where they clearly differ, or kept."""
+_ALL = Corrections()
 
 
 @dataclass(frozen=True)
 class Denoised:
-    """What was done to a file.
-
-    ``below_zero`` is the share of sites whose result was below the digital number 0. ``greens`` is by what share of
-    them the two greens differed, ``greens_error`` its standard error (None if not measured), and ``balanced`` says
-    whether they agree now.
-    """
+    """What was done to a file; ``below_zero`` is the share of sites whose result was below the digital number 0."""
 
     source: Path
     out: Path
@@ -58,9 +53,7 @@ class Denoised:
     seconds: float
     camera: str
     iso: float | None
-    greens: float | None = None
-    greens_error: float | None = None
-    balanced: bool = False
+    corrected: Corrected
 
 
 @dataclass
@@ -81,7 +74,8 @@ def denoise(
     noise: Noise = "auto",
     strength: float = 1.0,
     self_ensemble: bool = False,
-    greens: Greens = "auto",
+    greens: Correction = "auto",
+    black: Correction = "auto",
     device: str = "auto",
     overwrite: bool = False,
 ) -> RawFrame:
@@ -94,7 +88,8 @@ def denoise(
         noise: where the noise levels come from, see :data:`rawaug.denoise.levels.Noise`.
         strength: 1 removes the noise, 0.7 leaves 30% of it, 0 changes nothing.
         self_ensemble: average eight views, at eight times the cost.
-        greens: ``"keep"`` leaves greens that differ; see :func:`rawaug.bayer.measure_greens`.
+        greens, black: ``"keep"`` leaves greens that differ, and the file's black level where masked pixels tell
+            another one; see :class:`rawaug.denoise.corrections.Corrections`.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         overwrite: replace ``out`` if it exists.
 
@@ -115,7 +110,7 @@ def denoise(
     if out is not None:
         _require_new(Path(out), overwrite)
     frame = source if isinstance(source, RawFrame) else read_raw(source)
-    denoised = _denoised(frame, made, load_noise(noise, made), greens)
+    denoised = _denoised(frame, made, load_noise(noise, made), Corrections(greens, black))
     if out is not None:
         _write(Path(out), denoised, None if isinstance(source, RawFrame) else Path(source))
     return denoised.frame
@@ -127,7 +122,7 @@ def denoise_file(
     denoiser: Any = DEFAULT,
     noise: Noise = "auto",
     *,
-    greens: Greens = "auto",
+    corrections: Corrections = _ALL,
     preview: str | Path | None = None,
     overwrite: bool = False,
 ) -> Denoised:
@@ -138,7 +133,7 @@ def denoise_file(
         out: the DNG to write; its folder is made.
         denoiser: whatever :meth:`RawDenoiser.of` takes; one that demosaics writes a linear DNG.
         noise: see :data:`Noise`; ignored by denoisers that read no levels.
-        greens: ``"keep"`` leaves greens that differ.
+        corrections: which errors of the sensor are taken out.
         preview: a .jpg or .png of the result as LibRaw develops it.
         overwrite: replace ``out`` and ``preview`` if they exist.
 
@@ -158,7 +153,7 @@ def denoise_file(
         _require_new(preview, overwrite, ".jpg", ".jpeg", ".png")
         if made.upscale > 1:
             raise ValueError(f"--preview {preview}: is of mosaics; open a linear DNG in a RAW developer")
-    done = _file_denoised(source, out, made, load_noise(noise, made), greens)
+    done = _file_denoised(source, out, made, load_noise(noise, made), corrections)
     if preview is not None:
         frame = read_raw(out)
         preview.parent.mkdir(parents=True, exist_ok=True)
@@ -181,8 +176,7 @@ def _require_new(path: Path, overwrite: bool, *suffixes: str) -> None:
 
 class _Result(NamedTuple):
     """A frame with what is left of its noise, its full colour if the denoiser demosaics, the levels it was told and
-    where they are from, the share of sites that no digital number could hold, and the greens' difference that was found
-    and whether it was taken out.
+    where they are from, the share of sites that no digital number could hold, and what the frame told of its sensor.
     """
 
     frame: RawFrame
@@ -190,17 +184,13 @@ class _Result(NamedTuple):
     levels: Levels
     noise_source: str
     below_zero: float
-    greens: bayer.GreenDifference | None
-    balanced: bool
+    corrected: Corrected
 
 
-def _denoised(frame: RawFrame, denoiser: RawDenoiser, noise: Noise, greens: Greens) -> _Result:
-    if greens not in get_args(Greens):
-        raise ValueError(f"greens: {greens!r} is unknown; use one of {', '.join(get_args(Greens))}")
-    found = bayer.measure_greens(frame.mosaic, frame.cfa) if frame.cfa in bayer.CFA.__members__ else None
-    balanced = found is not None and found.significant and greens == "auto" and denoiser.strength > 0
-    if found is not None and balanced:
-        frame = replace(frame, mosaic=bayer.balance_greens(frame.mosaic, frame.cfa, found))
+def _denoised(frame: RawFrame, denoiser: RawDenoiser, noise: Noise, corrections: Corrections) -> _Result:
+    corrected = Corrected()
+    if denoiser.strength > 0:
+        frame, corrected = corrections(frame)
     levels, noise_source = None, "not needed"
     if denoiser.reads_levels:
         *told, noise_source = find_levels(frame, noise)
@@ -208,12 +198,12 @@ def _denoised(frame: RawFrame, denoiser: RawDenoiser, noise: Noise, greens: Gree
     image = denoiser.frame(frame, levels)
     if denoiser.upscale > 1:
         below = (image < -0.5 / LINEAR_WHITE).float().mean().item()
-        return _Result(frame, image, levels or (0.0, 0.0), noise_source, below, found, balanced)
+        return _Result(frame, image, levels or (0.0, 0.0), noise_source, below, corrected)
     below = _clip_below_zero(image, frame)
     known, rest = levels or frame.noise_profile, (1 - denoiser.strength) ** 2
     left = None if rest == 0 or known is None else (rest * known[0], rest * known[1])
     result = replace(frame, mosaic=image, noise_profile=left)
-    return _Result(result, None, levels or (0.0, 0.0), noise_source, below, found, balanced)
+    return _Result(result, None, levels or (0.0, 0.0), noise_source, below, corrected)
 
 
 def _write(out: Path, denoised: _Result, source: Path | None) -> None:
@@ -226,19 +216,26 @@ def _file_denoised(
     out: Path,
     denoiser: RawDenoiser,
     noise: Noise,
-    greens: Greens,
+    corrections: Corrections,
     read: Callable[[Path], RawFrame] = read_raw,
 ) -> Denoised:
     start = time.perf_counter()
-    result = _denoised(read(source), denoiser, noise, greens)
+    result = _denoised(read(source), denoiser, noise, corrections)
     _write(out, result, source)
-    seconds, frame, found = time.perf_counter() - start, result.frame, result.greens
-    done = Denoised(
-        source, out, *result.levels, result.noise_source, result.below_zero, seconds, frame.camera, frame.iso
+    seconds, frame = time.perf_counter() - start, result.frame
+    shot_var, read_var = result.levels
+    return Denoised(
+        source,
+        out,
+        shot_var,
+        read_var,
+        result.noise_source,
+        result.below_zero,
+        seconds,
+        frame.camera,
+        frame.iso,
+        result.corrected,
     )
-    if found is None:
-        return done
-    return replace(done, greens=found.share, greens_error=found.error, balanced=result.balanced)
 
 
 def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
@@ -260,7 +257,7 @@ def denoise_folder(
     denoiser: Any = DEFAULT,
     noise: Noise = "auto",
     *,
-    greens: Greens = "auto",
+    corrections: Corrections = _ALL,
     overwrite: bool = False,
 ) -> DenoisedFolder:
     """Denoise the RAW files of a folder and its subfolders to ``out/SUBFOLDER/STEM.dng``; existing results are skipped.
@@ -275,7 +272,7 @@ def denoise_folder(
     made = _made(denoiser)
     noise = load_noise(noise, made)
     settings = {**made.settings, "noise": as_json(noise)}
-    settings |= {} if greens == "auto" else {"greens": greens}
+    settings |= {name: value for name, value in vars(corrections).items() if value != "auto"}
     settings |= {} if made.strength == 1.0 else {"strength": made.strength}
     require_same_settings(out / "denoise.json", settings, overwrite)
     unread = [file.name for file in sorted(files_below(source, UNREADABLE))]
@@ -286,7 +283,7 @@ def denoise_folder(
             result.existing += 1
             continue
         try:
-            result.files.append(_file_denoised(file, target, made, noise, greens, read))
+            result.files.append(_file_denoised(file, target, made, noise, corrections, read))
         except UnknownNoise as error:
             unknown.append(file)
             result.broken[str(file)] = f"noise unknown: {_named(error, file)}"
@@ -297,7 +294,7 @@ def denoise_folder(
     known = _levels_by_shot(result.files) if noise == "auto" else {}
     for file in unknown:
         with suppress(UnknownNoise):
-            result.files.append(_file_denoised(file, targets[file], made, known, greens, read))
+            result.files.append(_file_denoised(file, targets[file], made, known, corrections, read))
             del result.broken[str(file)]
     if len(result.broken) == len(targets):
         raise ValueError(f"{source}: none of its {len(targets)} files can be denoised; {min(result.broken.values())}")

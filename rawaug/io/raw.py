@@ -32,6 +32,7 @@ from rawaug.bayer import CFA, pattern_name, plane_indices
 from rawaug.errors import extra
 from rawaug.files import require_file
 from rawaug.io.gain_map import GainMap, gains_at_sites
+from rawaug.io.masked import MaskedPixels, measure_masked
 from rawaug.io.pictures import require_utf8
 from rawaug.io.tiff import MAKE, MODEL, TiffTags, read_tiff_tags
 
@@ -127,6 +128,7 @@ class RawFrame:
         color_known: false where ``color_matrix`` is not this camera's.
         gain_maps: a DNG's correction of the lens shading, which is not applied to ``mosaic``.
         exposure: seconds, f-number, focal length in mm and EXIF date, each None if unknown.
+        masked: what masked pixels beside the picture tell of the black level; None if there are none.
     """
 
     mosaic: Tensor
@@ -144,6 +146,7 @@ class RawFrame:
     color_known: bool = True
     gain_maps: tuple[GainMap, ...] = ()
     exposure: Exposure = UNKNOWN
+    masked: MaskedPixels | None = None
 
     @property
     def shading_gains(self) -> Tensor:
@@ -266,7 +269,13 @@ def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
         color_known=color_known,
         gain_maps=tags.gain_maps,
         exposure=exposure_of(raw),
+        masked=None if tags.black_rows or tags.black_columns else measure_masked(raw.raw_image, _window(raw), cfa),
     )
+
+
+def _window(raw: Any) -> tuple[int, int, int, int]:
+    """First row and column, height and width of the visible mosaic."""
+    return raw.sizes.top_margin, raw.sizes.left_margin, *raw.raw_image_visible.shape
 
 
 def _black(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:

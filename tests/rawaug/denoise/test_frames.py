@@ -20,10 +20,12 @@ import rawaug
 from rawaug.bayer import CFA, mosaic, pack, unpack
 from rawaug.cli import main
 from rawaug.commands.denoise import run
+from rawaug.denoise.corrections import Corrections
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.denoise.frames import denoise_file, denoise_folder
 from rawaug.denoise.levels import find_levels
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng
+from rawaug.io.masked import MaskedPixels
 from rawaug.noise import noise_levels
 
 LEVELS = (1e-3, 1e-5)
@@ -113,8 +115,8 @@ def test_greens_that_differ_are_balanced_and_kept_on_request(
     for greens in ("auto", "keep"):
         out = tmp_path / f"{greens}.dng"
         assert main([*command[:2], str(out), *command[2:], "--greens", greens, "--overwrite"]) == 0
-        (done,) = json.loads((tmp_path / "done.json").read_text())["files"]
-        assert done["balanced"] is (greens == "auto") and done["greens"] == pytest.approx(0.02, rel=0.2)
+        done = json.loads((tmp_path / "done.json").read_text())["files"][0]["corrected"]
+        assert done["balanced"] is (greens == "auto") and done["greens"]["share"] == pytest.approx(0.02, rel=0.2)
         assert ("greens differed by 2" in capsys.readouterr().out) is (greens == "auto")
         packed = pack(read_raw(out).mosaic, CFA.RGGB)
         gaps[greens] = float((packed[1] - packed[2]).mean())
@@ -378,3 +380,21 @@ def test_a_link_to_itself_is_refused_in_one_line(name: str, tmp_path: Path) -> N
     (tmp_path / name).symlink_to(tmp_path / name)
     with pytest.raises(OSError, match=rf"{name}: cannot be opened"):
         run(str(tmp_path / name), str(tmp_path / f"out-{name}"))
+
+
+def test_the_black_level_of_masked_pixels_is_used_where_it_is_clearly_another() -> None:
+    true = torch.full((1, 64, 64), 0.25)
+    black, masked = (512.0,) * 4, MaskedPixels((520.0, 515.0, 517.0, 512.0), error=0.1, spread=0.5, sites=10_000)
+    levels = unpack(torch.tensor(masked.black)[:, None, None].expand(4, 32, 32), CFA.GRBG)
+    numbers = true * (16383 - levels) + levels
+    numbers[0, :8] = 16383
+    frame = RawFrame((numbers - 512) / (16383 - 512), CFA.GRBG, black, 16383, masked=masked)
+    corrected, found = Corrections()(frame)
+    assert found.black_moved and corrected.black == black
+    assert (corrected.mosaic[0, 8:] - 0.25).abs().max() < 1e-6 and (corrected.mosaic[0, :8] == 1).all()
+    for kept, corrections in (
+        (frame, Corrections(black="keep")),
+        (dataclasses.replace(frame, masked=dataclasses.replace(masked, spread=9.0)), Corrections()),
+    ):
+        same, found = corrections(kept)
+        assert not found.black_moved and torch.equal(same.mosaic, kept.mosaic) and "not used" in str(found)

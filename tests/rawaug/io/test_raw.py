@@ -172,6 +172,8 @@ def test_canon_and_gopro_frames(camera_files: Path) -> None:
     frame, srgb = read_raw_and_develop(camera_files / "raw/canon/s40_0101.crw")
     assert (frame.camera, frame.iso, frame.cfa) == ("Canon PowerShot S40", 50, CFA.RGGB)
     assert frame.mosaic.shape == (1, 1720, 2312) and frame.black == (32,) * 4 and frame.white == 1023
+    assert frame.masked is not None and frame.masked.black == pytest.approx(frame.black, abs=0.1)
+    assert frame.masked.sites > 100_000 and not frame.masked.corrects(frame.black, frame.white)  # the file is right
     assert psnr_of_raw_from_rendering(frame, srgb) > 60
     one_cell_off = dataclasses.replace(frame, mosaic=frame.mosaic.roll(2, -1))
     assert psnr_of_raw_from_rendering(one_cell_off, srgb) < 45
