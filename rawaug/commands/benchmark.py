@@ -14,7 +14,17 @@ from rawaug.data.pairs import Binned, SomePairs
 from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
 from rawaug.denoise.denoiser import RawDenoiser, shipped_of_mosaics
 from rawaug.denoise.pictures import PictureDenoiser
-from rawaug.evaluation.benchmark import TOLD, benchmark, costs_of, crops, display_strength, strengths_of, tables, trials
+from rawaug.evaluation.benchmark import (
+    TOLD,
+    benchmark,
+    costs_of,
+    crops,
+    display_strength,
+    noise_note,
+    strengths_of,
+    tables,
+    trials,
+)
 from rawaug.evaluation.page import Figure, Page, plot_costs
 from rawaug.evaluation.picture_trials import picture_scores, print_pictures
 from rawaug.evaluation.tables import print_rows
@@ -75,7 +85,8 @@ def run(
     pairs = open_pairs(data, split="test")
     frames = Binned(Measured(SomePairs(pairs, range(len(pairs))[:count]), count), bin)
     everyone, found = list(known.values()), trials(frames, crop, seed, strengths)
-    result = {"data": data, "bin": bin, "crop": crop, "seed": seed, **benchmark(everyone, found)}
+    noise_said = noise_note(found, strengths, seed)
+    result = {"data": data, "bin": bin, "crop": crop, "seed": seed, "noise": noise_said, **benchmark(everyone, found)}
     for title, head, cells in tables(result):
         print_rows(title, ["denoiser", *head], [[name, *row] for name, row in cells.items()])
     told = {name: row["scores"][TOLD] for name, row in result["rows"].items()}
@@ -83,11 +94,12 @@ def run(
     notes = ["GMAC and s: a megapixel of the mosaic. sRGB: after one fixed development."]
     notes += filter(None, [own_noise_note(shares)])
     notes.append(f"noisy input: {result['hash']} (equal hashes, comparable figures)")
-    print("\n".join(notes))
+    print("\n".join([*notes, noise_said]))
     if json:
         write_json(result, json)
     if report:
         page = Page(f"Denoisers on {data}")
+        page.lead = noise_said
         page.add(texts=notes)
         for title, head, cells in tables(result):
             page.add(title, head=["", *head], rows=cells)

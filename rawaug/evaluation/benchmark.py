@@ -157,6 +157,19 @@ def benchmark(denoisers: Sequence[RawDenoiser], found: Sequence[Trial]) -> dict[
     return {"frames": names, "hash": hash_of(found), "rows": rows}
 
 
+def noise_note(found: Sequence[Trial], strengths: Iterable[str], seed: int) -> str:
+    """A sentence that says what the noise of these :func:`trials` is, by strength and levels, and that it is drawn."""
+    said = []
+    for name in strengths:
+        levels = [trial.levels for trial in found if trial.levels and (trial.condition, trial.strength) == (TOLD, name)]
+        columns = [[f"{bound:.2g}" for bound in (min(column), max(column))] for column in zip(*levels, strict=True)]
+        said.append(f"{name} ({', '.join(' to '.join(dict.fromkeys(bounds)) for bounds in columns)})")
+    return (
+        "The noise is synthetic: Gaussian of variance shot_var y + read_var, drawn on clean frames with seed "
+        f"{seed}, not a camera's own. Strengths, with shot_var and read_var: {'; '.join(said)}."
+    )
+
+
 def _gmac(denoiser: RawDenoiser, trial: Trial) -> float | None:
     """Multiplications that PyTorch computes, in 10^9 a megapixel of the mosaic; None if there are none."""
     with FlopCounterMode(display=False) as counter:

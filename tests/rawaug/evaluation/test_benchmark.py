@@ -36,8 +36,12 @@ def test_the_function_of_the_docs_is_compared(
     told = {name: row["scores"]["levels told"]["[0.007, 0.00018]"]["psnr"] for name, row in rows.items()}
     assert told["noisy input"] < told["mine_of_docs:blur"] and told["noisy input"] < told["rawaug-small"]
     assert rows["rawaug-small"]["gmac"] > 1 and rows["noisy input"]["seconds"] is None
-    assert result["hash"] in capsys.readouterr().out
-    assert all(shown in Path("b.html").read_text() for shown in ("mine_of_docs:blur", "PSNR over GMAC"))
+    printed, page = capsys.readouterr().out, Path("b.html").read_text()
+    noise = result["noise"]
+    assert "synthetic" in noise and "(0.007, 0.00018)" in noise and "seed 0" in noise
+    assert result["hash"] in printed and noise in printed
+    assert page.index("The noise is synthetic") < page.index("<h2>")
+    assert all(shown in page for shown in ("mine_of_docs:blur", "PSNR over GMAC"))
     assert "rawaug-joint" not in rows and main(["benchmark", "rawaug-joint"]) == 2
     assert "rawaug-joint: demosaics, too; rawaug run demosaic" in capsys.readouterr().err
 
