@@ -45,6 +45,12 @@ def entry_pattern(pattern: bayer.Pattern) -> bayer.Pattern:
     return next(moved for i in (0, 1) for j in (0, 1) if (moved := pattern.shift(-i, -j)) in places)
 
 
+def lines_before(pattern: bayer.Pattern) -> tuple[int, int]:
+    """Count the lines that a mosaic of the pattern lacks, above and on the left, to begin as networks meet it."""
+    entry = entry_pattern(pattern)
+    return next((i, j) for i in (0, 1) for j in (0, 1) if pattern.shift(-i, -j) == entry)
+
+
 def with_planes(mosaic: Tensor, pattern: bayer.Pattern) -> Tensor:
     """Put the planes of its colours behind a mosaic ``(B, 1, H, W)``: ``(B, 4, H, W)``."""
     planes = pattern.planes(*mosaic.shape[-2:]).to(mosaic)
@@ -67,7 +73,7 @@ def denoise_mosaic(run: Callable[[Tensor, Tensor], Tensor], mosaic: Tensor, vari
         The denoised mosaic ``(1, 1, H, W)``.
     """
     known = bayer.pattern(cfa)
-    top, left = next((i, j) for i in (0, 1) for j in (0, 1) if known.shift(-i, -j) == entry_pattern(known))
+    top, left = lines_before(known)
     noisy, told = (F.pad(x, (left, 0, top, 0), mode="reflect") for x in (with_planes(mosaic, known), variance))
     return run(noisy, told)[..., top:, left:]
 

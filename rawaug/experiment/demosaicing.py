@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from denoisers.files import DEFAULT
-from denoisers.mosaic import with_planes
+from denoisers.mosaic import lines_before, with_planes
 from denoisers.network import PACKED
 from rawaug import bayer
 from rawaug.bayer import CFA
@@ -285,11 +285,16 @@ def mosaic_trial(pair: Pair, cfa: str, noise: NoiseModel) -> Trial:
 
 
 def planes_trial(pair: Pair, cfa: str, noise: NoiseModel) -> Trial:
-    """A frame as a network of mosaics takes it, with the planes of its colours: ``(1, 4, H, W)``, domain ``raw``."""
+    """A frame as a network of mosaics takes it, with the planes of its colours: ``(1, 4, H, W)``, domain ``raw``.
+
+    It begins at the line from which the network is trained to meet the pattern.
+    """
     trial, known = mosaic_trial(pair, cfa, noise), bayer.pattern(cfa)
     assert trial.variance is not None
-    raw, variance = (mosaic_of(x, cfa) for x in (trial.noisy, trial.variance))
-    return Trial(with_planes(raw, known), known.mosaic(trial.clean), variance, pair.name, condition=cfa)
+    top, left = (-lines % known.period for lines in lines_before(known))
+    raw, variance = (mosaic_of(x, cfa)[..., top:, left:] for x in (trial.noisy, trial.variance))
+    clean = known.mosaic(trial.clean)[..., top:, left:]
+    return Trial(with_planes(raw, known.shift(top, left)), clean, variance, pair.name, condition=cfa)
 
 
 class MosaicRun(FullColourRun):
