@@ -41,7 +41,7 @@ def run(
 
     Args:
         benchmark: sidd:PATH with BenchmarkNoisyBlocksRaw.mat, or dnd:PATH with info.mat.
-        out: SubmitRaw.csv or .mat for SIDD, a folder for DND.
+        out: SubmitRaw.csv for SIDD, a folder for DND.
         denoiser: .safetensors file written by rawaug run, or the name of a shipped denoiser; by default rawaug-small.
         classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, or {name, settings}.
         self_ensemble: average eight views of a network, at eight times the cost.

@@ -22,7 +22,7 @@ from rawaug.data.folders import PICTURE_EXTENSIONS, PictureFolder
 from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import Lazy, Pair
-from rawaug.data.published import CAMERAS, FIVEK_DNG, RAWIR_FOLDERS, Rawir, Zurich, fivek_numbers
+from rawaug.data.published import RAWIR_FOLDERS, Rawir, Zurich
 from rawaug.data.sidd import SiddBlocks, SiddFrames, SiddPlusBlocks, is_scene
 from rawaug.data.submissions import Dnd, SiddBenchmark, check_submission
 from rawaug.errors import escape
@@ -44,15 +44,7 @@ class PartReport:
     items: int = 0
     examined: int = 0
     counts: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
-    signal: tuple[float, float] | None = None
     broken: list[str] = field(default_factory=list)
-
-    def add(self, facts: dict[str, str], signal: tuple[float, float] | None) -> None:
-        for what, value in facts.items():
-            self.counts[what][value] += 1
-        if signal is not None:
-            low, high = self.signal or signal
-            self.signal = min(low, signal[0]), max(high, signal[1])
 
     def add_broken(self, error: Exception) -> None:
         """Note a damaged item; a file of many blocks is one line."""
@@ -67,8 +59,6 @@ class PartReport:
             more = f", {len(counts) - _SHOWN} more" if len(counts) > _SHOWN else ""
             shown = ", ".join(f"{escape(value)} ({count})" for value, count in counts.most_common(_SHOWN))
             lines.append(f"  {what}: {shown}{more}")
-        if self.signal is not None:
-            lines.append(f"  signal: {self.signal[0]:.4g} to {self.signal[1]:.4g}")
         lines.append(f"  damaged: {len(self.broken) or 'none'}")
         return "\n".join([*lines, *(f"    {escape(line)}" for line in self.broken)])
 
@@ -106,7 +96,7 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
-    if path.is_file() and path.suffix in (".csv", ".mat"):
+    if path.is_file() and path.suffix == ".csv":
         return DataReport(path, [_part("SIDD submission", partial(_submission, path), first)])
     known = list(_datasets(path)) or list(_files(path))
     if not known:
@@ -149,27 +139,16 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
 
 
 def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """RAW files and pictures of no known dataset, and FiveK, which cannot be told from other DNGs."""
+    """RAW files and pictures of no known dataset; FiveK cannot be told from other DNGs."""
     files = [path] if path.is_file() else list(files_below(path))
     if path.is_dir() and looks_like_pairs(files):
         yield "noisy/clean pairs", partial(PairFolder, path)
         return
     raws = sorted(file for file in files if file.suffix.lower() in RAW_EXTENSIONS)
-    numbers = {found[1] for file in raws if (found := FIVEK_DNG.fullmatch(file.name))}
     if raws:
-        yield f"RAW files{_fivek(numbers)}", partial(_RawFrames, path)
+        yield "RAW files", partial(_RawFrames, path)
     if any(file.suffix.lower() in PICTURE_EXTENSIONS for file in files) and path.is_dir():
         yield "pictures", partial(PictureFolder, path, allowed_share=1)
-
-
-def _fivek(numbers: set[str]) -> str:
-    parts = []
-    for camera in CAMERAS:
-        for split in ("train", "test"):
-            wanted = fivek_numbers(camera, split)
-            if existing := len(numbers.intersection(wanted)):
-                parts.append(f"{camera} {split} {existing} of {len(wanted)}")
-    return f" (FiveK: {', '.join(parts)})" if parts else ""
 
 
 class _RawFrames(Lazy[RawFrame]):
@@ -200,7 +179,8 @@ def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartRep
     opening, names = pickle.dumps(open_part), getattr(items, "names", range(part.items))
     for index in range(part.examined):
         try:
-            part.add(*isolated(_facts, opening, index, name=names[index]))
+            for kind, value in isolated(_facts, opening, index, name=names[index]).items():
+                part.counts[kind][value] += 1
         except (OSError, ValueError) as error:
             part.add_broken(error)
     return part
@@ -211,14 +191,14 @@ def _opened(opening: bytes) -> Any:
     return pickle.loads(opening)()
 
 
-def _facts(opening: bytes, index: int) -> tuple[dict[str, str], tuple[float, float] | None]:
-    """What is counted of an item (a picture, pair, RAW frame or noisy block), and the range of its signal."""
+def _facts(opening: bytes, index: int) -> dict[str, str]:
+    """What is counted of an item: a picture, pair, RAW frame or noisy block."""
     items = _opened(opening)
     item = getattr(items, "read", items.__getitem__)(index)
     image: Tensor = item.raw if isinstance(item, Pair) else getattr(item, "mosaic", item)
     facts = {"sizes": f"{image.shape[-2]} x {image.shape[-1]}"}
     if item is image:
-        return facts, None
+        return facts
     facts["cfas"] = str(item.cfa)
     levels = (item.shot_var, item.read_var) if isinstance(item, Pair) else item.noise_profile
     if isinstance(item, RawFrame) and item.white > 1:
@@ -230,4 +210,4 @@ def _facts(opening: bytes, index: int) -> tuple[dict[str, str], tuple[float, flo
         facts["cameras"] = item.camera
     if item.iso:
         facts["iso"] = f"{item.iso:g}"
-    return facts, (image.min().item(), image.max().item())
+    return facts

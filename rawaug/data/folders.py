@@ -27,7 +27,7 @@ from rawaug.data.pairs import LazyPairs, Pair, SomePairs, centre
 from rawaug.errors import escape
 from rawaug.files import files_in
 from rawaug.io import read_picture, read_raw, read_raw_and_develop
-from rawaug.io.pictures import MAX_PIXELS, through_jpeg
+from rawaug.io.pictures import MAX_PIXELS, recode_jpeg
 from rawaug.io.raw import RAW_EXTENSIONS
 
 PICTURE_EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
@@ -274,7 +274,7 @@ class RawFolder(LazyPairs):
             sizes = "is {} x {} but its RAW file is {} x {}".format(*sides)
             warnings.warn(f"{jpeg}: {sizes}; using LibRaw's rendering instead", stacklevel=2)
         frame, srgb = read_raw_and_develop(file, self.adjust_maximum_thr)
-        srgb = srgb if self.jpeg_quality is None else through_jpeg(srgb, self.jpeg_quality)
+        srgb = srgb if self.jpeg_quality is None else recode_jpeg(srgb, self.jpeg_quality)
         return Pair.of_frame(self.names[index], frame, srgb)
 
 

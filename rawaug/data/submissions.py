@@ -2,8 +2,8 @@
 
 *SIDD.* ``BenchmarkNoisyBlocksRaw.mat`` holds an array of the same name, (40 scene instances, 32 blocks, rows, columns),
 as :mod:`rawaug.data.sidd` says. A submission is a CSV with the columns ID (0 to 1279, block by block, frame by frame)
-and BLOCK (the bytes of the float32 block, row by row, in base64), or ``SubmitRaw.mat`` of version 5 with the array
-``SubmitRaw`` (40, 32, 256, 256). Source: the example code of the dataset's first author, ``sidd_kaggle_submit``.
+and BLOCK (the bytes of the float32 block, row by row, in base64). Source: the example code of the dataset's first
+author, ``sidd_kaggle_submit``.
 
 *DND*: fifty frames of four cameras, to be denoised in twenty boxes each. ``info.mat`` (version 7.3) holds the struct
 array ``info`` with, for each frame, ``boundingboxes`` (top, left, bottom, right, counted from 1, both ends inside),
@@ -60,19 +60,14 @@ class SiddBenchmark(Lazy[RawFrame]):
 def write_submission(path: str | Path, blocks: Iterable[Tensor], side: int = SIDE) -> None:
     """Write 1,280 denoised mosaics ``(1, side, side)``, finite, in the order and patterns of :class:`SiddBenchmark`.
 
-    ``path`` is ``SubmitRaw.csv`` or ``SubmitRaw.mat``; values are written as they are.
+    ``path`` is ``SubmitRaw.csv``; values are written as they are.
     """
     path = Path(path)
-    if path.suffix not in (".csv", ".mat"):
-        raise ValueError(f"{path}: a SIDD submission must be a .csv or .mat file")
+    if path.suffix != ".csv":
+        raise ValueError(f"{path}: a SIDD submission must be a .csv file")
     arrays = [_denoised(block, f"block {k}", (side, side)) for k, block in enumerate(blocks)]
     if len(arrays) != COUNT:
         raise ValueError(f"{path}: a submission must have {COUNT} blocks, got {len(arrays)}")
-    if path.suffix == ".mat":
-        from scipy.io import savemat
-
-        savemat(path, {"SubmitRaw": np.stack(arrays).reshape(len(HELD_BACK), BLOCKS, side, side)})
-        return
     with path.open("w", encoding="ascii", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(["ID", "BLOCK"])
@@ -84,8 +79,7 @@ def check_submission(path: str | Path, side: int = SIDE) -> Tensor:
 
     ValueError, in one line, if the benchmark would refuse it, or if values leave [0, 1], which it would not notice.
     """
-    path = Path(path)
-    blocks = _from_mat(path, side) if path.suffix == ".mat" else _from_csv(path, side)
+    blocks = _from_csv(Path(path), side)
     _require_range(blocks, f"{path}:")
     return torch.from_numpy(blocks)[:, None]
 
@@ -101,13 +95,6 @@ def _denoised(mosaic: Tensor, name: str, size: tuple[int, int] | None = None) ->
 def _require_range(values: np.ndarray, name: str) -> None:
     if not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1):
         raise ValueError(f"{name} has values from {values.min():.4g} to {values.max():.4g}; clip them to [0, 1]")
-
-
-def _from_mat(path: Path, side: int) -> np.ndarray:
-    array, expected = read_array(path, "SubmitRaw"), (len(HELD_BACK), BLOCKS, side, side)
-    if array.shape != expected or array.dtype != np.float32:
-        raise ValueError(f"{path}: SubmitRaw must be float32 {expected}, got {array.dtype} {array.shape}")
-    return np.ascontiguousarray(array).reshape(COUNT, side, side)
 
 
 def _from_csv(path: Path, side: int) -> np.ndarray:

@@ -277,7 +277,7 @@ def _transform(profile: bytes) -> tuple[str, Any]:
     return mode, ImageCms.buildTransform(source, target, mode, "RGB", intent, flags)
 
 
-def through_jpeg(srgb: Tensor, quality: int, chroma: str = "4:2:2") -> Tensor:
+def recode_jpeg(srgb: Tensor, quality: int, chroma: str = "4:2:2") -> Tensor:
     """sRGB ``(3, H, W)`` uint8, encoded at ``quality`` (1 to 100) and decoded again; ``chroma`` is its subsampling."""
     with extra("raw"):
         from PIL import Image

@@ -120,11 +120,11 @@ def compress_jpeg(srgb: Tensor, quality: Tensor, chroma_420: Tensor | None = Non
 
     Chroma is 4:2:2, or, where ``chroma_420`` ``(B,)`` is given, 4:2:0 where it is true and 4:4:4 elsewhere.
     """
-    from rawaug.io.pictures import through_jpeg  # OpenImageIO
+    from rawaug.io.pictures import recode_jpeg  # OpenImageIO
 
     in_bytes = (srgb * 255.0).round().to("cpu", torch.uint8)
     halved = ["4:2:2"] * len(srgb) if chroma_420 is None else ["4:2:0" if x else "4:4:4" for x in chroma_420.tolist()]
-    shown = [through_jpeg(*one) for one in zip(in_bytes, quality.tolist(), halved, strict=True)]
+    shown = [recode_jpeg(*one) for one in zip(in_bytes, quality.tolist(), halved, strict=True)]
     return torch.stack(shown).to(srgb) / 255.0
 
 

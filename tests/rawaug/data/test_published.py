@@ -14,7 +14,7 @@ from rawaug.bayer import CFA, pack
 from rawaug.data import check, open_pairs
 from rawaug.data.published import CAMERAS, Rawir, Rgb2Raw, Zurich, fivek_numbers, fivek_pairs
 from rawaug.io import develop, write_picture
-from rawaug.io.pictures import through_jpeg
+from rawaug.io.pictures import recode_jpeg
 
 SPLITS = {("canon", "train"): 650, ("canon", "test"): 127, ("nikon", "train"): 414, ("nikon", "test"): 73}
 
@@ -62,7 +62,7 @@ def test_invisps_pictures_are_scaled_by_the_frames_maximum_and_stored_as_jpegs(
     pair, plain = (open_pairs(f"{kind}_nikon:{fivek}", split="test")[72] for kind in ("invisp", "fivek"))
     assert torch.equal(pair.raw, plain.raw) and pair.name == plain.name == file.stem
     assert torch.equal(plain.srgb, develop(file))
-    assert torch.equal(pair.srgb, through_jpeg(develop(file, 0.75), 90))
+    assert torch.equal(pair.srgb, recode_jpeg(develop(file, 0.75), 90))
     assert pair.srgb.float().mean() > plain.srgb.float().mean() + 2, "the brightest becomes white"
 
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageCms, ImageOps
 
 from rawaug.io import decode_srgb, encode_srgb, read_picture, write_picture
-from rawaug.io.pictures import read_plane, through_jpeg
+from rawaug.io.pictures import read_plane, recode_jpeg
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (24, 37, 3), np.uint8)
 SRGB = torch.from_numpy(PIXELS).permute(2, 0, 1)
@@ -217,11 +217,11 @@ def test_it_is_what_a_file_of_that_quality_holds_with_colour_at_half_the_width()
     picture = (255 * torch.nn.functional.interpolate(coarse, (48, 64), mode="bilinear")[0]).to(torch.uint8)
     expected = io.BytesIO()
     Image.fromarray(picture.permute(1, 2, 0).numpy()).save(expected, "JPEG", quality=90, subsampling="4:2:2")
-    assert np.array_equal(through_jpeg(picture, 90).permute(1, 2, 0).numpy(), np.array(Image.open(expected)))
-    errors = [(through_jpeg(picture, quality).float() - picture).square().mean() for quality in (30, 90)]
+    assert np.array_equal(recode_jpeg(picture, 90).permute(1, 2, 0).numpy(), np.array(Image.open(expected)))
+    errors = [(recode_jpeg(picture, quality).float() - picture).square().mean() for quality in (30, 90)]
     assert errors[0] > errors[1] > 0
     stripes = torch.tensor([[255, 0], [0, 0], [0, 255]], dtype=torch.uint8)[:, None].repeat(1, 32, 16)
-    fine, turned = (through_jpeg(x, 90).float() - x for x in (stripes, stripes.mT))
+    fine, turned = (recode_jpeg(x, 90).float() - x for x in (stripes, stripes.mT))
     assert fine.square().mean() > 2 * turned.square().mean(), "columns of colour are lost, rows are not"
 
 
