@@ -42,8 +42,7 @@ from rawaug import DictionaryISP
 from rawaug.cli import main as rawaug
 from rawaug.commands.info import describe
 from rawaug.commands.run import with_values
-from rawaug.data.formats import read_mosaic
-from rawaug.data.mat import read_value
+from rawaug.data.formats import read_mosaic, read_value
 from rawaug.data.published import read_packed
 from rawaug.data.sidd import colour_of, mosaic_of
 from rawaug.experiment.plan import settings_of

@@ -28,7 +28,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA, turn_back
 from rawaug.data.development import UNKNOWN_COLOUR, developed_pair, gains_from_neutral, srgb_from_camera
-from rawaug.data.mat import normalised, read_array, read_value
+from rawaug.data.formats import read_array, read_value, to_raw
 from rawaug.data.pairs import FrameLabel, LazyPairs, Pair, captured_noise, measured_levels
 from rawaug.files import files_below, require_file
 from rawaug.io import read_picture
@@ -117,7 +117,7 @@ class SiddFrames(LazyPairs):
 
 def mosaic_of(file: Path) -> Tensor:
     """The mosaic ``x`` of a frame, float32 ``(1, H, W)``; of an odd side the last line is left out."""
-    return _even(normalised(read_array(file, "x"), 2, file))
+    return _even(to_raw(read_array(file, "x"), 2, file))
 
 
 def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
@@ -322,7 +322,7 @@ class SiddPlusBlocks(_Blocks):
         return _Known(f"frame {number}", "SIDD+", self.cfas[number])
 
     def _read_all(self) -> dict[str, Tensor]:
-        clean, noisy = (normalised(read_array(file, file.stem), 3, file) for file in self.files)
+        clean, noisy = (to_raw(read_array(file, file.stem), 3, file) for file in self.files)
         _require_same_shape(clean, noisy, self.files[1])
         if len(clean) != len(self):
             raise ValueError(f"{self.files[0]}: has {len(clean)} blocks, but there are patterns for {len(self)}")
@@ -397,7 +397,7 @@ def _patterns(file: Path) -> list[CFA]:
 
 def blocks_of_scenes(file: Path) -> Tensor:
     """``(40, 32, 1, H, W)``."""
-    blocks = normalised(read_array(file, file.stem), 4, file)
+    blocks = to_raw(read_array(file, file.stem), 4, file)
     if blocks.shape[:2] != (len(HELD_BACK), BLOCKS):
         raise ValueError(f"{file}: holds {tuple(blocks.shape[:2])} blocks, the published file {len(HELD_BACK), BLOCKS}")
     return blocks

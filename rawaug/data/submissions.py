@@ -29,7 +29,7 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.data.development import gains_from_neutral, srgb_from_camera
-from rawaug.data.mat import normalised, read_array, read_value
+from rawaug.data.formats import read_array, read_value, to_raw
 from rawaug.data.pairs import Lazy, Pair
 from rawaug.data.sidd import BLOCKS, HELD_BACK, Once, blocks_of_scenes, find_file, noise_level_functions, phone_of
 from rawaug.files import require_file
@@ -140,7 +140,7 @@ class Dnd(Lazy[RawFrame]):
     def read(self, index: int) -> RawFrame:
         k, box = self.places[index]
         if self._frame is None or self._frame[0] != k:
-            self._frame = k, normalised(read_array(self.file(k), "Inoisy"), 2, self.file(k))
+            self._frame = k, to_raw(read_array(self.file(k), "Inoisy"), 2, self.file(k))
         (_, noisy), frame = self._frame, self.frames[k]
         top, left, bottom, right = frame.boxes[box]
         if not (0 <= top < bottom <= noisy.shape[1] and 0 <= left < right <= noisy.shape[2]):

@@ -12,7 +12,7 @@ MOST = 2**31
 """The largest number of steps, samples or processes that a setting may have."""
 
 Weighing = Literal["linear", "normalised", "stabilised", "mixed", "relative"]
-"""How the loss weighs light and shade; :mod:`rawaug.training.criteria` has the formulas."""
+"""How the loss weighs light and shade; :mod:`rawaug.training.estimators` has the formulas."""
 
 
 @dataclass
@@ -48,7 +48,7 @@ class TrainConfig:
         halve_every: steps between halvings.
         loss: l1, l2 or rms, or {name, settings}.
         weigh: loss weighting of light and shade: linear, normalised, stabilised, mixed or relative,
-            see :mod:`rawaug.training.criteria`.
+            see :mod:`rawaug.training.estimators`.
         ema: decay of the running average of the weights, which are validated and saved; 0 disables it.
         clip_norm: gradient norm limit; 0 disables it.
         validate_every: steps between validations; the best weights are kept.

@@ -32,8 +32,7 @@ from rawaug.metrics import psnr
 from rawaug.progress import progress
 from rawaug.registry import LOSSES
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.criteria import Criterion, weigh_loss
-from rawaug.training.estimators import Supervised
+from rawaug.training.estimators import Criterion, Supervised, weigh_loss
 from rawaug.training.state import TrainingState, first_network
 from rawaug.training.stream import StepSampler, TrainingStream
 

@@ -13,7 +13,7 @@ import torch
 from rawaug.bayer import CFA
 from rawaug.commands.submit import submit_dnd
 from rawaug.data import Dnd, check_dnd_submission, open_pairs, write_dnd_submission
-from rawaug.data.mat import read_value
+from rawaug.data.formats import read_value
 from rawaug.denoise.denoiser import RawDenoiser
 
 Writer = Callable[[Path, dict[str, Any]], Path]

@@ -26,7 +26,7 @@ from rawaug.data import (
     sidd,
     write_submission,
 )
-from rawaug.data.mat import read_array
+from rawaug.data.formats import read_array
 from rawaug.data.sidd import HELD_BACK, PHONES, SiddBlocks, SiddFrames, SiddPlusBlocks, phone_of
 from rawaug.denoise.denoiser import RawDenoiser
 from rawaug.io import RawFrame, write_picture

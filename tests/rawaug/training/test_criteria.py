@@ -9,7 +9,7 @@ from torch.nn import L1Loss, MSELoss
 
 from denoisers.domains import Anscombe
 from rawaug.data.pairs import Sample
-from rawaug.training.criteria import RootMeanSquare, weigh_loss
+from rawaug.training.estimators import RootMeanSquare, weigh_loss
 
 SHOT, READ = 2e-3, 1e-5
 NOISY = torch.rand(2, 4, 8, 8, generator=torch.Generator().manual_seed(0)) * 0.8
