@@ -19,9 +19,9 @@ png     16 bits, one channel                            none                    
 ======  ==============================================  =============================================  ===============
 
 MATLAB files of version 5 are read through SciPy, those of 7.3 (HDF5 behind 512 bytes of header) through h5py. A 7.3
-file holds a matrix with its axes in reverse, since MATLAB counts down the columns and HDF5 along the rows: read naively,
-a picture comes transposed, and a GRBG mosaic looks like GBRG. Here all axes are MATLAB's. Source: MathWorks, "MAT-File
-Format".
+file holds a matrix with its axes in reverse, since MATLAB counts down the columns and HDF5 along the rows: read
+naively, a picture comes transposed, and a GRBG mosaic looks like GBRG. Here all axes are MATLAB's. Source: MathWorks,
+"MAT-File Format".
 """
 
 from __future__ import annotations
