@@ -17,7 +17,7 @@ from torch.nn.functional import interpolate
 
 from benchmarks.measure import parser
 from rawaug import bayer
-from rawaug.data.development import developed
+from rawaug.data.development import render_raw
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.denoise.levels import find_levels
 from rawaug.io import RawFrame, read_raw, write_picture
@@ -27,7 +27,7 @@ SIDE, MARGIN, GAP = 384, 128, 6
 
 def picture(frame: RawFrame, mosaic: Tensor, stops: float) -> Tensor:
     """A mosaic ``(1, H, W)`` developed with the frame's colours, sRGB ``(3, H, W)``."""
-    return developed(mosaic, frame.cfa, frame.white_balance, frame.color_matrix, "ahd", 2.0**stops, None)
+    return render_raw(mosaic, frame.cfa, frame.white_balance, frame.color_matrix, "ahd", 2.0**stops, None)
 
 
 def framed(frame: RawFrame, top: int, left: int) -> Tensor:

@@ -45,7 +45,7 @@ def gains_from_neutral(as_shot_neutral: np.ndarray) -> tuple[float, float, float
     return green / red, 1.0, green / blue
 
 
-def developed(
+def render_raw(
     raw: Tensor,
     cfa: CFA | str,
     gains: Sequence[float],
@@ -60,26 +60,26 @@ def developed(
     of shadows until it is sRGB.
 
     Example:
-        >>> developed(torch.full((1, 8, 8), 0.5), "RGGB", (1, 1, 1), torch.eye(3)).mean().item()  # doctest: +ELLIPSIS
+        >>> render_raw(torch.full((1, 8, 8), 0.5), "RGGB", (1, 1, 1), torch.eye(3)).mean().item()  # doctest: +ELLIPSIS
         0.735...
     """
-    return rendered(bayer.demosaic(raw[None], cfa, demosaicing)[0], gains, matrix, exposure, least)
+    return render_rgb(bayer.demosaic(raw[None], cfa, demosaicing)[0], gains, matrix, exposure, least)
 
 
-def rendered(
+def render_rgb(
     rgb: Tensor, gains: Sequence[float], matrix: Tensor, exposure: float = 1.0, least: float | None = 0.0
 ) -> Tensor:
-    """Linear camera RGB ``(3, H, W)`` as a picture; arguments as in :func:`developed`."""
+    """Linear camera RGB ``(3, H, W)`` as a picture; arguments as in :func:`render_raw`."""
     balanced = (rgb * exposure * torch.tensor(gains).reshape(3, 1, 1)).clamp(least, 1)
     return encode_srgb(torch.einsum("ij,jhw->ihw", matrix, balanced).clamp(0, 1))
 
 
 def develop_mosaic(raw: Tensor, cfa: CFA, gains: tuple[float, float, float], matrix: Tensor) -> Tensor:
     """A mosaic ``(1, H, W)`` as the picture of a pair, uint8 ``(3, H, W)``."""
-    return (developed(raw, cfa, gains, matrix) * 255).round_().to(torch.uint8)
+    return (render_raw(raw, cfa, gains, matrix) * 255).round_().to(torch.uint8)
 
 
-def developed_pair(
+def develop_pair(
     name: str, raw: Tensor, cfa: CFA, white_balance: tuple[float, float, float], color_matrix: Tensor, **known: Any
 ) -> Pair:
     """A pair whose picture, unless one is ``known``, is a plain development of its RAW."""
@@ -91,7 +91,7 @@ def developed_pair(
 def develop_packed(packed: Tensor, cfa: CFA, pair: Pair, exposure: float = 1.0) -> Tensor:
     """Packed RAW ``(1, 4, h, w)`` to sRGB ``(3, H, W)`` in [0, 1] with the colours of ``pair``, for scores."""
     raw = bayer.unpack(packed, cfa)[0]
-    return developed(raw, cfa, pair.white_balance, pair.color_matrix, "bilinear", exposure, least=None)
+    return render_raw(raw, cfa, pair.white_balance, pair.color_matrix, "bilinear", exposure, least=None)
 
 
 def exposure_of(packed: Tensor, pair: Pair) -> float:

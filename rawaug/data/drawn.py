@@ -163,7 +163,7 @@ class Shapes(Dataset[Tensor]):
 
     def __getitem__(self, index: int) -> Tensor:
         number = range(self.count)[index]
-        return drawn(self.side, np.random.default_rng(derive_seed(self.seed, "shapes", number)))
+        return draw_shapes(self.side, np.random.default_rng(derive_seed(self.seed, "shapes", number)))
 
 
 @PICTURES.register("shapes")
@@ -174,7 +174,7 @@ def open_shapes(path: str = "", min_side: int = 2) -> Shapes:
     return Shapes(int(path), max(SIDE, min_side))
 
 
-def drawn(side: int, rng: Rng) -> Tensor:
+def draw_shapes(side: int, rng: Rng) -> Tensor:
     """One picture, uint8 ``(3, side, side)``: anti-aliased shapes of two to six kinds, shaded, some out of focus."""
     with extra("train"):
         from PIL import Image, ImageFilter

@@ -185,7 +185,7 @@ Metadata = dict[str, Any]
 """What is known of a mosaic besides its numbers: values of :data:`KINDS`."""
 
 
-def parsed(values: Mapping[str, Any], where: str | Path) -> Metadata:
+def parse_metadata(values: Mapping[str, Any], where: str | Path) -> Metadata:
     """Metadata of plain values or arrays; other keys, and None, are left out."""
     found: Metadata = {}
     for key, value in values.items():
@@ -197,7 +197,7 @@ def parsed(values: Mapping[str, Any], where: str | Path) -> Metadata:
     return found
 
 
-def completed(stated: Metadata, given: Metadata, file: Path) -> Metadata:
+def complete_metadata(stated: Metadata, given: Metadata, file: Path) -> Metadata:
     """What a file states and what is ``given`` besides; ValueError where they contradict each other."""
     for key, value in given.items():
         own = stated.get(key, value)
@@ -366,13 +366,13 @@ def read_mosaic(file: Path, which: str, given: Metadata, alone: bool = False, ma
     suffix = file.suffix.lower()
     if suffix in RAW_EXTENSIONS:
         frame = read_raw(file)
-        completed({"cfa": frame.cfa, "black": levels(frame.black), "white": frame.white}, given, file)
+        complete_metadata({"cfa": frame.cfa, "black": levels(frame.black), "white": frame.white}, given, file)
         return frame
     if suffix not in READERS:
         raise ValueError(f"{file}: cannot hold a mosaic; use {', '.join(READERS)} or a RAW format")
     require_file(file)
     numbers, values = READERS[suffix](file, which, alone, max_pixels)
-    stated = completed(parsed(values, file), given, file)
+    stated = complete_metadata(parse_metadata(values, file), given, file)
     if "cfa" not in stated:
         raise ValueError(f"{file}: does not state its CFA; give cfa, such as RGGB")
     known: dict[str, Any] = {"color_known": {"white_balance", "color_matrix"} <= stated.keys()}

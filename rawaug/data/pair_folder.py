@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rawaug.bayer import CFA
-from rawaug.data.development import UNKNOWN_COLOUR, developed_pair
+from rawaug.data.development import UNKNOWN_COLOUR, develop_pair
 from rawaug.data.folders import RawFolder
-from rawaug.data.formats import READABLE, TWO_IN_ONE, parsed, read_mosaic
+from rawaug.data.formats import READABLE, TWO_IN_ONE, parse_metadata, read_mosaic
 from rawaug.data.pairs import LazyPairs, Pair
 from rawaug.files import files_below
 from rawaug.registry import DATASETS
@@ -87,7 +87,7 @@ class PairFolder(LazyPairs):
         black: float | Sequence[float] | None = None,
         white: float | None = None,
     ) -> None:
-        self.given = parsed({"cfa": cfa, "black": black, "white": white}, f"pairs:{path}")
+        self.given = parse_metadata({"cfa": cfa, "black": black, "white": white}, f"pairs:{path}")
         self.pairs = _pairs_below(Path(path), noisy, clean)
         super().__init__([pair.name for pair in self.pairs])
 
@@ -121,7 +121,7 @@ class PairFolder(LazyPairs):
         shot_var, read_var = noisy.noise_profile or (None, None)
         known: dict[str, Any] = {"noisy": noisy.mosaic, "shot_var": shot_var, "read_var": read_var}
         known |= {"color_known": bool(stated), "camera": noisy.camera, "iso": noisy.iso}
-        return developed_pair(name, clean.mosaic, CFA(clean.cfa), *colour, **known)
+        return develop_pair(name, clean.mosaic, CFA(clean.cfa), *colour, **known)
 
 
 def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:

@@ -120,7 +120,7 @@ class Pair:
         """This pair, with levels measured against ``raw`` if the capture states none."""
         if self.noisy is None or self.shot_var is not None:
             return self
-        shot_var, read_var = measured_levels(self.raw, self.noisy)
+        shot_var, read_var = measure_levels(self.raw, self.noisy)
         return replace(self, shot_var=shot_var, read_var=read_var, levels_from_clean=True)
 
     def require_rendered(self) -> None:
@@ -373,7 +373,9 @@ class PairPictures(Lazy[Tensor]):
         return self.pairs[index].srgb
 
 
-def selected(pairs: Sequence[Pair], kept: int, count: int | None, select: str | Sequence[str] = "first") -> list[int]:
+def select_pairs(
+    pairs: Sequence[Pair], kept: int, count: int | None, select: str | Sequence[str] = "first"
+) -> list[int]:
     """Choose ``count`` (None: all) of the first ``kept`` pairs without reading any; returns their indices."""
     if not isinstance(select, str):
         return _named(names_of(pairs)[:kept], select)[:count]
@@ -432,7 +434,7 @@ _LEAST = 1e-9
 _SITES = 2**20
 
 
-def captured_noise(clean: np.ndarray, noisy: np.ndarray) -> tuple[float, float]:
+def measure_noise(clean: np.ndarray, noisy: np.ndarray) -> tuple[float, float]:
     """(shot_var, read_var) of ``noisy``, both positive; arrays of the same shape, black 0, white 1."""
     signal = np.ravel(clean).astype(np.float64)
     square = (np.ravel(noisy) - signal) ** 2
@@ -448,10 +450,10 @@ def captured_noise(clean: np.ndarray, noisy: np.ndarray) -> tuple[float, float]:
     return shot, read
 
 
-def measured_levels(clean: Tensor, noisy: Tensor) -> tuple[float, float]:
-    """:func:`captured_noise` of two mosaics ``(1, H, W)``, of about a million of their sites if they are larger."""
+def measure_levels(clean: Tensor, noisy: Tensor) -> tuple[float, float]:
+    """:func:`measure_noise` of two mosaics ``(1, H, W)``, of about a million of their sites if they are larger."""
     step = max(1, clean.numel() // _SITES) | 1  # odd, so that all four sites of the cell take part
-    return captured_noise(clean.flatten()[::step].numpy(), noisy.flatten()[::step].numpy())
+    return measure_noise(clean.flatten()[::step].numpy(), noisy.flatten()[::step].numpy())
 
 
 def _line(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, float]:

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, unpack
-from rawaug.data.development import develop_mosaic, developed_pair
+from rawaug.data.development import develop_mosaic, develop_pair
 from rawaug.data.folders import RawFolder
 from rawaug.data.formats import read_npz
 from rawaug.data.pairs import LazyPairs, Pair, require_split
@@ -279,7 +279,7 @@ class RealFrames(LazyPairs):
         numbers = read_plane(REAL_FRAMES / f"{name}.png").astype(np.float32)
         planes = torch.from_numpy((numbers - REAL_BLACK) / (REAL_WHITE - REAL_BLACK)).reshape(4, -1, numbers.shape[-1])
         shot = {"camera": known["camera"], "iso": known["iso"], "own_noise": tuple(known["own_noise"])}
-        return developed_pair(name, unpack(planes, cfa), cfa, gains, matrix, **shot)
+        return develop_pair(name, unpack(planes, cfa), cfa, gains, matrix, **shot)
 
 
 @cache

@@ -27,9 +27,9 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA, turn_back
-from rawaug.data.development import UNKNOWN_COLOUR, developed_pair, gains_from_neutral, srgb_from_camera
+from rawaug.data.development import UNKNOWN_COLOUR, develop_pair, gains_from_neutral, srgb_from_camera
 from rawaug.data.formats import read_array, read_value, to_raw
-from rawaug.data.pairs import FrameLabel, LazyPairs, Pair, captured_noise, measured_levels
+from rawaug.data.pairs import FrameLabel, LazyPairs, Pair, measure_levels, measure_noise
 from rawaug.files import files_below, require_file
 from rawaug.io import read_picture
 from rawaug.io.pictures import view_of_orientation
@@ -85,7 +85,7 @@ class SiddFrames(LazyPairs):
         self.path = Path(path)
         self.shots = [
             (scene, number, files)
-            for (scene, number), files in sorted(indexed(self.path).items())
+            for (scene, number), files in sorted(index_files(self.path).items())
             if "NOISY_RAW" in files and scene not in left_out
         ]
         for _, number, files in self.shots:
@@ -106,13 +106,13 @@ class SiddFrames(LazyPairs):
             raise ValueError(f"{files['NOISY_RAW']}: the clean and the noisy frame differ in size, {sizes}")
         gains, matrix, view = colour_of(files["METADATA_RAW"])
         (camera, cfa), published = phone_of(scene), self.levels.get(scene)
-        shot_var, read_var = published or measured_levels(clean, noisy)
+        shot_var, read_var = published or measure_levels(clean, noisy)
         known: dict[str, Any] = {"noisy": noisy, "shot_var": shot_var, "read_var": read_var, "camera": camera}
         for key, kind in (("srgb", "GT_SRGB"), ("noisy_srgb", "NOISY_SRGB")):
             if kind in files:
                 known[key] = _turned_back(files[kind], view, self.max_pixels)
         known["levels_from_clean"] = published is None
-        return developed_pair(self.names[index], clean, cfa, gains, matrix, **known)
+        return develop_pair(self.names[index], clean, cfa, gains, matrix, **known)
 
 
 def mosaic_of(file: Path) -> Tensor:
@@ -139,7 +139,7 @@ def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
     return levels
 
 
-def indexed(path: Path) -> dict[tuple[str, str], dict[str, Path]]:
+def index_files(path: Path) -> dict[tuple[str, str], dict[str, Path]]:
     """Files below ``path`` by (scene instance, number), and by kind: GT_RAW, NOISY_RAW, METADATA_RAW, GT_SRGB,
     NOISY_SRGB."""
     if not path.is_dir():
@@ -183,7 +183,7 @@ LEAST_LIKENESS = 0.8
 """Correlation of the greens below which pictures do not show the blocks of the mosaics."""
 
 
-def turned_like(pictures: Tensor, mosaics: Tensor, cfa: CFA, what: str) -> Tensor:
+def turn_like(pictures: Tensor, mosaics: Tensor, cfa: CFA, what: str) -> Tensor:
     """The pictures ``(K, 3, H, W)`` of a frame's blocks, turned as their mosaics ``(K, 1, H, W)`` are."""
     square = pictures.shape[-2] == pictures.shape[-1]
     views = range(bayer.N_VIEWS if square else bayer.N_VIEWS // 2)
@@ -263,14 +263,14 @@ class _Blocks(LazyPairs):
             self._frame = number, *self._shared(number)
         _, images, shared = self._frame
         known: dict[str, Any] = {key: image[block] for key, image in images.items()} | shared
-        return developed_pair(self.names[index], **known)
+        return develop_pair(self.names[index], **known)
 
     def _shared(self, number: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """The images of a frame's blocks, turned alike, and what else of a :class:`Pair` they share."""
         images, known = {key: every[number] for key, every in self._all().items()}, self._known(number)
         for key in {"srgb", "noisy_srgb"} & images.keys():
-            images[key] = turned_like(images[key], images["raw"], known.cfa, f"{self.path}: {known.name}")
-        shot_var, read_var = known.levels or captured_noise(images["raw"].numpy(), images["noisy"].numpy())
+            images[key] = turn_like(images[key], images["raw"], known.cfa, f"{self.path}: {known.name}")
+        shot_var, read_var = known.levels or measure_noise(images["raw"].numpy(), images["noisy"].numpy())
         gains, matrix, _ = known.colour or _NO_COLOUR
         return images, {
             "cfa": known.cfa,
@@ -404,7 +404,7 @@ def blocks_of_scenes(file: Path) -> Tensor:
 
 
 def _colours(path: Path) -> dict[str, Colour]:
-    files = {scene: found["METADATA_RAW"] for (scene, _), found in indexed(path).items() if "METADATA_RAW" in found}
+    files = {scene: found["METADATA_RAW"] for (scene, _), found in index_files(path).items() if "METADATA_RAW" in found}
     return {scene: colour_of(file) for scene, file in files.items() if scene in HELD_BACK}
 
 

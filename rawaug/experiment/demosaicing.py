@@ -32,7 +32,7 @@ from denoisers.mosaic import lines_before, with_planes
 from denoisers.network import PACKED
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.development import exposure_of, rendered
+from rawaug.data.development import exposure_of, render_rgb
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.errors import extra
@@ -95,7 +95,7 @@ def rgb_trial(
 def develop(image: Tensor, pair: Pair, exposure: float) -> Tensor:
     """Linear RGB ``(1, 3, H, W)``, or packed RAW at its own size, to sRGB ``(3, H, W)`` in the frame's colours."""
     rgb = image[0, [0, 1, 3]] if image.shape[1] == PACKED else image[0]
-    return rendered(rgb, pair.white_balance, pair.color_matrix, exposure, least=None)
+    return render_rgb(rgb, pair.white_balance, pair.color_matrix, exposure, least=None)
 
 
 def mosaic_of(image: Tensor, cfa: str) -> Tensor:

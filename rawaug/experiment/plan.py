@@ -26,7 +26,7 @@ from rawaug.data.pairs import (
     PairPictures,
     SomePairs,
     names_of,
-    selected,
+    select_pairs,
     shared_frame,
 )
 from rawaug.data.picture_pairs import PicturePairs, is_picture_pairs, open_picture_pairs
@@ -146,7 +146,7 @@ def plan_data(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
     for part, frames in {"pairs": pairs, "validation": [] if held_out else validation}.items():
         if (seen := shared_frame(test, frames)) is not None:
             raise ValueError(f"data.test: {seen} is also in data.{part}; test on unseen frames")
-    chosen = SomePairs(pairs, selected(pairs, kept, data.count, data.select))
+    chosen = SomePairs(pairs, select_pairs(pairs, kept, data.count, data.select))
     pictures: Any = PairPictures(chosen) if data.pictures == OWN_PICTURES else None
     if pictures is None:
         pictures = open_pictures(data.pictures, recipe.train.crop + 6, data.max_pixels)

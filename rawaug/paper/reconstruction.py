@@ -22,7 +22,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.folders import Readable, skip_broken
-from rawaug.data.pairs import Pair, SomePairs, names_of, selected, shared_frame
+from rawaug.data.pairs import Pair, SomePairs, names_of, select_pairs, shared_frame
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.plan import claim, require_free, run_folder
@@ -265,7 +265,7 @@ class ComparisonRun:
 
 def _fitted_frames(settings: Comparison, found: Sequence[Pair]) -> list[Pair]:
     """The chosen frames, all of one pattern, and registered where a method needs that."""
-    chosen = SomePairs(found, selected(found, len(found), settings.count, settings.select))
+    chosen = SomePairs(found, select_pairs(found, len(found), settings.count, settings.select))
     names = names_of(chosen)
     if twice := [name for name in names if names.count(name) > 1]:
         raise ValueError(f"data: several frames are named {twice[0]}; rename the files")

@@ -17,9 +17,9 @@ from rawaug.data.pairs import (
     LazyPairs,
     Pair,
     PairPictures,
-    captured_noise,
+    measure_noise,
     one_a_phone,
-    selected,
+    select_pairs,
     shared_frame,
     stamps,
     whole_scenes,
@@ -92,9 +92,9 @@ class Shots(LazyPairs):
 
 def test_the_first_ones_are_of_one_phone_and_others_are_not() -> None:
     shots = Shots()
-    first = selected(shots, 18, 3)
+    first = select_pairs(shots, 18, 3)
     assert first == [0, 1, 2] and {LABELS[k].phone for k in first} == {"GP"}
-    one_each = selected(shots, 18, 3, "phones")
+    one_each = select_pairs(shots, 18, 3, "phones")
     assert not shots.seen, "none is read"
     assert sorted(LABELS[k].phone for k in one_each) == sorted(PHONES)
     assert {LABELS[k].iso for k in one_each} == {400}, "not base ISO"
@@ -113,26 +113,26 @@ def test_phones_take_turns_and_spread_in_iso() -> None:
 def test_scenes_are_whole() -> None:
     assert whole_scenes(LABELS, 9) == list(range(9)) and whole_scenes(LABELS, 18) == list(range(18))
     with pytest.raises(ValueError, match=r"data\.count: 5 pairs are not whole scenes; use 9 or 18"):
-        selected(Shots(), 18, 5, "scenes")
+        select_pairs(Shots(), 18, 5, "scenes")
 
 
 def test_names_are_of_frames_or_of_their_folders_and_what_is_held_out_is_not_chosen() -> None:
-    assert selected(Shots(), 18, None, ["0004_001_IP_010", "0017_002_S6"]) == [4, 17]
+    assert select_pairs(Shots(), 18, None, ["0004_001_IP_010", "0017_002_S6"]) == [4, 17]
     with pytest.raises(ValueError, match=r"data\.select: 0099 is none of the 18 frames, such as 0000_001_GP_010"):
-        selected(Shots(), 18, None, ["0099"])
-    assert selected(Shots(), 4, None) == [0, 1, 2, 3]
-    assert max(selected(Shots(), 9, 3, "phones")) < 9 and selected(Shots(), 9, 9, "scenes") == list(range(9))
+        select_pairs(Shots(), 18, None, ["0099"])
+    assert select_pairs(Shots(), 4, None) == [0, 1, 2, 3]
+    assert max(select_pairs(Shots(), 9, 3, "phones")) < 9 and select_pairs(Shots(), 9, 9, "scenes") == list(range(9))
     with pytest.raises(ValueError, match="0017_002_S6 is none of the 9 frames"):
-        selected(Shots(), 9, None, ["0017_002_S6"])
+        select_pairs(Shots(), 9, None, ["0017_002_S6"])
 
 
 def test_what_has_no_labels_is_refused() -> None:
     pairs = list(Shots())
-    assert selected(pairs, 18, 2) == [0, 1]
+    assert select_pairs(pairs, 18, 2) == [0, 1]
     with pytest.raises(ValueError, match="phones needs frames with labels"):
-        selected(pairs, 18, 2, "phones")
+        select_pairs(pairs, 18, 2, "phones")
     with pytest.raises(ValueError, match="'best' is unknown; use first, scenes, phones or a list of names"):
-        selected(pairs, 18, 2, "best")
+        select_pairs(pairs, 18, 2, "best")
 
 
 COLOURS = torch.tensor([0.2, 0.5, 0.8]).reshape(3, 1, 1)
@@ -191,7 +191,7 @@ def test_noise_falls_by_the_number_of_sites() -> None:
     pair = Pair("a", srgb, raw.contiguous(), CFA.RGGB, noisy=noisy, shot_var=4e-3, read_var=1e-4).binned(4)
     left = bin_mosaic_variance(4)
     assert pair.noisy is not None and (pair.shot_var, pair.read_var) == pytest.approx((4e-3 * left, 1e-4 * left))
-    measured = captured_noise(pair.raw.numpy(), pair.noisy.numpy())
+    measured = measure_noise(pair.raw.numpy(), pair.noisy.numpy())
     assert measured[0] * 0.5 + measured[1] == pytest.approx((4e-3 * 0.5 + 1e-4) * left, rel=0.05)
 
 
@@ -217,14 +217,14 @@ def test_both_levels_are_found(shot_var: float, read_var: float, clipped: bool) 
     rng = np.random.default_rng(0)
     clean = rng.random((400, 500)) ** 2
     noisy = clean + rng.normal(size=clean.shape) * np.sqrt(shot_var * clean + read_var)
-    found = captured_noise(clean, noisy.clip(0, 1) if clipped else noisy)
+    found = measure_noise(clean, noisy.clip(0, 1) if clipped else noisy)
     for y in (0.05, 0.3, 0.8):
         assert found[0] * y + found[1] == pytest.approx(shot_var * y + read_var, rel=0.15 if clipped else 0.05)
 
 
 def test_levels_are_positive_whatever_is_given() -> None:
     flat = np.full((8, 8), 0.5)
-    assert min(captured_noise(flat, flat)) > 0 and min(captured_noise(flat, flat + 0.1)) > 0
+    assert min(measure_noise(flat, flat)) > 0 and min(measure_noise(flat, flat + 0.1)) > 0
     rng = np.random.default_rng(0)
     falling = rng.random((300, 300))
-    assert min(captured_noise(falling, falling + rng.normal(size=falling.shape) * (1.1 - falling))) > 0
+    assert min(measure_noise(falling, falling + rng.normal(size=falling.shape) * (1.1 - falling))) > 0
