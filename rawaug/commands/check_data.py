@@ -13,7 +13,7 @@ def run(path: str, /, *, first: int | None = None, settings: Annotated[PairSetti
     """Identify a dataset, count its files and list damaged ones.
 
     Args:
-        path: a folder, a RAW file, a submission to SIDD, or kind:PATH, such as pairs:PATH or real:test.
+        path: a folder, a RAW file, or kind:PATH, such as pairs:PATH or real:test.
         first: read at most this many items of each kind.
         settings: of pairs:PATH.
     """

@@ -24,7 +24,7 @@ from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import Lazy, Pair
 from rawaug.data.published import RAWIR_FOLDERS, Rawir, Zurich
 from rawaug.data.sidd import SiddBlocks, SiddFrames, SiddPlusBlocks, is_scene
-from rawaug.data.submissions import Dnd, SiddBenchmark, check_submission
+from rawaug.data.submissions import Dnd, SiddBenchmark
 from rawaug.errors import escape
 from rawaug.files import files_below, files_in
 from rawaug.io import RawFrame, read_raw
@@ -79,7 +79,7 @@ class DataReport:
 
 
 def check(path: str | Path, first: int | None = None, **settings: Any) -> DataReport:
-    """Identify the data in a folder, a RAW file or a SIDD submission, or take that of ``kind:PATH``, and read it.
+    """Identify the data in a folder, or a RAW file, or take that of ``kind:PATH``, and read it.
 
     At most ``first`` items of each kind are read; ``settings`` are those of :class:`PairFolder`, for ``pairs:PATH``.
     """
@@ -96,8 +96,6 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
-    if path.is_file() and path.suffix == ".csv":
-        return DataReport(path, [_part("SIDD submission", partial(_submission, path), first)])
     known = list(_datasets(path)) or list(_files(path))
     if not known:
         raise ValueError(f"{path}: contains no known dataset, RAW file or picture; see docs/datasets.md")
@@ -160,10 +158,6 @@ class _RawFrames(Lazy[RawFrame]):
 
     def read(self, index: int) -> RawFrame:
         return read_raw(self.files[index])
-
-
-def _submission(path: Path) -> list[Tensor]:
-    return list(check_submission(path))
 
 
 def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartReport:

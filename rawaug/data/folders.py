@@ -138,10 +138,16 @@ def reports(pictures: Any) -> list[str]:
 
 
 class Cached(Dataset[T]):
-    """A dataset that keeps up to ``megabytes`` of its pictures, or of what holds some, in each worker its own."""
+    """A dataset that keeps up to ``megabytes`` of its pictures, or of what holds some, in each worker its own.
 
-    def __init__(self, pictures: Sequence[T] | Any, megabytes: int) -> None:
-        self.pictures, self._left = pictures, megabytes * 2**20
+    Args:
+        pictures: what is kept, or what each item is made of.
+        megabytes: the most that is kept; the rest is read and made again whenever it is asked for.
+        make: makes an item of one of the ``pictures``; by default it is one of them.
+    """
+
+    def __init__(self, pictures: Any, megabytes: int, make: Callable[[Any], T] | None = None) -> None:
+        self.pictures, self.make, self._left = pictures, make, megabytes * 2**20
         self._kept: dict[int, T] = {}
 
     def __len__(self) -> int:
@@ -149,7 +155,8 @@ class Cached(Dataset[T]):
 
     def __getitem__(self, index: int) -> T:
         if index not in self._kept:
-            item: T = self.pictures[index]
+            found = self.pictures[index]
+            item: T = found if self.make is None else self.make(found)
             parts = [item] if isinstance(item, Tensor) else vars(item).values()
             size = sum(part.nbytes for part in parts if isinstance(part, Tensor))
             if size > self._left:

@@ -143,20 +143,9 @@ def raw_trial(
     return Trial(noisy, clean, variance, pair.name, levels=levels, cfa=cfa, develop=develop, own=own, **about)
 
 
-class _Made(Sequence[Trial]):
-    def __init__(self, cases: Sequence[Case], make: Callable[[Case], Trial]) -> None:
-        self.cases, self.make = cases, make
-
-    def __len__(self) -> int:
-        return len(self.cases)
-
-    def __getitem__(self, index: Any) -> Any:
-        return self.make(self.cases[index])
-
-
 def make_trials(cases: Sequence[Case], make: Callable[[Case], Trial]) -> Sequence[Trial]:
     """``make(case)`` of every case, made when it is asked for and kept, up to :data:`KEPT`."""
-    kept: Any = Cached(_Made(cases, make), KEPT)
+    kept: Any = Cached(cases, KEPT, make)
     return kept
 
 

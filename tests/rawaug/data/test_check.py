@@ -91,14 +91,6 @@ def test_every_dataset_is_recognised(tmp_path: Path, mat73: Writer) -> None:
     assert rawir.items == 1 and dict(rawir.counts["sizes"]) == {"8 x 12": 1} and not rawir.broken
 
 
-def test_blocks_of_a_submission_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "SubmitRaw.csv").touch()
-    module = sys.modules["rawaug.data.check"]
-    monkeypatch.setattr(module, "check_submission", lambda path: torch.zeros(6, 1, 8, 8))
-    (part,) = check(tmp_path / "SubmitRaw.csv", first=5).parts
-    assert (part.items, part.examined, dict(part.counts["sizes"])) == (6, 5, {"8 x 8": 5})
-
-
 def test_what_crashes_the_helper_is_named_and_the_rest_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_pictures(tmp_path, 4)
     module = sys.modules["rawaug.data.check"]
