@@ -92,7 +92,7 @@ def methods(batch: Tensor) -> dict[str, tuple[Callable[[], object], int]]:
     device = batch.device
     generator = torch.Generator(device).manual_seed(0)
     pixels, small = batch[:, 0].numel(), batch[:1, :, :UNBAKED_CROP, :UNBAKED_CROP]
-    isp, network, turned = DictionaryISP.from_pretrained("universal").to(device), CycleISP().rgb2raw, geometry()
+    isp, network, turned = DictionaryISP.from_pretrained("universal").to(device), CycleISP().reverse_network, geometry()
     network, ours = network.to(device), augmentations(device)
     augment, floats = ours["rawaug"], batch / 255.0
     drawn = augment.sample(batch)

@@ -146,7 +146,7 @@ class Cached(Dataset[T]):
         make: makes an item of one of the ``pictures``; by default it is one of them.
     """
 
-    def __init__(self, pictures: Any, megabytes: int, make: Callable[[Any], T] | None = None) -> None:
+    def __init__(self, pictures: Sequence[T] | Any, megabytes: int, make: Callable[[Any], T] | None = None) -> None:
         self.pictures, self.make, self._left = pictures, make, megabytes * 2**20
         self._kept: dict[int, T] = {}
 

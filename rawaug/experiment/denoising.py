@@ -279,8 +279,8 @@ class TrainingRun:
 
     def denoiser(self, arm: str, views: int = 1) -> RawDenoiser:
         """An arm's network as it is tested; one whose training diverged is scored as it is."""
-        made = {"name": arm, "cfa": self.pattern(arm), "views": views, "checked": False}
-        return RawDenoiser.of(self.models[arm], self.recipe.device, **made)
+        cfa, device = self.pattern(arm), self.recipe.device
+        return RawDenoiser.of(self.models[arm], device, name=arm, cfa=cfa, views=views, checked=False)
 
     def report(self) -> None:
         """Write ``results.json``, the table, the picture, and the page with all of it."""
