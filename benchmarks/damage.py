@@ -61,10 +61,7 @@ def make_originals(folder: Path) -> dict[str, list[Path]]:
         "raw": sorted(shared.glob("raw/canon/*.crw"))[:3],
         "dng": _make_dngs(folder, sorted(shared.glob("raw/*/*.dng"))[:1]),
         "jpeg": _make_jpegs(folder, sorted(shared.glob("raw_jpeg/*/*.jpg"))[:1]),
-        **{
-            kind: make(folder)
-            for kind, make in {**made, "npy": _make_npy, "pair": _make_pairs, "recipe": _make_recipes}.items()
-        },
+        **{kind: make(folder) for kind, make in made.items()},
     }
 
 
