@@ -92,7 +92,8 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
         raise ValueError(f"{path}: {', '.join(settings)} can only be given for {_PAIRS}PATH")
     kind, colon, _ = str(path).partition(":")
     if colon and not Path(path).exists():
-        return DataReport(Path(path), [_part(what, opened, first) for what, opened in _of_kind(kind, str(path))])
+        parts = [_part(what, opened, first) for what, opened in _of_kind(kind, str(path))]
+        return DataReport(Path(path), [part for part in parts if part.items] or parts)
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
@@ -103,7 +104,7 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
 
 
 def _of_kind(kind: str, spec: str) -> list[tuple[str, Callable[[], Any]]]:
-    """What ``kind:path`` opens everywhere else, as pairs, as pictures, or as both."""
+    """What ``kind:path`` may open everywhere else: pairs, pictures, or both."""
     openers = ((DATASETS, "pairs", open_pairs), (PICTURES, "pictures", open_pictures))
     found: list[tuple[str, Callable[[], Any]]] = [
         (f"{what} of {spec}", partial(opener, spec)) for kinds, what, opener in openers if kind in kinds

@@ -132,6 +132,8 @@ def test_kinds_of_data_are_opened_as_everywhere(monkeypatch: pytest.MonkeyPatch)
     pictures, pairs = "pictures of shapes:3", "pairs of real:test"
     report = check("shapes:3")
     assert [part.what for part in report.parts] == [pictures] and report.parts[0].items == 3 and not report.broken
+    report = check("demo:validation", first=1)
+    assert [part.what for part in report.parts] == ["pairs of demo:validation"] and not report.broken
     report = check("real:test", first=1)
     assert [part.what for part in report.parts] == [pairs] and report.parts[0].examined == 1 and not report.broken
     assert set(report.parts[0].counts) >= {"sizes", "cfas"}
