@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, demosaic
 from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
 
 _MARGIN = 6
@@ -18,7 +18,9 @@ _HALF, _QUARTER, _TWO = np.float32(0.5), np.float32(0.25), np.float32(2)
 
 
 def demosaic_directional(raw: Tensor, cfa: CFA, method: str) -> Tensor:
-    """Demosaic ``(B, 1, H, W)``, float32 on the CPU, to ``(B, 3, H, W)`` by ``adams`` or ``ahd``."""
+    """Demosaic ``(B, 1, H, W)``, float32 on the CPU, to ``(B, 3, H, W)``; only ``adams`` and ``ahd`` have loops."""
+    if method not in ("adams", "ahd"):
+        return demosaic(raw, cfa, method)
     batch, _, height, width = raw.shape
     rgb = torch.empty(batch, 3, height, width)
     for mosaic, out in zip(raw.detach().numpy()[:, 0], rgb.numpy(), strict=True):

@@ -59,6 +59,15 @@ def test_choices_of_direction_are_those_of_pytorch(cfa: bayer.CFA, method: str, 
     assert demosaic_directional(raw[..., :4, :4], cfa, method).isfinite().all()
 
 
+@pytest.mark.skipif(not runtime.has_numba(), reason="without Numba there are no loops")
+def test_a_demosaicing_that_chooses_directions_needs_no_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    from rawaug.kernels.cpu import demosaic_directional
+
+    raw = torch.rand(1, 1, 16, 16, generator=torch.Generator().manual_seed(0))
+    monkeypatch.setitem(bayer.DIRECTIONAL, "flat", lambda raw, cfa: raw.expand(-1, 3, -1, -1))
+    assert torch.equal(demosaic_directional(raw, bayer.CFA.RGGB, "flat"), raw.expand(-1, 3, -1, -1))
+
+
 class Augmented(Dataset[torch.Tensor]):
     """The same pair over and over."""
 
