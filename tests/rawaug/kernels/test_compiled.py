@@ -65,6 +65,7 @@ def test_a_demosaicing_that_chooses_directions_needs_no_loop(monkeypatch: pytest
 
     raw = torch.rand(1, 1, 16, 16, generator=torch.Generator().manual_seed(0))
     monkeypatch.setitem(bayer.DIRECTIONAL, "flat", lambda raw, cfa: raw.expand(-1, 3, -1, -1))
+    monkeypatch.setattr("rawaug.bayer.demosaicing.METHODS", (*bayer.METHODS, "flat"))
     assert torch.equal(demosaic_directional(raw, bayer.CFA.RGGB, "flat"), raw.expand(-1, 3, -1, -1))
 
 
