@@ -69,7 +69,7 @@ def measure_masked(numbers: np.ndarray, window: tuple[int, int, int, int], cfa: 
     means, variances, counts = np.moveaxis(np.array(sums), -1, 0)  # (parts, kinds) each
     levels = (means * counts).sum(0) / counts.sum(0)
     error = np.sqrt((variances * counts).sum(0) / counts.sum(0) / counts.sum(0)).max()
-    by_kind = dict(zip(np.unique(kinds).tolist(), levels.tolist(), strict=True))
+    by_kind: dict[int, float] = dict(zip(np.unique(kinds).tolist(), levels.tolist(), strict=True))
     black = by_kind[0], by_kind[1], by_kind.get(2, by_kind[1]), by_kind[3]
     return MaskedPixels(black, float(error), float(np.ptp((means - levels).mean(1))), int(counts.sum()))
 

@@ -358,7 +358,9 @@ def _cell(path: Path, raw: Any, tags: TiffTags) -> tuple[np.ndarray, str]:
         first = raw.sizes.top_margin - tags.area[0], raw.sizes.left_margin - tags.area[1]
         cell = np.roll(stated, (-first[0], -first[1]), axis=(0, 1))
     elif shape in ((2, 2), (6, 6)) and raw.raw_type != _stack():
-        cell = np.asarray(raw.raw_colors_visible[: shape[0], : shape[1]])
+        stated_rows = tags.cfa or ()
+        if stated_rows[shape[0] :] == stated_rows[: -shape[0]]:  # of 8 rows rawpy sees the first two
+            cell = np.asarray(raw.raw_colors_visible[: shape[0], : shape[1]])
     colours = raw.color_desc.decode("ascii", "replace")
     name = pattern_name(["".join(colours[k] for k in row) for row in cell]) if colours == "RGBG" else None
     if name is None or (len(cell) == 2 and set(cell.flat) != {0, 1, 2, 3}):

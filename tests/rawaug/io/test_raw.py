@@ -110,10 +110,22 @@ def test_the_upright_view_is_how_libraw_shows_it(tmp_path: Path, bayer_dng: Dng,
     assert np.array_equal(turn(srgb, frame.upright_view).permute(1, 2, 0).numpy(), shown)
 
 
+CELLS: dict[str, tuple[int, int, list[int], tuple[int, ...]]] = {
+    "6 x 6": (6, 6, [1] * 35 + [0], (0, 1, 2)),
+    "RGBE": (2, 2, [0, 1, 3, 2], (0, 1, 2, 3)),
+    "CYGM of 4 x 4": (4, 4, [3, 5, 3, 5, 4, 1, 1, 4, 3, 5, 3, 5, 1, 4, 4, 1], (1, 4, 3, 5)),
+    "RGBW of 4 x 4": (4, 4, [6, 0, 6, 1, 0, 6, 1, 6, 6, 1, 6, 2, 1, 6, 2, 6], (0, 1, 2, 6)),
+    "4 x 4 that begins as RGGB": (4, 4, [0, 1, 1, 0, 1, 2, 2, 1] * 2, (0, 1, 2)),
+    "8 x 2 that begins as RGGB": (8, 2, [0, 1, 1, 2] * 3 + [1, 0, 2, 1], (0, 1, 2)),
+}
+"""Rows, columns, colours and planes as DNG numbers them: red, green, blue, cyan, magenta, yellow, white."""
+
+
 def not_bayer(name: str) -> dict[str, object]:
-    if name == "6 x 6":
-        cell = bytes([1] * 35 + [0])
-        return {"cfa": None, "extra": [(33421, 3, 2, (6, 6), True), (33422, 1, 36, cell, True)]}
+    if name in CELLS:
+        rows, columns, cell, planes = CELLS[name]
+        layout = (33421, 3, 2, (rows, columns), True), (33422, 1, len(cell), bytes(cell), True)
+        return {"cfa": None, "extra": [*layout, (50710, 1, len(planes), bytes(planes), True)]}
     if name == "monochrome":
         return {"cfa": "GGGG"}
     return {"numbers": np.stack([NUMBERS] * 3, -1), "cfa": None}
@@ -123,6 +135,11 @@ def not_bayer(name: str) -> dict[str, object]:
     ("name", "said"),
     [
         ("6 x 6", r"but a mosaic of other colours \(RGBG, cell 6 x 6\);"),
+        ("RGBE", r"but a mosaic of other colours \(GMCY, cell 2 x 2\);"),
+        ("CYGM of 4 x 4", r"but a mosaic of other colours \(GMCY, cell 4 x 4\);"),
+        ("RGBW of 4 x 4", r"but a mosaic of other colours \(GMCY, cell 4 x 4\);"),
+        ("4 x 4 that begins as RGGB", r"but a mosaic of other colours \(RGBG, cell 4 x 4\);"),
+        ("8 x 2 that begins as RGGB", r"but a mosaic of other colours \(RGBG, cell 2 x 2\);"),
         ("monochrome", "but a monochrome picture;"),
         ("linear", r"but full colour at every pixel \(linear DNG, small RAW, Foveon\);"),
     ],
