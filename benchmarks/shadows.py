@@ -1,9 +1,10 @@
 """The picture of the front page: the shadows of a photograph, made brighter, before and after; its noise is its own.
 
-    python -m benchmarks.shadows s40_0117.crw --place 780 330 --out docs/shadows.jpg
+    python -m benchmarks.shadows s40_0117.crw --place 600 1400 --stops 2 --out docs/shadows.jpg
 
-From the left: the frame as shot, with a square; the square at 100 %, ``--stops`` brighter; the same denoised with the
-levels that ``rawaug denoise`` reads. All are developed alike, and nothing but the denoiser removes noise.
+Left, a square of the frame at 100 %, ``--stops`` brighter than it was shot; right, the same denoised with the levels
+that ``rawaug denoise`` reads. Both are developed alike, and nothing but the denoiser removes noise. Together they are
+as wide as a column of text, so that a page shows them pixel by pixel.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from benchmarks.measure import parser
 from rawaug import bayer
@@ -22,7 +22,7 @@ from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.denoise.levels import find_levels
 from rawaug.io import RawFrame, read_raw, write_picture
 
-SIDE, MARGIN, GAP = 384, 128, 6
+SIDE, MARGIN, GAP = 364, 130, 8
 
 
 def picture(frame: RawFrame, mosaic: Tensor, stops: float) -> Tensor:
@@ -30,22 +30,11 @@ def picture(frame: RawFrame, mosaic: Tensor, stops: float) -> Tensor:
     return render_raw(mosaic, frame.cfa, frame.white_balance, frame.color_matrix, "ahd", 2.0**stops, None)
 
 
-def framed(frame: RawFrame, top: int, left: int) -> Tensor:
-    """The whole frame as shot, ``SIDE`` high, with the square drawn in."""
-    whole = picture(frame, frame.mosaic, 0.0)
-    outer = 8
-    edge = torch.zeros_like(whole[:1], dtype=torch.bool)
-    edge[:, top - outer : top + SIDE + outer, left - outer : left + SIDE + outer] = True
-    edge[:, top : top + SIDE, left : left + SIDE] = False
-    whole = torch.where(edge, 1.0, whole)
-    return interpolate(whole[None], scale_factor=SIDE / whole.shape[-2], mode="bilinear", antialias=True)[0]
-
-
 def main(command: Sequence[str] | None = None) -> None:
     cli = parser(__doc__)
     cli.add_argument("frame", type=Path)
     cli.add_argument("--place", type=int, nargs=2, required=True, metavar=("TOP", "LEFT"))
-    cli.add_argument("--stops", type=float, default=3.0)
+    cli.add_argument("--stops", type=float, default=2.0)
     cli.add_argument("--denoiser", default="rawaug-base")
     cli.add_argument("--out", type=Path, required=True)
     args = cli.parse_args(command)
@@ -59,7 +48,7 @@ def main(command: Sequence[str] | None = None) -> None:
     pieces = [picture(frame, bayer.unpack(x, frame.cfa)[0], args.stops) for x in (noisy, clean)]
     inner = [piece[:, MARGIN:-MARGIN, MARGIN:-MARGIN] for piece in pieces]
     gap = torch.ones(3, SIDE, GAP)
-    shown = torch.cat([framed(frame, top, left), gap, inner[0], gap, inner[1]], dim=2)
+    shown = torch.cat([inner[0], gap, inner[1]], dim=2)
     write_picture(args.out, (shown.clamp(0, 1) * 255).round().to(torch.uint8))
 
 

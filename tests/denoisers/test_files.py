@@ -128,8 +128,8 @@ def test_weights_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
         save(UNet(width=4), tmp_path / "b.safetensors", {"noise": [float("inf"), 0.0]})
 
 
-FIELDS = ["Licence", "Architecture", "Training data", "Command", "Commit", "Seed", "SHA-256", "Noise", "Measured"]
-FIELDS += ["Not good for"]
+FIELDS = ["For", "Licence", "Architecture", "Training data", "Command", "Commit", "Seed", "SHA-256", "Noise"]
+FIELDS += ["Chosen on", "Real noise", "Not good for"]
 """Rows of the card, as the template in docs/model_card.md has them."""
 
 ROOT = Path(__file__).parents[2]
