@@ -6,14 +6,13 @@ Every command runs in a forked child on small generated files. First it runs to 
 times at moments drawn uniformly over that time, by SIGKILL, SIGTERM and SIGINT in turn, and after each kill the same
 command is run again to its end in the same folder. Its files must then equal those of the run that was not killed, bit
 for bit (tensors of safetensors; of JSON all but times), and nothing else may be left. Other faults follow; those that
-need a small file system are skipped where it cannot be mounted, and a small /dev/shm is for commands whose workers
-send tensors through it. Exit status 1 if anything differs or ends in more than one line.
+need a small file system are skipped where it cannot be mounted. Exit status 1 if anything differs or ends in more than
+one line.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import json
 import os
 import random
@@ -23,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -46,12 +45,6 @@ COMMANDS: dict[str, list[str]] = {
     "denoise": ["denoise", "shots", OUT, "--denoiser", "denoiser.safetensors"],
 }  # fmt: skip
 """In a folder that :func:`make_inputs` has filled."""
-
-WITH_WORKERS = {"run": ["--train.workers", "2"]}
-"""What makes a command send tensors through shared memory."""
-
-SHARED_KILOBYTES = (4, 64)
-"""Too little for the process itself, and for what its workers send."""
 
 RECIPE = """
 name: small
@@ -96,12 +89,12 @@ def make_inputs(folder: Path) -> None:
 class Child:
     """A forked process that runs a command in ``folder``; what it prints goes to ``folder/log.txt``."""
 
-    def __init__(self, folder: Path, command: list[str], before: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, folder: Path, command: list[str]) -> None:
         self.log, self.start = folder / "log.txt", time.monotonic()
         sys.stdout.flush()
         self.pid = os.fork()
         if self.pid == 0:
-            os._exit(_run(folder, self.log, command, before))
+            os._exit(_run(folder, self.log, command))
 
     def send(self, number: signal.Signals) -> None:
         """Send a signal, if the child is still there."""
@@ -124,7 +117,7 @@ class Child:
         return self.log.read_text(errors="replace")[-2000:]
 
 
-def _run(folder: Path, log: Path, command: list[str], before: Callable[[], None]) -> int:
+def _run(folder: Path, log: Path, command: list[str]) -> int:
     file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     for stream in (1, 2):
         os.dup2(file, stream)
@@ -136,7 +129,6 @@ def _run(folder: Path, log: Path, command: list[str], before: Callable[[], None]
         torch.set_num_threads(1)
         os.environ["RAWAUG_READ_SECONDS"] = "0"  # decoders in the child itself
         os.chdir(folder)
-        before()
         from rawaug.cli import main
 
         return main(command)
@@ -223,27 +215,13 @@ class Skipped(Exception):
 def small_file_system(place: Path, kilobytes: int) -> Iterator[None]:
     """Mount a tmpfs of this size over a folder; Skipped where that is not allowed."""
     place.mkdir(exist_ok=True)
-    mount(place, kilobytes)
+    command = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(place)]
+    if shutil.which("mount") is None or subprocess.run(command, capture_output=True).returncode:
+        raise Skipped("needs the right to mount file systems")
     try:
         yield
     finally:
         subprocess.run(["umount", "--lazy", str(place)], check=True)
-
-
-def mount(place: Path, kilobytes: int) -> None:
-    """Likewise, for as long as nobody unmounts it."""
-    command = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(place)]
-    if shutil.which("mount") is None or subprocess.run(command, capture_output=True).returncode:
-        raise Skipped("needs the right to mount file systems")
-
-
-def small_shared_memory(kilobytes: int) -> None:
-    """A /dev/shm of this size for this process alone and those that come from it; Skipped likewise."""
-    new_mount_namespace = 0x00020000
-    if ctypes.CDLL(None, use_errno=True).unshare(new_mount_namespace):
-        raise Skipped(f"needs a mount namespace ({os.strerror(ctypes.get_errno())})")
-    subprocess.run(["mount", "--make-rprivate", "/"], check=True, capture_output=True)
-    mount(Path("/dev/shm"), kilobytes)
 
 
 # -- other faults ------------------------------------------------------------------------------------------------------
@@ -322,30 +300,9 @@ def unwritable_folder(folder: Path, name: str, whole: Files) -> str | None:
         return one_line(Child(folder, COMMANDS[name]), OUT, "Read-only file system")
 
 
-def little_shared_memory(folder: Path, name: str, whole: Files) -> str | None:
-    """Workers whose /dev/shm is full: one line; and the same command goes on to the same files where it is not."""
-    if name not in WITH_WORKERS:
-        raise Skipped("sends no tensors between processes")
-    command = [*COMMANDS[name], *WITH_WORKERS[name]]
-    alone = Child(fresh(folder), command)
-    if status := alone.wait():
-        return f"with workers: status {status}: {alone.said()}"
-    expected = contents(folder / OUT)
-    for kilobytes in SHARED_KILOBYTES:
-        short = Child(fresh(folder), command, lambda size=kilobytes: small_shared_memory(size))  # type: ignore[misc]
-        if wrong := one_line(short, "shared memory is full"):
-            if "Skipped: " in wrong:
-                raise Skipped(wrong.rpartition("Skipped: ")[2].strip())
-            return f"{kilobytes} KiB: {wrong}"
-        again = Child(folder, command)
-        if (status := again.wait()) or contents(folder / OUT) != expected:
-            return f"{kilobytes} KiB, then run again: status {status}: {again.said()}"
-    return None
-
-
 FAULTS = {
     "full disk": full_disk, "two at once": two_at_once, "strange files": strange_files,
-    "folder removed": removed_folder, "folder read-only": unwritable_folder, "small /dev/shm": little_shared_memory,
+    "folder removed": removed_folder, "folder read-only": unwritable_folder,
 }  # fmt: skip
 
 
