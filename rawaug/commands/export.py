@@ -10,7 +10,6 @@ h/2, w/2)``. An ONNX file is run by ONNX Runtime and compared with PyTorch befor
 from __future__ import annotations
 
 import json
-import timeit
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -159,7 +158,6 @@ def run(
     out: str,
     /,
     *,
-    time: bool = False,
     white_balance: Annotated[tuple[float, float, float] | None, YAML] = None,
 ) -> None:
     """Write a denoiser as ONNX, or an ISP as JSON, .cube and ONNX.
@@ -167,7 +165,6 @@ def run(
     Args:
         weights: a .safetensors file written by rawaug run or rawaug fit, or the name of a shipped denoiser or ISP.
         out: the .onnx file of a denoiser; of an ISP .json, .cube, .onnx, or a folder for all three.
-        time: also time a denoiser and its ONNX.
         white_balance: as-shot multipliers R, G, B for which an ISP is exported; by default those typical of the fit.
     """
     if read_header(find_weights(weights, FOLDER))["kind"] == "isp":
@@ -176,11 +173,11 @@ def run(
         return
     if white_balance is not None:
         raise ValueError(f"--white-balance: is for ISPs, and {weights} is a denoiser")
-    print(export(weights, out, time))
+    print(export(weights, out))
 
 
-def export(denoiser: str | Path, out: str | Path, time: bool = False) -> str:
-    """Write a denoiser as ONNX; the text tells its size, its difference from PyTorch and, with ``time``, its time."""
+def export(denoiser: str | Path, out: str | Path) -> str:
+    """Write a denoiser as ONNX; the text tells the size of its file and its difference from PyTorch."""
     out = Path(out)
     if out.suffix != ".onnx":
         raise ValueError(f"{out}: give a name that ends in .onnx")
@@ -196,16 +193,8 @@ def export(denoiser: str | Path, out: str | Path, time: bool = False) -> str:
         steps.update()
         difference = difference_from(model(*inputs.values()), session, inputs, out)
         steps.update()
-    size = f"{out}: {out.stat().st_size / 1e6:.1f} MB, of any batch, height and width"
-    line = f"{size}; largest difference from PyTorch {difference:.1e}"
-    if not time:
-        return line
-    values, megapixels = feeds(names, list(inputs.values())), inputs["noisy"].numel() / 1e6
-    with torch.inference_mode():
-        both = (lambda: session.run(None, values)), (lambda: model(*inputs.values()))
-        onnx, own = (min(timeit.repeat(call, number=1, repeat=3)) / megapixels for call in both)
-    threads = torch.get_num_threads()
-    return f"{line}\nnow, on {threads} threads: ONNX Runtime {onnx:.2f} s a megapixel, PyTorch {own:.2f} s"
+    size = f"{out.stat().st_size / 1e6:.1f} MB, of any batch, height and width"
+    return f"{out}: {size}; largest difference from PyTorch {difference:.1e}"
 
 
 def _comparison_frame() -> tuple[Tensor, Tensor]:
