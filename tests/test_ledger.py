@@ -1,4 +1,4 @@
-"""Every decibel of the README and of the model cards stands in the ledger, docs/results.md."""
+"""Every figure of the README and of the model cards stands in the ledger, docs/results.md."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LEDGER = (ROOT / "docs" / "results.md").read_text()
 CARDS = sorted([*(ROOT / "denoisers" / "weights").glob("*.md"), *(ROOT / "rawaug" / "weights").glob("*.md")])
-DECIMALS = re.compile(r"(?<![\w.])\d+\.\d\d(?![\w.])(?!e-)")
-"""Figures are given to two decimals; an exponent makes it a noise level, which is a setting."""
+DECIMALS = re.compile(r"(?<![\w.-])\d+\.\d+(?![\w.])(?!e-)")
+"""Figures have decimals. An exponent makes one a noise level, which is a setting, and a hyphen the version of a licence."""
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", *CARDS], ids=lambda page: page.stem)
