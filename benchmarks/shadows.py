@@ -1,6 +1,6 @@
 """The picture of the front page: the shadows of a photograph, made brighter, before and after; its noise is its own.
 
-    python -m benchmarks.shadows s40_0117.crw --place 600 1400 --stops 2 --out docs/shadows.jpg
+    python -m benchmarks.shadows s40_0117.crw --place 604 1404 --out docs/shadows.jpg
 
 Left, a square of the frame at 100 %, ``--stops`` brighter than it was shot; right, the same denoised with the levels
 that ``rawaug denoise`` reads. Both are developed alike, and nothing but the denoiser removes noise. Together they are
@@ -22,7 +22,7 @@ from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.denoise.levels import find_levels
 from rawaug.io import RawFrame, read_raw, write_picture
 
-SIDE, MARGIN, GAP = 364, 130, 8
+SIDE, MARGIN, GAP = 356, 134, 8
 
 
 def picture(frame: RawFrame, mosaic: Tensor, stops: float) -> Tensor:

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 LEDGER = (ROOT / "docs" / "results.md").read_text()
 CARDS = sorted([*(ROOT / "denoisers" / "weights").glob("*.md"), *(ROOT / "rawaug" / "weights").glob("*.md")])
 DECIMALS = re.compile(r"(?<![\w.-])\d+\.\d+(?![\w.])(?!e-)")
-"""Figures have decimals. An exponent makes one a noise level, which is a setting, and a hyphen the version of a licence."""
+"""Figures have decimals; an exponent makes one a noise level, a hyphen before it the version of a licence."""
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", *CARDS], ids=lambda page: page.stem)
