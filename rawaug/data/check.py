@@ -65,7 +65,7 @@ class PartReport:
 
 @dataclass
 class DataReport:
-    """What :func:`check` found; ``str()`` is the text that ``rawaug data check`` prints."""
+    """The report of :func:`check`; ``str()`` is the text that ``rawaug data check`` prints."""
 
     path: Path
     parts: list[PartReport]
@@ -187,7 +187,7 @@ def _opened(opening: bytes) -> Any:
 
 
 def _facts(opening: bytes, index: int) -> dict[str, str]:
-    """What is counted of an item: a picture, pair, RAW frame or noisy block."""
+    """Size, pattern, levels, camera and ISO of an item, which is a picture, pair, RAW frame or noisy block."""
     items = _opened(opening)
     item = getattr(items, "read", items.__getitem__)(index)
     image: Tensor = item.raw if isinstance(item, Pair) else getattr(item, "mosaic", item)

@@ -55,7 +55,7 @@ _SHOULDER, _CONTRAST = 1.2, 0.4
 
 
 class Shot(NamedTuple):
-    """What changes from shot to shot: gains of R, G, B; exposure; ISO, a key of NOISE_LEVELS; the noise's seed."""
+    """The settings of one shot: gains of R, G, B; exposure; ISO, a key of NOISE_LEVELS; the noise's seed."""
 
     white_balance: tuple[float, float, float]
     exposure: float

@@ -35,7 +35,7 @@ _OVERSAMPLING = 2
 _FLAT_SHARE = 0.25
 _BATCH = 4096
 _LEAST_RADIUS = 4.0
-"""Of a leaf, in pixels of the picture."""
+"""The smallest radius of a leaf, in pixels of the picture."""
 
 
 def dead_leaves(height: int, width: int, sources: Sequence[Tensor], generator: torch.Generator) -> Tensor:

@@ -106,7 +106,7 @@ class PictureFolder(Dataset[Tensor]):
         return {self.file(index): self._reasons[index] for index in bad}
 
     def report(self) -> str:
-        """What was skipped so far, one line a file."""
+        """Name the files that were skipped so far, with the reasons, a line each."""
         skipped = self.skipped
         if not skipped:
             return f"{escape(self.path)}: none of {len(self)} pictures skipped so far"

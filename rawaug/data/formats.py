@@ -182,7 +182,7 @@ def _refers(node: Any) -> bool:
 
 
 Metadata = dict[str, Any]
-"""What is known of a mosaic besides its numbers: values of :data:`KINDS`."""
+"""The metadata of a mosaic, by the keys of :data:`KINDS`."""
 
 
 def parse_metadata(values: Mapping[str, Any], where: str | Path) -> Metadata:
@@ -198,7 +198,7 @@ def parse_metadata(values: Mapping[str, Any], where: str | Path) -> Metadata:
 
 
 def complete_metadata(stated: Metadata, given: Metadata, file: Path) -> Metadata:
-    """What a file states and what is ``given`` besides; ValueError where they contradict each other."""
+    """Add what is ``given`` to what a file states; ValueError where they contradict each other."""
     for key, value in given.items():
         own = stated.get(key, value)
         if own != value:
@@ -256,7 +256,7 @@ KINDS: dict[str, Callable[[Any], Any]] = {
     "shot_var": _variance,
     "read_var": _variance,
 }
-"""What may be stated, and how each is read."""
+"""The keys that a file may state, each with the function that reads its value."""
 
 
 def _shown(value: Any) -> str:

@@ -100,7 +100,7 @@ class Pair:
 
     @classmethod
     def of_frame(cls, name: str, frame: RawFrame, srgb: Tensor, **known: Any) -> Pair:
-        """What a RAW file states and its picture, with further attributes that are ``known``.
+        """Make the pair of a RAW file and its picture, with further attributes that are ``known``.
 
         A mosaic of another pattern than Bayer's becomes one of RGGB at half its sides.
         """
@@ -169,7 +169,7 @@ class Pair:
         return self._changed(binned, **levels)
 
     def _changed(self, change: Callable[[Tensor], Tensor], **known: Any) -> Pair:
-        """With every image changed, and attributes that are ``known`` besides."""
+        """Copy the pair with every image changed, and attributes that are ``known`` besides."""
         for key in ("srgb", "raw", "noisy", "noisy_srgb"):
             if (image := getattr(self, key)) is not None:
                 known[key] = change(image)
@@ -199,7 +199,7 @@ def _bin_picture(srgb: Tensor, factor: int) -> Tensor:
 
 
 class Sample(NamedTuple):
-    """What a denoiser is trained on, packed ``(4, h, w)`` or ``(B, 4, h, w)``."""
+    """A training sample of a denoiser, packed ``(4, h, w)``, or a batch of them, ``(B, 4, h, w)``."""
 
     noisy: Tensor
     clean: Tensor
@@ -256,7 +256,7 @@ class LazyPairs(Lazy[Pair]):
         return ()
 
     def stamp(self, index: int) -> str:
-        """What a pair depends on: path, size and modification time of its files, or its name."""
+        """Identify the content of a pair by the path, size and modification time of its files, or by its name."""
         files = [f"{os.path.realpath(f)} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in self.files_of(index)]
         return " ".join(files) or self.names[index]
 

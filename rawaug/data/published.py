@@ -106,7 +106,7 @@ class Rawir(LazyPairs):
         super().__init__([str(file.relative_to(folder).with_suffix("")) for file in self.files])
 
     def of_split(self, files: list[Path], split: str) -> list[Path]:
-        """Those of a folder that belong to a split: here all, since splits are folders."""
+        """Choose the files of a split: here all, since every split is a folder."""
         return files
 
     def camera_of(self, file: Path) -> str:
@@ -165,7 +165,7 @@ class Rgb2Raw(Rawir):
     """The pairs of a split below a folder; a pair's camera is the name of its folder."""
 
     def of_split(self, files: list[Path], split: str) -> list[Path]:
-        """By the place of a RAW among those of its folder."""
+        """Choose the files of a split by the place of their RAW among those of the folder."""
         places: dict[Path, dict[str, int]] = {}
         for file in files:
             shots = places.setdefault(file.parent, {})
@@ -260,7 +260,7 @@ class RawBench(LazyPairs):
 
 REAL_FRAMES = Path(__file__).with_name("real_frames")
 REAL_BLACK, REAL_WHITE = 512, 16383
-"""Of the PNGs. Below black lies what is left of the noise there."""
+"""Black and white level of the PNGs; below black lies what is left of the noise."""
 
 
 @DATASETS.register("real")

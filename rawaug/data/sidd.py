@@ -50,7 +50,7 @@ _NAME = re.compile(r"\d{4}_(\d{3})_([A-Z0-9]{2})_(\d{5})_\d{5}_\d{4}_[LNH]")
 
 
 def label_of(name: str) -> FrameLabel:
-    """What the name of a scene instance, that of its folder, states."""
+    """Read scene, phone and ISO from the name of a scene instance, which is that of its folder."""
     found = _NAME.fullmatch(name)
     if found is None or found[2] not in PHONES:
         raise ValueError(f"{name}: is not a SIDD scene instance such as 0052_002_S6_01600_01000_5500_N")
@@ -58,7 +58,7 @@ def label_of(name: str) -> FrameLabel:
 
 
 def phone_of(name: str) -> tuple[str, CFA]:
-    """Of a scene instance the phone, and the pattern of its frames."""
+    """The phone of a scene instance, and the pattern of its frames."""
     return PHONES[label_of(name).phone]
 
 
@@ -207,7 +207,7 @@ BLOCKS = 32
 """Blocks of a frame."""
 
 MOST_FRAMES = 1000
-"""Of SIDD+, which has 32."""
+"""The most frames that are read of SIDD+, which has 32."""
 
 _NO_COLOUR = Colour(*UNKNOWN_COLOUR, 0)
 
@@ -231,7 +231,7 @@ class Once(Generic[T]):
 
 
 class _Known(NamedTuple):
-    """What is stated of a frame: published levels, and its colour, if there are any."""
+    """A frame of blocks: its name, phone and pattern, and its published levels and colour if there are any."""
 
     name: str
     camera: str
@@ -255,7 +255,7 @@ class _Blocks(LazyPairs):
 
     @abstractmethod
     def _known(self, number: int) -> _Known:
-        """Of a frame."""
+        """What is known of the frame with this number."""
 
     def read(self, index: int) -> Pair:
         number, block = divmod(index, BLOCKS)

@@ -85,7 +85,7 @@ def check_submission(path: str | Path, side: int = SIDE) -> Tensor:
 
 
 def _denoised(mosaic: Tensor, name: str, size: tuple[int, int] | None = None) -> np.ndarray:
-    """What is written of a denoised mosaic, float32 ``(H, W)``."""
+    """The array that is written for a denoised mosaic, float32 ``(H, W)``."""
     height, width = size or mosaic.shape[-2:]
     if tuple(mosaic.shape) != (1, height, width) or not mosaic.isfinite().all():
         raise ValueError(f"{name}: must be finite with shape (1, {height}, {width}), got {tuple(mosaic.shape)}")
@@ -151,7 +151,7 @@ class Dnd(Lazy[RawFrame]):
 
 
 class _Frame(NamedTuple):
-    """What ``info`` says of a frame; boxes run from 0, and end outside."""
+    """A frame as ``info`` describes it; boxes are counted from 0, and their ends lie outside."""
 
     boxes: list[tuple[int, int, int, int]]
     cfa: CFA

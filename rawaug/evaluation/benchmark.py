@@ -43,7 +43,7 @@ SENSOR: dict[str, Any] = {
     "bits": 12,
     "black_level": 64,
 }
-"""What sensors add to shot and read noise, at the strengths of :data:`OF_SENSORS`, or at the caller's."""
+"""The faults that sensors add to shot and read noise, at the strengths of :data:`OF_SENSORS` or at the caller's."""
 OF_SENSORS = ("phone", "strong")
 CONDITIONS = TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensors as they are"
 

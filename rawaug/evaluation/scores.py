@@ -28,7 +28,7 @@ SHOWN_FAULTS = 5
 
 
 class Denoiser(Protocol):
-    """What can be scored: :class:`rawaug.RawDenoiser`, and whatever denoises developed pictures.
+    """A denoiser that can be scored: :class:`rawaug.RawDenoiser`, and whatever denoises developed pictures.
 
     Attributes:
         name: in tables.
@@ -37,7 +37,7 @@ class Denoiser(Protocol):
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Its name in tables."""
 
     @property
     def takes(self) -> str:

@@ -29,7 +29,7 @@ from rawaug.noise import NoiseModel, own_noise
 from rawaug.seeding import keyed_generator
 
 Domain = Literal["raw", "rgb", "srgb"]
-"""What a result is compared in: packed RAW ``(1, 4, h, w)``, linear camera RGB or developed sRGB ``(1, 3, H, W)``."""
+"""The form in which results are compared: packed RAW ``(1, 4, h, w)``, linear camera RGB or sRGB ``(1, 3, H, W)``."""
 KEPT = 1024
 """Megabytes of trials that stay in memory; others are made again for each pass."""
 TEST_NOISE = "test noise"

@@ -93,7 +93,7 @@ class TrainingRun:
     """
 
     input: Any = NOISY
-    """What stands for the noisy input in tables."""
+    """The denoiser that stands for the noisy input in tables."""
     compared_in: ClassVar[str] = ""
     """Ends the table's title with what is compared, if it is not RAW."""
     isp: DictionaryISP
@@ -163,7 +163,7 @@ class TrainingRun:
             _say(faintness_note(self.frames["pairs"]) if self.recipe.self_supervised else "")
 
     def arm_folder(self, arm: str, seed: int) -> Path:
-        """Where an arm's weights, log and scores are written."""
+        """The folder of an arm's weights, log and scores."""
         return self.folder / f"seed{seed}" / arm
 
     def pattern(self, arm: str) -> CFA:
@@ -231,7 +231,7 @@ class TrainingRun:
         return validation_samples(self.recipe, self.frames["validation"], self.pictures, isp, self.noise)
 
     def weights_key(self, arm: str, seed: int) -> str:
-        """What the weights of an arm depend on, as a short hash."""
+        """Hash the settings and frames that the weights of an arm depend on."""
         recipe, data, start = self.recipe, self.data, self.starts[arm]
         real = self.isp.info["key"], recipe.noise, data.pairs, stamps(self.pairs)
         pictures = data.pictures, len(self.pictures), data.max_pixels
@@ -261,7 +261,7 @@ class TrainingRun:
         return {kind: result[kind] for kind in kinds}
 
     def scores_key(self, digest: str) -> str:
-        """What the scores of an arm depend on besides the noise and the arm's own settings, as a short hash.
+        """Hash what the scores of an arm depend on besides the noise and the arm's own settings.
 
         ``digest`` is that of its weights.
         """
@@ -383,7 +383,7 @@ def find_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
 
 
 def methods_of(recipe: Recipe) -> dict[str, str]:
-    """What each row of the table is, in a line, by its name."""
+    """Explain each row of the table in a line, by its name."""
     filters = {spec_label(spec): "a filter, nothing is trained" for spec in recipe.classical}
     unchanged = {Path(name).stem: "trained weights as they are" for name in recipe.untouched}
     return {**filters, **unchanged, **{label: _explain(recipe, label) for label in recipe.arms}}

@@ -41,7 +41,7 @@ from rawaug.training.noisy_frames import noise_of
 MOST_HELD_OUT = 16
 """Largest number of frames that are held out for validation: a fifth of them, but at least one."""
 GIVEN = "given pairs"
-"""What ``data.pairs``, ... say in results of pairs that were given from Python."""
+"""The value of ``data.pairs``, ``data.validation`` or ``data.test`` in the results of pairs given from Python."""
 _NAMED = 6
 STAMP = "run.json"
 FREE = frozenset({"name", "out", "device", "devices", "seeds", "self_ensemble", "views"})
@@ -179,7 +179,7 @@ def _open(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, clean
 
 
 def listing(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
-    """What is used of a dataset, such as ``"2 of 8 of demo:train: a, b"``.
+    """Tell which frames of a dataset are used, as in ``"2 of 8 of demo:train: a, b"``.
 
     Args:
         frames: what is used.

@@ -52,7 +52,7 @@ _SCALE = 8
 
 @dataclass(frozen=True)
 class Look:
-    """What the page is set to: a picture's file, the settings of its pair, and the seed, as of ``rawaug synth``."""
+    """The settings of the page: a picture's file, the settings of its pair, and the seed, as of ``rawaug synth``."""
 
     picture: str
     config: AugmentConfig = field(default_factory=AugmentConfig)

@@ -221,7 +221,7 @@ class AttentionMask(nn.Module):
 
 
 class Tables(NamedTuple):
-    """What the baked pass looks up, at the nodes of an N x N x N cube.
+    """The tables of the baked pass, at the nodes of an N x N x N cube.
 
     Args:
         cube: the colours of the nodes, ``(1, 3, N, N * N)``.
@@ -235,7 +235,7 @@ class Tables(NamedTuple):
 
 
 class BatchParams(NamedTuple):
-    """What the baked pass takes from the settings of a batch of B pictures.
+    """The numbers that the baked pass takes from the settings of a batch of B pictures.
 
     Args:
         matrix: ``(B, 3, 3)``, x2 to x3.

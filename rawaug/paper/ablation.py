@@ -53,7 +53,7 @@ TITLES = ("x", "x1 tone", "x2 gamma", "x3 colour", "x4 gains", "x5 shading")
 SPACES = ("RGB", "Y", "UV")
 LEFT_OUT = ("tone", "colour", "gains", "shading")
 STRIDE = 4
-"""Of a registered frame every fourth pixel in both directions is compared."""
+"""Every fourth pixel of a registered frame is compared, in both directions."""
 
 
 @dataclass
@@ -308,7 +308,7 @@ def _camera_in_light(xyz_to_camera: Tensor, generator: torch.Generator) -> Calla
 
 
 def photographs(pictures: Sequence[Tensor] | PictureFolder, learned: ComponentAblation, seed: int) -> list[Tensor]:
-    """As many uint8 pictures ``(3, H, W)`` as are needed, of those that hold a frame, in a random order.
+    """Draw as many uint8 pictures ``(3, H, W)`` as are needed, in a random order, of those that are large enough.
 
     Raises:
         ValueError: if there are too few.

@@ -159,7 +159,7 @@ def _maker(model: Method, given: Any) -> Callable[[Tensor, Tensor], Tensor]:
 
 
 def settings(model: Method, pair: Pair) -> dict[str, Any]:
-    """By row the camera setting that it is made with; a method that makes no use of gains has one row."""
+    """Make the camera setting of each row; a method that makes no use of gains has one row."""
     if isinstance(model, DictionaryISP):
         return dictionary_params(model, pair)
     as_shot = model.setting_of(pair.white_balance) if pair.balance_known else None

@@ -231,7 +231,7 @@ class ComparisonRun:
         return resume(path, key, measure)
 
     def _all_frames(self, family: str) -> dict[str, Any]:
-        """What a fit to all pairs is measured by on other data than these: cycle and PSNR_d."""
+        """Measure a fit to all pairs on other data: its cycle and its PSNR_d."""
         settings = self.settings
         downstream = settings.downstream if settings.downstream and family in settings.downstream.methods else None
         training = self._training(settings.seed)
@@ -255,7 +255,7 @@ class ComparisonRun:
         return Training(self.settings.seconds, crop=self.settings.crop, batch=self.settings.batch, seed=seed)
 
     def _frames(self) -> tuple[Any, ...]:
-        """What a fit depends on besides its family, budget and seed."""
+        """The settings and frames that a fit depends on besides its family, budget and seed."""
         settings = self.settings
         return asdict(self.fit), settings.noise, settings.data, names_of(self.pairs), settings.test
 

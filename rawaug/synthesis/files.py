@@ -37,7 +37,7 @@ _SHADING_NODES = (25, 33)
 
 Format = Literal["dng", "npz", "tiff", "png", "webdataset"]
 TARGETS: dict[Format, tuple[Target, ...]] = {"dng": ("raw",), "png": ("srgb",)}
-"""What a format can hold; the others hold any target."""
+"""The targets that a format can hold; the others hold any."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, o
 
 
 def _images(pair: RawPair, augment: RawAugment) -> dict[str, Tensor]:
-    """What a pair holds, ``(C, H, W)`` each, by the end of its file's name."""
+    """The images of a pair, ``(C, H, W)`` each, by the end of their files' names."""
     noisy = {"_noisy": pair.noisy} if augment.burst is None else {f"_noisy_{k}": x for k, x in enumerate(pair.noisy)}
     return {end: x if len(x) == 3 else augment.mosaic(x) for end, x in {"_clean": pair.clean, **noisy}.items()}
 
@@ -251,7 +251,7 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
 
 
 def _metadata(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
-    """What NPZ and TIFF say of a pair; colour that cannot be inverted is left out."""
+    """The metadata of a pair in NPZ and TIFF; colour that cannot be inverted is left out."""
     if augment.target == "srgb":
         return pair_levels(pair)
     stated: dict[str, Any] = {"cfa": augment.cfa, **pair_levels(pair)}

@@ -29,7 +29,7 @@ WATCHED = 16
 
 
 class Source(Protocol):
-    """Where samples come from; one with a ``draw_batch(generators)`` makes those of a step together."""
+    """A source of samples; one with a ``draw_batch(generators)`` makes those of a step together."""
 
     def draw(self, generator: torch.Generator) -> Any:
         """A training sample, a named tuple of tensors ``(C, h, w)``, that depends on ``generator`` alone."""

@@ -71,7 +71,7 @@ class FramePair(Protocol):
 
 
 class FrameSummary(NamedTuple):
-    """What is kept of a frame besides its pixels.
+    """The facts that a fit keeps of a frame besides its pixels.
 
     Args:
         name: of the frame.

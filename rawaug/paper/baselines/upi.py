@@ -163,7 +163,7 @@ class TunedUPI(SmoothstepISP):
 
 
 class Moments(NamedTuple):
-    """What the squared errors of F frames depend on, in double precision, as means over each frame's known readings."""
+    """Second moments of F frames, in double precision, as means over each frame's known readings."""
 
     a: Tensor  # (F, 3, 3, 3): products of the inputs, by output channel
     b: Tensor  # (F, 3, 3): of input and output
