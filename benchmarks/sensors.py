@@ -23,8 +23,7 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.denoise.corrections import Corrections
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
-from rawaug.evaluation.scores import Denoiser, NoisyInput
-from rawaug.evaluation.tables import print_rows
+from rawaug.evaluation.scores import Denoiser, NoisyInput, print_rows
 from rawaug.io import RawFrame
 from rawaug.io.masked import measure_masked
 from rawaug.noise import SensorNoise

@@ -1,6 +1,6 @@
 """The page of a run: one self-contained HTML file with curves, tables and pictures.
 
-RAW is shown by the same fixed development as in :mod:`rawaug.evaluation.tables`. Each frame is shown
+RAW is shown by the same fixed development as in :mod:`rawaug.evaluation.scores`. Each frame is shown
 whole and clean, with its most detailed window at twice the size: noisy, from every arm, and clean.
 """
 
@@ -20,11 +20,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from denoisers.network import PACKED
-from rawaug.evaluation.scores import Panels
-from rawaug.evaluation.tables import (
+from rawaug.evaluation.scores import (
     ENSEMBLE,
     PLAIN,
     QUARTERS,
+    Panels,
     Runs,
     first_runs,
     join_figures,

@@ -25,8 +25,20 @@ from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, stamps
 from rawaug.denoise.denoiser import RawDenoiser, require_classical
 from rawaug.errors import extra
 from rawaug.evaluation.page import Page, plot_curves, select_for_page
-from rawaug.evaluation.scores import NOISY, Panels, Row, group_rows, panels_of, require_numbers, score, summary
-from rawaug.evaluation.tables import first_runs, print_table, save_picture, verdict
+from rawaug.evaluation.scores import (
+    NOISY,
+    Panels,
+    Row,
+    first_runs,
+    group_rows,
+    panels_of,
+    print_table,
+    require_numbers,
+    save_picture,
+    score,
+    summary,
+    verdict,
+)
 from rawaug.evaluation.trials import Trial, added_noise_note, make_trials, own_noise_note, trial_of
 from rawaug.experiment.plan import claim, name_given_pairs, plan_data, require_free, require_usable, run_folder
 from rawaug.experiment.recipe import ArmConfig, Recipe

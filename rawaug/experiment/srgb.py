@@ -31,8 +31,7 @@ from rawaug.denoise.denoiser import Levels, Noisy, RawDenoiser
 from rawaug.denoise.pictures import PictureDenoiser
 from rawaug.evaluation.page import Figure, Page, find_detail
 from rawaug.evaluation.picture_trials import picture_trials
-from rawaug.evaluation.scores import NoisyInput, Panels, Row, panels_of, score
-from rawaug.evaluation.tables import print_rows
+from rawaug.evaluation.scores import NoisyInput, Panels, Row, panels_of, print_rows, score
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.denoising import Results, TrainingRun
 from rawaug.experiment.recipe import Recipe

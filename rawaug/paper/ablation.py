@@ -29,7 +29,7 @@ from rawaug.data import DemoCamera, PictureFolder, open_pairs, open_pictures
 from rawaug.data.demo import FRAME
 from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.tables import mean_and_spread, new_figure, print_rows
+from rawaug.evaluation.scores import mean_and_spread, new_figure, print_rows
 from rawaug.experiment.plan import claim, require_free
 from rawaug.files import fingerprint, write_json
 from rawaug.isp import staged

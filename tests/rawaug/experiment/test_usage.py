@@ -13,7 +13,7 @@ import torch
 from rawaug.bayer import CFA
 from rawaug.commands.run import run
 from rawaug.data import demo_pairs
-from rawaug.evaluation.tables import verdict
+from rawaug.evaluation.scores import verdict
 from rawaug.experiment import plan
 from rawaug.experiment.denoising import TrainingRun
 from rawaug.registry import DENOISERS
