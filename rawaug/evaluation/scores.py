@@ -1,4 +1,4 @@
-"""PSNR and SSIM of denoisers on trials: flat rows, their means as the JSON that others read, tables and pictures of them.
+"""PSNR and SSIM of denoisers on trials: flat rows, their means as the JSON that others read, their tables and pictures.
 
 Scores are those of the whole mosaic, and once more of sRGB, after one fixed development of result and clean frame:
 bilinear demosaic, the frame's white balance and colour matrix, one exposure taken from the clean frame, the sRGB curve
