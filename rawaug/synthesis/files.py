@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from rawaug import __version__
 from rawaug.data.formats import write_npz, write_tiff
-from rawaug.files import find_weights, read_header, replacing, sha256, write_tensors
+from rawaug.files import digest, find_weights, read_header, replacing, sha256, write_tensors
 from rawaug.io import GainMap, RawFrame, read_picture, write_dng
 from rawaug.io.pictures import MAX_PIXELS, encode_png
 from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, frame_coordinates
@@ -30,6 +31,9 @@ from rawaug.plugin.config import AugmentConfig, pair_generator
 from rawaug.plugin.params import AugmentParams, RawPair, load_params
 from rawaug.plugin.pictures import trim_to_even
 from rawaug.plugin.targets import Target
+
+LONGEST_STEM = 200
+"""Bytes of a picture's name in those of its pairs, which have at most 255."""
 
 _WHITE = 65535
 _BLACK_STEP = 256
@@ -177,8 +181,16 @@ def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: 
             raise ValueError(
                 f"{picture}: its pairs would have the same names as those of {taken[own].name}; rename one"
             )
-        stem = out / own.relative_to(source)
+        stem = out / own.relative_to(source).with_name(_short(own.name))
         yield PictureTask(picture, picture.relative_to(source).as_posix(), stem, per_image)
+
+
+def _short(name: str) -> str:
+    """Shorten a name, and add a hash, if the pairs' file names would become too long."""
+    encoded = os.fsencode(name)
+    if len(encoded) <= LONGEST_STEM:
+        return name
+    return encoded[: LONGEST_STEM - 20].decode("utf-8", "ignore") + f"-{digest(encoded)[:16]}"
 
 
 def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, origin: Origin) -> None:
