@@ -270,7 +270,7 @@ def two_at_once(folder: Path, name: str, whole: Files) -> str | None:
 
 def strange_files(folder: Path, name: str, whole: Files) -> str | None:
     """A pipe, a link to itself and an endless device among the files: they are left out, and the rest is as before."""
-    place = next((folder / word for word in COMMANDS[name] if (folder / word).is_dir()), None)
+    place = next((folder / word for word in COMMANDS[name] if word != OUT and (folder / word).is_dir()), None)
     if place is None:
         raise Skipped("reads no folder")
     strange = [place / f"{make.__name__}{next(place.iterdir()).suffix}" for make in IRREGULAR]
