@@ -301,24 +301,6 @@ def tiff(whole: bytes, rng: np.random.Generator) -> bytes:
     return bytes(data)
 
 
-# -- CRW ---------------------------------------------------------------------------------------------------------------
-
-
-def crw(whole: bytes, rng: np.random.Generator) -> bytes:
-    """A record of the heap's directory, which is at the end of the file: its tag, length or offset."""
-    data = bytearray(whole)
-    start = struct.unpack_from("<I", data, 2)[0]
-    directory = start + struct.unpack_from("<I", data, len(data) - 4)[0]
-    (count,) = struct.unpack_from("<H", data, directory)
-    record = directory + 2 + 10 * int(rng.integers(max(count, 1)))
-    offset, size = _pick(rng, [(0, 2), (2, 4), (6, 4)])
-    near = int.from_bytes(data[record + offset : record + offset + size], "little")
-    data[record + offset : record + offset + size] = _number(rng, size, near)
-    if rng.random() < 0.2:  # a heap that holds itself
-        struct.pack_into("<HII", data, record, 0x300A, len(data) - start, 0)
-    return bytes(data)
-
-
 # -- MATLAB ------------------------------------------------------------------------------------------------------------
 
 _HDF5_BLOCKS = (b"TREE", b"HEAP", b"SNOD", b"GCOL", b"OHDR", b"\x89HDF")
@@ -528,7 +510,7 @@ def _with_texts(content: Any, text: str) -> Any:
 
 MUTATIONS: dict[str, Mutation] = {
     ".pair.tif": tiff_pair, ".npz": npz,
-    ".crw": crw, ".dng": tiff, ".tif": tiff, ".jpg": jpeg, ".png": png, ".mat5.mat": mat5, ".mat73.mat": hdf5,
+    ".dng": tiff, ".tif": tiff, ".jpg": jpeg, ".png": png, ".mat5.mat": mat5, ".mat73.mat": hdf5,
     ".safetensors": safetensors, ".yaml": recipe,
 }  # fmt: skip
 """By the end of a file's name."""
