@@ -100,9 +100,15 @@ def measure_greens(mosaic: Tensor, cfa: CFA | str) -> GreenDifference | None:
 
 
 def balance_greens(mosaic: Tensor, cfa: CFA | str, difference: GreenDifference) -> Tensor:
-    """Take the difference out of a mosaic ``(1, H, W)``: half of it from Gr, half of it into Gb, in a new mosaic.
+    """Take half of the difference from Gr and add half of it to Gb; red, blue and clipped sites stay.
 
-    Red, blue and clipped sites stay. ``difference`` is what :func:`measure_greens` found, significant or not.
+    Args:
+        mosaic: ``(1, H, W)``, as :func:`measure_greens` takes it.
+        cfa: its pattern.
+        difference: what :func:`measure_greens` found in it, significant or not.
+
+    Returns:
+        A new mosaic ``(1, H, W)``.
     """
     row, column, _ = _neighbours(mosaic)
     down, along = (_powers(torch.linspace(-1, 1, side).to(mosaic)) for side in mosaic.shape[-2:])
