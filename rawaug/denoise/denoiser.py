@@ -182,7 +182,7 @@ class RawDenoiser:
     def _of_mosaic(self, given: Noisy) -> Tensor:
         if self.of_any is None or self.views > 1 or self.tiles is None:
             what = self.name if self.of_any is None else "the self-ensemble"
-            how = "give --denoiser the weights of a network of every mosaic, as rawaug run any trains it"
+            how = "give --denoiser rawaug-xtrans, or weights of rawaug run any"
             raise ValueError(
                 f"{what}: is for Bayer mosaics, not {given.cfa}; {how if self.of_any is None else 'omit it'}"
             )
