@@ -191,7 +191,8 @@ def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, An
     def select(tab: str, *values: Any) -> list[Any]:
         return [tab, *redraw(tab, *values)]
 
-    quiet = {"show_progress": "hidden", "api_visibility": "private"}
+    # one after the other: the late answer to a tab's opening must not replace that to a newer setting
+    quiet = {"show_progress": "hidden", "api_visibility": "private", "concurrency_id": "draw"}
     inputs, results = list(controls.values()), list(outputs.values())
     moved = [page.load, *(control.change for control in inputs)]
     gr.on(moved, redraw, [opened, *inputs], results, trigger_mode="always_last", **quiet)
