@@ -104,8 +104,8 @@ class ArmConfig:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
         draw: how the camera settings of pictures are drawn.
         srgb: of sRGB targets: how pictures are developed; null draws every demosaicing, without JPEG.
-        zoom: of supervised arms: half of the crops of pictures are enlarged by up to this factor, or all of them by a
-            factor between [lowest, highest], see :class:`rawaug.RawPairs`; 1 for none.
+        zoom: of supervised arms: half of the crops of pictures are enlarged by up to this factor, see
+            :class:`rawaug.RawPairs`; 1 for none.
         srgb_noise: of sRGB targets: noise drawn on the pictures themselves, in place of the camera's: Gaussian, BSRGAN,
             Coloured, or {name, settings}, see :mod:`rawaug.training.srgb_noise`.
         srgb_share: share of the samples that have ``srgb_noise``; the rest have the camera's.
@@ -121,7 +121,7 @@ class ArmConfig:
     augmented: float = 0.0
     draw: Draw = Draw()
     srgb: Srgb | None = None
-    zoom: float | tuple[float, float] = 1.0
+    zoom: float = 1.0
     srgb_noise: str | dict[str, Any] | None = None
     srgb_share: float = 1.0
     told: Told | None = None

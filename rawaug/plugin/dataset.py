@@ -29,9 +29,6 @@ from rawaug.plugin.params import AugmentParams, RawPair, require_keys
 from rawaug.plugin.pictures import find_picture, get_picture, replace_picture, to_rgb_tensor, trim_to_even
 from rawaug.seeding import keyed_generator
 
-Zoom = float | tuple[float, float]
-"""By how much crops are enlarged, see :class:`RawPairs`."""
-
 
 class _Pairs(Dataset[Any]):
     """What a Dataset of pairs and a stream of them share: the settings, the epochs, and how a sample becomes a pair."""
@@ -46,13 +43,10 @@ class _Pairs(Dataset[Any]):
         key: str | int | None = None,
         turns: bool = True,
         keys: Sequence[str] | None = None,
-        zoom: Zoom = 1.0,
+        zoom: float = 1.0,
     ) -> None:
-        low, high = zoom if isinstance(zoom, Sequence) else (1.0, zoom)
-        if not 1.0 <= low <= high or (high > 1.0 and crop is None):
-            raise ValueError(
-                f"zoom must be at least 1, or (lowest, highest), and 1 without a crop; got {zoom}, {crop=}"
-            )
+        if not zoom >= 1.0 or (zoom > 1.0 and crop is None):
+            raise ValueError(f"zoom must be at least 1, and 1 without a crop; got {zoom} with crop={crop}")
         self._epochs = self._make_epochs(dataset)
         self.dataset, self.augment = dataset, as_augment(augment)
         self.crop, self.seed, self.turns, self.zoom = crop_size(crop), seed, turns, zoom
@@ -125,9 +119,8 @@ class RawPairs(_Pairs):
         turns: whether to draw flips and quarter turns; what is not square is only flipped.
         keys: names for the pair's noisy, clean, variance and params, in this order, as many as are wanted: the pair is
             then a dict of these. In samples that are mappings they stand in place of the picture.
-        zoom: half of the crops are enlarged by up to this factor (bicubic), drawn log-uniformly; 1 for none. With
-            (lowest, highest) all of them are, by a factor between these. Pictures scaled down for the screen are
-            sharper, pixel by pixel, than RAW of a lens and an optical low-pass filter.
+        zoom: half of the crops are enlarged by up to this factor (bicubic), drawn log-uniformly; 1 for none. Pictures
+            scaled down for the screen are sharper, pixel by pixel, than RAW of a lens and an optical low-pass filter.
 
     Raises:
         TypeError: if ``augment`` is none of these, or ``dataset`` has no index: a :class:`RawPairStream` takes it.
@@ -227,7 +220,7 @@ class RawPairStream(_Pairs, IterableDataset[Any]):
         key: str | int | None = None,
         turns: bool = True,
         keys: Sequence[str] | None = None,
-        zoom: Zoom = 1.0,
+        zoom: float = 1.0,
         identity: str | int | None = None,
         divide: bool = False,
     ) -> None:
@@ -290,7 +283,7 @@ def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
 
 
 def draw_crop(
-    picture: Tensor, size: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: Zoom = 1.0
+    picture: Tensor, size: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
 ) -> Tensor:
     """Draw where a picture is cropped and how the crop is turned, as :class:`AugmentParams` keeps it.
 
@@ -299,18 +292,16 @@ def draw_crop(
         size: height and width of the crop; None for the whole picture.
         turns: whether flips are drawn, and, of a square, quarter turns.
         generator: on the CPU.
-        zoom: half of the crops are enlarged by up to this factor, or all by a factor between (lowest, highest).
+        zoom: half of the crops are enlarged by up to this factor.
 
     Returns:
         ``(5,)`` top, left, H, W, view; with a zoom ``(6,)``, where the last is the number of rows that are enlarged.
     """
     height, width = picture.shape[-2:]
     region = size or (height, width)
-    every = isinstance(zoom, Sequence)
-    low, high = zoom if isinstance(zoom, Sequence) else (1.0, zoom)
-    if size and high > 1.0:
+    if size and zoom > 1.0:
         share, drawn = torch.rand(2, generator=generator).tolist()
-        rows = math.ceil(size[0] / 2 / low * (high / low) ** -drawn) * 2 if every or share >= 0.5 else size[0]
+        rows = size[0] if share < 0.5 else math.ceil(size[0] / 2 * zoom**-drawn) * 2
         return torch.cat([draw_crop(picture, _region(size, rows), turns, generator), torch.tensor([rows])])
     corner = bayer.RandomCrop(region).sample(height, width, generator)
     turn = bayer.RandomTurn(bayer.CFA.RGGB, quarter=region[0] == region[1])
@@ -319,7 +310,7 @@ def draw_crop(
 
 
 def draw_patch(
-    picture: Any, size: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: Zoom = 1.0
+    picture: Any, size: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
 ) -> tuple[Tensor, Tensor]:
     """Draw a crop of a picture in any form, and cut it out.
 

@@ -25,7 +25,7 @@ from rawaug.data.pairs import Sample
 from rawaug.isp.stages import as_float
 from rawaug.noise.levels import uniform
 from rawaug.noise.models import Params, draw_normals, draw_seeds, per_picture, poisson
-from rawaug.plugin.dataset import Zoom, crop_size, draw_patch
+from rawaug.plugin.dataset import crop_size, draw_patch
 from rawaug.plugin.finishing import blur
 from rawaug.plugin.targets import compress_jpeg
 from rawaug.registry import SRGB_NOISE, require_between
@@ -179,7 +179,7 @@ def _require_limits(key: str, limits: tuple[float, float], least: int, most: int
 class NoisyPictures:
     """Training samples of a model of noise on sRGB: a crop of a picture, placed as in :class:`rawaug.RawPairs`."""
 
-    def __init__(self, pictures: Sequence[Any], noise: SrgbNoise, crop: int, zoom: Zoom = 1.0) -> None:
+    def __init__(self, pictures: Sequence[Any], noise: SrgbNoise, crop: int, zoom: float = 1.0) -> None:
         self.pictures, self.noise, self.crop, self.zoom = pictures, noise, crop_size(crop), zoom
 
     def draw(self, generator: torch.Generator) -> Sample:

@@ -21,7 +21,7 @@ from rawaug.data.pairs import Pair, Sample
 from rawaug.evaluation.trials import Trial
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import RawPairs, Zoom
+from rawaug.plugin.dataset import RawPairs
 from rawaug.seeding import keyed_generator
 
 WATCHED = 16
@@ -105,7 +105,7 @@ class MosaicCrops:
     """
 
     def __init__(
-        self, pictures: Any, augment: RawAugment, crop: int, zoom: Zoom, patterns: Mapping[str, float]
+        self, pictures: Any, augment: RawAugment, crop: int, zoom: float, patterns: Mapping[str, float]
     ) -> None:
         self.crop, self.patterns = crop, [entry_pattern(bayer.pattern(name)) for name in patterns]
         self.shares = torch.tensor([*patterns.values()])

@@ -318,7 +318,7 @@ def test_half_of_the_crops_are_enlarged_and_replayed(augment: RawAugment, pictur
         assert torch.equal(pairs.replay(i, pair.params).noisy, pair.noisy)
         rows.append(int(pair.params.crop[5]))
     assert 8 <= min(rows) < 12 and max(rows) == 16
-    for wrong in ({"zoom": 0.5}, {"zoom": 2.0, "crop": None}, {"zoom": (3.0, 2.0)}, {"zoom": (0.5, 2.0)}):
+    for wrong in ({"zoom": 0.5}, {"zoom": 2.0, "crop": None}):
         with pytest.raises(ValueError, match="zoom must be at least 1"):
             RawPairs(pictures, augment, **wrong)
 
@@ -327,8 +327,6 @@ def test_half_of_the_crops_are_enlarged() -> None:
     picture, generator = torch.zeros(3, 64, 64), torch.Generator().manual_seed(0)
     rows = [int(draw_crop(picture, (32, 32), True, generator, zoom=2.0)[5]) for _ in range(1000)]
     assert 0.4 < sum(side < 32 for side in rows) / len(rows) < 0.6
-    rows = [int(draw_crop(picture, (32, 32), True, generator, zoom=(2.0, 4.0))[5]) for _ in range(1000)]
-    assert min(rows) == 10 and max(rows) == 16
 
 
 def test_absurd_weights_end_in_a_line_that_names_the_picture(pictures: list[Tensor]) -> None:
