@@ -66,8 +66,10 @@ LOSSES.register("l2")(nn.MSELoss)
 
 @LOSSES.register("rms")
 class RootMeanSquare(nn.Module):
-    """The mean over pictures of ``sqrt(mean (a - b)^2 + epsilon^2)``: l2 in which hard pictures do not outweigh the
-    rest; what it is least for is the same. With ``weigh: relative`` it is the share of the noise that is left.
+    """The mean over pictures of ``sqrt(mean (a - b)^2 + epsilon^2)``.
+
+    Hard pictures do not outweigh the rest, as they do in l2. With ``weigh: relative`` it is the share of the noise that
+    is left.
     """
 
     def __init__(self, epsilon: float = 1e-2) -> None:
@@ -75,6 +77,7 @@ class RootMeanSquare(nn.Module):
         self.epsilon = epsilon
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        """Compare two batches ``(B, C, H, W)``: a scalar."""
         return ((a - b).square().flatten(1).mean(1) + self.epsilon**2).sqrt().mean()
 
 

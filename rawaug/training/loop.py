@@ -169,9 +169,8 @@ def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> d
     net.eval()
     raw, srgb = [], []
     for frame in frames:
-        variance = (
-            torch.zeros_like(frame.noisy) if frame.variance is None else frame.variance
-        )  # 0 where it is not known
+        # a variance of 0 stands for an unknown one
+        variance = torch.zeros_like(frame.noisy) if frame.variance is None else frame.variance
         denoised = denoisers.denoise_tiles(net, frame.noisy.to(device), variance.to(device)).cpu()
         raw.append(psnr(denoised, frame.clean).mean().item())
         if frame.develop is not None and frame.domain != "srgb":
