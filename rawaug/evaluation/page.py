@@ -45,7 +45,7 @@ WHOLE = 640
 ON_PAGE = 12
 """Largest number of frames on the page."""
 
-CURVES = {"loss": "loss", "psnr": "validation PSNR, RAW (dB)", "psnr_srgb": "validation PSNR, sRGB (dB)"}
+CURVES = {"loss": "loss", "psnr": "validation PSNR (dB)", "psnr_srgb": "validation PSNR, sRGB (dB)"}
 """Columns of a log that are plotted, with the titles of their plots."""
 
 

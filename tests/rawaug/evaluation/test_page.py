@@ -81,7 +81,7 @@ def test_the_window_is_where_the_detail_is() -> None:
 def test_a_curve_of_one_point_is_seen(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text("step,loss,psnr\n4,0.1,30\n")
     pictures = plot_curves({"real": [tmp_path / "log.csv"]})
-    assert set(pictures) == {"loss", "validation PSNR, RAW (dB)"}
+    assert set(pictures) == {"loss", "validation PSNR (dB)"}
     for png in pictures.values():
         pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
         legend_alone = 60  # pixels of the line beside the arm's name
