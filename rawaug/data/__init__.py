@@ -1,7 +1,7 @@
 """What is read: pictures, RAW files, published datasets and the built-in demo data.
 
 They come as datasets of sRGB pictures (:func:`open_pictures`) or as RAW-sRGB pairs (:func:`open_pairs`); what has no
-clean version, the benchmarks of SIDD and DND, comes as noisy blocks with a writer for submissions.
+clean version, the benchmark of SIDD, comes as noisy blocks with a writer for submissions.
 """
 
 from __future__ import annotations
@@ -13,17 +13,10 @@ from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder
 from rawaug.data.pairs import Binned, Pair
-from rawaug.data.submissions import (
-    Dnd,
-    SiddBenchmark,
-    check_dnd_submission,
-    check_submission,
-    write_dnd_submission,
-    write_submission,
-)
+from rawaug.data.sidd import SiddBenchmark, write_submission
 
 __all__ = [
-    "Binned", "DemoCamera", "Dnd", "Pair", "PairFolder", "PictureFolder", "RawFolder", "Shapes", "SiddBenchmark",
-    "check", "check_dnd_submission", "check_submission", "dead_leaves", "demo_pairs", "demo_photographs",
-    "demo_pictures", "open_pairs", "open_pictures", "write_dnd_submission", "write_submission",
+    "Binned", "DemoCamera", "Pair", "PairFolder", "PictureFolder", "RawFolder", "Shapes", "SiddBenchmark",
+    "check", "dead_leaves", "demo_pairs", "demo_photographs", "demo_pictures", "open_pairs", "open_pictures",
+    "write_submission",
 ]  # fmt: skip

@@ -23,8 +23,7 @@ from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import Lazy, Pair
 from rawaug.data.published import RAWIR_FOLDERS, Rawir, Zurich
-from rawaug.data.sidd import SiddBlocks, SiddFrames, SiddPlusBlocks, is_scene
-from rawaug.data.submissions import Dnd, SiddBenchmark
+from rawaug.data.sidd import SiddBenchmark, SiddBlocks, SiddFrames, SiddPlusBlocks, is_scene
 from rawaug.errors import escape
 from rawaug.files import files_below, files_in
 from rawaug.io import RawFrame, read_raw
@@ -126,8 +125,6 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
         yield "SIDD, benchmark blocks (noisy only)", partial(SiddBenchmark, path)
     if any(re.fullmatch(r"siddplus_valid_\w+_raw\.mat", name) for name in files):
         yield "SIDD+, validation blocks", partial(SiddPlusBlocks, path)
-    if (path / "info.mat").is_file():
-        yield "DND, boxes (noisy only)", partial(Dnd, path)
     if any((path / split / "huawei_raw").is_dir() for split in ("train", "test")):
         for split in ("train", "test"):
             yield f"Zurich RAW to RGB, {split}", partial(Zurich, path, split)

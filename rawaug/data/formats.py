@@ -80,8 +80,8 @@ def read_array(path: str | Path, name: str) -> np.ndarray:
 
 
 def read_value(path: str | Path, name: str) -> Any:
-    """The variable ``name`` as plain values: structs are dicts, struct arrays lists of dicts, cells lists, characters
-    strings, numbers arrays without axes of length 1. A matrix of cells or structs is listed row by row.
+    """The variable ``name`` as plain values: structs are dicts, cells lists (row by row), characters strings, numbers
+    arrays without axes of length 1.
     """
     return isolated(_read, Path(path), name, True)
 
@@ -156,26 +156,15 @@ def _plain(node: Any, file: Any) -> Any:
     import h5py
 
     if isinstance(node, h5py.Group):
-        fields = {key: _plain(_member(node, key), file) for key in node}
-        # the fields of a struct array refer to their values, and unlike cells they have no class of their own
-        if fields and all(_refers(node[key]) and "MATLAB_class" not in node[key].attrs for key in node):
-            return [dict(zip(fields, values, strict=True)) for values in zip(*fields.values(), strict=True)]
-        return fields
+        return {key: _plain(_member(node, key), file) for key in node}
     value = _values(node)
-    if _refers(node):
+    if h5py.check_ref_dtype(node.dtype) is not None:
         return [_plain(file[reference], file) for reference in np.ravel(value, order="F")]
     if node.attrs.get("MATLAB_class") == b"char":
         return "".join(map(chr, np.ravel(value)))
     if node.attrs.get("MATLAB_empty", 0):
         return np.zeros(0)
     return np.array(np.asarray(value).T.squeeze(), order="C")
-
-
-def _refers(node: Any) -> bool:
-    """Whether a node holds references: a cell, or a field of a struct array."""
-    import h5py
-
-    return isinstance(node, h5py.Dataset) and h5py.check_ref_dtype(node.dtype) is not None
 
 
 # -- metadata ---------------------------------------------------------------------------------------------------------

@@ -9,15 +9,21 @@ colour (``rendered`` is False): they can test a denoiser, but no ISP.
 
 Source: A. Abdelhamed, S. Lin, M. S. Brown, "A high-quality denoising dataset for smartphone cameras", CVPR 2018, and
 the dataset's ``noise_level_functions.csv``; SIDD+: NTIRE 2020.
+
+The clean blocks of its benchmark are not public. A submission is a CSV with the columns ID (0 to 1279, block by block,
+frame by frame) and BLOCK (the bytes of the float32 block, row by row, in base64). Source: the example code of the
+dataset's first author, ``sidd_kaggle_submit``.
 """
 
 from __future__ import annotations
 
+import base64
 import csv
 import re
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -29,9 +35,9 @@ from rawaug import bayer
 from rawaug.bayer import CFA, turn_back
 from rawaug.data.development import UNKNOWN_COLOUR, develop_pair, gains_from_neutral, srgb_from_camera
 from rawaug.data.formats import read_array, read_value, to_raw
-from rawaug.data.pairs import FrameLabel, LazyPairs, Pair, measure_levels, measure_noise
+from rawaug.data.pairs import FrameLabel, Lazy, LazyPairs, Pair, measure_levels, measure_noise
 from rawaug.files import files_below, require_file
-from rawaug.io import read_picture
+from rawaug.io import RawFrame, read_picture
 from rawaug.io.pictures import view_of_orientation
 from rawaug.registry import DATASETS
 
@@ -307,6 +313,47 @@ class SiddBlocks(_Blocks):
         self._colours = _colours(self.path)
         pictures = _pictures(self.path, "Validation{}BlocksSrgb.mat", ("Gt", "Noisy"), clean)
         return {"raw": clean, "noisy": noisy, **pictures}
+
+
+class SiddBenchmark(Lazy[RawFrame]):
+    """The noisy blocks of ``BenchmarkNoisyBlocksRaw.mat`` below a folder, with their levels where these are published.
+
+    Results go to :func:`write_submission`, in the same order.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.levels = noise_level_functions(Path(path))
+        self._all = Once(partial(blocks_of_scenes, find_file(Path(path), "BenchmarkNoisyBlocksRaw.mat")))
+        super().__init__([f"{scene}_{block:02d}" for scene in HELD_BACK for block in range(BLOCKS)])
+
+    def read(self, index: int) -> RawFrame:
+        scene, block = divmod(index, BLOCKS)
+        (_, cfa), levels = phone_of(HELD_BACK[scene]), self.levels.get(HELD_BACK[scene])
+        return RawFrame(self._all()[scene, block], cfa, noise_profile=levels, name=self.names[index], color_known=False)
+
+
+def write_submission(path: str | Path, blocks: Iterable[Tensor], side: int = 256) -> None:
+    """Write 1,280 denoised mosaics ``(1, side, side)`` in [0, 1], in the order and patterns of :class:`SiddBenchmark`.
+
+    Raises:
+        ValueError: if ``path`` is not a .csv file, or the server would refuse the blocks.
+    """
+    path = Path(path)
+    if path.suffix != ".csv":
+        raise ValueError(f"{path}: a SIDD submission must be a .csv file")
+    rows = []
+    for k, block in enumerate(blocks):
+        if block.shape != (1, side, side) or not (block.min() >= 0.0 and block.max() <= 1.0):  # NaN is refused as well
+            raise ValueError(
+                f"block {k}: must have values in [0, 1] and shape (1, {side}, {side}): {tuple(block.shape)}"
+            )
+        rows.append((k, base64.b64encode(block[0].cpu().numpy().astype("<f4").tobytes()).decode()))
+    if len(rows) != len(HELD_BACK) * BLOCKS:
+        raise ValueError(f"{path}: a submission must have {len(HELD_BACK) * BLOCKS} blocks, got {len(rows)}")
+    with path.open("w", encoding="ascii", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(["ID", "BLOCK"])
+        table.writerows(rows)
 
 
 @DATASETS.register("siddplus")

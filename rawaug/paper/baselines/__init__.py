@@ -7,18 +7,14 @@ upi         Brooks et al., CVPR 2019                     0            no        
 upi-tuned   the same, matrix and gains from pairs        12           at once   exact inverse
 unet        Ronneberger et al., MICCAI 2015              11.77 M      descent   none
 cycleisp    Zamir et al., CVPR 2020                      3.14 M       descent   none
-invisp      Xing et al., CVPR 2021                       1.41 M       descent   exact inverse
 =========== ============================================ ============ ========= =================================
 
 Parameters are those of the reverse pass at the default, published size.
 """
 
 from rawaug.paper.baselines.base import BaselineISP, Training, fit_baseline
-from rawaug.paper.baselines.networks import CycleISP, InvISP, UNetISP
+from rawaug.paper.baselines.networks import CycleISP, UNetISP
 from rawaug.paper.baselines.upi import UPI, TunedUPI
 from rawaug.registry import BASELINES
 
-__all__ = [
-    "BASELINES", "UPI", "BaselineISP", "CycleISP", "InvISP", "Training", "TunedUPI", "UNetISP",
-    "fit_baseline",
-]  # fmt: skip
+__all__ = ["BASELINES", "UPI", "BaselineISP", "CycleISP", "Training", "TunedUPI", "UNetISP", "fit_baseline"]

@@ -114,11 +114,10 @@ class BaselineISP(nn.Module, ABC):
 
 
 class Crops(NamedTuple):
-    """A training batch, in the CFA of the model: sRGB ``(B, 3, H, W)``, mosaics ``(B, 1, H, W)``, gains ``(B, 3)``."""
+    """A training batch, in the CFA of the model: sRGB ``(B, 3, H, W)``, mosaics ``(B, 1, H, W)``."""
 
     srgb: Tensor
     raw: Tensor
-    white_balance: Tensor
 
 
 class CropTrainedISP(BaselineISP):
@@ -136,11 +135,8 @@ class CropTrainedISP(BaselineISP):
         made: Tensor = self.reverse_network(srgb)
         return made
 
-    def prepare(self, pairs: Sequence[FramePair]) -> None:
-        """Set from the pairs what descent does not learn; called once, before training."""
-
     def loss(self, crops: Crops) -> Tensor:
-        """The scalar that training lowers: by default :meth:`raw_error`."""
+        """The :meth:`raw_error` of a batch, which training lowers."""
         return self.raw_error(bayer.mosaic(self.unprocess(crops.srgb), self.cfa), crops.raw)
 
     def raw_error(self, predicted: Tensor, raw: Tensor) -> Tensor:
@@ -153,7 +149,6 @@ class CropTrainedISP(BaselineISP):
         if not given or min(given) <= 0:
             raise ValueError(f"give seconds or steps above 0, got {training.seconds} and {training.steps}")
         require_crops(pairs, training.crop)
-        self.prepare(pairs)
         self.train()
         parameters = [parameter for parameter in self.parameters() if parameter.requires_grad]
         start, done, value = time.perf_counter(), 0, math.nan
@@ -203,7 +198,7 @@ def random_crops(
             pair = pairs[k]
             srgb, raw = (bayer.crop_to_cfa(image, CFA(pair.cfa), cfa) for image in (pair.srgb, pair.raw))
             corner = crop.sample(raw.shape[-2], raw.shape[-1], generator)
-            yield Crops(as_float(crop.apply(srgb, corner)), crop.apply(raw, corner), torch.tensor(pair.white_balance))
+            yield Crops(as_float(crop.apply(srgb, corner)), crop.apply(raw, corner))
 
     return Crops(*(torch.stack(values).to(device) for values in zip(*draw(), strict=True)))
 

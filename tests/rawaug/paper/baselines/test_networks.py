@@ -1,16 +1,14 @@
-"""CycleISP: blocks, checkpoints in the published layout; InvISP: invertible, balanced."""
+"""CycleISP: blocks, checkpoints in the published layout."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 
 from denoisers.cycleisp import RENAMED, DualAttentionBlock
-from rawaug.data.pairs import Pair
-from rawaug.paper.baselines.networks import CycleISP, InvISP
+from rawaug.paper.baselines.networks import CycleISP
 
 SMALL: dict[str, Any] = {"features": 8, "groups": 2, "blocks": 1}
 
@@ -41,40 +39,3 @@ def test_a_block_weighs_its_features_over_space_and_over_channels() -> None:
     out = block(torch.full((1, 4, 5, 5), 0.5))[0, :, 2, 2]
     expected = torch.tensor([0.5 + torch.tensor(4.0).sigmoid(), 0.5 + 2.0 * torch.tensor(9.0).sigmoid(), 0.5, 0.5])
     torch.testing.assert_close(out, expected)
-
-
-def shaken(blocks: int = 8, growth: int = 32) -> InvISP:
-    """A model whose weights are far from the start."""
-    model, generator = InvISP(blocks=blocks, growth=growth), torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
-    return model
-
-
-@torch.no_grad()
-def test_it_is_exactly_invertible() -> None:
-    flow = shaken().flow
-    x = torch.rand(2, 3, 16, 24, generator=torch.Generator().manual_seed(1))
-    assert (flow(x) - x).abs().max() > 0.05
-    torch.testing.assert_close(flow(flow.inverse(x)), x, atol=1e-5, rtol=0)
-    torch.testing.assert_close(flow.inverse(flow(x)), x, atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("blocks", [1, 2, 3, 8])
-def test_untrained_it_is_a_plain_gamma_camera(blocks: int) -> None:
-    srgb = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(2))
-    raw = InvISP("GRBG", blocks=blocks, growth=4).reverse(srgb, (2.0, 1.0, 1.6))
-    linear = srgb**2.2
-    torch.testing.assert_close(raw[:, 0, 0::2, 1::2], linear[:, 0, 0::2, 1::2], atol=1e-6, rtol=1e-4)
-    assert raw.max() <= 1.0  # w is (1, 0.5, 0.8): green and blue are divided by it
-    green = (2.0 * linear[:, 1, 0::2, 0::2]).clamp(max=1.0)
-    torch.testing.assert_close(raw[:, 0, 0::2, 0::2], green, atol=1e-6, rtol=1e-4)
-
-
-def test_blind_it_uses_the_mean_balance_of_the_pairs(exact_pairs: list[Pair]) -> None:
-    model = InvISP(blocks=1, growth=4)
-    model.prepare(exact_pairs)
-    mean = torch.tensor([pair.white_balance for pair in exact_pairs]).log().mean(0).exp()
-    srgb = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(3))
-    torch.testing.assert_close(model.reverse(srgb), model.reverse(srgb, mean))
