@@ -172,28 +172,26 @@ def pairs_by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -
     """Match every noisy file with its clean one."""
     if len(_WILD.findall(noisy)) != len(_WILD.findall(clean)):
         raise ValueError(f"the patterns {noisy} and {clean} must have the same number of * and ?")
-    index = {file.relative_to(top).as_posix().casefold(): file for file in files}
-    found: list[PairFiles] = []
-    for file in files:
-        match = _regex(noisy).fullmatch(file.relative_to(top).as_posix())
-        if not match:
-            continue
-        folder, *parts = match.groups()
-        wanted = folder + "".join(
-            f"{fixed}{part}" for fixed, part in zip(_WILD.split(clean), [*parts, ""], strict=True)
-        )
-        partner = index.get(wanted.casefold())
-        if partner is None:
-            raise FileNotFoundError(f"{file}: has no clean frame {top / wanted}; add it, or set the pattern clean")
-        if partner == file:
-            raise ValueError(f"{file}: would be its own clean frame by the pattern {clean}")
-        found.append(PairFiles(re.sub(r"_noisy$", "", _stem(top, file), flags=re.IGNORECASE), file, partner))
-    paired = {file for pair in found for file in pair[1:]}
-    cleans = (file for file in files if _regex(clean).fullmatch(file.relative_to(top).as_posix()))
-    single = next((file for file in cleans if file not in paired), None)
-    if single is not None:
-        raise FileNotFoundError(f"{single}: has no noisy frame named {noisy}; add it, or remove this one")
-    return found
+    of_noisy, of_clean = (_by_wild_parts(top, files, pattern) for pattern in (noisy, clean))
+    for parts in sorted(of_noisy.keys() ^ of_clean.keys()):
+        if parts in of_noisy:
+            raise FileNotFoundError(f"{of_noisy[parts]}: has no clean frame named {clean}; add it, or set that pattern")
+        raise FileNotFoundError(f"{of_clean[parts]}: has no noisy frame named {noisy}; add it, or remove this one")
+    if same := of_noisy.items() & of_clean.items():
+        raise ValueError(f"{min(same)[1]}: would be its own clean frame by the pattern {clean}")
+    return [
+        PairFiles(re.sub(r"_noisy$", "", _stem(top, file), flags=re.IGNORECASE), file, of_clean[parts])
+        for parts, file in of_noisy.items()
+    ]
+
+
+def _by_wild_parts(top: Path, files: Sequence[Path], pattern: str) -> dict[tuple[str, ...], Path]:
+    """The files that match a pattern, by their folder and what its ``*`` and ``?`` stand for there."""
+    wild = {"*": "([^/]*)", "?": "([^/])"}
+    parts = (wild.get(part, re.escape(part)) for part in re.split(r"([*?])", pattern))
+    regex = re.compile("((?:.*/)?)" + "".join(parts), re.IGNORECASE)
+    found = ((regex.fullmatch(file.relative_to(top).as_posix()), file) for file in files)
+    return {tuple(map(str.casefold, match.groups())): file for match, file in found if match}
 
 
 def clean_pattern(noisy: str) -> str:
@@ -203,13 +201,6 @@ def clean_pattern(noisy: str) -> str:
     if not count:
         raise ValueError(f"the pattern {noisy} does not contain the word noisy; give that of the clean files too")
     return clean
-
-
-def _regex(pattern: str) -> re.Pattern[str]:
-    """A pattern for paths below a folder: the folders above it, then what each ``*`` and ``?`` stands for."""
-    wild = {"*": "([^/]*)", "?": "([^/])"}
-    parts = (wild.get(part, re.escape(part)) for part in re.split(r"([*?])", pattern))
-    return re.compile("((?:.*/)?)" + "".join(parts), re.IGNORECASE)
 
 
 def _stem(top: Path, file: Path) -> str:

@@ -1,15 +1,7 @@
-r"""The methods of the reconstruction table, on equal terms: fitted to the same pairs, scored on the same patches.
+"""The methods of the reconstruction table, on equal terms: fitted to the same pairs, scored on the same patches.
 
-A family is fitted once and may fill several rows: the dictionary ISP blind, with the as-shot white balance, with 64 RAW
-samples, and with the best setting that can be found (oracle). A shipped ISP, or the file of one, is not fitted.
-
-The oracle is the setting of an ISP that comes closest to a frame's RAW,
-
-.. math:: \min_{w, v, g} \; \log \bigl( \| y - f^{-1}(x; w, v, g) \|^2 / P + \epsilon \bigr)
-
-over the weights of the atoms and, for an ISP of published cameras, the gains. Descent starts where alternating least
-squares end (:mod:`rawaug.isp.staged`), with all P pixels for readings; of a fitted ISP, whose gains stay within
-the hull of its own, from the middle of the hulls. The settings of rows that know less are compared as well.
+A family is fitted once and may fill several rows: the dictionary ISP blind, with the as-shot white balance, and with 64
+RAW samples. A shipped ISP, or the file of one, is not fitted.
 
 PSNR_d is that of a denoiser trained on the RAW that a method makes of sRGB pictures, on real RAW. Pictures, network,
 steps and noise are the same for every method. The dictionary ISP draws camera settings from its hull, UPI from its
@@ -43,7 +35,7 @@ from rawaug.files import find_weights, write_json
 from rawaug.isp import staged
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.samples import PixelSamples, block_averages, sample_pixels
+from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, coordinates_or_full
 from rawaug.metrics import PATCH, psnr
@@ -59,7 +51,7 @@ from rawaug.training.loop import train
 from rawaug.training.stream import PictureCrops, Source, TrainingStream, add_noise, freeze_samples
 
 FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
-ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples", "oracle": "oracle weights"}
+ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples"}
 SAMPLES = 64
 SHORTEST_CROP = 256
 Method = BaselineISP | DictionaryISP
@@ -144,8 +136,6 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any
     makers = {row: _maker(model, given) for row, given in settings(model, pair).items()}
     start = time.perf_counter()
     rows = {row: windows_psnr(make, pair, patches) for row, make in makers.items()}
-    if "oracle" in rows:  # chosen by the error on some pixels of the frame, which is not the mean of the patches' PSNR
-        rows["oracle"] = max(rows.values())
     area = min(PATCH, pair.raw.shape[-2]) * min(PATCH, pair.raw.shape[-1])
     pixels = len(makers) * len(windows_of(pair, patches)) * area
     return {"rows": rows, "mpix_s": pixels / (time.perf_counter() - start) / 1e6}
@@ -182,8 +172,7 @@ def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
         blind = isp.choose(pair.srgb[None])
         as_shot = staged.with_white_balance(isp, blind, pair.white_balance, None)
         known = {"blind": blind} | ({"as-shot": as_shot} if pair.balance_known else {})
-        known["samples"] = _from_samples(isp, pair, blind)
-        return known | {"oracle": oracle(isp, pair, list(known.values()))}
+        return known | {"samples": _from_samples(isp, pair, blind)}
 
 
 def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams:
@@ -219,69 +208,6 @@ def mosaic_only_psnr(pictures: Sequence[Tensor], cfa: CFA | str = "RGGB") -> flo
     """Mean PSNR in dB of pictures ``(3, H, W)`` after a mosaic and bilinear interpolation: the ceiling of a cycle."""
     values = [as_float(p[None]) for p in pictures]
     return fmean(psnr(bayer.demosaic(bayer.mosaic(x, cfa), cfa).clamp(0.0, 1.0), x).item() for x in values)
-
-
-PIXELS = 16384
-STEPS = 300
-RATE = 0.1
-LOG_RATE = 0.01
-"""Learning rate of the log gains, which start near their end."""
-EPS = 1e-9
-FLOOR = 1e-3
-"""Added to weights before their logarithm, or an atom that starts at 0 stays there."""
-
-
-@torch.no_grad()
-def oracle(isp: DictionaryISP, pair: Pair, others: Sequence[ISPParams]) -> ISPParams:
-    """The best setting for the frame among what descent finds and the ``others``, one or more."""
-    pixels = sample_pixels([pair], PIXELS, seed=0).pixels
-    start = None
-    if isp.config.cameras:
-        own, value = pixels.site[:, :, 0], pixels.target.sum(dim=(1, 2))
-        start = staged.with_readings(isp, pixels.srgb, pixels.coordinates, own, value, others[0])
-    found = [*others, _descend(isp, pixels, start)]
-    return min(found, key=lambda setting: squared_error(isp, pixels, setting).item())
-
-
-def squared_error(isp: DictionaryISP, pixels: PixelSamples, setting: ISPParams) -> Tensor:
-    """Mean squared error of the reverse pass, within [0, 1], over readings that are not clipped, a scalar.
-
-    The few clipped ones would outweigh all others.
-    """
-    made = isp.reverse_pixels(pixels.srgb, setting, pixels.coordinates).clamp(0.0, 1.0)
-    return ((made - pixels.target) ** 2 * pixels.known).sum() / pixels.known.sum()
-
-
-@torch.enable_grad()
-def _descend(isp: DictionaryISP, pixels: PixelSamples, start: ISPParams | None) -> ISPParams:
-    """Descend from ``start``, with free gains; or from uniform weights of all atoms, those of the gains among them."""
-    config = isp.config
-    if start is None:
-        logits = [torch.zeros(1, n) for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
-        log_gains = torch.zeros(0)
-    else:
-        logits = [(weights + FLOOR).log() for weights in (start.colour_weights, start.tone_weights) if weights.shape[1]]
-        log_gains = start.gains.log()
-    logits, log_gains = [value.clone().requires_grad_() for value in logits], log_gains.clone().requires_grad_()
-
-    def setting() -> ISPParams:
-        weights = [value.softmax(dim=1) for value in logits]
-        if start is None:
-            return isp.params_from_weights(*weights)
-        tones = weights[1] if len(weights) > 1 else start.tone_weights
-        return ISPParams(weights[0], start.gain_weights[:, :0], isp.colour.combine(weights[0]), log_gains.exp(), tones)
-
-    optimiser = torch.optim.Adam([{"params": logits, "lr": RATE}, {"params": [log_gains], "lr": LOG_RATE}])
-    best, least = setting(), torch.inf
-    for _ in range(STEPS):
-        tried = setting()
-        error = squared_error(isp, pixels, tried)
-        if error.item() < least:
-            best, least = tried, error.item()
-        optimiser.zero_grad()
-        (error + EPS).log().backward()
-        optimiser.step()
-    return ISPParams(*(value.detach() for value in best))
 
 
 # -- PSNR_d -----------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import pytest
 from rawaug.data.pairs import Pair
 from rawaug.experiment.plan import dry_run
 from rawaug.isp.fit import FitConfig
-from rawaug.paper import ablation, methods, reconstruction
+from rawaug.paper import ablation, reconstruction
 from rawaug.paper.ablation import Ablation, ComponentAblation
 from rawaug.paper.reconstruction import Comparison
 
@@ -22,7 +22,6 @@ def frames(frame_of: Callable[..., Pair], monkeypatch: pytest.MonkeyPatch) -> li
     made = [frame_of(name) for name in "abc"]
     for module in (reconstruction, ablation):
         monkeypatch.setattr(module, "open_pairs", lambda spec, split: made)
-    monkeypatch.setattr(methods, "STEPS", 1)
     return made
 
 
