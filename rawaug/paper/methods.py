@@ -35,7 +35,8 @@ from rawaug.files import find_weights, write_json
 from rawaug.isp import staged
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.samples import block_averages
+from rawaug.isp.fit.descent import cycle_error
+from rawaug.isp.fit.samples import block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, coordinates_or_full
 from rawaug.metrics import PATCH, psnr
@@ -53,6 +54,8 @@ from rawaug.training.stream import PictureCrops, Source, TrainingStream, add_noi
 FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
 ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples"}
 SAMPLES = 64
+PIXELS = 8192
+"""Number of pixels of a frame on which the forward pass is scored."""
 SHORTEST_CROP = 256
 Method = BaselineISP | DictionaryISP
 
@@ -125,20 +128,35 @@ def reverse_parameters(model: Method) -> int:
 
 
 def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any]:
-    """``rows``, the PSNR_r in dB of every row that the family fills, and ``mpix_s``, the speed of its reverse pass.
+    """``rows``, the PSNR_r in dB of every row that the family fills, ``mpix_s``, the speed of its reverse pass, and
+    ``forward``, as :func:`forward_psnr` measures it.
 
-    An unregistered pair is compared as averages over blocks, and has no speed. ``patches`` None scores all patches.
+    An unregistered pair is compared as averages over blocks, and has PSNR_r alone. ``patches`` None scores all patches.
     """
     pair.require_rendered()
     model = fitted.model
     if not pair.registered:
-        return {"rows": _block_rows(model, pair), "mpix_s": None}
+        return {"rows": _block_rows(model, pair), "mpix_s": None, "forward": None}
     makers = {row: _maker(model, given) for row, given in settings(model, pair).items()}
     start = time.perf_counter()
     rows = {row: windows_psnr(make, pair, patches) for row, make in makers.items()}
     area = min(PATCH, pair.raw.shape[-2]) * min(PATCH, pair.raw.shape[-1])
     pixels = len(makers) * len(windows_of(pair, patches)) * area
-    return {"rows": rows, "mpix_s": pixels / (time.perf_counter() - start) / 1e6}
+    speed = pixels / (time.perf_counter() - start) / 1e6
+    return {"rows": rows, "mpix_s": speed, "forward": forward_psnr(model, pair)}
+
+
+@torch.no_grad()
+def forward_psnr(model: Method, pair: Pair) -> float | None:
+    """PSNR in dB of the dictionary's forward pass, pixel by pixel, under the setting that it chooses for the RAW.
+
+    None for other methods, and where the frame does not state its colours.
+    """
+    if not isinstance(model, DictionaryISP) or not pair.color_known:
+        return None
+    part = sample_pixels([pair], PIXELS, seed=0).pixels
+    error = cycle_error(model, part, model.forward(pair.raw[None]).params, {}, FitConfig())
+    return float(-10.0 * error.log10())
 
 
 def _maker(model: Method, given: Any) -> Callable[[Tensor, Tensor], Tensor]:

@@ -52,7 +52,7 @@ from rawaug.training.config import weights_key
 from rawaug.training.loop import require_trainable
 
 COLUMNS = {
-    "psnr_r": "PSNR_r", "worst25": "worst 25%", "best25": "best 25%", "cycle": "cycle",
+    "psnr_r": "PSNR_r", "worst25": "worst 25%", "best25": "best 25%", "forward": "RAW to sRGB", "cycle": "cycle",
     "cycle_without_mosaic": "no mosaic", "psnr_d": "PSNR_d",
 }  # fmt: skip
 
@@ -191,10 +191,16 @@ class ComparisonRun:
         speeds = [fold["mpix_s"] for fold in folds if fold["mpix_s"] is not None]
         whole = self._all_frames(family)
 
+        def by_seed(values: list[float]) -> list[list[float]]:
+            return [values[k : k + len(names)] for k in range(0, len(values), len(names))]
+
+        back = [fold["forward"] for fold in folds if fold.get("forward") is not None]
+        if len(back) == len(folds):
+            whole["forward"] = [fmean(of_seed) for of_seed in by_seed(back)]
+
         rows = {}
         for row in folds[0]["rows"]:
-            found = [fold["rows"][row] for fold in folds]
-            values = [found[k : k + len(names)] for k in range(0, len(found), len(names))]  # by seed
+            values = by_seed([fold["rows"][row] for fold in folds])
             worst, best = zip(*map(worst_and_best_quarter, values), strict=True)
             name = family if row == "blind" else f"{family}, {ROWS[row]}"
             rows[name] = {

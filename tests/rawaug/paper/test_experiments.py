@@ -12,7 +12,7 @@ from rawaug.data.pairs import Pair
 from rawaug.experiment.plan import dry_run
 from rawaug.isp.fit import FitConfig
 from rawaug.paper import ablation, reconstruction
-from rawaug.paper.ablation import Ablation, ComponentAblation
+from rawaug.paper.ablation import Ablation
 from rawaug.paper.reconstruction import Comparison
 
 
@@ -25,17 +25,16 @@ def frames(frame_of: Callable[..., Pair], monkeypatch: pytest.MonkeyPatch) -> li
     return made
 
 
-RUNS: dict[str, Comparison | Ablation | ComponentAblation] = {
+RUNS: dict[str, Comparison | Ablation] = {
     "reconstruction": Comparison(data="mine", methods=["dictionary", "upi"], seeds=3),
     "ablation": Ablation(data="mine", fit=FitConfig(atoms=3)),
-    "learned": ComponentAblation(frames=4, variants={"all parts": {}, "without encoders": {"encoders": "off"}}),
 }
 
 
 @pytest.mark.parametrize(("kind", "settings"), RUNS.items(), ids=list(RUNS))
 def test_a_dry_run_tries_everything_once_and_writes_nothing(
     kind: str,
-    settings: Comparison | Ablation | ComponentAblation,
+    settings: Comparison | Ablation,
     frames: list[Pair],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],

@@ -23,6 +23,7 @@ from rawaug.paper.methods import (
     Fitted,
     cycle_psnr,
     fit_family,
+    forward_psnr,
     is_method,
     mosaic_only_psnr,
     score_rows,
@@ -91,6 +92,16 @@ def test_in_light_that_the_camera_does_not_expect_what_is_known_brings_it_back(
     rows = rows_of(known_camera, frame_of("lamps", LAMPS, size=(64, 96)))
     assert rows["blind"] < 32.0
     assert rows["as-shot"] > 75.0 and rows["samples"] > 60.0  # what was given is exact, or 64 readings of 12 bits
+
+
+def test_the_forward_pass_is_scored_under_its_own_choice_of_light(
+    known_camera: DictionaryISP, frame_of: FrameOf
+) -> None:
+    known_camera.forward_encoders.gain.set_prior(torch.tensor([1.0, 0.0]))
+    right, wrong = (forward_psnr(known_camera, frame_of("a", light)) for light in (DAYLIGHT, LAMPS))
+    assert right is not None and wrong is not None and wrong < right - 3.0
+    assert forward_psnr(UPI(), frame_of("a")) is None
+    assert forward_psnr(known_camera, replace(frame_of("a"), color_known=False)) is None
 
 
 def test_a_cycle_loses_the_mosaic_and_nothing_else_in_a_camera_that_inverts_itself(known_camera: DictionaryISP) -> None:

@@ -65,7 +65,8 @@ class Laboratory:
 
     def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
         value = 10.0 * (int(pair.name[1:]) + 1) + fitted.seed
-        return {"rows": {"blind": value, "as-shot": value + 1}, "mpix_s": 2.0 ** int(pair.name[1:])}
+        rows = {"blind": value, "as-shot": value + 1}
+        return {"rows": rows, "mpix_s": 2.0 ** int(pair.name[1:]), "forward": value - 5}
 
     def cycle_psnr(self, fitted: Any, pictures: Sequence[torch.Tensor]) -> dict[str, float]:
         return {"cycle": 33.0}
@@ -93,6 +94,7 @@ def test_every_figure_is_the_mean_that_its_name_says(laboratory: Laboratory, tmp
     assert row["frames"] == {f"f{k}": [10.0 * (k + 1), 10.0 * (k + 1) + 1] for k in range(8)}
     assert rows["dictionary, as-shot gains"]["worst25"] == [16.0, 17.0]
     assert row["seconds"] == 20.5 and row["mpix_s"] == 12.0 and row["parameters"] == 1234
+    assert row["forward"] == [40.0, 41.0] and "forward" not in rows["dictionary, as-shot gains"]
     assert row["cycle"] == 33.0 and "cycle" not in rows["dictionary, as-shot gains"]
     assert [frame for _, frame, _, seed in laboratory.folds if seed == 0] == [f"f{k}" for k in range(8)]
     assert laboratory.wholes == [("dictionary", 0)] and laboratory.denoisers == [] and laboratory.min_side == 2
@@ -113,7 +115,7 @@ def test_a_published_split_is_fitted_once_and_scored_on_every_test_frame(
 
         def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
             scored.append(pair)
-            return {"rows": {"blind": 40.0 + int(pair.name[1:])}, "mpix_s": 1.0}
+            return {"rows": {"blind": 40.0 + int(pair.name[1:])}, "mpix_s": 1.0, "forward": None}
 
     laboratory = Split(monkeypatch)
     rows = compare(settings(tmp_path, test="blocks", methods=["dictionary"], seeds=1))
