@@ -110,7 +110,7 @@ def _middles(split: str) -> list[Pair]:
 
 @pytest.fixture
 def tiny(registries: list[registry.Registry]) -> None:
-    """``tiny:SPLIT``: the middle of two shots by the demo camera; ``tiny:``: four of its pictures."""
+    """``tiny:SPLIT``: the middle of two shots by the demo camera; ``tiny:``: a corner of four of its pictures."""
 
     @registry.DATASETS.register("tiny")
     def pairs(path: str = "", split: str = "test") -> list[Pair]:
@@ -118,7 +118,7 @@ def tiny(registries: list[registry.Registry]) -> None:
 
     @registry.PICTURES.register("tiny")
     def pictures(path: str = "", min_side: int = 2) -> list[torch.Tensor]:
-        return demo_pictures(4)
+        return [picture[:, :128, :160] for picture in demo_pictures(4)]
 
 
 @pytest.fixture

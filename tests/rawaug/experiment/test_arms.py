@@ -24,7 +24,8 @@ def test_other_targets_are_trained_and_watched_on(aim: Target, noisy: tuple[int,
 
     arms = {"one": ArmConfig(1.0, srgb=Srgb(jpeg=(10, 10)) if aim == "srgb" else None), "other": ArmConfig(1.0)}
     recipe = Aimed(data=DataConfig(pairs=None), camera="universal", arms=arms, train=TrainConfig(crop=32))
-    isp, noise, pictures = DictionaryISP(), noise_model((1e-4, 1e-6)), demo_pictures(2)
+    isp, noise = DictionaryISP(), noise_model((1e-4, 1e-6))
+    pictures = [picture[:, :96, :128] for picture in demo_pictures(2)]
     one, other = (training_stream(recipe, arm, [], pictures, isp, noise, 0)[0] for arm in recipe.arms.values())
     assert one.noisy.shape == one.variance.shape == noisy and one.clean.shape == clean
     assert torch.equal(one.noisy, other.noisy) == (aim == "rgb"), "through JPEG, if any"

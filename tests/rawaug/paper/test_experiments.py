@@ -18,10 +18,11 @@ from rawaug.paper.reconstruction import Comparison
 
 @pytest.fixture
 def frames(frame_of: Callable[..., Pair], monkeypatch: pytest.MonkeyPatch) -> list[Pair]:
-    """Three frames, which every dataset consists of."""
+    """Three frames, which every dataset consists of, and whose pictures are all there are."""
     made = [frame_of(name) for name in "abc"]
     for module in (reconstruction, ablation):
         monkeypatch.setattr(module, "open_pairs", lambda spec, split: made)
+    monkeypatch.setattr(reconstruction, "open_pictures", lambda spec, min_side: [frame.srgb for frame in made])
     return made
 
 
