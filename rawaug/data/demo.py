@@ -65,7 +65,7 @@ class Shot(NamedTuple):
 
 @dataclass(frozen=True)
 class DemoCamera:
-    """A camera with a sensor of pattern ``cfa``; ``color_matrix`` M has rows that sum to 1.
+    """A camera with a sensor of pattern ``cfa``.
 
     Example:
         >>> picture = torch.randint(0, 256, (3, 64, 96), dtype=torch.uint8)
@@ -75,7 +75,6 @@ class DemoCamera:
     """
 
     cfa: CFA = CFA.GRBG
-    color_matrix: tuple[tuple[float, float, float], ...] = _COLOR_MATRIX
 
     def sample(self, generator: torch.Generator, iso: int | None = None) -> Shot:
         """Draw the parameters of a shot; the ISO too, unless it is given."""
@@ -112,7 +111,7 @@ class DemoCamera:
             raw=clean,
             cfa=self.cfa,
             white_balance=shot.white_balance,
-            color_matrix=torch.tensor(self.color_matrix),
+            color_matrix=torch.tensor(_COLOR_MATRIX),
             noisy=_digitise(shot_var * electrons + read_noise),
             shot_var=shot_var,
             read_var=read_var,
@@ -128,14 +127,14 @@ class DemoCamera:
         from kornia.filters import gaussian_blur2d
 
         scene = gaussian_blur2d(decode_srgb(picture[None].float() / 255), 5, (_BLUR, _BLUR))[0]
-        to_camera = torch.linalg.inv(torch.tensor(self.color_matrix))
+        to_camera = torch.linalg.inv(torch.tensor(_COLOR_MATRIX))
         camera = torch.einsum("ij,jhw->ihw", to_camera, scene) / _column(shot.white_balance)
         return mosaic(shot.exposure * _shading(*picture.shape[-2:]) * camera, self.cfa).clamp(min=0)
 
     def _render(self, raw: Tensor, shot: Shot) -> Tensor:
         flat = raw / _shading(*raw.shape[-2:])
         camera = demosaic(flat[None], self.cfa, "malvar")[0] * _column(shot.white_balance)
-        linear = torch.einsum("ij,jhw->ihw", torch.tensor(self.color_matrix), camera.clamp(0, 1)).clamp(0, 1)
+        linear = torch.einsum("ij,jhw->ihw", torch.tensor(_COLOR_MATRIX), camera.clamp(0, 1)).clamp(0, 1)
         return (_tone(linear) * 255).round().to(torch.uint8)
 
 

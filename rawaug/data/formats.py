@@ -295,24 +295,16 @@ def _read_mat(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
 
 
 def _read_tiff(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
-    try:
-        with damage_as_os_error(file, "cannot be read as TIFF", OSError), opened_tiff(file) as tiff:
-            page = tiff.pages[0]
-            if page.nbytes > MAX_BYTES:
-                raise ValueError(f"its first page declares {page.nbytes} bytes, above the limit of {MAX_BYTES}")
-            text = getattr(page, "description", "")
-            numbers = page.asarray()
-    except OSError as error:
-        if "imagecodecs" in str(error):
-            raise ValueError(f"{file}: has a compression that is not supported; save it without one") from error
-        raise
-    try:
-        stated = json.loads(text) if text.startswith("{") else {}
-    except RecursionError:
-        raise ValueError(f"{file}: its description is nested too deeply; save it again") from None
-    except ValueError:  # a description of another program
-        stated = {}
-    return numbers, stated
+    with damage_as_os_error(file, "cannot be read as TIFF", OSError), opened_tiff(file) as tiff:
+        page = tiff.pages[0]
+        if page.nbytes > MAX_BYTES:
+            raise ValueError(f"its first page declares {page.nbytes} bytes, above the limit of {MAX_BYTES}")
+        text = getattr(page, "description", "")
+        try:
+            stated = json.loads(text) if text.startswith("{") else {}
+        except ValueError:  # a description of another program
+            stated = {}
+        return page.asarray(), stated
 
 
 def write_tiff(file: Path, image: Tensor, stated: Mapping[str, Any]) -> None:

@@ -30,7 +30,7 @@ from rawaug.data.development import develop_mosaic, develop_pair
 from rawaug.data.folders import RawFolder
 from rawaug.data.formats import read_npz
 from rawaug.data.pairs import LazyPairs, Pair, require_split
-from rawaug.files import files_below, files_in, require_file
+from rawaug.files import files_below, files_in
 from rawaug.io import read_picture, read_raw
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import read_plane
@@ -131,22 +131,14 @@ def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
             arrays = read_npz(file, lambda names: ["raw", "max_val"])
             numbers, stated = arrays["raw"], float(arrays["max_val"])
         else:
-            numbers, stated = _array(file), None
+            # mapped: one that claims more than the file holds takes no memory
+            numbers, stated = np.lib.format.open_memmap(file, mode="r"), None
     if numbers.ndim != 3 or numbers.shape[2] != 4 or numbers.dtype.kind != "u" or not numbers.size:
         raise ValueError(f"{file}: packed RAW must be unsigned (h, w, 4), got {numbers.dtype} {numbers.shape}")
     white = white or stated or WHITE[picture.suffix.lower()]
     if numbers.max() > white:
         raise ValueError(f"{file}: has value {numbers.max()}, above the white level {white:g}; pass white=")
     return torch.from_numpy(numbers.astype(np.float32)).permute(2, 0, 1) / white
-
-
-def _array(file: Path) -> np.ndarray:
-    """The array of an ``.npy`` file, mapped: one that claims more than the file holds takes no memory."""
-    require_file(file)
-    with file.open("rb") as opened:
-        if opened.read(6) != b"\x93NUMPY":  # NumPy would open an archive of arrays, or a pickle
-            raise ValueError("does not begin as an array")
-    return np.load(file, mmap_mode="r", allow_pickle=False)
 
 
 def picture_beside(file: Path) -> Path:

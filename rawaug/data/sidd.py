@@ -212,9 +212,6 @@ def _correlation(a: Tensor, b: Tensor) -> Tensor:
 BLOCKS = 32
 """Blocks of a frame."""
 
-MOST_FRAMES = 1000
-"""The most frames that are read of SIDD+, which has 32."""
-
 _NO_COLOUR = Colour(*UNKNOWN_COLOUR, 0)
 
 
@@ -435,8 +432,6 @@ def _patterns(file: Path) -> list[CFA]:
     try:
         with file.open(encoding="utf-8-sig", newline="") as stream:
             names = [row[0].strip().upper() for row in csv.reader(stream) if row]
-        if len(names) > MOST_FRAMES:
-            raise ValueError(f"{len(names)} rows, at most {MOST_FRAMES} expected")
         return [CFA(name) for name in names]
     except (ValueError, csv.Error) as error:
         raise ValueError(f"{file}: is not a list of patterns, one for each frame ({error}); copy it again") from None

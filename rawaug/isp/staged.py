@@ -285,22 +285,8 @@ def with_raw_samples(
     where = coordinates.expand(len(x), -1, -1, -1)[batch, :, rows, columns].transpose(1, 2)[:, :, None]
     channel = torch.tensor(isp.cfa.channels, device=x.device)[rows % 2, columns % 2]
     own = F.one_hot(channel, 3).transpose(1, 2).to(x)
-    return with_readings(isp, pixels, where, own, raw_samples[..., 2], params)
+    value = raw_samples[..., 2]
 
-
-def with_readings(
-    isp: StagedISP, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams
-) -> ISPParams:
-    """Do what :func:`with_raw_samples` does for pixels that were picked already.
-
-    Args:
-        isp: the camera.
-        pixels: their sRGB, ``(B, 3, 1, K)``.
-        where: their coordinates in the full frame, ``(B, 2, 1, K)``.
-        own: 1 for the colour that each site has and 0 for the others, ``(B, 3, K)``.
-        value: the readings, ``(B, K)``.
-        params: the settings to start from.
-    """
     params = _solve(isp, pixels, where, own, value, params)
     if isp.tone is not None and isinstance(isp.colour, CameraDictionary):
         for _ in range(ROUNDS):

@@ -39,11 +39,6 @@ def srgb_to_linear(code: Tensor) -> Tensor:
     return torch.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055).clamp_min(0.0) ** 2.4)
 
 
-def inverse_smoothstep(x: Tensor) -> Tensor:
-    """Invert ``3x^2 - 2x^3`` on [0, 1] by ``1/2 - sin(asin(1 - 2x) / 3)``; tensors of any shape."""
-    return 0.5 - torch.sin(torch.asin(1.0 - 2.0 * x.clamp(0.0, 1.0)) / 3.0)
-
-
 def to_linear(srgb: Tensor, tables: Tensor) -> Tensor:
     """Map pictures ``(B, C, H, W)``, uint8 or float in [0, 1], each by its own table ``(B, 1021)``, to linear light."""
     return apply_curves(tables[:, ::STEPS] if srgb.dtype == torch.uint8 else tables, srgb)

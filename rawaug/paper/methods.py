@@ -203,13 +203,13 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
 
 @torch.no_grad()
 def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
-    """Mean PSNR in dB of sRGB to RAW and back over uint8 pictures ``(3, H, W)``; empty for a method without a way back.
+    """Mean PSNR in dB of the dictionary ISP from sRGB to RAW and back, over uint8 pictures ``(3, H, W)``.
 
-    The dictionary ISP has a second figure, ``cycle_without_mosaic``.
+    It has two keys, ``cycle`` and ``cycle_without_mosaic``; other methods have none.
     """
     model, shown = fitted.model, [as_float(picture[None]) for picture in pictures]
     if not isinstance(model, DictionaryISP):
-        return {"cycle": fmean(psnr(model.cycle(x), x).item() for x in shown)} if model.bidirectional else {}
+        return {}
     made = (model.reverse(x) for x in shown)
     cycled = [model.forward(result.raw.clamp(0.0, 1.0), result.params).srgb for result in made]
     ways = {"cycle": cycled, "cycle_without_mosaic": [cycle_without_mosaic(model, x) for x in shown]}

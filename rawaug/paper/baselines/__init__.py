@@ -1,15 +1,15 @@
 r"""The methods that the dictionary ISP is compared with, written from their papers, on one interface.
 
-=========== ============================================ ============ ========= =================================
-name        source                                       parameters   fitted    forward pass
-=========== ============================================ ============ ========= =================================
-upi         Brooks et al., CVPR 2019                     0            no        exact inverse
-upi-tuned   the same, matrix and gains from pairs        12           at once   exact inverse
-unet        Ronneberger et al., MICCAI 2015              11.77 M      descent   none
-cycleisp    Zamir et al., CVPR 2020                      3.14 M       descent   none
-=========== ============================================ ============ ========= =================================
+=========== ============================================ ============ =========
+name        source                                       parameters   fitted
+=========== ============================================ ============ =========
+upi         Brooks et al., CVPR 2019                     0            no
+upi-tuned   the same, matrix and gains from pairs        12           at once
+unet        Ronneberger et al., MICCAI 2015              11.77 M      descent
+cycleisp    Zamir et al., CVPR 2020                      3.14 M       descent
+=========== ============================================ ============ =========
 
-Parameters are those of the reverse pass at the default, published size.
+They make RAW of sRGB and not the other way round. Parameters are those at the published size.
 """
 
 from rawaug.paper.baselines.base import BaselineISP, Training, fit_baseline

@@ -1,8 +1,8 @@
 r"""What the methods that the dictionary ISP is compared with have in common, and how they are fitted.
 
 ``y = mosaic(u(x))``, u being the method: sRGB ``x`` ``(B, 3, H, W)`` becomes linear camera colour of the same size, of
-which the mosaic keeps one channel a site. Whatever a method predicts, RAW and sRGB leave it within [0, 1]; training
-sees the values as they are.
+which the mosaic keeps one channel a site. Whatever a method predicts, RAW leaves it within [0, 1]; training sees the
+values as they are.
 
 Networks are trained by Adam, each with its own loss, on random crops of the pairs, which start where the frame's CFA is
 that of the model, so frames of any pattern train one model. The learning rate falls to 0 by half a cosine over the
@@ -67,11 +67,10 @@ class BaselineISP(nn.Module, ABC):
     The ``setting`` of a pass is what the method may know of a shot, such as its gains; None leaves it to its own.
 
     Args:
-        cfa: the pattern of the RAW that it makes and takes.
+        cfa: the pattern of the RAW that it makes.
     """
 
     name: ClassVar[str]
-    bidirectional: ClassVar[bool] = True
 
     def __init__(self, cfa: CFA | str = "RGGB") -> None:
         super().__init__()
@@ -94,23 +93,9 @@ class BaselineISP(nn.Module, ABC):
     def unprocess(self, srgb: Tensor, setting: Any = None) -> Tensor:
         """Float sRGB ``(B, 3, H, W)`` to linear camera colour ``(B, 3, H, W)``, not clipped."""
 
-    def render(self, raw: Tensor, setting: Any = None) -> Tensor:
-        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``, not clipped; ValueError if the method cannot."""
-        raise ValueError(
-            f"{self.name} only converts sRGB to RAW; rawaug.paper.baselines lists the methods that also render RAW"
-        )
-
     def reverse(self, srgb: Tensor, setting: Any = None) -> Tensor:
         """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides, to the mosaic ``(B, 1, H, W)`` in [0, 1]."""
         return bayer.mosaic(self.unprocess(as_float(srgb), setting).clamp(0.0, 1.0), self.cfa)
-
-    def forward(self, raw: Tensor, setting: Any = None) -> Tensor:
-        """RAW mosaic ``(B, 1, H, W)`` in :attr:`cfa` to sRGB ``(B, 3, H, W)`` in [0, 1]."""
-        return self.render(raw, setting).clamp(0.0, 1.0)
-
-    def cycle(self, srgb: Tensor) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to RAW and back to sRGB of the same shape."""
-        return self.forward(self.reverse(srgb))
 
 
 class Crops(NamedTuple):

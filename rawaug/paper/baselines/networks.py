@@ -30,7 +30,7 @@ LOG_FLOOR = 1e-3
 
 @BASELINES.register("unet")
 class UNetISP(CropTrainedISP):
-    """The U-Net, which has no forward pass.
+    """The U-Net.
 
     Args:
         cfa: the pattern of the RAW that it makes.
@@ -39,7 +39,6 @@ class UNetISP(CropTrainedISP):
     """
 
     name = "unet"
-    bidirectional = False
     learning_rate = 1e-3
 
     def __init__(self, cfa: CFA | str = "RGGB", width: int = PUBLISHED_WIDTH, seed: int = 0) -> None:
@@ -64,7 +63,7 @@ class RGB2RAW(cycleisp.Trunk):
 
 @BASELINES.register("cycleisp")
 class CycleISP(CropTrainedISP):
-    """CycleISP's network from sRGB to RAW, which has no forward pass.
+    """CycleISP's network from sRGB to RAW.
 
     Args:
         cfa: the pattern of the RAW that it makes.
@@ -76,7 +75,6 @@ class CycleISP(CropTrainedISP):
     """
 
     name = "cycleisp"
-    bidirectional = False
     learning_rate = 3e-4
 
     def __init__(

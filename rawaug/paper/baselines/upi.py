@@ -21,13 +21,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp import stages
 from rawaug.isp.cameras import SRGB_TO_XYZ
 from rawaug.isp.config import HIGHLIGHT_KNEE
 from rawaug.isp.fit.samples import FramePair, PixelSamples, sample_pixels
-from rawaug.isp.tone import inverse_smoothstep
 from rawaug.paper.baselines.base import BaselineISP, Training
 from rawaug.registry import BASELINES
 
@@ -52,10 +50,9 @@ class UPIParams(NamedTuple):
     gains: Tensor
 
 
-def smoothstep(x: Tensor) -> Tensor:
-    """The tone curve ``3x^2 - 2x^3`` of values of any shape, clipped to [0, 1], beyond which it would turn back."""
-    x = x.clamp(0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)
+def inverse_smoothstep(x: Tensor) -> Tensor:
+    """Invert ``3x^2 - 2x^3`` on [0, 1] by ``1/2 - sin(asin(1 - 2x) / 3)``; tensors of any shape."""
+    return 0.5 - torch.sin(torch.asin(1.0 - 2.0 * x.clamp(0.0, 1.0)) / 3.0)
 
 
 def camera_matrix(weights: Tensor) -> Tensor:
@@ -82,22 +79,11 @@ class SmoothstepISP(BaselineISP):
         """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape."""
         return unprocess_pixels(srgb, setting or self.default_params(len(srgb)))
 
-    def render(self, raw: Tensor, setting: UPIParams | None = None) -> Tensor:
-        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``."""
-        return render_pixels(bayer.demosaic(raw, self.cfa), setting or self.default_params(len(raw)))
-
 
 def unprocess_pixels(x: Tensor, params: UPIParams) -> Tensor:
     """sRGB to linear camera colour, both ``(B, 3, H, W)``; not clipped yet."""
     linear = stages.gamma_expand(inverse_smoothstep(x), GAMMA)
     return stages.inverse_gains(stages.correct_colour(linear, params.matrix.to(x)), params.gains.to(x))
-
-
-def render_pixels(x: Tensor, params: UPIParams) -> Tensor:
-    """Linear camera colour to sRGB, both ``(B, 3, H, W)``: the inverse of :func:`unprocess_pixels` below highlights."""
-    balanced = stages.apply_gains(x, params.gains.to(x)).clamp(0.0, 1.0)
-    linear = stages.correct_colour(balanced, torch.linalg.inv(params.matrix).to(x))
-    return smoothstep(stages.gamma_compress(linear, GAMMA))
 
 
 @BASELINES.register("upi")

@@ -17,7 +17,6 @@ from rawaug.isp.fit import FitConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.paper import methods
 from rawaug.paper.baselines import UPI, Training, TunedUPI
-from rawaug.paper.baselines.networks import UNetISP
 from rawaug.paper.methods import (
     ROWS,
     Fitted,
@@ -109,8 +108,7 @@ def test_a_cycle_loses_the_mosaic_and_nothing_else_in_a_camera_that_inverts_itse
     scores = cycle_psnr(Fitted(known_camera, 0.0, 0), [fine, fine])
     assert scores["cycle_without_mosaic"] > 80.0
     assert abs(scores["cycle"] - mosaic_only_psnr([fine], "GRBG")) < 3.0
-    assert set(cycle_psnr(Fitted(UPI(), 0.0, 0), [fine])) == {"cycle"}
-    assert cycle_psnr(Fitted(UNetISP(width=4), 0.0, 0), [fine]) == {}  # no way back
+    assert cycle_psnr(Fitted(UPI(), 0.0, 0), [fine]) == {}
 
 
 BALANCE = (2.0, 1.0, 1.6)

@@ -62,8 +62,6 @@ def test_every_method_makes_raw_through_one_interface(name: str) -> None:
         assert torch.equal(raw[:, 0, 0::2, 1::2], linear[:, 2, 0::2, 1::2]), "a site keeps its own channel"
         assert torch.equal(raw[:, 0, 0::2, 0::2], linear[:, 1, 0::2, 0::2])
         assert torch.equal(drawn[0], drawn[1]) and torch.equal(drawn[0], drawn[2]) == (name != "upi")
-        if model.bidirectional:
-            assert model.cycle(srgb).shape == srgb.shape
 
 
 TINY: list[tuple[type[CropTrainedISP], dict[str, Any]]] = [

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.isp.fit.samples import sample_pixels
-from rawaug.isp.tone import inverse_smoothstep
 from rawaug.paper.baselines import Training, fit_baseline
 from rawaug.paper.baselines.upi import (
     UPI,
@@ -21,10 +20,8 @@ from rawaug.paper.baselines.upi import (
     TunedUPI,
     UPIParams,
     camera_matrix,
-    render_pixels,
-    smoothstep,
+    inverse_smoothstep,
 )
-from rawaug.paper.baselines.upi import unprocess_pixels as unprocess
 
 
 def flat(red: float, green: float, blue: float) -> torch.Tensor:
@@ -33,8 +30,8 @@ def flat(red: float, green: float, blue: float) -> torch.Tensor:
 
 @given(st.floats(0.0, 1.0))
 def test_the_inverse_undoes_the_tone_curve(value: float) -> None:
-    x = torch.tensor(value, dtype=torch.float64)
-    assert smoothstep(inverse_smoothstep(x)).item() == pytest.approx(value, abs=1e-9)
+    x = inverse_smoothstep(torch.tensor(value, dtype=torch.float64))
+    assert (x * x * (3.0 - 2.0 * x)).item() == pytest.approx(value, abs=1e-9)
 
 
 def test_the_matrix_of_the_first_camera_by_hand() -> None:
@@ -75,16 +72,6 @@ def test_parameters_replay_and_pictures_do_not_mix(cfa: CFA) -> None:
     alone = UPIParams(*(value[1:2] for value in params))
     torch.testing.assert_close(upi.reverse(srgb[1:2], alone), raw[1:2], atol=1e-6, rtol=0)
     assert not torch.equal(raw, upi.reverse(srgb))
-
-
-def test_rendering_is_the_exact_inverse_below_the_highlights() -> None:
-    generator = torch.Generator().manual_seed(3)
-    srgb = 0.15 + 0.7 * torch.rand(4, 3, 16, 16, generator=generator)
-    params = UPI().sample(4, generator)
-    linear = unprocess(srgb, params)
-    inside = (linear > 0.0).all(1, keepdim=True).expand_as(srgb)  # a saturated colour may lie outside the camera's
-    assert inside.float().mean() > 0.7
-    torch.testing.assert_close(render_pixels(linear, params)[inside], srgb[inside], atol=1e-4, rtol=0)
 
 
 MATRIX = torch.tensor([[0.7, 0.3, 0.0], [0.1, 0.8, 0.1], [0.0, 0.3, 0.7]])
