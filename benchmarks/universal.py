@@ -32,7 +32,8 @@ from rawaug.isp.cameras import camera_from_srgb, gains_in_light, load_cameras, s
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.dictionary import CameraDictionary, is_plausible, nearest_in_hull
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.tone import NODES, STEPS, inverse_smoothstep, srgb_to_linear
+from rawaug.isp.tone import NODES, STEPS, srgb_to_linear
+from rawaug.paper.baselines.upi import inverse_smoothstep
 from rawaug.seeding import keyed_generator
 
 CURVES = Path(__file__).with_name("tone_curves.json")

@@ -14,7 +14,7 @@ from rawaug.denoise.frames import DenoisedFolder, denoise_file, denoise_folder
 from rawaug.denoise.pictures import PICTURES, PictureDenoiser, denoise_picture, denoise_pictures
 from rawaug.errors import escape
 from rawaug.files import files_below, require_writable, write_json
-from rawaug.io.picture_files import PICTURE_FORMATS
+from rawaug.io.pictures import PICTURE_FORMATS
 from rawaug.io.raw import RAW_EXTENSIONS
 from rawaug.registry import Spec
 

@@ -30,7 +30,7 @@ from rawaug.denoise.denoiser import CPU, Noisy, progress_by
 from rawaug.denoise.foreign import AGAIN, load_published
 from rawaug.errors import extra
 from rawaug.files import files_in, read_tensors, require_file, require_writable
-from rawaug.io.picture_files import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
+from rawaug.io.pictures import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
 from rawaug.kernels.runtime import find_device
 from rawaug.progress import progress
 from rawaug.registry import FILTERS, Spec, spec_label, suggest

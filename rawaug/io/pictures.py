@@ -8,6 +8,9 @@ The display transfer of sRGB (IEC 61966-2-1:1999), for linear light l and displa
 OpenEXR and Radiance files hold l, everything else is taken to hold v. An embedded ICC profile of another space (Display
 P3, Adobe RGB, grey of another gamma) is applied by LittleCMS, relative colorimetric with black point compensation, in 8
 bits; without one, a picture is taken to be sRGB whatever else its tags say. Source: ICC.1:2022.
+
+A picture that is denoised (:func:`read_stored`) is neither turned nor converted: its EXIF, its ICC profile and its
+orientation go to the new file as they are, and so does transparency. 8 and 16 bits are kept where that format has them.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +29,7 @@ from torch import Tensor
 
 from rawaug.bayer import turn
 from rawaug.errors import extra
-from rawaug.files import require_file
+from rawaug.files import replacing, require_file
 
 MAX_PIXELS = 2**26
 """Larger pictures (8192 x 8192) are refused by default, since a few header bytes can claim any size."""
@@ -101,10 +104,10 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
         raise ValueError(f"{path}: unsupported extension; use .png, .tif or .jpg ({oiio.geterror()})")
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
     written = output.open(str(path), spec) and output.write_image(np.ascontiguousarray(pixels))
-    require_written(output, written, path)
+    _require_written(output, written, path)
 
 
-def require_written(output: Any, written: bool, path: str | Path) -> None:
+def _require_written(output: Any, written: bool, path: str | Path) -> None:
     """Close OpenImageIO's ``output``; OSError if it, or what was ``written`` to it, failed."""
     if not (output.close() and written):
         raise OSError(f"{path}: cannot be written (OpenImageIO: {_reason(output) or 'no reason given'})")
@@ -124,7 +127,7 @@ def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:
     """Pixels uint8 ``(H, W, 3)`` as stored, and the EXIF orientation."""
 
     def kind(spec: Any) -> str:
-        require_srgb(spec, path)
+        _require_srgb(spec, path)
         floats = _oiio().HALF, _oiio().FLOAT, _oiio().DOUBLE
         return "float" if spec.format.basetype in floats else "uint8"
 
@@ -191,7 +194,7 @@ def _require_size(spec: Any, path: Path, max_pixels: int) -> None:
         raise ValueError(f"{path}: declares {size}, above the limit of {max_pixels}; split it, or raise max_pixels")
 
 
-def require_srgb(spec: Any, path: Path) -> None:
+def _require_srgb(spec: Any, path: Path) -> None:
     """Raise ValueError if a conversion to sRGB would need a profile or a choice of channels."""
     stored = spec.get_string_attribute("tiff:ColorSpace") or spec.get_string_attribute("jpeg:ColorSpace")
     if any(name in stored for name in ("CMYK", "YCCK", "LAB", "separated")):
@@ -286,3 +289,81 @@ def recode_jpeg(srgb: Tensor, quality: int, chroma: str = "4:2:2") -> Tensor:
     picture = Image.fromarray(srgb.permute(1, 2, 0).contiguous().numpy())
     picture.save(stored, "JPEG", quality=quality, subsampling=chroma)
     return torch.from_numpy(np.array(Image.open(stored))).permute(2, 0, 1).contiguous()
+
+
+# -- files of pictures to denoise, with all that they say of them ------------------------------------------------------
+
+QUALITY = 97
+"""Of a JPEG that is written, with chroma at full size."""
+PICTURE_FORMATS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+"""Extensions of the files that are read and written here."""
+
+
+class StoredPicture(NamedTuple):
+    """A picture as its file has it.
+
+    Args:
+        srgb: float32 ``(3, H, W)`` in [0, 1], display values, not turned upright; grey has three equal channels.
+        channels: of the file, 1 to 4.
+        spec: OpenImageIO's description of the file, with its metadata.
+        alpha: uint8 or uint16 ``(H, W, 1)``, where there is transparency.
+    """
+
+    srgb: Tensor
+    channels: int
+    spec: Any
+    alpha: np.ndarray | None
+
+
+def read_stored(path: str | Path, max_pixels: int = MAX_PIXELS) -> StoredPicture:
+    """A picture of 8 or 16 bits.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        OSError: if it is not a picture, or is truncated.
+        ValueError: if it is larger than ``max_pixels``, animated, CMYK or CIELAB, or holds floating-point numbers.
+    """
+    path = Path(path)
+
+    def kind(spec: Any) -> Any:
+        _require_srgb(spec, path)
+        if str(spec.format) not in ("uint8", "uint16"):
+            raise ValueError(f"{path}: holds {spec.format} numbers; a picture to denoise has 8 or 16 bits")
+        return spec.format
+
+    pixels, spec = decode_file(path, max_pixels, kind)
+    channels = pixels.shape[-1]
+    alpha = pixels[..., -1:] if channels in (2, 4) else None
+    colours = pixels[..., :3] if channels > 2 else np.repeat(pixels[..., :1], 3, axis=-1)
+    scale = np.float32(1.0 / np.iinfo(pixels.dtype).max)
+    srgb = torch.from_numpy(np.ascontiguousarray(colours.transpose(2, 0, 1)).astype(np.float32) * scale)
+    return StoredPicture(srgb, channels, spec, alpha)
+
+
+def write_stored(path: str | Path, srgb: Tensor, like: StoredPicture) -> None:
+    """Write sRGB ``(3, H, W)`` in [0, 1] with the channels, bits and metadata of ``like``, whole or not at all.
+
+    Raises:
+        ValueError: if the extension is none of :data:`PICTURE_FORMATS`.
+        OSError: if the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in PICTURE_FORMATS:
+        raise ValueError(f"{path}: cannot be written; use one of {', '.join(PICTURE_FORMATS)}")
+    jpeg = path.suffix.lower() in (".jpg", ".jpeg")
+    stored = np.dtype(np.uint8) if jpeg else np.dtype(str(like.spec.format))
+    most = np.iinfo(stored).max
+    colours = srgb if like.channels > 2 else srgb.mean(0, keepdim=True)
+    pixels = (colours.clamp(0.0, 1.0) * most).round().permute(1, 2, 0).numpy().astype(stored)
+    if like.alpha is not None and not jpeg:
+        pixels = np.concatenate([pixels, like.alpha], axis=-1)
+    spec = _oiio().ImageSpec(like.spec)
+    spec.set_format(str(stored))
+    spec.nchannels, spec.channelnames = pixels.shape[-1], list(like.spec.channelnames)[: pixels.shape[-1]]
+    if jpeg:
+        spec.attribute("Compression", f"jpeg:{QUALITY}")
+        spec.attribute("jpeg:subsampling", "4:4:4")
+    with replacing(path) as partial:
+        output = _oiio().ImageOutput.create(str(path))
+        written = output.open(str(partial), spec) and output.write_image(np.ascontiguousarray(pixels))
+        _require_written(output, written, path)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from rawaug.io.picture_files import read_stored, write_stored
+from rawaug.io.pictures import read_stored, write_stored
 
 oiio = pytest.importorskip("OpenImageIO")
 
