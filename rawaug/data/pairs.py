@@ -28,7 +28,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.bayer import CFA, bin_mosaic, bin_mosaic_variance, to_bayer
+from rawaug.bayer import CFA, bin_mosaic, bin_mosaic_variance, crop_to_cfa, to_bayer
 from rawaug.files import digest
 from rawaug.io import RawFrame
 from rawaug.io.pictures import MAX_PIXELS, decode_srgb, encode_srgb
@@ -131,12 +131,11 @@ class Pair:
             )
 
     def in_pattern(self, cfa: CFA | str) -> Pair:
-        """The frame without the first row or column, where that gives it the pattern ``cfa``; sides stay even."""
-        top, left = self.cfa.shift_to(CFA(cfa))
-        if not (top or left):
+        """The frame without its outer rows or columns, where that gives it the pattern ``cfa``."""
+        target = CFA(cfa)
+        if target == self.cfa:
             return self
-        height, width = ((size - first) // 2 * 2 for size, first in zip(self.raw.shape[-2:], (top, left), strict=True))
-        return self._changed(lambda image: image[:, top : top + height, left : left + width].contiguous(), cfa=CFA(cfa))
+        return self._changed(lambda image: crop_to_cfa(image, self.cfa, target).contiguous(), cfa=target)
 
     def middle(self, side: int) -> Pair:
         """The middle ``side x side`` of the frame, or all of it along a side that is shorter; the CFA is kept."""

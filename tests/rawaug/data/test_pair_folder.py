@@ -226,7 +226,7 @@ def test_damage_by_others_is_a_line_and_the_rest_is_read(tmp_path: Path, monkeyp
     (part,) = check(tmp_path).parts
     assert part.counts["cfas"] == {"GRBG": 1}
     for said in (
-        "deep_noisy.tif: cannot be read as TIFF (maximum recursion depth",
+        "deep_noisy.tif: its TIFF tags are damaged (maximum recursion depth",
         "empty.npz: cfa is not valid",
         "loop_noisy.tif",
     ):
