@@ -52,7 +52,7 @@ def run(
         strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing; of pictures, a factor on
             the estimated level of the noise: 2 removes more, 0.5 less.
         linear: demosaic too, to a linear DNG of full colour; by default with rawaug-joint.
-        self_ensemble: average eight views of a network, at eight times the cost.
+        self_ensemble: average eight views of a network, at eight times the cost (rawaug-srgb averages two as it is).
         greens: auto makes the two greens of a Bayer sensor agree where they clearly differ, since demosaicing makes a
             maze of the difference; keep leaves them.
         black: auto takes the black level from masked pixels, where the file has them, their margins agree and they tell
@@ -69,7 +69,7 @@ def run(
             options = ", ".join(f"--{name.replace('_', '-')}" for name in unfit)
             raise ValueError(f"{source}: is a developed picture; {options} is for RAW")
         spec = PICTURES if denoiser is None else denoiser
-        denoise_all(source, out, PictureDenoiser.of(spec, device, strength, 8 if self_ensemble else 1), overwrite)
+        denoise_all(source, out, PictureDenoiser.of(spec, device, strength, 8 if self_ensemble else None), overwrite)
         return
     if json:
         require_writable(Path(json))

@@ -75,8 +75,8 @@ def run(
     if is_picture_pairs(data):
         if noise is not None or bin != 1 or report:
             raise ValueError(f"{data}: has developed pictures; --noise, --bin and --report are for RAW")
-        made = PictureDenoiser.of(weights, device, views=views or (8 if self_ensemble else 1))
-        return _pictures(made, data, [str(spec) for spec in classical or ()], json, settings)
+        turns = views or (8 if self_ensemble else None)
+        return _pictures(weights, device, turns, data, [str(spec) for spec in classical or ()], json, settings)
     file = find_weights(weights, FOLDER)
     kind = read_header(file)["kind"]
     if kind == "isp" and (self_ensemble or views or noise is not None or bin != 1 or classical or report):
@@ -111,23 +111,30 @@ def run(
 
 
 def _pictures(
-    denoiser: PictureDenoiser, data: str, classical: Sequence[str], json: str | None, settings: PairSettings | None
+    weights: str,
+    device: str,
+    views: int | None,
+    data: str,
+    classical: Sequence[str],
+    json: str | None,
+    settings: PairSettings | None,
 ) -> dict[str, Any]:
     """The result of a denoiser of pictures, beside classical filters, as published and registered.
 
-    That of a self-ensemble has the single pass under ``plain``.
+    That of more views than usual has the usual result under ``plain``.
     """
     given = settings or PairSettings()
-    plain, ensemble = replace(denoiser, views=1), replace(denoiser, name=f"{denoiser.name}, {denoiser.views} views")
+    plain = PictureDenoiser.of(weights, device)
+    ensemble = [replace(plain, name=f"{plain.name}, {views} views", views=views)] if views else []
     filters = [PictureDenoiser.of(spec) for spec in classical]
-    tested = [plain, *([ensemble] if denoiser.views > 1 else []), *filters]
+    tested = [plain, *ensemble, *filters]
     result = picture_scores(tested, open_picture_pairs(data, given.noisy, given.clean))
     print_pictures(data, result)
     rows = result["rows"]
-    own = rows[tested[denoiser.views > 1].name]
+    own = rows[tested[len(ensemble)].name]
     found = {"kind": "denoiser", "data": data, "version": __version__, **own[PUBLISHED], "registered": own[REGISTERED]}
-    if denoiser.views > 1:
-        found |= {"self_ensemble": True, "views": denoiser.views, "plain": rows[plain.name][PUBLISHED]}
+    if ensemble:
+        found |= {"self_ensemble": True, "views": views, "plain": rows[plain.name][PUBLISHED]}
     found |= {"classical": {one.name: rows[one.name] for one in filters}} if classical else {}
     if json:
         write_json(found, json)

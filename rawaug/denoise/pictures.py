@@ -7,8 +7,8 @@ the level being 0. What it takes away then, x - f(x, 0), tells the level: r is t
 squares of 16 x 16, which texture hardly moves. The estimate is unsure, since noise and detail are alike, so that the
 network does best when it is told the geometric mean of it and a usual level K; and a picture of which no more than D is
 taken away is clean. K and D are chosen on validation pictures. The strength s is 1 unless the user says otherwise.
-FFDNet, which needs a level, is told scikit-image's estimate. The self-ensemble is the mean of eight turns of the
-picture, as for RAW.
+FFDNet, which needs a level, is told scikit-image's estimate. A network of this kind sees the picture twice, upright and
+turned by a quarter, and the mean is taken: half of what the self-ensemble gains, the mean of eight turns as for RAW.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ USUAL, CLEAN = 20.0 / 255.0, 1.0 / 255.0
 """K, as found on CC15, and D, on clean photographs."""
 _SAMPLED, _SIDE, _SQUARE = 3, 256, 16
 """The level is estimated on this many parts of this side in both directions, in squares of the last side."""
+TURNS = {1: (0,), 2: (0, 5), 4: range(4), 8: range(bayer.N_VIEWS)}
+"""The turns whose mean is taken, by their number: flips are the first four, 5 is a quarter turn."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,9 @@ class PictureDenoiser:
     takes: ClassVar[str] = "srgb"
 
     @classmethod
-    def of(cls, spec: str | Path, device: str = "cpu", strength: float = 1.0, views: int = 1) -> PictureDenoiser:
+    def of(
+        cls, spec: str | Path, device: str = "cpu", strength: float = 1.0, views: int | None = None
+    ) -> PictureDenoiser:
         """The denoiser that a name or a file stands for.
 
         Args:
@@ -63,7 +67,8 @@ class PictureDenoiser:
                 or of FFDNet's authors; with ``@15`` behind it, it is told this level, in units of 1/255, every time.
             device: auto, cpu, cuda, ...
             strength: factor on the estimated level: 2 removes more, 0.5 less, 0 nothing.
-            views: 1, or 4 or 8 of a self-ensemble, at that many times the work.
+            views: 1, 2, 4 or 8 turns of the picture, at that many times the work; by default 2 of a network that
+                estimates the level, and 1 of others.
 
         Raises:
             FileNotFoundError: if there is no such file.
@@ -78,11 +83,11 @@ class PictureDenoiser:
         if not 0.0 <= strength <= 10.0:
             raise ValueError(f"strength must be between 0 and 10, got {strength}")
         if path in FILTERS:
-            return replace(cls.of_filter(path, level, strength), views=views)
+            return replace(cls.of_filter(path, level, strength), views=views or 1)
         name, network = _network(path)
         made = cls.of_network(f"{name}, told {told}" if at else name, network, device, strength)
         made = made if level is None else replace(made, run=lambda srgb: _denoise_at(network, srgb, level))
-        return replace(made, views=views)
+        return replace(made, views=views or (2 if getattr(network, "light", False) else 1))
 
     @classmethod
     def of_filter(cls, spec: Spec, level: float | None = None, strength: float = 1.0) -> PictureDenoiser:
@@ -100,7 +105,7 @@ class PictureDenoiser:
     def of_network(cls, name: str, network: nn.Module, device: str = "cpu", strength: float = 1.0) -> PictureDenoiser:
         """A network of sRGB, which is moved to the device, in tiles; one that reads levels is told the picture's."""
         where = find_device(device)
-        network = network.to(where).eval()
+        network = network.to(where, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
         def run(srgb: Tensor) -> Tensor:
             if not getattr(network, "reads_variance", False):
@@ -113,7 +118,7 @@ class PictureDenoiser:
     def __call__(self, given: Noisy) -> Tensor:
         """sRGB ``(1, 3, H, W)`` denoised, on the CPU, cut to [0, 1]."""
         image = given.image.to(self.device)
-        turns = (bayer.turn_back(self.run(bayer.turn(image, k).contiguous()), k) for k in range(self.views))
+        turns = (bayer.turn_back(self.run(bayer.turn(image, k).contiguous()), k) for k in TURNS[self.views])
         return (sum(turns, torch.zeros_like(image)) / self.views).cpu().clamp(0.0, 1.0)
 
 

@@ -74,9 +74,17 @@ def test_a_self_ensemble_denoises_a_turned_picture_to_the_turned_result() -> Non
     denoiser = PictureDenoiser.of("rawaug-srgb@10", views=8)
     upright, turned = (denoiser(Noisy(bayer.turn(noisy()[None], view))) for view in (0, 5))
     assert torch.allclose(bayer.turn(upright, 5), turned, atol=1e-4)
-    plain = PictureDenoiser.of("rawaug-srgb@10")
-    assert (plain(Noisy(noisy()[None])) - upright).abs().max() > 1e-3
-    assert error(upright[0]) < error(plain(Noisy(noisy()[None]))[0])
+    two = PictureDenoiser.of("rawaug-srgb@10")
+    assert error(upright[0]) < error(two(Noisy(noisy()[None]))[0])
+
+
+def test_the_shipped_network_sees_a_picture_upright_and_turned_by_a_quarter() -> None:
+    seen = noisy()[None, :, :48]
+    two, one = PictureDenoiser.of("rawaug-srgb@10"), PictureDenoiser.of("rawaug-srgb@10", views=1)
+    turned = bayer.turn_back(one.run(bayer.turn(seen, 5).contiguous()), 5)
+    assert torch.allclose(two(Noisy(seen)), ((one.run(seen) + turned) / 2).clamp(0.0, 1.0), atol=1e-5)
+    assert (one.run(seen) - turned).abs().max() > 1e-3
+    assert PictureDenoiser.of("NonLocalMeans@10").views == 1
 
 
 def test_ffdnet_is_told_the_deviation_of_its_noise() -> None:
