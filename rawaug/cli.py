@@ -6,6 +6,7 @@ add commands as entry points in the group ``rawaug.commands``. Errors are one li
 
 from __future__ import annotations
 
+import ctypes
 import io
 import json
 import os
@@ -39,8 +40,9 @@ COMMANDS = {
     "synth": "Write noisy and clean RAW pairs made from sRGB pictures.",
 }
 """Modules of :mod:`rawaug.commands`, each with a function ``run`` whose docstring opens with this line."""
-WHOLE_FRAMES = ("benchmark", "denoise", "evaluate")
-"""Commands that take memory in huge pages, where Linux has them: page faults took a third of their time."""
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+NETWORKS = ("benchmark", "denoise", "evaluate", "run")
+"""Commands that take memory in huge pages and keep it, where Linux can: page faults took a third of their time."""
 
 app = App(
     name="rawaug",
@@ -97,6 +99,15 @@ def _import(file: Path) -> None:
     spec.loader.exec_module(module)
 
 
+def _keep_memory() -> None:
+    """Let PyTorch take memory in huge pages, and the C library keep freed blocks of up to 1 GiB for the next tile."""
+    os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # read when PyTorch first takes memory
+    with suppress(AttributeError, OSError, TypeError):  # glibc alone has mallopt
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+        mallopt(M_MMAP_THRESHOLD, 2**30)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -104,8 +115,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # names of files need not fit the terminal's encoding
             stream.reconfigure(errors="backslashreplace")
-    if words[:1] and words[0] in WHOLE_FRAMES:
-        os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # before PyTorch first takes memory
+    if words[:1] and words[0] in NETWORKS:
+        _keep_memory()
     if not words or words[0] in ("-h", "--help"):
         for point in _PLUGINS:  # those alone are imported for the first lines of their docstrings
             with suppress(ImportError, AttributeError):

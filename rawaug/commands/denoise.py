@@ -69,7 +69,8 @@ def run(
             options = ", ".join(f"--{name.replace('_', '-')}" for name in unfit)
             raise ValueError(f"{source}: is a developed picture; {options} is for RAW")
         spec = PICTURES if denoiser is None else denoiser
-        denoise_all(source, out, PictureDenoiser.of(spec, device, strength, 8 if self_ensemble else None), overwrite)
+        of_pictures = PictureDenoiser.of(spec, device, strength, 8 if self_ensemble else None, "auto")
+        denoise_all(source, out, of_pictures, overwrite)
         return
     if json:
         require_writable(Path(json))

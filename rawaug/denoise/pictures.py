@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -31,7 +31,7 @@ from rawaug.denoise.foreign import AGAIN, load_published
 from rawaug.errors import extra
 from rawaug.files import files_in, read_tensors, require_file, require_writable
 from rawaug.io.pictures import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
-from rawaug.kernels.runtime import find_device
+from rawaug.kernels.runtime import find_device, has_fast_bfloat16
 from rawaug.progress import progress
 from rawaug.registry import FILTERS, Spec, spec_label, suggest
 
@@ -41,24 +41,35 @@ USUAL, CLEAN = 20.0 / 255.0, 1.0 / 255.0
 """K, as found on CC15, and D, on clean photographs."""
 _SAMPLED, _SIDE, _SQUARE = 3, 256, 16
 """The level is estimated on this many parts of this side in both directions, in squares of the last side."""
+_TILE = 1280
+"""Side of a tile: of the default's, 12 megapixels take more than 2 GB."""
 TURNS = {1: (0,), 2: (0, 5), 4: range(4), 8: range(bayer.N_VIEWS)}
 """The turns whose mean is taken, by their number: flips are the first four, 5 is a quarter turn."""
 
 
 @dataclass(frozen=True)
 class PictureDenoiser:
-    """Anything that denoises pictures: ``run(srgb) -> srgb``, called on ``device``, for each of ``views`` turns."""
+    """Anything that denoises pictures: ``run(srgb) -> srgb``, called on ``device``, for each of ``views`` turns.
+
+    ``mixed`` says whether it computes in bfloat16.
+    """
 
     name: str
     run: Callable[[Tensor], Tensor]
     device: torch.device = CPU
     views: int = 1
+    mixed: bool = False
 
     takes: ClassVar[str] = "srgb"
 
     @classmethod
     def of(
-        cls, spec: str | Path, device: str = "cpu", strength: float = 1.0, views: int | None = None
+        cls,
+        spec: str | Path,
+        device: str = "cpu",
+        strength: float = 1.0,
+        views: int | None = None,
+        precision: Literal["full", "auto"] = "full",
     ) -> PictureDenoiser:
         """The denoiser that a name or a file stands for.
 
@@ -69,6 +80,7 @@ class PictureDenoiser:
             strength: factor on the estimated level: 2 removes more, 0.5 less, 0 nothing.
             views: 1, 2, 4 or 8 turns of the picture, at that many times the work; by default 2 of a network that
                 estimates the level, and 1 of others.
+            precision: ``"auto"`` computes in bfloat16 where that is fast and costs the network less than 0.05 dB.
 
         Raises:
             FileNotFoundError: if there is no such file.
@@ -87,7 +99,8 @@ class PictureDenoiser:
         name, network = _network(path)
         made = cls.of_network(f"{name}, told {told}" if at else name, network, device, strength)
         made = made if level is None else replace(made, run=lambda srgb: _denoise_at(network, srgb, level))
-        return replace(made, views=views or (2 if getattr(network, "light", False) else 1))
+        mixed = precision == "auto" and getattr(network, "mixed", False) and has_fast_bfloat16(made.device)
+        return replace(made, views=views or (2 if getattr(network, "light", False) else 1), mixed=mixed)
 
     @classmethod
     def of_filter(cls, spec: Spec, level: float | None = None, strength: float = 1.0) -> PictureDenoiser:
@@ -118,8 +131,11 @@ class PictureDenoiser:
     def __call__(self, given: Noisy) -> Tensor:
         """sRGB ``(1, 3, H, W)`` denoised, on the CPU, cut to [0, 1]."""
         image = given.image.to(self.device)
-        turns = (bayer.turn_back(self.run(bayer.turn(image, k).contiguous()), k) for k in TURNS[self.views])
-        return (sum(turns, torch.zeros_like(image)) / self.views).cpu().clamp(0.0, 1.0)
+        total = torch.zeros_like(image)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
+            for k in TURNS[self.views]:
+                total += bayer.turn_back(self.run(bayer.turn(image, k).contiguous()), k)
+        return (total / self.views).cpu().clamp_(0.0, 1.0)
 
 
 def _level(spec: str, told: str) -> float:
@@ -153,14 +169,14 @@ def _network(spec: str) -> tuple[str, nn.Module]:
 def _denoise_at(network: Any, srgb: Tensor, level: float) -> Tensor:
     """The picture denoised by a network that is told the deviation of its noise, 0 for unknown."""
     variance = srgb.new_full((1, 1, 1, 1), level**2).expand_as(srgb)
-    return denoisers.denoise_tiles(network, srgb, variance, each=progress_by("tile"))
+    return denoisers.denoise_tiles(network, srgb, variance, tile=_TILE, each=progress_by("tile")).float()
 
 
 def estimate_level(network: Any, srgb: Tensor) -> float:
     """The deviation that a network of pictures is told for ``(1, 3, H, W)``: see the module."""
     if not getattr(network, "light", False):  # it cannot do without a level
         return _white_level(srgb)
-    removed = [(part - network(part, torch.zeros_like(part))).square().mean(1) for part in _spread_parts(srgb)]
+    removed = [(part - network(part, torch.zeros_like(part))).float().square().mean(1) for part in _spread_parts(srgb)]
     side = min(_SQUARE, *srgb.shape[-2:])
     local = torch.cat([F.avg_pool2d(power, side).flatten() for power in removed]).sqrt().quantile(0.25)
     return float((USUAL * local).sqrt() / (1.0 + (CLEAN / local.clamp_min(1e-6)) ** 6))
