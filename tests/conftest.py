@@ -25,7 +25,7 @@ from rawaug import registry
 from rawaug.data import demo_pairs, demo_pictures
 from rawaug.data.pairs import Pair
 from rawaug.files import digest
-from rawaug.isp.fast import BakedISP
+from rawaug.isp import fast
 from rawaug.isp.model import DictionaryISP
 
 torch.set_num_threads(1)
@@ -61,20 +61,22 @@ def no_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def baked_once() -> Iterator[None]:
-    """Augmentations of equal ISPs share their tables, which take 0.3 s: hundreds of tests make one."""
-    known: dict[str, BakedISP] = {}
+    """Equal ISPs share their tables, which take 0.3 s, on one number of threads: hundreds of tests make one."""
+    known: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
+    bake = fast._tables
 
-    def baked(isp: DictionaryISP) -> BakedISP:
+    def baked(isp: DictionaryISP, nodes: int, forward: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
         tensors = [tensor.detach().cpu().reshape(-1) for tensor in (*isp.parameters(), *isp.buffers())]
-        key = digest(repr(isp.config).encode(), *(tensor.view(torch.uint8).numpy().tobytes() for tensor in tensors))
+        given = isp.config, isp.ordered_stages, isp.gain.log_gains.device, nodes, forward, torch.get_num_threads()
+        key = digest(repr(given).encode(), *(tensor.view(torch.uint8).numpy().tobytes() for tensor in tensors))
         if key not in known:
-            if len(known) == 4:
+            if len(known) == 8:
                 known.clear()
-            known[key] = BakedISP(isp)
+            known[key] = bake(isp, nodes, forward)
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("rawaug.plugin.augment.BakedISP", baked)
+        patch.setattr(fast, "_tables", baked)
         yield
 
 

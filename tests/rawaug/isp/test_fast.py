@@ -50,7 +50,7 @@ def test_the_table_has_the_same_bits_with_any_number_of_threads() -> None:
 @pytest.mark.parametrize("left_out", POINTWISE_STAGES)
 def test_any_stage_may_be_left_out(left_out: str) -> None:
     isp = full_isp(stages=tuple(stage for stage in POINTWISE_STAGES if stage != left_out))
-    srgb = torch.rand(1, 3, 16, 16, generator=torch.Generator().manual_seed(1))
+    srgb = torch.randint(256, (1, 3, 16, 16), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
     params = isp.choose(srgb)
     unbaked = bayer.pack(isp.reverse(srgb, params).raw, isp.cfa)
     assert psnr(BakedISP(isp)(srgb, params), unbaked).item() > 75.0

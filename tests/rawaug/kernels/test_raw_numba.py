@@ -48,7 +48,7 @@ def threads() -> Iterator[None]:
 @pytest.mark.parametrize("white", [1.0, 0.2, float("inf")])
 def test_compiled_is_the_same_pass(attention: bool, shading: bool, white: float) -> None:
     srgb, setting = pictures(3, 3, 6, 1100), camera(3, attention, shading)
-    for x in (srgb, srgb / 255.0):
+    for x in (srgb, srgb / 255.0) if attention and shading else (srgb,):  # each compiles code of its own
         torch.testing.assert_close(cpu.unprocess(x, setting, white), unprocess(x, setting, white), atol=1e-4, rtol=0)
 
 
@@ -56,7 +56,7 @@ def test_compiled_is_the_same_pass(attention: bool, shading: bool, white: float)
 @pytest.mark.parametrize("all_stages", [False, True])
 def test_curves_by_picture_are_the_same_pass(entries: int, all_stages: bool) -> None:
     srgb, setting = pictures(3, 3, 6, 1100), camera(3, all_stages, all_stages, entries=entries)
-    for x in (srgb, srgb / 255.0):
+    for x in (srgb, srgb / 255.0) if all_stages else (srgb,):
         expected = unprocess(x, setting, 0.9)
         torch.testing.assert_close(cpu.unprocess(x, setting, 0.9), expected, atol=1e-5, rtol=0)
         assert torch.equal(cpu.unprocess(x[1:2], one_of(setting, 1), 0.9)[0], cpu.unprocess(x, setting, 0.9)[1])
