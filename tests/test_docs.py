@@ -47,6 +47,7 @@ def test_snippet_runs(name: str, code: str, tmp_path: Path, monkeypatch: pytest.
         pytest.importorskip(library, reason=f"shows rawaug with {library}: {OPTIONAL[library]}")
     (folder := tmp_path / "pictures").mkdir()  # what a snippet writes beside it is its own, too
     monkeypatch.chdir(folder)
+    monkeypatch.setattr("rawaug.isp.fit.pipeline.CURVE_STEPS", 30)
     exec(compile(code, name, "exec"), {"__name__": "__main__"})
 
 

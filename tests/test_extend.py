@@ -118,12 +118,12 @@ def in_a_fresh_process(site: Path, *lines: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.usefixtures("installed")
 def test_a_package_is_imported_before_its_network_is_outlined(site: Path, tmp_path: Path) -> None:
     """Its module makes tensors and imports rawaug.noise, neither of which works on the meta device."""
     file = str(tmp_path / "x.safetensors")
-    look_up = "import denoisers; from rawaug.commands.info import describe"
-    in_a_fresh_process(site, look_up, f"denoisers.save(denoisers.build('Shallow', width=4), {file!r}, {{}})")
-    in_a_fresh_process(site, look_up, f"describe({file!r})")
+    denoisers.save(denoisers.build("Shallow", width=4), file, {})
+    in_a_fresh_process(site, f"from rawaug.commands.info import describe; describe({file!r})")
 
 
 def test_what_is_imported_on_another_device_is_whole(site: Path) -> None:

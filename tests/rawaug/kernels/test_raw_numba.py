@@ -94,7 +94,7 @@ def test_same_bits_on_any_number_of_threads(threads: None) -> None:
 
 def test_floats_beyond_the_cube_are_held_to_it_and_strides_do_not_matter() -> None:
     wild = torch.tensor([-1e30, -0.5, 0.0, 0.5, 1.0, 1.5, 1e30, float("inf")]).repeat(3)[:, None].expand(1, 3, 24, 16)
-    setting = camera(1, True, False)
+    setting = camera(1, True, True)
     expected = cpu.unprocess(wild.clamp(0.0, 1.0), setting, 1.0)
     assert torch.equal(cpu.unprocess(wild, setting, 1.0), expected)
     cpu.unprocess(torch.full((1, 3, 4, 4), float("nan")), setting, 1.0)  # must not read outside the table
