@@ -79,7 +79,7 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
     def frame_of() -> RawFrame:
         frame = read_raw(path)
         numbers = [*frame.white_balance, *frame.daylight, *(frame.noise_profile or ()), frame.white, *frame.black]
-        for tensor in (frame.mosaic, frame.color_matrix, frame.shading_gains, torch.tensor(numbers)):
+        for tensor in (frame.mosaic, frame.color_matrix, *(m.gains for m in frame.gain_maps), torch.tensor(numbers)):
             if not tensor.isfinite().all():
                 raise ArithmeticError(f"not finite: {tensor.flatten()[:20].tolist()}")
         return frame

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug.bayer import CFA, pattern
+from rawaug.bayer import CFA
 
 _GAIN_MAP = 9
 _OPCODE = struct.Struct(">4I")  # id, version, flags, bytes that follow
@@ -104,34 +104,3 @@ def of_planes(m: GainMap, cfa: CFA | str) -> list[GainMap]:
     colour = CFA(cfa).channels[m.area[0] % 2][m.area[1] % 2]
     gains = m.gains.sqrt() if colour == 1 else m.gains  # both greens have a map, and the plane is multiplied by both
     return [replace(m, area=(0, 0, *m.area[2:]), pitch=(1, 1), planes=(colour, 1), gains=gains)]
-
-
-def gains_at_sites(maps: Iterable[GainMap], cfa: CFA | str, height: int, width: int) -> Tensor:
-    """The product of the maps at every site: float32 ``(1, H, W)``, which corrects a mosaic when multiplied with it."""
-    product = torch.ones(height, width)
-    for m in maps:
-        first, count = m.planes
-        if m.on_mosaic:
-            if first == 0 and count:
-                _multiply(product, m, 0, None)
-            continue
-        colours = pattern(cfa).channels(height, width)
-        for plane in range(first, min(first + count, 3)):
-            _multiply(product, m, min(plane - first, len(m.gains) - 1), colours == plane)
-    return product[None]
-
-
-def _multiply(product: Tensor, m: GainMap, plane: int, where: Tensor | None) -> None:
-    top, left, bottom, right = m.area
-    height, width = product.shape
-    window = slice(top, min(bottom, height), m.pitch[0]), slice(left, min(right, width), m.pitch[1])
-    rows, columns = (_weights(m, axis, product.shape[axis])[window[axis]] for axis in (0, 1))
-    gains = rows @ m.gains[plane] @ columns.T
-    product[window] *= gains if where is None else torch.where(where[window], gains, 1.0)
-
-
-def _weights(m: GainMap, axis: int, size: int) -> Tensor:
-    """Of the map's nodes along an axis at each of ``size`` pixels, ``(size, nodes)``."""
-    nodes = m.gains.shape[1 + axis]
-    position = ((torch.arange(size) + 0.5) / size - m.origin[axis]) / (m.spacing[axis] if nodes > 1 else 1.0)
-    return (1 - (position.clamp(0, nodes - 1)[:, None] - torch.arange(nodes)).abs()).clamp_min(0)

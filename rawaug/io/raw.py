@@ -31,7 +31,7 @@ from torch import Tensor
 from rawaug.bayer import CFA, pattern_name, plane_indices
 from rawaug.errors import extra
 from rawaug.files import require_file
-from rawaug.io.gain_map import GainMap, gains_at_sites
+from rawaug.io.gain_map import GainMap
 from rawaug.io.masked import MaskedPixels, measure_masked
 from rawaug.io.pictures import require_utf8
 from rawaug.io.tiff import MAKE, MODEL, TiffTags, read_tiff_tags
@@ -147,11 +147,6 @@ class RawFrame:
     gain_maps: tuple[GainMap, ...] = ()
     exposure: Exposure = UNKNOWN
     masked: MaskedPixels | None = None
-
-    @property
-    def shading_gains(self) -> Tensor:
-        """What corrects the lens shading when ``mosaic`` is multiplied with it: float32 ``(1, H, W)``, 1 if unknown."""
-        return gains_at_sites(self.gain_maps, self.cfa, *self.mosaic.shape[-2:])
 
     @property
     def upright_view(self) -> int:

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from rawaug.bayer import CFA, pack
 from rawaug.io import read_raw, write_dng
-from rawaug.io.gain_map import GainMap, gains_at_sites, opcode_list, parse_gain_maps
+from rawaug.io.gain_map import GainMap, opcode_list, parse_gain_maps
 from rawaug.io.tiff import all_pages, opened_tiff
 
 LONG = 4
@@ -74,40 +73,6 @@ def a_map(**changes: object) -> GainMap:
         "gains": torch.rand(1, 3, 5, generator=torch.Generator().manual_seed(0)) + 1,
     }
     return GainMap(**{**defaults, **changes})  # type: ignore[arg-type]
-
-
-def by_the_specification(m: GainMap, row: int, column: int, height: int, width: int) -> float:
-    """One gain, pixel by pixel, as the DNG specification words it."""
-    y = min(max(((row + 0.5) / height - m.origin[0]) / m.spacing[0], 0), m.gains.shape[1] - 1)
-    x = min(max(((column + 0.5) / width - m.origin[1]) / m.spacing[1], 0), m.gains.shape[2] - 1)
-    i, j = min(int(y), m.gains.shape[1] - 2), min(int(x), m.gains.shape[2] - 2)
-    (a, b), (c, d) = m.gains[0, i : i + 2, j : j + 2].tolist()
-    top, bottom = a + (b - a) * (x - j), c + (d - c) * (x - j)
-    return top + (bottom - top) * (y - i)
-
-
-@pytest.mark.parametrize("origin", [(0.0, 0.0), (0.1, -0.2)])
-def test_gains_are_interpolated_between_the_nodes(origin: tuple[float, float]) -> None:
-    m = a_map(origin=origin)
-    gains = gains_at_sites([m], "RGGB", 8, 12)
-    expected = [[by_the_specification(m, i, j, 8, 12) for j in range(12)] for i in range(8)]
-    assert gains.shape == (1, 8, 12)
-    assert np.allclose(gains[0].numpy(), expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("cfa", list(CFA))
-def test_a_map_reaches_its_own_sites_alone(cfa: CFA) -> None:
-    top, left = cfa.sites[3]
-    m = a_map(area=(top, left, 8, 12), pitch=(2, 2), gains=torch.full((1, 1, 1), 3.0))
-    planes = pack(gains_at_sites([m, m], cfa, 8, 12), cfa)
-    assert (planes[:3] == 1).all() and (planes[3] == 9).all()
-
-
-def test_a_map_of_the_demosaiced_picture_reaches_the_sites_of_its_colours() -> None:
-    gains = torch.tensor([2.0, 5.0]).reshape(2, 1, 1)
-    m = a_map(planes=(1, 2), gains=gains, on_mosaic=False)
-    planes = pack(gains_at_sites([m], "GBRG", 8, 12), "GBRG")
-    assert planes.flatten(1).mean(1).tolist() == [1, 2, 2, 5]
 
 
 def test_opcode_lists_go_there_and_back() -> None:

@@ -177,7 +177,10 @@ def test_lens_shading_comes_as_a_gain_map() -> None:
     pair = augment.apply(srgb, augment.sample(srgb, torch.Generator().manual_seed(0)))
     frames, stops = camera_frames(pair, augment)
     clean = frames["_clean"]
-    flat = pack(clean.mosaic * clean.shading_gains, clean.cfa)
+    (gains,) = (m.gains[None] for m in clean.gain_maps)
+    rows, columns = ((torch.arange(side) + 0.5) / side * 2 - 1 for side in (64, 96))  # nodes are at the edges
+    place = torch.stack(torch.meshgrid(rows, columns, indexing="ij")[::-1], dim=-1)[None]
+    flat = pack(clean.mosaic * torch.nn.functional.grid_sample(gains, place, align_corners=True)[0], clean.cfa)
     assert clean.mosaic.std() / clean.mosaic.mean() > 0.05
     assert (flat.std((1, 2)) / flat.mean((1, 2))).max() < 1e-3
     rgb = flat[[0, 1, 3]].mean((1, 2)) * torch.tensor(clean.white_balance) * 2**stops

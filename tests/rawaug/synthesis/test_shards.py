@@ -158,10 +158,6 @@ def test_what_cannot_go_on_is_refused(pictures: Path, whole: Path, tmp_path: Pat
     for shard in ("0/4", "5/4", "3", "1/0", "a/b", "-1/2", "1/2/3"):
         with pytest.raises(ValueError, match="shard must be K/N with K from 1 to N"):
             parse_shard(shard)
-    (tmp_path / ".shards").mkdir()
-    (tmp_path / ".shards/shard-000000.json").write_text("{")
-    with pytest.raises(ValueError, match=r"shard-000000\.json: not JSON.*; delete it to make the shard again"):
-        shards(pictures, tmp_path)
 
 
 def test_parts_of_files_are_every_nth_picture(pictures: Path, tmp_path: Path) -> None:
