@@ -36,7 +36,6 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.paper.baselines.networks import CycleISP
 from rawaug.paper.baselines.upi import UPI, unprocess_pixels
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.draw import Draw
 
 COUNTED = 3 + 4 + 4
 """Bytes a pixel that any augmentation must move: uint8 in, noisy and clean RAW out in float32."""
@@ -69,16 +68,6 @@ def published_upi(picture: Tensor, generator: torch.Generator) -> tuple[Tensor, 
     return clean, noisy, variance
 
 
-def augmentations(device: torch.device) -> dict[str, RawAugment]:
-    """The shipped ISP, its constants first, then with encoders that look at every picture."""
-    looking = DictionaryISP.from_pretrained("universal")
-    looking.use_encoders(True)
-    return {
-        "rawaug": RawAugment.from_pretrained("universal").to(device),
-        "rawaug, encoders": RawAugment.from_pretrained(looking, draw=Draw(sampling="chosen")).to(device),
-    }
-
-
 def geometry() -> torch.nn.Module:
     """kornia's flips and affine transform, drawn for each picture."""
     from kornia.augmentation import RandomAffine, RandomHorizontalFlip, RandomVerticalFlip
@@ -93,8 +82,8 @@ def methods(batch: Tensor) -> dict[str, tuple[Callable[[], object], int]]:
     generator = torch.Generator(device).manual_seed(0)
     pixels, small = batch[:, 0].numel(), batch[:1, :, :UNBAKED_CROP, :UNBAKED_CROP]
     isp, network, turned = DictionaryISP.from_pretrained("universal").to(device), CycleISP().reverse_network, geometry()
-    network, ours = network.to(device), augmentations(device)
-    augment, floats = ours["rawaug"], batch / 255.0
+    network, augment = network.to(device), RawAugment.from_pretrained("universal").to(device)
+    floats = batch / 255.0
     drawn = augment.sample(batch)
     develop, colour = FastForward(isp).to(device), floats.square()
     own, one = augment.sample(batch[:1]).isp, small[:, 0].numel()
@@ -104,10 +93,7 @@ def methods(batch: Tensor) -> dict[str, tuple[Callable[[], object], int]]:
         clean = bayer.pack(isp.reverse(small).raw.clamp(max=1.0), isp.cfa)
         return augment.noise.apply_with_variance(clean, augment.noise.sample(1, torch.Generator().manual_seed(0)))
 
-    runs: dict[str, tuple[Callable[[], object], int]] = {
-        name: (lambda augment=augment: augment(batch), pixels)  # type: ignore[misc]
-        for name, augment in ours.items()
-    }
+    runs: dict[str, tuple[Callable[[], object], int]] = {"rawaug": (lambda: augment(batch), pixels)}
     for target in ("rgb", "srgb"):
         other = RawAugment.from_pretrained("universal", target=target).to(device)
         runs[target] = (lambda other=other: other(batch), pixels)  # type: ignore[misc]
@@ -142,11 +128,7 @@ def measure(batch: Tensor, repeats: int, gb_s: float) -> dict[str, dict[str, flo
             time.sleep(0.02)  # PyTorch's threads spin on for a while after the method before
             best[name] = min(best[name], seconds(run, batch.device))
     speed = {name: pixels / best[name] / 1e6 for name, (_, pixels) in runs.items()}
-    ours = {"ratio": "rawaug", "ratio, encoders": "rawaug, encoders"}
-    rows = {
-        name: {"mpix_s": value} | {key: speed[own] / value for key, own in ours.items()}
-        for name, value in speed.items()
-    }
+    rows = {name: {"mpix_s": value, "ratio": speed["rawaug"] / value} for name, value in speed.items()}
     for name in [name for name in rows if name.startswith("rawaug")]:
         rows[name] |= {what: speed[name] * size / 1e3 / gb_s for what, size in (("counted", COUNTED), ("moved", MOVED))}
     return rows
@@ -181,11 +163,9 @@ def first_call(device: torch.device) -> float:
 
 def show(title: str, rows: dict[str, dict[str, float]]) -> None:
     """A table of :func:`measure`."""
-    print(
-        f"{title}: Mpix/s; rawaug as a multiple, without and with encoders; its bytes, counted and moved, of a copy's"
-    )
+    print(f"{title}: Mpix/s; rawaug as a multiple; its bytes, counted and moved, of a copy's")
     for name, row in rows.items():
-        line = f"  {name:22}{row['mpix_s']:10.3g}{row['ratio']:10.3g}{row['ratio, encoders']:10.3g}"
+        line = f"  {name:22}{row['mpix_s']:10.3g}{row['ratio']:10.3g}"
         print(line + (f"{row['counted']:10.2f}{row['moved']:10.2f}" if "moved" in row else ""))
 
 

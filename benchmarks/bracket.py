@@ -1,6 +1,6 @@
 r"""Denoisers on real noise: each shot of a handheld bracket against the next longer exposure of the same scene.
 
-    python -m benchmarks.bracket RAW_DIR PMRID.safetensors BF_DNCNN.safetensors [--keep FOLDER]
+    python -m benchmarks.bracket RAW_DIR PMRID.safetensors BF_DNCNN.safetensors
 
 Nothing is added to the shots. The reference r, exposed longer, has less noise for its signal. Block by block it is
 moved onto the noisy shot y, at the fraction of a pixel that phase correlation of their greens finds, and fitted to y
@@ -39,7 +39,6 @@ from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
 from rawaug.denoise.levels import UnknownNoise, find_levels
 from rawaug.evaluation.scores import Denoiser, NoisyInput, print_rows
-from rawaug.files import fingerprint
 from rawaug.io import RawFrame, read_raw
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
@@ -201,21 +200,14 @@ def used(noisy: Shot, reference: Shot) -> tuple[list[Block], Counter[str]]:
     return kept, left_out
 
 
-def denoised(one: Denoiser, noisy: Shot, blocks: Sequence[Block], keep: Path | None) -> Iterator[Tensor]:
-    """What a denoiser makes of each block, packed ``(1, 4, h, w)``, kept in a folder if one is given."""
+def denoised(one: Denoiser, noisy: Shot, blocks: Sequence[Block]) -> Iterator[Tensor]:
+    """What a denoiser makes of each block, packed ``(1, 4, h, w)``."""
     frame, around = noisy.frame, MARGIN // 2
-    settings = getattr(one, "settings", None)
     for block in progress(blocks, label=one.name, unit="block"):
-        key = fingerprint(one.name, settings, frame.name, block.top, block.left, noisy.levels)
-        file = keep / f"{key}.npy" if keep else None
-        if file is None or not file.is_file():
-            rows, columns = (slice(at - MARGIN, at + BLOCK + MARGIN) for at in (block.top, block.left))
-            packed = bayer.pack(frame.mosaic[None, :, rows, columns], frame.cfa)
-            result = one(Noisy.of(packed, noisy.levels, frame.cfa)).clamp(max=1.0)
-            result = result[..., around:-around, around:-around].clone()
-            if file is not None:
-                np.save(file, result.numpy())
-        yield torch.from_numpy(np.load(file)) if file is not None else result
+        rows, columns = (slice(at - MARGIN, at + BLOCK + MARGIN) for at in (block.top, block.left))
+        packed = bayer.pack(frame.mosaic[None, :, rows, columns], frame.cfa)
+        result = one(Noisy.of(packed, noisy.levels, frame.cfa)).clamp(max=1.0)
+        yield result[..., around:-around, around:-around]
 
 
 def errors_of(results: Iterator[Tensor], noisy: Shot, blocks: Sequence[Block]) -> list[tuple[float, float]]:
@@ -244,7 +236,7 @@ def scored(noisy: Shot, reference: Shot, everyone: Sequence[Denoiser], args: Any
     if not blocks:
         raise ValueError(f"{noisy.frame.name}: no block agrees with {reference.frame.name}; are they of one scene?")
     blocks = blocks[:2] if args.quick else blocks
-    errors = {one.name: errors_of(denoised(one, noisy, blocks, args.keep), noisy, blocks) for one in everyone}
+    errors = {one.name: errors_of(denoised(one, noisy, blocks), noisy, blocks) for one in everyone}
     firsts = Counter(min(errors, key=lambda name: errors[name][k][0]) for k in range(len(blocks)))
     return {
         "levels": [*noisy.levels, noisy.source],
@@ -274,11 +266,8 @@ def main(command: Sequence[str] | None = None) -> None:
     parser = arguments(__doc__, 1, "two blocks of each shot")
     parser.add_argument("folder", type=Path, help="the RAW files of a bracket")
     parser.add_argument("denoisers", nargs="*", help="named as for rawaug benchmark, beside those that are shipped")
-    parser.add_argument("--keep", type=Path, help="keep what denoisers make of the blocks here, for the next run")
     args = parser.parse_args(command)
     figures = start(args)
-    if args.keep:
-        args.keep.mkdir(parents=True, exist_ok=True)
     specs = ("NonLocalMeans", *args.denoisers, *shipped_of_mosaics())
     everyone: list[Denoiser] = [NoisyInput("noisy"), *(RawDenoiser.of(spec).require_mosaic() for spec in specs)]
     for noisy, reference in pairwise(bracket(args.folder)):

@@ -1,8 +1,8 @@
-"""Small whole files of every kind that rawaug reads, and damage to them; the inputs of benchmarks/fuzz.py.
+"""Small whole files of every kind that rawaug reads, and damage to them; what fuzz.py and faults.py share.
 
-A mutation takes the bytes of a whole file and a generator, and gives those of a hostile one. Some know the structure of
-the file: directories in a circle, sizes and counts beyond reason, types exchanged, parts twice or missing, checksums
-that are right all the same.
+A mutation takes the bytes of a whole file and a generator, and gives those of a hostile one. Those of formats that
+rawaug itself parses know the structure of the file: directories in a circle, sizes and counts beyond reason, values
+exchanged, parts twice or missing.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ import io
 import json
 import os
 import struct
-import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,13 +19,13 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
+from torch import Tensor
 
 from rawaug.bayer import CFA
+from rawaug.io import RawFrame
 
 HEADER = 4096
 """Bytes at the beginning, and at the end, that most of the damage is done to: there the directories are."""
-
-MATRIX = torch.tensor([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.6, 1.6]])
 
 NUMBERS = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 2**62)
 """Lengths, counts and offsets that are seldom right."""
@@ -60,60 +59,49 @@ def make_originals(folder: Path) -> dict[str, list[Path]]:
     return {
         "raw": sorted(shared.glob("raw/canon/*.crw"))[:3],
         "dng": _make_dngs(folder, sorted(shared.glob("raw/*/*.dng"))[:1]),
-        "jpeg": _make_jpegs(folder, sorted(shared.glob("raw_jpeg/*/*.jpg"))[:1]),
         **{kind: make(folder) for kind, make in made.items()},
     }
 
 
+def small_frame(mosaic: Tensor, cfa: CFA) -> RawFrame:
+    """A RAW frame ``(1, H, W)`` of no camera, with everything that a DNG states."""
+    matrix = torch.tensor([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.6, 1.6]])
+    levels = {"black": (512.0, 513.0, 511.0, 512.0), "white": 16383.0, "iso": 800.0, "noise_profile": (1e-3, 1e-5)}
+    colours = {"white_balance": (2.0, 1.0, 1.5), "daylight": (1.9, 1.0, 1.6), "color_matrix": matrix}
+    return RawFrame(mosaic, cfa, **levels, **colours, camera="Maker Model")  # type: ignore[arg-type]
+
+
 def _make_dngs(folder: Path, real: list[Path]) -> list[Path]:
     """One with gain maps, and one with all the tags of a real file."""
-    from rawaug.io import GainMap, RawFrame, read_raw, write_dng
+    from rawaug.io import GainMap, read_raw, write_dng
     from rawaug.io.raw import Exposure
 
     gains = torch.rand(1, 3, 4, generator=torch.Generator().manual_seed(0)) + 1
     maps = (GainMap((0, 0, 64, 96), (2, 2), (0, 1), (0.0, 0.0), (0.5, 1 / 3), gains),)
+    frame = small_frame(torch.rand(1, 64, 96, generator=torch.Generator().manual_seed(1)), CFA.GRBG)
     exposure = Exposure(0.01, 2.0, 35.0, "2020:01:01 00:00:00")
-    mosaic = torch.rand(1, 64, 96, generator=torch.Generator().manual_seed(1))
-    frame = RawFrame(mosaic, CFA.GRBG, (512.0, 513.0, 511.0, 512.0), 16383.0, (2.0, 1.0, 1.5), (1.9, 1.0, 1.6), MATRIX)
-    write_dng(folder / "own.dng", replace(frame, iso=800.0, noise_profile=(1e-3, 1e-5), orientation=1, gain_maps=maps,
-                                          camera="Maker Model", exposure=exposure))  # fmt: skip
+    write_dng(folder / "own.dng", replace(frame, orientation=1, gain_maps=maps, exposure=exposure))
     for source in real:
         full = read_raw(source)
         write_dng(folder / "real.dng", replace(full, mosaic=full.mosaic[:, :64, :96]), source=source)
     return sorted(folder.glob("*.dng"))
 
 
-def _make_jpegs(folder: Path, real: list[Path]) -> list[Path]:
+def _make_pictures(folder: Path) -> list[Path]:
     from PIL import Image, ImageCms
 
-    colour = Image.fromarray(_numbers(0, (120, 160, 3)))
-    turned = Image.Exif()
+    colour, turned = Image.fromarray(_numbers(0, (60, 80, 3))), Image.Exif()
     turned[274] = 6
-    colour.save(folder / "exif.jpg", quality=90, exif=turned)
-    colour.save(folder / "progressive.jpg", progressive=True)
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    colour.save(folder / "profile.jpg", icc_profile=profile.replace("sRGB".encode("utf-16-be"), b"\0o\0w\0n\0 "))
+    own = profile.replace("sRGB".encode("utf-16-be"), b"\0o\0w\0n\0 ")
+    colour.save(folder / "exif.jpg", exif=turned)
+    colour.save(folder / "profile.jpg", icc_profile=own)
+    colour.save(folder / "progressive.jpg", progressive=True)
     colour.convert("L").save(folder / "grey.jpg")
-    for source in real:
-        with Image.open(source) as picture:
-            picture.crop((0, 0, 320, 240)).save(folder / "real.jpg", exif=picture.getexif())
-    return sorted(folder.glob("*.jpg"))
-
-
-def _make_pictures(folder: Path) -> list[Path]:
-    import OpenImageIO as oiio
-    from PIL import Image
-
     files = [folder / f"picture{end}" for end in (".png", ".tif", ".webp", ".gif", ".bmp", ".ppm")]
     for file in files:
-        Image.fromarray(_numbers(0, (60, 80, 3))).save(file)
-    for file, kind in ((folder / "picture.exr", "half"), (folder / "picture.jxl", "uint8")):
-        output = oiio.ImageOutput.create(str(file))
-        if output is not None and output.open(str(file), oiio.ImageSpec(80, 60, 3, kind)):
-            output.write_image(_numbers(0, (60, 80, 3)))
-            output.close()
-            files.append(file)
-    return files
+        colour.save(file)
+    return [*sorted(folder.glob("*.jpg")), *files]
 
 
 def _make_mat5(folder: Path) -> list[Path]:
@@ -200,7 +188,7 @@ def mutated(whole: bytes, rng: np.random.Generator) -> bytes:
     data = bytearray(whole)
     for _ in range(int(rng.choice(3, p=(0.7, 0.2, 0.1))) + 1):
         if len(data) > 16:
-            (_flip, _cut, _overwrite, _exchange, _repeat)[int(rng.integers(5))](data, rng)
+            _pick(rng, [_flip, _cut, _overwrite, _repeat])(data, rng)
     return bytes(data)
 
 
@@ -230,12 +218,6 @@ def _overwrite(data: bytearray, rng: np.random.Generator) -> None:
     data[place : place + len(inside)] = inside
 
 
-def _exchange(data: bytearray, rng: np.random.Generator) -> None:
-    size = min(1 << int(rng.integers(2, 11)), len(data) // 2)
-    a, b = (min(_place(data, rng), len(data) - size) for _ in range(2))
-    data[a : a + size], data[b : b + size] = data[b : b + size], data[a : a + size]
-
-
 def _repeat(data: bytearray, rng: np.random.Generator) -> None:
     """A piece twice, or not at all: what follows is shifted."""
     size, place = 1 << int(rng.integers(0, 9)), _place(data, rng)
@@ -246,6 +228,13 @@ def _repeat(data: bytearray, rng: np.random.Generator) -> None:
 
 
 # -- damage that knows the structure -----------------------------------------------------------------------------------
+
+
+def said_one_line(text: str) -> str | None:
+    """The only line with which a command that prints this refuses; None if it has none, several or a traceback."""
+    lines = [line for line in text.splitlines() if line.startswith("rawaug: ")]
+    return lines[0] if len(lines) == 1 and "Traceback" not in text else None
+
 
 Mutation = Callable[[bytes, np.random.Generator], bytes]
 
@@ -262,36 +251,21 @@ def _pick(rng: np.random.Generator, items: list[Any]) -> Any:
 
 # -- TIFF and DNG ------------------------------------------------------------------------------------------------------
 
-_SUB_IFDS, _POINTERS = 330, (330, 34665, 34853)
-
-
-def _directories(data: bytes, order: str) -> Iterator[tuple[int, int]]:
-    """Place and number of entries of each directory, those that pointers name too."""
-    todo, seen = [struct.unpack_from(order + "I", data, 4)[0]], set[int]()
-    while todo:
-        place = todo.pop()
-        if place in seen or not 0 < place < len(data) - 6:
-            continue
-        seen.add(place)
-        (count,) = struct.unpack_from(order + "H", data, place)
-        if place + 6 + 12 * count > len(data):
-            continue
-        yield place, count
-        todo.append(struct.unpack_from(order + "I", data, place + 2 + 12 * count)[0])
-        for entry in range(place + 2, place + 2 + 12 * count, 12):
-            code, _, values, value = struct.unpack_from(order + "HHII", data, entry)
-            todo += [value] if code in _POINTERS and values == 1 else []
+_SUB_IFDS = 330
 
 
 def tiff(whole: bytes, rng: np.random.Generator) -> bytes:
     """An entry's code, type, count or value; a pointer into a circle."""
+    import tifffile
+
     data, order = bytearray(whole), "<" if whole[:2] == b"II" else ">"
-    found = list(_directories(whole, order))
-    place, count = _pick(rng, found)
-    entry = place + 2 + 12 * int(rng.integers(count))
-    what, other = rng.random(), _pick(rng, found)[0]
+    with tifffile.TiffFile(io.BytesIO(whole)) as file:
+        pages = [inner for page in file.pages for inner in (page, *(page.pages or ()))]
+        page = _pick(rng, pages)
+        entry = _pick(rng, [tag.offset for tag in page.tags])
+    what, other = rng.random(), _pick(rng, pages).offset
     if what < 0.15:  # the successor
-        struct.pack_into(order + "I", data, place + 2 + 12 * count, other)
+        struct.pack_into(order + "I", data, page.offset + 2 + 12 * len(page.tags), other)
     elif what < 0.3:  # children, of which each is its own parent
         struct.pack_into(order + "HHII", data, entry, _SUB_IFDS, 4, 1 if rng.random() < 0.5 else 2**20, other)
     else:
@@ -299,61 +273,6 @@ def tiff(whole: bytes, rng: np.random.Generator) -> bytes:
         number = _number(rng, size, int.from_bytes(data[entry + offset : entry + offset + size], "little"))
         data[entry + offset : entry + offset + size] = number if order == "<" else number[::-1]
     return bytes(data)
-
-
-# -- MATLAB ------------------------------------------------------------------------------------------------------------
-
-_HDF5_BLOCKS = (b"TREE", b"HEAP", b"SNOD", b"GCOL", b"OHDR", b"\x89HDF")
-
-
-def hdf5(whole: bytes, rng: np.random.Generator) -> bytes:
-    """A number in the head of a block, or the address of another block in its place."""
-    data = bytearray(whole)
-    places = [k for name in _HDF5_BLOCKS for k in range(0, len(data) - 64, 8) if data[k : k + 4] == name]
-    block = _pick(rng, places)
-    if rng.random() < 0.3:
-        address = _pick(rng, places) - whole.index(b"\x89HDF")  # MATLAB's header comes before
-        at = block + 8 * int(rng.integers(1, 8))
-        data[at : at + 8] = (address % 2**64).to_bytes(8, "little")
-    else:
-        size = _pick(rng, [1, 2, 4, 8])
-        at = block + 4 + int(rng.integers(60 // size)) * size
-        data[at : at + size] = _number(rng, size)
-    return bytes(data)
-
-
-_COMPRESSED, _MATRIX = 15, 14
-
-
-def _elements(data: bytes, start: int, end: int) -> Iterator[int]:
-    """Places of the tags of a file of version 5, inside matrices too."""
-    while start + 8 <= end:
-        kind, size = struct.unpack_from("<II", data, start)
-        yield start
-        small = kind >> 16
-        if kind == _MATRIX:
-            yield from _elements(data, start + 8, min(start + 8 + size, end))
-        start += 8 if small else 8 + size + -size % 8
-
-
-def mat5(whole: bytes, rng: np.random.Generator) -> bytes:
-    """An element's type, size or first number; inside compressed ones too."""
-    head, body = whole[:128], whole[128:]
-    tags = [k for k in _elements(body, 0, len(body)) if struct.unpack_from("<I", body, k)[0] == _COMPRESSED]
-    if tags and rng.random() < 0.9:
-        tag = _pick(rng, tags)
-        (size,) = struct.unpack_from("<I", body, tag + 4)
-        inner = zlib.compress(_changed_element(zlib.decompress(body[tag + 8 : tag + 8 + size]), rng))
-        body = body[:tag] + struct.pack("<II", _COMPRESSED, len(inner)) + inner + body[tag + 8 + size :]
-        return head + body
-    return head + _changed_element(body, rng)
-
-
-def _changed_element(body: bytes, rng: np.random.Generator) -> bytes:
-    data, tag = bytearray(body), _pick(rng, list(_elements(body, 0, len(body))))
-    at = tag + 4 * int(rng.integers(4))
-    data[at : at + 4] = _number(rng, 4, int.from_bytes(data[at : at + 4], "little"))
-    return bytes(data[: len(body)])
 
 
 # -- safetensors -------------------------------------------------------------------------------------------------------
@@ -395,56 +314,6 @@ def _changed_text(text: str, rng: np.random.Generator) -> str:
     value[_pick(rng, sorted(value))] = "@"
     new = _pick(rng, _VALUES)
     return json.dumps(value).replace('"@"', new if new in _NO_NUMBERS else json.dumps(new))
-
-
-# -- pictures ----------------------------------------------------------------------------------------------------------
-
-
-def png(whole: bytes, rng: np.random.Generator) -> bytes:
-    """A chunk changed, twice or missing; checksums are right."""
-    chunks, at = list[tuple[bytes, bytes]](), 8
-    while at + 12 <= len(whole):
-        (size,) = struct.unpack_from(">I", whole, at)
-        chunks.append((whole[at + 4 : at + 8], whole[at + 8 : at + 8 + size]))
-        at += 12 + size
-    k = 0 if rng.random() < 0.5 else int(rng.integers(len(chunks)))
-    kind, content = chunks[k]
-    what = rng.random()
-    if kind == b"IHDR" and what < 0.8:
-        field, size = _pick(rng, [(0, 4), (4, 4), (8, 1), (9, 1), (12, 1)])
-        changed = bytearray(content)
-        changed[field : field + size] = _number(rng, size)[::-1]
-        chunks[k] = kind, bytes(changed)
-    elif what < 0.5:
-        chunks.insert(int(rng.integers(len(chunks))), chunks[k])
-    elif what < 0.7:
-        del chunks[k]
-    else:
-        chunks[k] = kind, content[: len(content) // 2]
-    parts = [struct.pack(">I", len(c)) + kind + c + struct.pack(">I", zlib.crc32(kind + c)) for kind, c in chunks]
-    return whole[:8] + b"".join(parts)
-
-
-def jpeg(whole: bytes, rng: np.random.Generator) -> bytes:
-    """A byte or two of a segment before the scan, a segment twice or missing, or a wrong length."""
-    segments, at = list[bytes](), 2
-    while at + 4 <= len(whole) and whole[at] == 0xFF and whole[at + 1] != 0xDA:
-        size = 2 + struct.unpack_from(">H", whole, at + 2)[0]
-        segments.append(whole[at : at + size])
-        at += size
-    k = int(rng.integers(len(segments)))
-    what = rng.random()
-    if what < 0.2:
-        del segments[k]
-    elif what < 0.4:
-        segments.insert(int(rng.integers(len(segments))), segments[k])
-    else:
-        changed = bytearray(segments[k])
-        place = int(rng.integers(2, min(len(changed), 24)))
-        size = min(1 + int(rng.integers(2)), len(changed) - place)
-        changed[place : place + size] = _number(rng, size)
-        segments[k] = bytes(changed)
-    return whole[:2] + b"".join(segments) + whole[at:]
 
 
 # -- pairs -------------------------------------------------------------------------------------------------------------
@@ -509,8 +378,6 @@ def _with_texts(content: Any, text: str) -> Any:
 
 
 MUTATIONS: dict[str, Mutation] = {
-    ".pair.tif": tiff_pair, ".npz": npz,
-    ".dng": tiff, ".tif": tiff, ".jpg": jpeg, ".png": png, ".mat5.mat": mat5, ".mat73.mat": hdf5,
-    ".safetensors": safetensors, ".yaml": recipe,
+    ".pair.tif": tiff_pair, ".npz": npz, ".dng": tiff, ".tif": tiff, ".safetensors": safetensors, ".yaml": recipe,
 }  # fmt: skip
-"""By the end of a file's name."""
+"""By the end of a file's name; what other packages alone decode is damaged byte by byte."""

@@ -1,11 +1,11 @@
-"""What a large folder of pictures with damaged files costs: its start, an epoch with workers, and their memory.
+"""What a large folder of pictures with damaged files costs: its start, and an epoch with workers.
 
     python -m benchmarks.folder [--files 20000] [--damaged 0.01] [--workers 2] [--quick] [--json FILE]
 
 The folder is made first, in a temporary place: small JPEGs in a hundred subfolders, of which a share is truncated,
 empty, text, or a link to nowhere. Printed are the seconds until the dataset is there and until the first batch, the
-pictures a second of an epoch relative to reading the good files alone without workers, each worker's own memory early
-and late in the epoch, and whether the report names every damaged file and no other.
+pictures a second of an epoch relative to reading the good files alone without workers, and whether the report names
+every damaged file and no other.
 """
 
 from __future__ import annotations
@@ -56,33 +56,15 @@ def make_folder(folder: Path, files: int, damaged: float) -> set[str]:
     return names
 
 
-def own_megabytes(processes: list[int]) -> list[float]:
-    """Memory private to each process, where the system reports it."""
-    sizes = []
-    for process in processes:
-        try:
-            lines = Path(f"/proc/{process}/smaps_rollup").read_text(encoding="ascii").splitlines()
-        except OSError:
-            return []
-        sizes.append(sum(int(line.split()[1]) for line in lines if line.startswith("Private")) / 1024)
-    return sizes
-
-
 def epoch(pictures: PictureFolder, workers: int, began: float) -> dict[str, Any]:
     """Read every picture once, shuffled."""
     order = torch.Generator().manual_seed(0)
     loader = DataLoader(pictures, batch_size=50, shuffle=True, generator=order, num_workers=workers)
-    batches = iter(loader)
-    processes = [worker.pid for worker in getattr(batches, "_workers", [])]
-    memory, count, first = [], 0, 0.0
-    for number, batch in enumerate(batches):
-        if number == 0:
-            first = time.perf_counter() - began
-        if number in (len(loader) // 10, len(loader) * 9 // 10):
-            memory.append(own_megabytes(processes))
+    count, first = 0, 0.0
+    for batch in loader:
+        first = first or time.perf_counter() - began
         count += len(batch)
-    taken = time.perf_counter() - began
-    return {"first_batch_s": first, "epoch_s": taken, "pictures": count, "own_mb_early_late": memory}
+    return {"first_batch_s": first, "epoch_s": time.perf_counter() - began, "pictures": count}
 
 
 def main() -> int:

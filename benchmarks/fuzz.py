@@ -2,7 +2,7 @@
 
     python -m benchmarks.fuzz [--cases 10000] [--seed 0] [--kinds dng mat5 ...] [--quick] [--keep FOLDER] [--json FILE]
 
-Small files of every kind are made and damaged (benchmarks/damage.py), half of them as their structure suggests, keyed
+Small files of every kind are made and damaged (benchmarks/damage.py), half of some as their structure suggests, keyed
 by (seed, kind, number); real camera files take part where RAWAUG_SHARED, or shared/data beside the repository, has
 them. The helper process of :mod:`rawaug.io.isolated` reads one after the other, every eighth by the commands too.
 Counted are files that were read; that were refused as documented (ValueError or OSError of one line with the file's
@@ -36,7 +36,7 @@ import numpy as np
 import torch
 
 import denoisers
-from benchmarks.damage import IMPORTED, IRREGULAR, MUTATIONS, make_originals, mutated
+from benchmarks.damage import IMPORTED, IRREGULAR, MUTATIONS, make_originals, mutated, said_one_line
 from benchmarks.measure import parser
 from rawaug import DictionaryISP
 from rawaug.cli import main as rawaug
@@ -56,7 +56,7 @@ from rawaug.training.state import first_network
 WAITING_SECONDS = 240
 """For a file, which may have to wait for a processor."""
 DECODERS = {
-    "picture": "OpenImageIO", "jpeg": "OpenImageIO", "npy": "NumPy", "mat5": "SciPy", "mat73": "HDF5",
+    "picture": "OpenImageIO", "npy": "NumPy", "mat5": "SciPy", "mat73": "HDF5",
     "pair": "tifffile", "safetensors": "safetensors", "recipe": "PyYAML", "dng": "LibRaw", "raw": "LibRaw",
 }  # fmt: skip
 """What reads each kind for us, the cheapest first."""
@@ -97,7 +97,7 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
         return [frame_of]
     if kind == "dng":
         return [lambda: read_raw_and_develop(path), rewritten]
-    if kind in ("jpeg", "picture"):
+    if kind == "picture":
         return [lambda: read_picture(path)]
     if kind == "recipe":
         return [lambda: _set_up(path)]
@@ -150,30 +150,24 @@ def _described(error: Exception) -> str:
 # -- commands ----------------------------------------------------------------------------------------------------------
 
 NOT_A_NUMBER = re.compile(r"(?<![\w.])[-+]?(nan|inf)(?![\w.])", re.IGNORECASE)
-_FIT = ["--steps", "2", "--curve-steps", "2", "--pixels", "1024", "--batch", "64"]
-_SYNTH = ["--workers", "0", "--noise", "[0.001, 1e-5]"]
+COMMANDS = {
+    "dng": ["fit {file} --out {out}/camera.safetensors --steps 2 --curve-steps 2 --pixels 1024 --batch 64",
+            "evaluate {whole}/isp.safetensors --data {file}",
+            "denoise {file} {out}/denoised.dng --denoiser {whole}/denoiser.safetensors"],
+    "picture": ["synth {folder} {out}/pairs --workers 0 --noise [0.001,1e-5]"],
+    "npy": ["data check {folder}", "evaluate {whole}/isp.safetensors --data rawir:{folder}"],
+    "denoiser": ["info {file} --json", "evaluate {file} --data {whole}/own.dng --noise [0.001,1e-5]",
+                 "denoise {whole}/own.dng {out}/d.dng --denoiser {file}"],
+    "isp": ["info {file} --json", "evaluate {file} --data {whole}/own.dng"],
+}  # fmt: skip
+"""By the kind of file, of weights by what is in them."""
 
 
 def commands(kind: str, path: Path) -> list[list[str]]:
     """The command lines that read a file of this kind; the whole files that they need too are two folders above."""
-    whole, out, file = path.parents[1], _out(path), str(path)
-    isp, denoiser, dng = (f"{whole / name}" for name in ("isp.safetensors", "denoiser.safetensors", "own.dng"))
-    if kind == "dng":
-        return [
-            ["fit", file, "--out", f"{out}/camera.safetensors", *_FIT],
-            ["evaluate", isp, "--data", file],
-            ["denoise", file, f"{out}/denoised.dng", "--denoiser", denoiser],
-        ]
-    if kind in ("jpeg", "picture"):
-        return [["synth", f"{path.parent}", f"{out}/pairs", *_SYNTH]]
-    if kind == "npy":
-        return [["data", "check", f"{path.parent}"], ["evaluate", isp, "--data", f"rawir:{path.parent}"]]
-    if kind == "safetensors" and path.stem.startswith("denoiser"):
-        evaluate = ["evaluate", file, "--data", dng, "--noise", "[0.001, 1e-5]"]
-        return [["info", file, "--json"], evaluate, ["denoise", dng, f"{out}/d.dng", "--denoiser", file]]
-    if kind == "safetensors" and path.stem.startswith("isp"):
-        return [["info", file, "--json"], ["evaluate", file, "--data", dng]]
-    return []
+    kept = path.stem.split("-")[0] if kind == "safetensors" else kind
+    here = {"file": path, "folder": path.parent, "whole": path.parents[1], "out": _out(path)}
+    return [[word.format(**here) for word in line.split()] for line in COMMANDS.get(kept, ())]
 
 
 def run(argv: Sequence[str]) -> tuple[str, str]:
@@ -187,11 +181,10 @@ def run(argv: Sequence[str]) -> tuple[str, str]:
         return "fault", f"{command}: exits with {end.code}: {wrong.getvalue()[-200:]!r}"
     except Exception as error:
         return "fault", f"{command}: {_described(error)}"
-    lines = [line for line in wrong.getvalue().splitlines() if line.startswith("rawaug: ")]
-    if status == 2 and len(lines) == 1:
-        return "refused", lines[0]
+    if status == 2 and (line := said_one_line(wrong.getvalue())):
+        return "refused", line
     if status:
-        return "fault", f"{command}: status {status}, {len(lines)} lines: {wrong.getvalue()[-200:]!r}"
+        return "fault", f"{command}: status {status}: {wrong.getvalue()[-200:]!r}"
     if number := NOT_A_NUMBER.search(said.getvalue()):
         return "fault", f"{command}: {number.group()} in a result, and status 0"
     return "read", ""

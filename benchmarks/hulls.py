@@ -36,25 +36,23 @@ from rawaug.isp.dictionary import CameraDictionary, nearest_in_hull
 from rawaug.isp.model import DictionaryISP
 
 
-def halves(points: Tensor, atoms: int, count: int) -> list[float]:
-    """Share of one half of the points within 45 dB of the hull of atoms from the other, for random halves."""
-    shares = []
-    for seed in range(count):
-        order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
-        seen, unseen = points[order[::2]], points[order[1::2]]
-        shares.append(held(unseen, seen[chosen_atoms(seen, atoms).atoms]))
-    return shares
+def split(points: Tensor, seed: int) -> tuple[Tensor, Tensor]:
+    """Two random halves of points or cameras ``(N, ...)``."""
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
+    return points[order[::2]], points[order[1::2]]
 
 
-def lights_of_halves(cameras: Tensor, atoms: int, count: int) -> list[float]:
+def of_other_half(points: Tensor, atoms: int, seed: int) -> float:
+    """Share of one half of the points within 45 dB of the hull of atoms from the other."""
+    seen, unseen = split(points, seed)
+    return held(unseen, seen[chosen_atoms(seen, atoms).atoms])
+
+
+def lights_of_other_half(cameras: Tensor, atoms: int, seed: int) -> float:
     """The same for gains: atoms of one half of the cameras in random lights, and the other half in other lights."""
-    shares = []
-    for seed in range(count):
-        order = torch.randperm(len(cameras), generator=torch.Generator().manual_seed(seed))
-        seen = inverse_gains_in_any_light(cameras[order[::2]], f"seen {seed}")
-        unseen = inverse_gains_in_any_light(cameras[order[1::2]], f"unseen {seed}")
-        shares.append(held(unseen / 3**0.5, seen[chosen_gains(seen, atoms).atoms] / 3**0.5))
-    return shares
+    halves = zip(split(cameras, seed), ("seen", "unseen"), strict=True)
+    seen, unseen = (inverse_gains_in_any_light(half, f"{name} {seed}") for half, name in halves)
+    return held(unseen / 3**0.5, seen[chosen_gains(seen, atoms).atoms] / 3**0.5)
 
 
 def left_out_tones() -> dict[str, float]:
@@ -126,9 +124,9 @@ def main() -> None:
     cameras = distinct_cameras()
     points = camera_points(cameras)
     print(f"{len(points)} distinct matrices, {options.atoms} atoms", flush=True)
-    for seed, share in enumerate(halves(points, options.atoms, options.halves)):
-        print(f"half {seed}: {share:.1%} of the other half", flush=True)
-    for seed, share in enumerate(lights_of_halves(cameras, options.gains, options.halves)):
+    for seed in range(options.halves):
+        print(f"half {seed}: {of_other_half(points, options.atoms, seed):.1%} of the other half", flush=True)
+        share = lights_of_other_half(cameras, options.gains, seed)
         print(f"gains, half {seed}: {share:.1%} of the other half's", flush=True)
     print(f"all matrices: {held(points, points[chosen_atoms(points, options.atoms).atoms]):.1%}")
 

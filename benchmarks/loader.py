@@ -4,7 +4,6 @@
 
 The loader reads a folder of pictures, crops and collates; RawPairs makes the pairs in its workers, wrap on the device.
 The step is that of denoisers.UNet on a batch of pairs, alone and with the batch made by RawAugment first.
-``benchmarks.folder`` measures the memory of workers.
 """
 
 from __future__ import annotations

@@ -10,16 +10,10 @@ import pytest
 import torch
 
 from benchmarks import augment, binning, crops, denoise, measure, patterns, sensors, synth
-from benchmarks.noisy_pairs import write_pair
-from rawaug.bayer import CFA
-from rawaug.data import open_pairs
 from rawaug.data.demo import FRAME
-from rawaug.data.folders import RawFolder
 from rawaug.denoise.denoiser import RawDenoiser
 from rawaug.evaluation.scores import NOISY
-from rawaug.evaluation.trials import trial_of
-from rawaug.io import RawFrame, read_picture, write_dng
-from rawaug.noise import noise_model
+from rawaug.io import read_picture
 
 CPU = torch.device("cpu")
 
@@ -59,40 +53,6 @@ def test_pieces_of_frames_are_drawn_beside_a_filter(tmp_path: Path) -> None:
     assert read_picture(tmp_path / "crops.png").shape == (3, 325, 1092), "noisy, filtered, by the network, clean"
     with pytest.raises(SystemExit, match="page: 256 x 256 at 40, 0 is not within 288 x 448"):
         crops.main(["demo:test", "--place", "page", "40", "0", "--out", str(tmp_path / "crops.png")])
-
-
-@pytest.fixture
-def shots(tmp_path: Path) -> RawFolder:
-    frame = RawFrame(
-        mosaic=torch.linspace(0, 0.8, 64 * 96).reshape(1, 64, 96),
-        cfa=CFA.GRBG,
-        black=(512.0, 513.0, 511.0, 512.0),
-        white=16383.0,
-        white_balance=(2.0, 1.0, 1.5),
-        daylight=(1.9, 1.0, 1.6),
-        color_matrix=torch.eye(3),
-        camera="Maker Model",
-        iso=100.0,
-        noise_profile=None,
-        orientation=0,
-        name="shot",
-    )
-    (tmp_path / "raw").mkdir()
-    write_dng(tmp_path / "raw/shot.dng", frame)
-    return RawFolder(tmp_path / "raw")
-
-
-def test_a_pair_has_the_frozen_noise_and_states_its_levels(shots: RawFolder, tmp_path: Path) -> None:
-    noise, out = noise_model("cycleisp_sidd"), tmp_path / "pairs"
-    out.mkdir()
-    levels = write_pair(shots, 0, noise, 0, out)
-    (pair,) = open_pairs(f"pairs:{out}")
-    sample = trial_of(shots[0], noise)
-    assert levels == sample.levels == pytest.approx((pair.shot_var, pair.read_var))
-    again = trial_of(pair, noise, seed=1)
-    step = 1 / (65535 - 16384)
-    torch.testing.assert_close(again.noisy, sample.noisy, rtol=0, atol=step)
-    torch.testing.assert_close(again.clean, sample.clean, rtol=0, atol=step)
 
 
 def test_sensors_scores_flat_patches_frames_and_cells_beside_lights() -> None:

@@ -29,7 +29,7 @@ def test_damaged_files_are_read_or_refused_in_one_line(
     figures = tmp_path / "figures.json"
     assert fuzz.main(["--quick", "--json", str(figures)]) == 0, capsys.readouterr().out
     kinds = json.loads(figures.read_text())["kinds"]
-    assert {"dng", "jpeg", "picture", "mat5", "mat73", "safetensors", "npy", "pair", "recipe"} <= set(kinds)
+    assert {"dng", "picture", "mat5", "mat73", "safetensors", "npy", "pair", "recipe"} <= set(kinds)
     assert sum(row["mutated"] for row in kinds.values()) == 40
     assert all(row["refused"] for row in kinds.values()) and sum(row["read"] for row in kinds.values()) > 2
 
@@ -39,10 +39,10 @@ def test_a_crash_and_a_hang_of_a_reader_are_told_apart(
     fuzz: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     missing = tmp_path / "missing.jpg"
-    assert fuzz.judged("jpeg", missing, False) == ("refused", f"{missing}: no such picture file")
+    assert fuzz.judged("picture", missing, False) == ("refused", f"{missing}: no such picture file")
     for name, outcome in (("SIGSEGV", "crashed"), ("SIGXCPU", "hung")):
         monkeypatch.setattr(fuzz, "attempt", partial(killed, getattr(signal, name)))
-        found = fuzz.judged("jpeg", missing, False)
+        found = fuzz.judged("picture", missing, False)
         assert found[0] == outcome and name in found[1] and "missing.jpg" in found[1]
 
 
