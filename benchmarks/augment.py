@@ -4,11 +4,9 @@
 
 Every method makes clean RAW, noisy RAW and the variance map, packed, of photographs: a training batch of 16 crops, and
 pictures of 12 Mpix. *upi* is Brooks' pipeline as published: picture by picture and operation by operation, from floats,
-with its own noise. *cycleisp* is its network from sRGB to RAW alone, and *unbaked* the ISP's own reverse pass, each on
-one small crop whose time is scaled by pixels, in the network's favour. *copy* turns bytes into as many floats as are
-made of them, and does no more; *kornia* flips and rotates float pictures, as users of a GPU do anyway; *drawn before*
-is rawaug without the draw of its parameters; *rgb* and *srgb* are its other targets; *forward* is the way back from
-demosaiced RAW to sRGB. All are timed in turn, and the fastest run of each counts.
+with its own noise. *copy* turns bytes into as many floats as are made of them, and does no more; *drawn before* is
+rawaug without the draw of its parameters; *rgb* and *srgb* are its other targets. All are timed in turn, and the
+fastest run of each counts.
 
 The roofline is the bandwidth of a large copy in the same run, bytes read plus bytes written a second. A pixel counts
 as :data:`COUNTED` bytes, whatever a method moves; rawaug's two passes move :data:`MOVED`.
@@ -28,21 +26,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.measure import arguments, fastest, finish, memory_used, seconds, sized, start
+from benchmarks.measure import arguments, fastest, finish, memory_used, seconds, show, sized, start
 from rawaug import bayer
 from rawaug.data.demo import demo_photographs
-from rawaug.isp.fast import FastForward
-from rawaug.isp.model import DictionaryISP
-from rawaug.paper.baselines.networks import CycleISP
 from rawaug.paper.baselines.upi import UPI, unprocess_pixels
 from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.targets import Target
 
 COUNTED = 3 + 4 + 4
 """Bytes a pixel that any augmentation must move: uint8 in, noisy and clean RAW out in float32."""
 MOVED = (3 + 4) + (4 + 4 + 4)
 """Bytes a pixel that rawaug moves: pictures to clean RAW, then clean RAW to noisy RAW and variance."""
-NETWORK_CROP = 64
-UNBAKED_CROP = 256
 
 
 def pictures(count: int, height: int, width: int) -> Tensor:
@@ -68,44 +62,19 @@ def published_upi(picture: Tensor, generator: torch.Generator) -> tuple[Tensor, 
     return clean, noisy, variance
 
 
-def geometry() -> torch.nn.Module:
-    """kornia's flips and affine transform, drawn for each picture."""
-    from kornia.augmentation import RandomAffine, RandomHorizontalFlip, RandomVerticalFlip
-
-    affine = RandomAffine(degrees=15.0, translate=(0.1, 0.1), scale=(0.8, 1.2), p=1.0)
-    return torch.nn.Sequential(RandomHorizontalFlip(p=0.5), RandomVerticalFlip(p=0.5), affine)
-
-
-def methods(batch: Tensor) -> dict[str, tuple[Callable[[], object], int]]:
-    """What is timed, and the pixels that one run makes."""
-    device = batch.device
-    generator = torch.Generator(device).manual_seed(0)
-    pixels, small = batch[:, 0].numel(), batch[:1, :, :UNBAKED_CROP, :UNBAKED_CROP]
-    isp, network, turned = DictionaryISP.from_pretrained("universal").to(device), CycleISP().reverse_network, geometry()
-    network, augment = network.to(device), RawAugment.from_pretrained("universal").to(device)
-    floats = batch / 255.0
-    drawn = augment.sample(batch)
-    develop, colour = FastForward(isp).to(device), floats.square()
-    own, one = augment.sample(batch[:1]).isp, small[:, 0].numel()
-    crop = floats[:1, :, :NETWORK_CROP, :NETWORK_CROP].contiguous()
-
-    def unbaked() -> object:
-        clean = bayer.pack(isp.reverse(small).raw.clamp(max=1.0), isp.cfa)
-        return augment.noise.apply_with_variance(clean, augment.noise.sample(1, torch.Generator().manual_seed(0)))
-
-    runs: dict[str, tuple[Callable[[], object], int]] = {"rawaug": (lambda: augment(batch), pixels)}
-    for target in ("rgb", "srgb"):
-        other = RawAugment.from_pretrained("universal", target=target).to(device)
-        runs[target] = (lambda other=other: other(batch), pixels)  # type: ignore[misc]
-    return runs | {
-        "rawaug, drawn before": (lambda: augment.apply(batch, drawn), pixels),
-        "forward": (lambda: develop(colour, drawn.isp), pixels),
-        "forward, unbaked": (lambda: isp.forward_pixels(colour[:1, ..., :UNBAKED_CROP, :UNBAKED_CROP], own), one),
-        "copy": (lambda: batch.float(), pixels),
-        "kornia": (lambda: turned(floats), pixels),
-        "upi": (lambda: [published_upi(picture[None], generator) for picture in floats], pixels),
-        "unbaked": (unbaked, one),
-        "cycleisp": (lambda: network(crop), crop[:, 0].numel()),
+def methods(batch: Tensor) -> dict[str, Callable[[], object]]:
+    """What is timed, by name."""
+    generator, floats = torch.Generator(batch.device).manual_seed(0), batch / 255.0
+    targets: tuple[Target, ...] = ("raw", "rgb", "srgb")
+    ours = {target: RawAugment.from_pretrained("universal", target=target).to(batch.device) for target in targets}
+    drawn = ours["raw"].sample(batch)
+    return {
+        "rawaug": lambda: ours["raw"](batch),
+        "rgb": lambda: ours["rgb"](batch),
+        "srgb": lambda: ours["srgb"](batch),
+        "rawaug, drawn before": lambda: ours["raw"].apply(batch, drawn),
+        "copy": lambda: batch.float(),
+        "upi": lambda: [published_upi(picture[None], generator) for picture in floats],
     }
 
 
@@ -121,13 +90,11 @@ def measure(batch: Tensor, repeats: int, gb_s: float) -> dict[str, dict[str, flo
     """Mpix/s of each method, rawaug's speed as a multiple of it, and rawaug's share of the bandwidth ``gb_s``."""
     runs = methods(batch)
     best = dict.fromkeys(runs, float("inf"))
-    for round_ in range(repeats):
-        for name, (run, _) in runs.items():
-            if name in ("cycleisp", "unbaked", "forward, unbaked") and round_ >= 3:
-                continue
-            time.sleep(0.02)  # PyTorch's threads spin on for a while after the method before
-            best[name] = min(best[name], seconds(run, batch.device))
-    speed = {name: pixels / best[name] / 1e6 for name, (_, pixels) in runs.items()}
+    for name in [*runs] * repeats:
+        time.sleep(0.02)  # PyTorch's threads spin on for a while after the method before
+        best[name] = min(best[name], seconds(runs[name], batch.device))
+    pixels = batch[:, 0].numel()
+    speed = {name: pixels / taken / 1e6 for name, taken in best.items()}
     rows = {name: {"mpix_s": value, "ratio": speed["rawaug"] / value} for name, value in speed.items()}
     for name in [name for name in rows if name.startswith("rawaug")]:
         rows[name] |= {what: speed[name] * size / 1e3 / gb_s for what, size in (("counted", COUNTED), ("moved", MOVED))}
@@ -161,14 +128,6 @@ def first_call(device: torch.device) -> float:
     return seconds(lambda: augment(torch.zeros(1, 3, 64, 64, dtype=torch.uint8, device=device)), device)
 
 
-def show(title: str, rows: dict[str, dict[str, float]]) -> None:
-    """A table of :func:`measure`."""
-    print(f"{title}: Mpix/s; rawaug as a multiple; its bytes, counted and moved, of a copy's")
-    for name, row in rows.items():
-        line = f"  {name:22}{row['mpix_s']:10.3g}{row['ratio']:10.3g}"
-        print(line + (f"{row['counted']:10.2f}{row['moved']:10.2f}" if "moved" in row else ""))
-
-
 def main() -> None:
     parser = arguments(__doc__, repeats=40, quick="few runs, and 3 Mpix instead of 12")
     parser.add_argument("--task", choices=["memory", "first"], help=argparse.SUPPRESS)
@@ -191,7 +150,8 @@ def main() -> None:
     for shape, repeats in (((16, 256, 256), 5 if args.quick else args.repeats), ((4, *sides), 2 if args.quick else 5)):
         title, batch = "x".join(map(str, shape)), pictures(*shape).to(args.device)
         figures[title] = rows = measure(batch, repeats, copied)
-        show(title, rows)
+        print(f"{title}: Mpix/s; rawaug as a multiple; its bytes, counted and moved, of a copy's")
+        show(rows)
     finish(figures, args)
 
 

@@ -68,8 +68,7 @@ def make_inputs(folder: Path) -> None:
     from rawaug.bayer import CFA
     from rawaug.io import write_dng
 
-    for name in ("pictures", "shots"):
-        (folder / name).mkdir()
+    (folder / "shots").mkdir()
     write_pictures(folder / "pictures", 4, (96, 128))
     generator = torch.Generator().manual_seed(0)
     for k in range(4):

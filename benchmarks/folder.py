@@ -11,19 +11,18 @@ every damaged file and no other.
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 import tempfile
 import time
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 from torch.utils.data import DataLoader
 
-from benchmarks.measure import arguments, finish, seconds, start
+from benchmarks.measure import arguments, finish, seconds, start, write_pictures
 from rawaug.data import PictureFolder
 from rawaug.io import read_picture
 
@@ -33,11 +32,8 @@ DAMAGES = ("truncated", "empty", "text", "dangling")
 def make_folder(folder: Path, files: int, damaged: float) -> set[str]:
     """Fill ``folder``; the names of the damaged files."""
     rng = np.random.default_rng(0)
-    jpegs = []
-    for _ in range(50):
-        buffer = BytesIO()
-        Image.fromarray(rng.integers(0, 256, (12, 16, 3), np.uint8)).resize((160, 120)).save(buffer, "jpeg", quality=90)
-        jpegs.append(buffer.getvalue())
+    jpegs = [path.read_bytes() for path in sorted(write_pictures(folder / "whole", 50, (120, 160)).iterdir())]
+    shutil.rmtree(folder / "whole")
     bad = set(rng.permutation(files)[: round(files * damaged)].tolist())
     names = set()
     for k in range(files):

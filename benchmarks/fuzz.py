@@ -45,6 +45,7 @@ from rawaug.commands.run import with_values
 from rawaug.data.formats import read_mosaic, read_value
 from rawaug.data.published import read_packed
 from rawaug.data.sidd import colour_of, mosaic_of
+from rawaug.evaluation.scores import print_rows
 from rawaug.experiment.plan import settings_of
 from rawaug.experiment.recipe import Recipe, kind_of, read_recipe
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng
@@ -258,12 +259,10 @@ def fuzz(kinds: list[str], count: int, seed: int, keep: Path | None) -> dict[str
 def _fuzz_kind(
     kind: str, originals: list[Path], count: int, seed: int, folder: Path, keep: Path | None
 ) -> dict[str, Any]:
-    folder.mkdir()
     for original in originals:
         copy = _placed(original, folder, "whole", original.read_bytes())
         if (result := judged(kind, copy, by_commands=original is originals[0]))[0] != "read":
             raise ValueError(f"{original}: intact, but was {result[0]} ({result[1]})")
-        _empty(folder)
     outcomes, reasons, slowest = Counter[str](), [], 0.0
     for number in range(count):
         rng = np.random.default_rng(derive_seed(seed, kind, number))
@@ -281,23 +280,19 @@ def _fuzz_kind(
             if keep is not None and path.is_file():
                 keep.mkdir(parents=True, exist_ok=True)
                 shutil.copy(path, keep / f"{kind}-{path.name}")
-        _empty(folder)
     counted = {outcome: outcomes[outcome] for outcome in OUTCOMES}
     return {"mutated": count, **counted, "slowest_s": round(slowest, 2), "reasons": reasons}
 
 
 def _placed(original: Path, folder: Path, label: str, content: bytes) -> Path:
-    """A file like the original with this content, beside its picture where it needs one."""
+    """A file like the original with this content, alone in the folder but for its picture where it needs one."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
     path = folder / f"{original.stem.split('.')[0]}-{label}{original.suffix}"
     path.write_bytes(content)
     if original.suffix == ".npy":
         path.with_suffix(".png").write_bytes(original.with_suffix(".png").read_bytes())
     return path
-
-
-def _empty(folder: Path) -> None:
-    for entry in folder.iterdir():
-        shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
 
 
 def _damaged(original: Path, rng: np.random.Generator) -> bytes:
@@ -309,12 +304,9 @@ def _damaged(original: Path, rng: np.random.Generator) -> bytes:
 
 def print_table(results: dict[str, Any]) -> None:
     columns = ("mutated", *OUTCOMES, "slowest_s")
-    print("kind         decoder      " + "".join(name.rjust(10) for name in columns))
-    for kind, row in results.items():
-        print(f"{kind:13}{DECODERS[kind]:13}" + "".join(str(row[name]).rjust(10) for name in columns))
-    for kind, row in results.items():
-        for reason in row["reasons"]:
-            print(f"{kind}: {reason}")
+    rows = [[kind, DECODERS[kind], *(str(row[name]) for name in columns)] for kind, row in results.items()]
+    print_rows("Hostile files", ["kind", "decoder", *columns], rows)
+    print("\n".join(f"{kind}: {reason}" for kind, row in results.items() for reason in row["reasons"]))
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,6 +1,6 @@
 """What the hulls of colour, light and tone atoms hold, and whether it holds for cameras and curves not looked at.
 
-    python -m benchmarks.hulls [--atoms 10] [--halves 5]
+    python -m benchmarks.hulls [--halves 5]
     python -m benchmarks.hulls --figure docs/coverage.png
 
 Cameras: the error is that of linear colour on photographs, between a camera's own sRGB-to-camera matrix and the nearest
@@ -34,6 +34,9 @@ from benchmarks.universal import (
 from rawaug.isp.cameras import load_cameras
 from rawaug.isp.dictionary import CameraDictionary, nearest_in_hull
 from rawaug.isp.model import DictionaryISP
+
+ATOMS, GAINS = 10, 16
+"""Of the shipped ISP ``universal``."""
 
 
 def split(points: Tensor, seed: int) -> tuple[Tensor, Tensor]:
@@ -111,8 +114,6 @@ def draw(path: Path) -> None:
 
 def main() -> None:
     cli = parser(__doc__)
-    cli.add_argument("--atoms", type=int, default=10)
-    cli.add_argument("--gains", type=int, default=16)
     cli.add_argument("--halves", type=int, default=5)
     cli.add_argument("--figure", type=Path, help="draw this figure, and do nothing else")
     options = cli.parse_args()
@@ -123,12 +124,12 @@ def main() -> None:
         print(f"tone {name}: {value:.1f} dB under the others")
     cameras = distinct_cameras()
     points = camera_points(cameras)
-    print(f"{len(points)} distinct matrices, {options.atoms} atoms", flush=True)
+    print(f"{len(points)} distinct matrices, {ATOMS} atoms", flush=True)
     for seed in range(options.halves):
-        print(f"half {seed}: {of_other_half(points, options.atoms, seed):.1%} of the other half", flush=True)
-        share = lights_of_other_half(cameras, options.gains, seed)
+        print(f"half {seed}: {of_other_half(points, ATOMS, seed):.1%} of the other half", flush=True)
+        share = lights_of_other_half(cameras, GAINS, seed)
         print(f"gains, half {seed}: {share:.1%} of the other half's", flush=True)
-    print(f"all matrices: {held(points, points[chosen_atoms(points, options.atoms).atoms]):.1%}")
+    print(f"all matrices: {held(points, points[chosen_atoms(points, ATOMS).atoms]):.1%}")
 
 
 if __name__ == "__main__":

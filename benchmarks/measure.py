@@ -113,6 +113,7 @@ def sized(picture: Tensor, height: int, width: int) -> Tensor:
 def write_pictures(folder: Path, count: int | None = None, size: Sequence[int] | None = None) -> Path:
     """Fill a folder with ``count`` JPEGs of the built-in pictures, repeated if need be, in their own or one size."""
     pictures = demo_pictures()
+    folder.mkdir(exist_ok=True)
     for k in range(len(pictures) if count is None else count):
         picture = pictures[k % len(pictures)]
         shown = picture if size is None else sized(picture, *size).round().clamp(0, 255).to(torch.uint8)

@@ -52,9 +52,9 @@ SIDE = 512
 
 def inference(network: denoisers.Denoiser, args: argparse.Namespace) -> dict[str, float]:
     """GMAC and seconds a mosaic megapixel; on a CPU on one and on two threads."""
-    noisy = torch.rand(1, 4, args.side, args.side, device=args.device)
+    noisy = torch.rand(1, 4, SIDE, SIDE, device=args.device)
     inputs = [x.contiguous(memory_format=torch.channels_last) for x in (noisy, 1e-3 * noisy + 1e-5)]
-    megapixels, figures = 4 * args.side**2 / 1e6, dict[str, float]()
+    megapixels, figures = 4 * SIDE**2 / 1e6, dict[str, float]()
     with torch.inference_mode():
         with FlopCounterMode(display=False) as counter:
             network(*inputs)
@@ -133,10 +133,10 @@ def references(args: argparse.Namespace) -> dict[str, dict[str, float]]:
 # -- all of them -------------------------------------------------------------------------------------------------------
 
 
-def measure(name: str, args: argparse.Namespace, size: dict[str, Any] | None = None) -> dict[str, float]:
-    """Of one network, in the size of the table if none is given."""
+def measure(name: str, args: argparse.Namespace) -> dict[str, float]:
+    """Of one network."""
     torch.set_num_threads(args.threads)
-    size = (SIZES[name] if size is None else size) | ({"width": args.width} if args.width else {})
+    size = SIZES[name] | ({"width": args.width} if args.width else {})
     network = denoisers.build(name, **size)
     network = network.to(args.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     costs = {"parameters": sum(p.numel() for p in network.parameters()), **inference(network.eval(), args)}
@@ -157,7 +157,6 @@ def main() -> None:
     parser.add_argument("--pmrid", help="file of PMRID's published weights, to be scored beside --minutes")
     parser.add_argument("--batch", type=int, default=16, help="crops in a step of --minutes")
     parser.add_argument("--crop", type=int, default=128, help="side of these sRGB crops")
-    parser.add_argument("--side", type=int, default=SIDE, help="of the packed picture that inference is timed on")
     args = parser.parse_args()
     args.repeats = 1 if args.quick else args.repeats
     figures = start(args)
