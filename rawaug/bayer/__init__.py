@@ -1,6 +1,6 @@
 """Mosaics: colour filter arrays, geometry that keeps their pattern, demosaicing."""
 
-from rawaug.bayer.binning import Halving, to_bayer, to_bayer_variance
+from rawaug.bayer.binning import Halving, to_bayer
 from rawaug.bayer.cfa import (
     CFA,
     N_VIEWS,
@@ -15,7 +15,6 @@ from rawaug.bayer.cfa import (
     pack_rgb,
     turn,
     turn_back,
-    turn_keeping_cfa,
     unpack,
 )
 from rawaug.bayer.demosaicing import DIRECTIONAL, METHODS, STENCILS, demosaic, demosaicing_stencils, require_method
@@ -28,5 +27,5 @@ __all__ = [
     "Pattern", "RandomCrop", "RandomTurn", "balance_greens", "bin_mosaic", "bin_mosaic_variance", "bin_packed",
     "canonical_cfa", "crop", "crop_to_cfa", "demosaic", "demosaicing_stencils", "measure_greens", "mosaic",
     "noise_variance", "pack", "pack_rgb", "pattern", "pattern_name", "plane_indices", "require_method", "to_bayer",
-    "to_bayer_variance", "turn", "turn_back", "turn_keeping_cfa", "unpack",
+    "turn", "turn_back", "unpack",
 ]  # fmt: skip

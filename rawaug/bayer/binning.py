@@ -15,9 +15,6 @@ from torch.nn import functional as F
 from rawaug.bayer.cfa import CFA
 from rawaug.bayer.patterns import PATTERNS, pattern
 
-_WHOLE = 48
-"""A side that is a multiple of four cells of every pattern."""
-
 
 class Halving:
     """Brings mosaics of one pattern, sides multiples of 4, to half their sides as packed RGGB, and back.
@@ -64,7 +61,7 @@ def to_bayer(mosaic: Tensor, cfa: str) -> Tensor:
     """Convert a mosaic ``(1, H, W)`` of any pattern to RGGB at half the sides, ``(1, h, w)``, h and w even.
 
     Lines at the end that fill no cell are left out, and in Quad-Bayer a first line that would halve the squares of a
-    colour. :func:`to_bayer_variance` gives the share of the noise's variance that is left.
+    colour.
     """
     known, places = pattern(cfa), ((0, 0), (0, 1), (1, 0), (1, 1))
     top, left = next((place for place in places if known.shift(*place).name in PATTERNS), (0, 0))
@@ -73,9 +70,3 @@ def to_bayer(mosaic: Tensor, cfa: str) -> Tensor:
         raise ValueError(f"a mosaic of {tuple(mosaic.shape[-2:])} is too small for half of its sides; it needs 4 x 4")
     halving = Halving(known.shift(top, left).planes(height, width)[None])
     return F.pixel_shuffle(halving(mosaic[None, :, top : top + height, left : left + width]), 2)[0]
-
-
-def to_bayer_variance(cfa: str) -> float:
-    """The variance that :func:`to_bayer` leaves of independent noise of variance 1, the mean over all sites."""
-    halving = Halving(pattern(cfa).planes(_WHOLE, _WHOLE)[None])
-    return float(halving.variance(torch.ones(1, 1, 1, 1))[..., 2:-2, 2:-2].mean())

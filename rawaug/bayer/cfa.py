@@ -5,7 +5,7 @@ Bayer's patterns (US patent 3,971,065, 1976). *Packed* RAW holds the four sites 
 always in the order R, Gr, Gb, B (Gr is the green of the red row), so that a network need not know the sensor's pattern.
 
 A flip or a quarter turn of a mosaic moves the pattern: a mirrored RGGB is GRBG. :func:`turn` only moves pixels,
-:meth:`CFA.turn` says what the pattern becomes, and :func:`turn_keeping_cfa` crops a line where that brings it back.
+:meth:`CFA.turn` says what the pattern becomes, and :meth:`rawaug.bayer.Pattern.turn_keeping` brings it back.
 """
 
 from __future__ import annotations
@@ -129,15 +129,6 @@ def turn_back(image: Tensor, view: int) -> Tensor:
     """Undo :func:`turn` of the same ``view`` on an image ``(..., H, W)``."""
     flips = turn(image, view & 3)
     return flips.transpose(-2, -1) if view & 4 else flips
-
-
-def turn_keeping_cfa(raw: Tensor, cfa: CFA | str, view: int) -> Tensor:
-    """Turn a mosaic ``(..., H, W)`` and keep its pattern: where it would move, one line on either side is cropped."""
-    require_even(*raw.shape[-2:])
-    kept = crop_to_cfa(turn(raw, view), CFA(cfa).turn(view), CFA(cfa))
-    if not all(kept.shape[-2:]):
-        raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} is too small to turn while keeping its CFA")
-    return kept
 
 
 def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:

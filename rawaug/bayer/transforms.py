@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from rawaug.bayer.cfa import CFA, N_VIEWS, crop, pack, turn, turn_keeping_cfa
+from rawaug.bayer.cfa import CFA, N_VIEWS, crop, pack, turn
+from rawaug.bayer.patterns import pattern
 
 
 class _Transform(nn.Module, ABC):
@@ -103,7 +104,7 @@ class RandomTurn(_Transform):
 
     def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor:
         view = int(params)
-        return turn_keeping_cfa(raw, self.cfa, view) if self.keep_cfa else turn(raw, view)
+        return pattern(self.cfa).turn_keeping(raw, view) if self.keep_cfa else turn(raw, view)
 
     def forward(self, raw: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Turn ``(..., H, W)`` by a view drawn from ``generator``."""

@@ -154,7 +154,7 @@ def packed_crop(
     top, left = (2 * int(torch.randint((n - side) // 2 + 1, (), generator=generator)) for n in mosaics[0].shape[-2:])
     view = int(torch.randint(bayer.N_VIEWS, (), generator=generator))
     images = torch.cat([bayer.crop(mosaic, top, left, side, side) for mosaic in mosaics])
-    turned = bayer.turn_keeping_cfa(images, cfa, view)
+    turned = bayer.pattern(cfa).turn_keeping(images, view)
     return bayer.pack(bayer.crop(turned, 0, 0, crop, crop)[:, None], cfa)
 
 

@@ -45,7 +45,7 @@ def test_pack_orders_planes_by_colour_and_unpack_inverts(cfa: CFA, height: int, 
 @given(cfas, views, sides, sides)
 def test_a_turn_moves_the_pattern_as_it_says_or_keeps_it(cfa: CFA, view: int, height: int, width: int) -> None:
     mosaic = colour_map(cfa, height, width)
-    kept, turned = bayer.turn_keeping_cfa(mosaic, cfa, view), bayer.turn(mosaic, view)
+    kept, turned = bayer.pattern(cfa).turn_keeping(mosaic, view), bayer.turn(mosaic, view)
     assert torch.equal(kept, colour_map(cfa, *kept.shape[-2:]))
     assert torch.equal(turned, colour_map(cfa.turn(view), *turned.shape[-2:]))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rawaug.bayer import Halving, bin_mosaic, bin_mosaic_variance, pack, pattern, to_bayer, to_bayer_variance
+from rawaug.bayer import Halving, bin_mosaic, pack, pattern, to_bayer
 
 NAMES = ("RGGB", "GRBG", "XTRANS", "XTRANS+1+4", "QUAD-GBRG")
 
@@ -26,8 +26,6 @@ def test_new_sites_are_means_around_their_places(name: str) -> None:
 def test_noise_is_left_as_stated_and_colours_do_not_mix(name: str) -> None:
     height = width = 960
     noise = torch.randn(1, height, width, generator=torch.Generator().manual_seed(0))
-    left = to_bayer(noise, name)[..., 4:-4, 4:-4].square().mean().item()
-    assert left == pytest.approx(to_bayer_variance(name), rel=0.02)
     sites = Halving(pattern(name).planes(48, 48)[None]).variance(torch.ones(1, 1, 1, 1))[..., 2:-2, 2:-2]
     per_plane = pack(to_bayer(noise, name)[..., 4:-4, 4:-4], "RGGB").square().mean((1, 2))
     assert torch.allclose(sites.mean((0, 2, 3)), per_plane, rtol=0.04)
@@ -40,7 +38,6 @@ def test_red_and_blue_of_bayer_are_binned_as_by_bin_mosaic() -> None:
     raw = torch.rand(1, 48, 64, generator=torch.Generator().manual_seed(0))
     found, expected = (pack(x, "RGGB")[[0, 3], 1:-1, 1:-1] for x in (to_bayer(raw, "RGGB"), bin_mosaic(raw, "RGGB", 2)))
     torch.testing.assert_close(found, expected)
-    assert to_bayer_variance("RGGB") == pytest.approx(0.75 * bin_mosaic_variance(2))  # a green site sees both greens
 
 
 @pytest.mark.parametrize("name", NAMES)
