@@ -11,6 +11,7 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import gc
 import multiprocessing
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -34,6 +35,17 @@ settings.load_profile("rawaug")
 multiprocessing.set_forkserver_preload(
     ["rawaug.experiment.plan", "rawaug.camera.fit", "rawaug.plugin.dataset", "lightning_fabric"]
 )
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """What is collected stays to the end: to look through it for garbage again and again would take seconds."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
