@@ -139,7 +139,7 @@ def contents(folder: Path) -> Files:
     found: Files = {}
     for file in sorted(folder.rglob("*")):
         name = str(file.relative_to(folder))
-        if not file.is_file() or file.suffix in LEFT_OUT or file.name.startswith("events.out"):
+        if not file.is_file() or file.suffix in LEFT_OUT:
             continue
         if file.suffix == ".safetensors":
             tensors = read_tensors(file, "it is damaged", infinite=("colour.spread",))[1]

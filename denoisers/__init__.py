@@ -4,14 +4,13 @@ Every one is called as ``model(noisy, variance=None) -> denoised``, all ``(B, 4,
 """
 
 from denoisers.classical import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
-from denoisers.cycleisp import CycleISPDenoiser
 from denoisers.files import build, from_pretrained, load, save
 from denoisers.inference import SelfEnsemble, denoise_tiles
 from denoisers.joint import JointDRUNet
 from denoisers.mosaic import MosaicDRUNet
 from denoisers.network import Denoiser
 from denoisers.networks import DHDN, DnCNN, DRUNet, FFDNet, NAFNet, UNet
-from denoisers.pmrid import PMRID
+from denoisers.published import PMRID, CycleISPDenoiser
 from rawaug.registry import DENOISERS
 
 __all__ = [

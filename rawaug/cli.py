@@ -30,7 +30,7 @@ COMMANDS = {
     "denoise": "Denoise a RAW file to DNG, a JPEG, PNG or TIFF to another, or a folder of either.",
     "evaluate": "Measure PSNR and SSIM of a denoiser or an ISP.",
     "explore": "Show pictures as RAW of any camera, on a page in the browser.",
-    "export": "Write a denoiser as ONNX, or an ISP as JSON, .cube and ONNX.",
+    "export": "Write a denoiser as ONNX, or an ISP as a .cube.",
     "fit": "Fit a dictionary ISP to RAW files of a camera.",
     "hdr": "Merge exposures of a scene in RAW, or change the exposure of a single picture.",
     "info": "Describe a weights file, or list the known cameras: rawaug info cameras [PART].",

@@ -7,17 +7,14 @@ from __future__ import annotations
 
 import os
 import sys
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import wraps
-from typing import Any, TextIO, TypeVar
+from typing import Any, TextIO
 
 from tqdm.asyncio import tqdm as terminal_tqdm
 from tqdm.auto import tqdm
 
-T = TypeVar("T")
 _quiet: ContextVar[bool] = ContextVar("quiet", default=False)
 _LINE = "{desc}: {n_fmt}/{total_fmt} {unit}s, {elapsed} elapsed, {remaining} left{postfix}"
 
@@ -75,20 +72,3 @@ class _Lines(terminal_tqdm):
         if not self.disable and self.n > self.last_print_n and self.last_print_t > self.start_t:
             self.display()  # the end, where there was a line before
         self.disable = True
-
-
-def time_stage(stage: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Decorator: add the seconds that a method takes to ``self.seconds[stage]``."""
-
-    def decorate(method: Callable[..., T]) -> Callable[..., T]:
-        @wraps(method)
-        def run(self: Any, *arguments: Any) -> T:
-            start = time.perf_counter()
-            try:
-                return method(self, *arguments)
-            finally:
-                self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-
-        return run
-
-    return decorate

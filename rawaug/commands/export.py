@@ -1,17 +1,15 @@
-"""``rawaug export``: a denoiser as an ONNX file, an ISP as JSON, .cube and ONNX, for programs without PyTorch.
+"""``rawaug export``: a denoiser as an ONNX file, an ISP as a .cube, for programs without PyTorch.
 
 A denoiser maps ``noisy`` and, where the network reads it, its ``variance`` to ``denoised``: float32 packed RAW, any
-number of pictures of any size. An ISP becomes JSON (``rawaug info --json`` and the .cube's table), a .cube (Adobe's
-format, 33 nodes along each axis: sRGB to linear camera RGB, up to lens shading and mosaic), and ONNX: ``srgb (1, 3, h,
-w)`` of even sides in [0, 1], ``matrix (1, 3, 3)`` from linear sRGB to camera RGB and ``gains (1, 3)`` to ``raw (1, 4,
-h/2, w/2)``. An ONNX file is run by ONNX Runtime and compared with PyTorch before it is left there.
+number of pictures of any size. ONNX Runtime runs the file, and it is compared with PyTorch before it is left there. A
+.cube, Adobe's format, maps sRGB to linear camera RGB, up to lens shading and mosaic.
 """
 
 from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,18 +18,15 @@ from torch import Tensor, nn
 
 import denoisers
 from denoisers.files import FOLDER, find_denoiser
-from rawaug.bayer import pack_rgb
 from rawaug.commands import YAML
 from rawaug.data import demo_pairs
 from rawaug.denoise.foreign import feeds, session_of
 from rawaug.errors import extra
 from rawaug.evaluation.trials import trial_of
 from rawaug.files import find_weights, read_header, replacing
-from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.progress import progress
-from rawaug.seeding import keyed_generator
 
 OPSET = 18
 """The version of ONNX's operators that a graph is written in."""
@@ -79,26 +74,19 @@ def difference_from(expected: Tensor, session: Any, inputs: Mapping[str, Tensor]
     return difference
 
 
-def export_isp(isp: DictionaryISP, out: str | Path, white_balance: Sequence[float] | None = None) -> list[Path]:
-    """Write an ISP to ``out``, by its extension .json, .cube or .onnx; without one, a folder with all three."""
-    out = Path(out)
-    if out.suffix not in ("", *WRITERS):
-        raise ValueError(f"{out}: an ISP is exported to {', '.join(WRITERS)}, or to a folder with all of them")
-    files = [out] if out.suffix else [out / f"isp{suffix}" for suffix in WRITERS]
-    for file in files:
-        with replacing(file) as partial:
-            WRITERS[file.suffix](isp, partial, file, white_balance)
-    return files
+def export_cube(isp: DictionaryISP, out: str | Path, white_balance: Sequence[float] | None = None) -> None:
+    """Write the reverse pass of an ISP for one setting, :data:`NODES` nodes along each axis, as a .cube.
 
-
-def _write_json(isp: DictionaryISP, partial: Path, path: Path, white_balance: Sequence[float] | None) -> None:
-    table = isp.reverse_table(isp.typical_setting(white_balance), NODES)
-    values = [[round(value, 7) for value in row] for row in table.tolist()]
-    content = isp.description(white_balance) | {"lut": {"size": NODES, "fastest": "red", "values": values}}
-    partial.write_text(json.dumps(content) + "\n")
-
-
-def _write_cube(isp: DictionaryISP, partial: Path, path: Path, white_balance: Sequence[float] | None) -> None:
+    Args:
+        isp: the ISP.
+        out: the file.
+        white_balance: as-shot multipliers of the setting; by default those typical of the fit.
+    """
+    path = Path(out)
+    if path.suffix != ".cube":
+        raise ValueError(
+            f"{path}: an ISP is exported to a .cube; rawaug info WEIGHTS --json prints its atoms and curve"
+        )
     setting = isp.typical_setting(white_balance)
     gains = " ".join(f"{gain:.4f}" for gain in setting.gains[0].tolist())
     lines = [
@@ -109,48 +97,8 @@ def _write_cube(isp: DictionaryISP, partial: Path, path: Path, white_balance: Se
         "DOMAIN_MAX 1.0 1.0 1.0",
         *(" ".join(f"{value:.7f}" for value in row) for row in isp.reverse_table(setting, NODES).tolist()),
     ]
-    partial.write_text("\n".join(lines) + "\n")
-
-
-def _write_onnx(isp: DictionaryISP, partial: Path, path: Path, white_balance: Sequence[float] | None) -> None:
-    setting = isp.typical_setting(white_balance)
-    srgb = torch.rand(1, 3, 70, 90, generator=keyed_generator(0, "export"))
-    inputs = {"srgb": srgb, "matrix": setting.matrix.detach(), "gains": setting.gains.detach()}
-    session = write_onnx(ReversePass(isp).eval(), inputs, "raw", partial)
-    with torch.no_grad():
-        expected = pack_rgb(isp.reverse_pixels(srgb, setting), isp.cfa)
-    difference_from(expected, session, inputs, path)
-
-
-WRITERS: dict[str, Callable[[DictionaryISP, Path, Path, Sequence[float] | None], None]] = {
-    ".json": _write_json,
-    ".cube": _write_cube,
-    ".onnx": _write_onnx,
-}
-"""By extension: an ISP to a file that gets another name."""
-
-
-class ReversePass(nn.Module):
-    """The reverse pass of an ISP as a function of tensors alone; its tone curves are mixed as is typical."""
-
-    def __init__(self, isp: DictionaryISP) -> None:
-        super().__init__()
-        self.isp = isp
-
-    def forward(self, srgb: Tensor, matrix: Tensor, gains: Tensor) -> Tensor:
-        """``(1, 3, h, w)``, ``(1, 3, 3)`` and ``(1, 3)`` to ``(1, 4, h/2, w/2)``."""
-        none, tones = matrix.new_zeros(len(matrix), 0), self.isp.typical_tones().expand(len(matrix), -1)
-        params = ISPParams(none, none, matrix, gains, tones)
-        return pack_rgb(self.isp.reverse_pixels(srgb, params, _places(srgb)), self.isp.cfa)
-
-
-def _places(image: Tensor) -> Tensor:
-    """Coordinates of :func:`rawaug.isp.stages.frame_coordinates`, from a tensor, so that any size is traced."""
-    ones = torch.ones_like(image[:, :1])
-    rows, columns = ones.cumsum(2), ones.cumsum(3)
-    height, width = rows[..., -1:, -1:], columns[..., -1:, -1:]
-    half_diagonal = 0.5 * (height.square() + width.square()).sqrt()
-    return torch.cat([rows - 0.5 - height / 2, columns - 0.5 - width / 2], dim=1) / half_diagonal
+    with replacing(path) as partial:
+        partial.write_text("\n".join(lines) + "\n")
 
 
 def run(
@@ -160,16 +108,16 @@ def run(
     *,
     white_balance: Annotated[tuple[float, float, float] | None, YAML] = None,
 ) -> None:
-    """Write a denoiser as ONNX, or an ISP as JSON, .cube and ONNX.
+    """Write a denoiser as ONNX, or an ISP as a .cube.
 
     Args:
         weights: a .safetensors file written by rawaug run or rawaug fit, or the name of a shipped denoiser or ISP.
-        out: the .onnx file of a denoiser; of an ISP .json, .cube, .onnx, or a folder for all three.
+        out: the .onnx file of a denoiser, or the .cube of an ISP.
         white_balance: as-shot multipliers R, G, B for which an ISP is exported; by default those typical of the fit.
     """
     if read_header(find_weights(weights, FOLDER))["kind"] == "isp":
-        for path in export_isp(DictionaryISP.from_pretrained(weights), out, white_balance):
-            print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+        export_cube(DictionaryISP.from_pretrained(weights), out, white_balance)
+        print(f"{out}: {Path(out).stat().st_size / 1e6:.1f} MB")
         return
     if white_balance is not None:
         raise ValueError(f"--white-balance: is for ISPs, and {weights} is a denoiser")

@@ -19,14 +19,14 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any
 
 from torch import Tensor
 
 from denoisers.files import DEFAULT
 from rawaug import bayer
 from rawaug.denoise.corrections import Corrected, Correction, Corrections
-from rawaug.denoise.denoiser import Levels, RawDenoiser
+from rawaug.denoise.denoiser import RawDenoiser
 from rawaug.denoise.levels import Noise, Shots, UnknownNoise, as_json, find_levels, load_noise
 from rawaug.files import files_below, files_in, one_at_a_time, require_file, require_same_settings, require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
@@ -110,10 +110,10 @@ def denoise(
     if out is not None:
         _require_new(Path(out), overwrite)
     frame = source if isinstance(source, RawFrame) else read_raw(source)
-    denoised = _denoised(frame, made, load_noise(noise, made), Corrections(greens, black))
+    denoised, _, _ = _denoised(frame, made, load_noise(noise, made), Corrections(greens, black))
     if out is not None:
         _write(Path(out), denoised, None if isinstance(source, RawFrame) else Path(source))
-    return denoised.frame
+    return denoised
 
 
 def denoise_file(
@@ -174,20 +174,10 @@ def _require_new(path: Path, overwrite: bool, *suffixes: str) -> None:
     require_writable(path)
 
 
-class _Result(NamedTuple):
-    """A frame with what is left of its noise, its full colour if the denoiser demosaics, the levels it was told and
-    where they are from, the share of sites that no digital number could hold, and what the frame told of its sensor.
-    """
-
-    frame: RawFrame
-    rgb: Tensor | None
-    levels: Levels
-    noise_source: str
-    below_zero: float
-    corrected: Corrected
-
-
-def _denoised(frame: RawFrame, denoiser: RawDenoiser, noise: Noise, corrections: Corrections) -> _Result:
+def _denoised(
+    frame: RawFrame, denoiser: RawDenoiser, noise: Noise, corrections: Corrections
+) -> tuple[RawFrame, Tensor | None, dict[str, Any]]:
+    """The frame with what is left of its noise, its full colour if the denoiser demosaics, and what was done."""
     corrected = Corrected()
     if denoiser.strength > 0:
         frame, corrected = corrections(frame)
@@ -195,20 +185,22 @@ def _denoised(frame: RawFrame, denoiser: RawDenoiser, noise: Noise, corrections:
     if denoiser.reads_levels:
         *told, noise_source = find_levels(frame, noise)
         levels = (told[0], told[1])
-    image = denoiser.frame(frame, levels)
+    image, rgb = denoiser.frame(frame, levels), None
     if denoiser.upscale > 1:
-        below = (image < -0.5 / LINEAR_WHITE).float().mean().item()
-        return _Result(frame, image, levels or (0.0, 0.0), noise_source, below, corrected)
-    below = _clip_below_zero(image, frame)
-    known, rest = levels or frame.noise_profile, (1 - denoiser.strength) ** 2
-    left = None if rest == 0 or known is None else (rest * known[0], rest * known[1])
-    result = replace(frame, mosaic=image, noise_profile=left)
-    return _Result(result, None, levels or (0.0, 0.0), noise_source, below, corrected)
+        rgb, below = image, (image < -0.5 / LINEAR_WHITE).float().mean().item()
+    else:
+        below = _clip_below_zero(image, frame)
+        known, rest = levels or frame.noise_profile, (1 - denoiser.strength) ** 2
+        left = None if rest == 0 or known is None else (rest * known[0], rest * known[1])
+        frame = replace(frame, mosaic=image, noise_profile=left)
+    done: dict[str, Any] = dict(zip(("shot_var", "read_var"), levels or (0.0, 0.0), strict=True))
+    done |= {"noise_source": noise_source, "below_zero": below, "corrected": corrected}
+    return frame, rgb, done | {"camera": frame.camera, "iso": frame.iso}
 
 
-def _write(out: Path, denoised: _Result, source: Path | None) -> None:
+def _write(out: Path, frame: RawFrame, source: Path | None, rgb: Tensor | None = None) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_dng(out, denoised.frame, source, rgb=denoised.rgb)
+    write_dng(out, frame, source, rgb=rgb)
 
 
 def _file_denoised(
@@ -220,22 +212,9 @@ def _file_denoised(
     read: Callable[[Path], RawFrame] = read_raw,
 ) -> Denoised:
     start = time.perf_counter()
-    result = _denoised(read(source), denoiser, noise, corrections)
-    _write(out, result, source)
-    seconds, frame = time.perf_counter() - start, result.frame
-    shot_var, read_var = result.levels
-    return Denoised(
-        source,
-        out,
-        shot_var,
-        read_var,
-        result.noise_source,
-        result.below_zero,
-        seconds,
-        frame.camera,
-        frame.iso,
-        result.corrected,
-    )
+    frame, rgb, done = _denoised(read(source), denoiser, noise, corrections)
+    _write(out, frame, source, rgb)
+    return Denoised(source, out, seconds=time.perf_counter() - start, **done)
 
 
 def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:

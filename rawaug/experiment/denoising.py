@@ -47,7 +47,6 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import RawAugment, noise_for
 from rawaug.plugin.dataset import RawPairs
-from rawaug.progress import time_stage
 from rawaug.registry import ESTIMATORS, EXPERIMENTS, FILTERS, Spec, spec_label, split_spec
 from rawaug.seeding import derive_seed
 from rawaug.training.config import weights_key
@@ -144,7 +143,6 @@ class TrainingRun:
         self.pictures = PairPictures(self.pairs) if self.data.pictures == OWN_PICTURES else plan.pictures
         self.results: Results = {arm: [] for arm in recipe.arms}
         self.models: dict[str, Denoiser] = {}
-        self.seconds: dict[str, float] = {}
         require_usable(recipe, self.pairs, self.validation)
 
     @one_at_a_time(lambda self: self.folder if _leads() else None)
@@ -183,7 +181,6 @@ class TrainingRun:
         start = self.starts[arm]
         return self.isp.cfa if start is None else start.cfa
 
-    @time_stage("fit")
     def fit_isp(self, seed: int) -> DictionaryISP:
         """The ISP of the few pairs, or the recipe's own."""
         if self.recipe.camera is not None:
@@ -205,7 +202,6 @@ class TrainingRun:
         isp.save(path)
         return isp
 
-    @time_stage("training")
     def train_arm(self, arm: str, seed: int) -> Denoiser:
         """The network of an arm, trained, or loaded if it has been trained with the same settings."""
         recipe, folder = self.recipe, self.arm_folder(arm, seed)
@@ -253,7 +249,6 @@ class TrainingRun:
         samples = (seed, *real, *pictures, *how)
         return weights_key(recipe.network_of(arm), recipe.loop_of(arm), samples, validation)
 
-    @time_stage("scores of the arms")
     def evaluate(self, arm: str, seed: int) -> dict[str, Any]:
         """The arm's summaries ``plain`` and ``self_ensemble`` on the test frames; those in its file are kept."""
         path = self.arm_folder(arm, seed) / "evaluation.json"
@@ -316,17 +311,14 @@ class TrainingRun:
         print_table(results, title, others)
         _say(page.lead, own_noise_note(first_runs(results, others)))
         print(f"table: {file}\npicture: {picture}\npage: {self.folder / 'report.html'}")
-        spent = "time: " + ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in self.seconds.items())
-        _say(*reports(self.pictures), *self.unreadable, spent, *use)
+        _say(*reports(self.pictures), *self.unreadable, *use)
         require_numbers(
             [*(scores for runs in results.values() for run in runs for scores in run.values()), *others.values()]
         )
 
-    @time_stage("other denoisers")
     def _score_others(self) -> dict[str, list[Row]]:
         return group_rows(score(self.others, self.trials, "other denoisers")) if self.others else {}
 
-    @time_stage("report")
     def _draw(self, page: Page, denoisers: Sequence[RawDenoiser]) -> Path:
         """Write the page, with curves and frames, and the picture; of the classical denoisers they show the first."""
         page.add_curves(self.curves())

@@ -231,9 +231,9 @@ class DictionaryISP(StagedISP):
         return self.linear(torch.linspace(0.0, 1.0, 256).expand(1, 3, 1, -1))[0, :, 0].T.contiguous()
 
     @torch.no_grad()
-    def description(self, white_balance: Sequence[float] | None = None) -> dict[str, Any]:
+    def description(self) -> dict[str, Any]:
         """Describe the ISP as JSON: its atoms, curves and mask, :meth:`typical_setting`, and what the fit recorded."""
-        setting, shading, info = self.typical_setting(white_balance), self.find(stages.LensShading), dict(self.info)
+        setting, shading, info = self.typical_setting(), self.find(stages.LensShading), dict(self.info)
         mask = shading and {"mean": shading.mask.mean.tolist(), "precision": shading.mask.precision.tolist()}
         return {
             "kind": "isp",
@@ -244,7 +244,6 @@ class DictionaryISP(StagedISP):
             "colour_atoms": self.colour.atoms().tolist(),
             "gain_atoms": self.gain.atoms().tolist(),
             "setting": {
-                "white_balance": None if white_balance is None else list(white_balance),
                 "colour_weights": setting.colour_weights[0].tolist(),
                 "gain_weights": setting.gain_weights[0].tolist(),
                 "matrix": setting.matrix[0].tolist(),

@@ -1,4 +1,4 @@
-"""The training loop: one denoiser, one stream of samples; its validation, and its logs for people and TensorBoard.
+"""The training loop: one denoiser, one stream of samples; its validation, and its log.
 
 ``theta <- Adam(grad loss(net(noisy, variance; theta), target))`` with a warm-up, a cosine and a running average of the
 weights. Lightning Fabric places model and data: the same code on a CPU, one GPU, or the processes of several nodes, as
@@ -38,43 +38,31 @@ from rawaug.training.stream import StepSampler, TrainingStream
 
 
 class Journal:
-    """The log of a training: ``log.csv``, and TensorBoard's files.
+    """The log of a training, ``log.csv``.
 
     A row has the mean loss since the row before, the validation PSNR, the learning rate of the step and the speed.
 
     Args:
-        folder: of these files. A training from its first step clears what another one has left there.
+        folder: of this file. A training from its first step clears what another one has left there.
         start: the step from which the training goes on; rows that a killed one wrote beyond it are dropped.
     """
 
     def __init__(self, folder: Path, start: int) -> None:
-        with extra("train"):
-            from torch.utils.tensorboard.writer import SummaryWriter
-
         self.path = folder / "log.csv"
         if self.path.is_file():
             head, *rows = self.path.read_text().splitlines(keepends=True)
             kept = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= start]
             with replacing(self.path) as partial:
                 partial.write_text("".join([head, *kept]) if kept else "")
-        for events in folder.glob("events.out.tfevents.*") if not start else ():
-            events.unlink()
-        self.writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
 
     def log(self, step: int, **values: float) -> None:
-        """Write a row of the CSV file, and a point of each curve in TensorBoard."""
+        """Write a row."""
         begun = self.path.is_file() and self.path.stat().st_size
         with self.path.open("a", newline="") as file:
             rows = csv.writer(file, lineterminator="\n")
             if not begun:
                 rows.writerow(["step", *values])
             rows.writerow([step, *(f"{value:.6g}" for value in values.values())])
-        for name, value in values.items():
-            self.writer.add_scalar(name, value, step)
-
-    def close(self) -> None:
-        """Close TensorBoard's files."""
-        self.writer.close()
 
 
 def train(
@@ -98,7 +86,7 @@ def train(
         validation: frozen images ``(1, 4, h, w)``, scored every ``validate_every`` steps.
         network: what is trained.
         config: how it is trained.
-        folder: gets ``last.pt`` (all that a resume needs), ``log.csv`` and TensorBoard's files.
+        folder: gets ``last.pt`` (all that a resume needs) and ``log.csv``.
         seed: of the initial weights.
         device: Fabric's accelerator.
         devices: number of devices; where torchrun runs, its processes count instead.
@@ -142,8 +130,6 @@ def train(
             bar.set_postfix_str(_status(row, state.best["step"]), refresh=False)
         if saves and journal is not None:
             state.save(folder / "last.pt", key)
-    if journal is not None:
-        journal.close()
     return estimator.correct_network(state.best_network(label)).eval()
 
 
@@ -185,7 +171,7 @@ def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> d
 def require_trainable(device: str, devices: int, precision: str) -> None:
     """Raise ValueError or ImportError if a training's libraries, device or precision are not there."""
     with extra("train"):
-        for name in ("torch.utils.tensorboard.writer", "matplotlib", "skimage", "PIL"):
+        for name in ("matplotlib", "skimage", "PIL"):
             import_module(name)
         from lightning_fabric import Fabric
     if devices < 1:

@@ -18,7 +18,7 @@ import denoisers
 from denoisers import DHDN, CycleISPDenoiser, Denoiser, DnCNN, UNet
 from denoisers.network import mend_planes, pad_to_multiple
 from denoisers.networks import DRUNet, NAFNet
-from denoisers.pmrid import PMRID
+from denoisers.published import PMRID
 
 Make = Callable[..., Any]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -68,7 +67,6 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
     assert (tmp_path / "fewshot" / "picture.png").stat().st_size > 10_000
     assert listed[-1].startswith("to use")  # after four steps the frames may be best as they are
     assert f"denoiser, real: {place / 'denoiser.safetensors'}" in listed
-    assert any(re.match(r"time: fit \d+ s, training \d+ s, scores of the arms \d+ s", line) for line in listed)
     assert any(line.startswith("Use ") for line in listed)
     before = (place / "denoiser.safetensors").stat().st_mtime_ns
     assert main(command) == 0
@@ -83,7 +81,6 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
     one = ["--arms", json.dumps({"real": arms["real"]})]
     assert main([*other, *one, "--overwrite", "--self-ensemble", "false"]) == 0
     assert (place / "denoiser.safetensors").stat().st_mtime_ns != before
-    assert len(list(place.glob("events.out.tfevents.*"))) == 1
 
 
 @pytest.mark.parametrize(

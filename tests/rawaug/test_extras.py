@@ -19,7 +19,7 @@ SETUP.read(ROOT / "setup.cfg")
 
 WITHOUT_EXTRAS = """
 import sys
-for name in ("rawpy", "OpenImageIO", "tifffile", "PIL", "skimage", "lightning_fabric", "tensorboard", "matplotlib",
+for name in ("rawpy", "OpenImageIO", "tifffile", "PIL", "skimage", "lightning_fabric", "matplotlib",
              "pywt", "h5py"):
     sys.modules[name] = None
 import torch

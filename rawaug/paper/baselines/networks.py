@@ -5,7 +5,7 @@ UPI's U-Net with three channels in and out (five scales of three convolutions, 3
 interpolation up: 11,774,979 parameters), so the one in :mod:`denoisers.networks` is used. That the paper's U-Net is
 this one is concluded from the number of parameters. Source: Ronneberger et al., MICCAI 2015; Conde et al., AAAI 2022.
 
-*CycleISP*, ``y = mosaic(N_rgb2raw(x))``: three groups of five dual-attention blocks (:mod:`denoisers.cycleisp`) of 96
+*CycleISP*, ``y = mosaic(N_rgb2raw(x))``: three groups of five dual-attention blocks (:mod:`denoisers.published`) of 96
 features. Its other network, from RAW to sRGB, shares no weight with this one and is left out. Loss: ``|y - y^|_1 + |log
 y - log y^|_1``. Source: Zamir et al., CVPR 2020, and the published checkpoints.
 """
@@ -17,7 +17,7 @@ import os
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from denoisers import cycleisp
+from denoisers import published
 from denoisers.networks import PUBLISHED_WIDTH, UNet
 from rawaug.bayer import CFA
 from rawaug.paper.baselines.base import CropTrainedISP
@@ -49,7 +49,7 @@ class UNetISP(CropTrainedISP):
 # -- CycleISP ---------------------------------------------------------------------------------------------------------
 
 
-class RGB2RAW(cycleisp.Trunk):
+class RGB2RAW(published.Trunk):
     """The network from sRGB to linear camera colour, with the ``sizes`` features, groups, blocks and reduction."""
 
     def __init__(self, *sizes: int) -> None:
@@ -99,5 +99,5 @@ class CycleISP(CropTrainedISP):
         return F.l1_loss(predicted, raw) + F.l1_loss(log_predicted, log_raw)
 
     def load_published(self, path: str | os.PathLike[str]) -> None:
-        """Take the RGGB weights of a published checkpoint, as :func:`denoisers.cycleisp.load_published` does."""
-        cycleisp.load_published(self.reverse_network, path, "rgb2raw")
+        """Take the RGGB weights of a published checkpoint, as :func:`denoisers.published.load_published` does."""
+        published.load_published(self.reverse_network, path, "rgb2raw")

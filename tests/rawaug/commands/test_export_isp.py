@@ -1,4 +1,4 @@
-"""An ISP as JSON, .cube and ONNX: each gives the reverse pass that PyTorch gives."""
+"""An ISP as a .cube gives the reverse pass that PyTorch gives; its description as JSON."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ import pytest
 import torch
 from scipy.interpolate import RegularGridInterpolator
 
-from rawaug.bayer import pack_rgb
 from rawaug.cli import main
-from rawaug.commands.export import ReversePass, export_isp
+from rawaug.commands.export import export_cube
 from rawaug.commands.info import as_json
-from rawaug.denoise.foreign import session_of
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading
 
@@ -35,7 +33,8 @@ def centred(isp: DictionaryISP, srgb: torch.Tensor, white_balance: tuple[float, 
 
 
 def test_the_cube_interpolates_the_reverse_pass(isp: DictionaryISP, tmp_path: Path) -> None:
-    (path,) = export_isp(isp, tmp_path / "camera.cube", (2.0, 1.0, 1.5))
+    path = tmp_path / "camera.cube"
+    export_cube(isp, path, (2.0, 1.0, 1.5))
     lines = path.read_text().splitlines()
     assert "LUT_3D_SIZE 33" in lines
     rows = [[float(value) for value in line.split()] for line in lines if line[0].isdigit() or line[0] == "-"]
@@ -47,46 +46,6 @@ def test_the_cube_interpolates_the_reverse_pass(isp: DictionaryISP, tmp_path: Pa
     least = 70 if isp.tone is None else 40  # measured tone curves bend too sharply for 33 nodes
     assert -10 * (torch.from_numpy(read) - expected).square().mean().log10() > least
     assert (expected[:, 0] - expected[:, 2]).abs().mean() > 0.01, "red and blue cannot be told apart"
-
-
-def test_json_holds_the_curve_and_the_same_table(isp: DictionaryISP, tmp_path: Path) -> None:
-    (path,) = export_isp(isp, tmp_path / "camera.json")
-    content = json.loads(path.read_text())
-    values = torch.tensor(content["lut"]["values"])
-    assert values.shape == (33**3, 3)
-    corners = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]])
-    expected = centred(isp, corners.T[None, :, None])[0, :, 0].T
-    index = (corners * 32 @ torch.tensor([1.0, 33.0, 33.0**2])).long()
-    torch.testing.assert_close(values[index], expected, atol=1e-5, rtol=1e-4)
-    curve = torch.tensor(content["tone_curve"])
-    torch.testing.assert_close(curve[100], isp.linear(torch.full((1, 3, 1, 1), 100 / 255))[0, :, 0, 0].detach())
-    matrix, gains = torch.tensor(content["setting"]["matrix"]), torch.tensor(content["setting"]["gains"])
-    red = (matrix @ isp.linear(corners[:1].reshape(1, 3, 1, 1))[0, :, 0, 0].detach()) / gains  # below the knee
-    torch.testing.assert_close(values[32], red, atol=1e-4, rtol=1e-3)
-
-
-def test_onnx_gives_pytorch_s_numbers_at_any_size(tmp_path: Path) -> None:
-    for library in ("onnx", "onnxruntime"):
-        pytest.importorskip(library, reason="pip install rawaug[export]")
-    isp = DictionaryISP.from_pretrained("gopro-hero")
-    (path,) = export_isp(isp, tmp_path / "camera.onnx")
-    session, setting = session_of(path), isp.typical_setting((1.7, 1.0, 2.1))
-    for height, width in ((64, 32), (30, 46)):
-        srgb = torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(0))
-        inputs = {"srgb": srgb, "matrix": setting.matrix.detach(), "gains": setting.gains.detach()}
-        (raw,) = session.run(None, {name: value.numpy() for name, value in inputs.items()})
-        with torch.no_grad():
-            expected = pack_rgb(isp.reverse_pixels(srgb, setting), isp.cfa)
-        assert (torch.from_numpy(raw) - expected).abs().max() < 1e-5
-
-
-def test_the_traced_pass_is_the_reverse_pass(isp: DictionaryISP) -> None:
-    """What ONNX holds, without ONNX: the lens shading's coordinates among it."""
-    srgb, setting = torch.rand(1, 3, 24, 40, generator=torch.Generator().manual_seed(0)), isp.typical_setting()
-    with torch.no_grad():
-        expected = pack_rgb(isp.reverse_pixels(srgb, setting), isp.cfa)
-        traced = ReversePass(isp)(srgb, setting.matrix, setting.gains)
-    torch.testing.assert_close(traced, expected, atol=1e-6, rtol=1e-5)
 
 
 def test_the_commands_write_and_print_and_refuse(
@@ -104,7 +63,7 @@ def test_the_commands_write_and_print_and_refuse(
     assert main(["export", "canon-powershot", str(tmp_path / "a.cube"), "--white-balance", "[2.0, 1.0, 1.6]"]) == 0
     assert "a.cube: 1.1 MB" in capsys.readouterr().out
     for arguments, message in (
-        (["canon-powershot", str(tmp_path / "a.txt")], "an ISP is exported to .json, .cube, .onnx"),
+        (["canon-powershot", str(tmp_path / "a.txt")], "an ISP is exported to a .cube"),
         (["rawaug-small", str(tmp_path / "a.onnx"), "--white-balance", "[2, 1, 1]"], "--white-balance: is for ISPs"),
     ):
         assert message in refused("export", *arguments)

@@ -191,17 +191,10 @@ def test_the_rate_warms_up_and_falls() -> None:
     assert [learning_rate_factor(step, config) for step in range(8)] == [0.5, 1, 1, 0.5, 0.5, 0.5, 0.25, 0.25]
 
 
-def test_tensorboard_has_the_loss_and_the_rate_of_this_run_alone(tmp_path: Path) -> None:
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
+def test_the_log_has_the_rows_of_this_run_alone(tmp_path: Path) -> None:
     for loss, start in ((9.0, 0), (0.5, 0), (0.25, 2)):  # another run, this one, and this one resumed
         journal = Journal(tmp_path, start)
         for step in (start + 1, start + 2):
             journal.log(step, loss=loss, learning_rate=1e-3)
-        journal.close()
-    seen = EventAccumulator(str(tmp_path))
-    seen.Reload()
-    assert [(point.step, point.value) for point in seen.Scalars("loss")] == [(1, 0.5), (2, 0.5), (3, 0.25), (4, 0.25)]
-    assert seen.Scalars("learning_rate")[0].value == pytest.approx(1e-3)
     rows = (tmp_path / "log.csv").read_text().splitlines()
     assert [row.split(",")[:2] for row in rows[1:]] == [["1", "0.5"], ["2", "0.5"], ["3", "0.25"], ["4", "0.25"]]

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from denoisers.cycleisp import RENAMED, DualAttentionBlock
+from denoisers.published import RENAMED, DualAttentionBlock
 from rawaug.paper.baselines.networks import CycleISP
 
 SMALL: dict[str, Any] = {"features": 8, "groups": 2, "blocks": 1}
