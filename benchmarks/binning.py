@@ -14,10 +14,9 @@ from statistics import fmean
 import torch
 
 from benchmarks.measure import arguments, finish, start
-from benchmarks.sensors import middle
 from rawaug.bayer import CFA, crop_to_cfa, pack
 from rawaug.data import Binned, open_pairs
-from rawaug.data.pairs import SomePairs
+from rawaug.data.pairs import SomePairs, centre
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.evaluation.scores import Denoiser, NoisyInput, print_rows
 from rawaug.metrics import psnr
@@ -47,7 +46,8 @@ def main(command: Sequence[str] | None = None) -> None:
     for way, together in WAYS.items():
         found: dict[str, list[float]] = {one.name: [] for one in everyone}
         for pair in progress(Binned(pairs, args.bin, together), label=f"binned by {way}", unit="frame"):
-            clean = middle(pack(crop_to_cfa(pair.raw, pair.cfa, CFA.RGGB)[None], CFA.RGGB), side)
+            raw = pack(crop_to_cfa(pair.raw, pair.cfa, CFA.RGGB)[None], CFA.RGGB)
+            clean = centre(raw, side, side, step=1)
             params = noise.sample(1, keyed_generator(0, "binning", pair.name))
             levels = params["shot_var"].item(), params["read_var"].item()
             noisy = Noisy.of(noise.apply(clean, params), levels, CFA.RGGB)

@@ -30,7 +30,6 @@ HEADER = 4096
 NUMBERS = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 2**62)
 """Lengths, counts and offsets that are seldom right."""
 
-
 IMPORTED = "this"
 """A harmless module that nothing imports: a recipe that names it must not either."""
 
@@ -64,7 +63,7 @@ def make_originals(folder: Path) -> dict[str, list[Path]]:
 
 
 def small_frame(mosaic: Tensor, cfa: CFA) -> RawFrame:
-    """A RAW frame ``(1, H, W)`` of no camera, with everything that a DNG states."""
+    """A RAW frame of a mosaic ``(1, H, W)``, with everything that a DNG states; of no camera."""
     matrix = torch.tensor([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.6, 1.6]])
     levels = {"black": (512.0, 513.0, 511.0, 512.0), "white": 16383.0, "iso": 800.0, "noise_profile": (1e-3, 1e-5)}
     colours = {"white_balance": (2.0, 1.0, 1.5), "daylight": (1.9, 1.0, 1.6), "color_matrix": matrix}

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -19,12 +18,13 @@ import torch
 from torch import Tensor
 
 import denoisers
+from benchmarks.damage import small_frame
 from benchmarks.measure import arguments, fastest, finish, memory_used, show, start
 from denoisers.files import DEFAULT
 from rawaug import bayer
 from rawaug.denoise.denoiser import RawDenoiser
 from rawaug.denoise.frames import denoise_file
-from rawaug.io import RawFrame, write_dng
+from rawaug.io import write_dng
 
 
 def frame(megapixels: float, device: torch.device) -> Tensor:
@@ -63,9 +63,7 @@ def timed(
 
 def command(noisy: Tensor, denoiser: str, device: torch.device, repeats: int) -> dict[str, float]:
     """``rawaug denoise``, reading and writing included."""
-    mosaic, gains = bayer.unpack(noisy[0].cpu(), "RGGB"), (2.0, 1.0, 1.5)
-    shot = RawFrame(mosaic, bayer.CFA.RGGB, (512.0,) * 4, 16383.0, gains, gains, torch.eye(3))
-    shot = replace(shot, noise_profile=(1e-3, 1e-5))
+    shot = small_frame(bayer.unpack(noisy[0].cpu(), "RGGB"), bayer.CFA.RGGB)
     method = RawDenoiser.of(denoiser, device, "auto")
     with tempfile.TemporaryDirectory() as folder:
         source, out = Path(folder, "noisy.dng"), Path(folder, "denoised.dng")

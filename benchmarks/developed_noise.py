@@ -24,6 +24,7 @@ from torch import Tensor
 from benchmarks.measure import parser
 from rawaug import bayer
 from rawaug.data.demo import demo_photographs
+from rawaug.data.pairs import centre
 from rawaug.io import RawFrame, read_raw, write_dng
 from rawaug.io.raw import develop
 from rawaug.metrics import psnr
@@ -60,14 +61,6 @@ def correlation(clean: Tensor, noise: Tensor) -> Tensor:
     return by_lag / by_lag[0]
 
 
-def middle(frame: RawFrame) -> RawFrame:
-    """The frame's middle, without the maps of its lens, which LibRaw does not apply."""
-    height, width = frame.mosaic.shape[-2:]
-    sides = [min(SIDE, side) for side in (height, width)]
-    top, left = ((side - own) // 4 * 2 for side, own in zip((height, width), sides, strict=True))
-    return replace(frame, mosaic=bayer.crop(frame.mosaic, top, left, *sides), gain_maps=(), noise_profile=None)
-
-
 def by_libraw(frame: RawFrame, noisy: Tensor) -> tuple[Tensor, Tensor]:
     """Noisy and clean mosaics of the frame as LibRaw develops them, ``(3, H, W)`` in [0, 1]."""
     black = (0.1 * frame.white,) * 4  # so that noise is not clipped at black
@@ -81,7 +74,9 @@ def by_libraw(frame: RawFrame, noisy: Tensor) -> tuple[Tensor, Tensor]:
 
 def curves(path: Path) -> dict[str, list[tuple[Tensor, Tensor]]]:
     """(clean, noise) of the green channel, by how it was developed."""
-    frame = middle(read_raw(path))
+    whole = read_raw(path)
+    mosaic = centre(whole.mosaic, SIDE, SIDE)
+    frame = replace(whole, mosaic=mosaic, gain_maps=(), noise_profile=None)  # LibRaw applies no maps of the lens
     model, packed = noise_model(LEVELS), bayer.pack(frame.mosaic[None], frame.cfa)
     noisy_raw = bayer.unpack(model.apply(packed, model.sample(1, torch.Generator().manual_seed(0))), frame.cfa)[0]
     noisy, clean = by_libraw(frame, noisy_raw)

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from rawaug.data import demo_pictures
+from rawaug.data.pairs import centre
 from rawaug.io import write_picture
 
 
@@ -106,8 +107,7 @@ def sized(picture: Tensor, height: int, width: int) -> Tensor:
     scale = max(1.0, height / picture.shape[1] + 1e-3, width / picture.shape[2] + 1e-3)
     source = picture[None].float()
     source = torch.nn.functional.interpolate(source, scale_factor=scale, mode="bilinear") if scale > 1 else source
-    top, left = ((n - m) // 2 for n, m in zip(source.shape[2:], (height, width), strict=True))
-    return source[0, :, top : top + height, left : left + width]
+    return centre(source[0], height, width, step=1)
 
 
 def write_pictures(folder: Path, count: int | None = None, size: Sequence[int] | None = None) -> Path:

@@ -21,6 +21,7 @@ from benchmarks.measure import arguments, finish, start
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
+from rawaug.data.pairs import centre
 from rawaug.denoise.corrections import Corrections
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.evaluation.scores import Denoiser, NoisyInput, print_rows
@@ -138,7 +139,7 @@ def main() -> None:
     pairs = list(open_pairs(args.data, bin=args.bin))[: 1 if args.quick else None]
     packed = [(p.name, bayer.pack(bayer.crop_to_cfa(p.raw, p.cfa, CFA.RGGB)[None], CFA.RGGB)) for p in pairs]
     side = (96 if args.quick else args.crop) // 2
-    middles = [(name, middle(raw, side)) for name, raw in packed]
+    middles = [(name, centre(raw, side, side, step=1)) for name, raw in packed]
     wholes = middles if args.quick else [(name, balanced(raw)) for name, raw in packed]
     lights = [(name, raw) for name, raw in packed if (raw[:, 1:3] >= CLIPPED).all(1).any()]
     everyone: list[Denoiser] = [NoisyInput("noisy"), *map(RawDenoiser.of, args.denoisers)]
@@ -160,12 +161,6 @@ def main() -> None:
     rows = [[key, *(f"{figures[name][key]:g}" for name in names)] for key in figures[names[0]]]
     print_rows(f"RAW, {args.data} binned by {args.bin}", ["", *names], rows)
     finish(figures, args)
-
-
-def middle(raw: Tensor, side: int) -> Tensor:
-    """The middle of packed RAW, ``side`` cells at most."""
-    top, left = (max((size - side) // 2, 0) for size in raw.shape[-2:])
-    return raw[..., top : top + side, left : left + side].contiguous()
 
 
 if __name__ == "__main__":
