@@ -9,7 +9,7 @@ et al., "Deep Joint Demosaicking and Denoising", SIGGRAPH Asia 2016.
 from __future__ import annotations
 
 from contextlib import nullcontext
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -58,7 +58,6 @@ class JointDRUNet(DRUNet):
         torch.Size([2, 3, 66, 100])
     """
 
-    tiny: ClassVar[dict[str, Any]] = {"width": 4, "scales": 2, "refine": 1}
     upscale: ClassVar[int] = 2
 
     def __init__(

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -126,8 +125,6 @@ class MosaicDRUNet(DRUNet):
         >>> MosaicDRUNet(width=4)(noisy, torch.full((2, 1, 30, 36), 1e-4)).shape
         torch.Size([2, 1, 30, 36])
     """
-
-    tiny: ClassVar[dict[str, Any]] = {"width": 4, "scales": 2}
 
     def __init__(
         self,

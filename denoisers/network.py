@@ -199,8 +199,6 @@ class Denoiser(nn.Module, ABC):
     """The shared settings where a call leaves them out."""
     __signature__: ClassVar[inspect.Signature]
 
-    tiny: ClassVar[dict[str, Any]] = {}
-    """Settings of a network of a few thousand weights, for the smoke form of a recipe."""
     mixed: ClassVar[bool] = False
     """Whether bfloat16 costs it less than 0.05 dB, and dense convolutions gain by it."""
     upscale: ClassVar[int] = 1

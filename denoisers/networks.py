@@ -5,7 +5,7 @@ The settings that they share are those of :class:`denoisers.Denoiser`. Any heigh
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Unpack
+from typing import ClassVar, Unpack
 
 import torch
 from torch import Tensor, nn
@@ -43,8 +43,6 @@ class UNet(Denoiser):
         >>> UNet(width=8)(noisy, torch.full_like(noisy, 1e-4)).shape
         torch.Size([2, 4, 33, 50])
     """
-
-    tiny: ClassVar[dict[str, Any]] = {"width": 4, "scales": 2}
 
     def __init__(self, width: int = PUBLISHED_WIDTH, scales: int = 5, **shared: Unpack[Shared]) -> None:
         require_width(width)
@@ -117,8 +115,6 @@ class DHDN(Denoiser):
         torch.Size([1, 4, 20, 30])
     """
 
-    tiny: ClassVar[dict[str, Any]] = {"width": 4}
-
     def __init__(self, width: int = 16, **shared: Unpack[Shared]) -> None:
         require_width(width, multiple=2)
         super().__init__({"width": width}, 2 ** (LEVELS - 1), **shared)
@@ -172,8 +168,6 @@ class DnCNN(Denoiser):
         torch.Size([1, 4, 20, 30])
     """
 
-    tiny: ClassVar[dict[str, Any]] = {"width": 8, "depth": 3}
-
     def __init__(self, width: int = 64, depth: int = 17, batch_norm: bool = True, **shared: Unpack[Shared]) -> None:
         require_width(width)
         if depth < 2:
@@ -207,8 +201,6 @@ class FFDNet(Denoiser):
         >>> FFDNet(width=8, depth=3)(noisy, torch.full_like(noisy, (15 / 255) ** 2)).shape
         torch.Size([1, 3, 33, 50])
     """
-
-    tiny: ClassVar[dict[str, Any]] = {"width": 8, "depth": 3}
 
     def __init__(self, width: int = 96, depth: int = 12, channels: int = 3, seed: int = 0) -> None:
         require_width(width)
@@ -293,8 +285,6 @@ class NAFNet(Denoiser):
         >>> NAFNet(width=4, encoder=(1, 1), middle=1, decoder=(1, 1))(noisy, torch.full_like(noisy, 1e-4)).shape
         torch.Size([2, 4, 33, 50])
     """
-
-    tiny: ClassVar[dict[str, Any]] = {"width": 4, "encoder": (1, 1), "middle": 1, "decoder": (1, 1)}
 
     def __init__(
         self,
@@ -383,7 +373,6 @@ class DRUNet(Denoiser):
         torch.Size([2, 4, 33, 50])
     """
 
-    tiny: ClassVar[dict[str, Any]] = {"width": 4, "scales": 2, "blocks": 1}
     mixed: ClassVar[bool] = True
 
     def __init__(

@@ -15,7 +15,7 @@ import os
 import pickle
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any, ClassVar, Unpack
+from typing import ClassVar, Unpack
 
 import torch
 from torch import Tensor, nn
@@ -115,7 +115,6 @@ class PMRID(Denoiser):
     """
 
     defaults: ClassVar[Shared] = {**Denoiser.defaults, "variance_map": False, "domain": "ksigma"}
-    tiny: ClassVar[dict[str, Any]] = {"width": 4}
 
     def __init__(self, width: int = PUBLISHED_WIDTH, **shared: Unpack[Shared]) -> None:
         require_width(width)
@@ -284,7 +283,6 @@ class CycleISPDenoiser(Denoiser):
     """
 
     defaults: ClassVar[Shared] = {**Denoiser.defaults, "deviation": False}
-    tiny: ClassVar[dict[str, Any]] = {"width": 8, "groups": 1, "blocks": 1, "reduction": 4}
 
     def __init__(
         self, width: int = 64, groups: int = 4, blocks: int = 8, reduction: int = 16, **shared: Unpack[Shared]
