@@ -124,9 +124,9 @@ class Page:
         page.add("Every image", **_every_image(first_runs(results, others)))
         return page
 
-    def add_curves(self, pngs: Mapping[str, bytes], heading: str = "Training") -> None:
-        """Add pictures of curves, by title, under a heading."""
-        self.add(heading, figures=[Figure(png, title, "curve") for title, png in pngs.items()])
+    def add_curves(self, pngs: Mapping[str, bytes]) -> None:
+        """Add pictures of the curves of a training, by title."""
+        self.add("Training", figures=[Figure(png, title, "curve") for title, png in pngs.items()])
 
     def add_frame(self, row: Panels) -> None:
         """Add a frame: its most detailed window in every image, and the whole of the clean one."""

@@ -59,15 +59,15 @@ class Look:
     seed: int = 0
 
 
-def make_example(look: Look, number: int = 0) -> Example:
-    """Make the pair of this number of the picture, as ``rawaug synth`` makes it."""
-    return _make_example(look, number, Path(look.picture).stat().st_mtime_ns)
+def make_example(look: Look) -> Example:
+    """Make the first pair of the picture, as ``rawaug synth`` makes it."""
+    return _make_example(look, Path(look.picture).stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=16)
-def _make_example(look: Look, number: int, changed: int) -> Example:
+def _make_example(look: Look, changed: int) -> Example:
     srgb, augment = _read_even(look.picture, changed), make_augment(look.config)
-    return Example(srgb, augment, augment(srgb, pair_generator(look.seed, Path(look.picture).name, number)))
+    return Example(srgb, augment, augment(srgb, pair_generator(look.seed, Path(look.picture).name, 0)))
 
 
 @lru_cache(maxsize=2)

@@ -207,7 +207,7 @@ class NoisyCrops:
         return self.estimator.apply(NoisyCrop(packed[:-1], packed[-1], frame.shot_var, frame.read_var), drawn)
 
 
-def r2r_trials(frames: Sequence[NoisyFrame], cfa: CFA, seed: int = 0) -> list[Trial]:
+def r2r_trials(frames: Sequence[NoisyFrame], cfa: CFA) -> list[Trial]:
     """Whole noisy frames as r2r pairs ``(1, 4, h, w)``, whose score needs no clean frame.
 
     The error against a target of independent noise is the error against the clean frame plus that noise's variance, a
@@ -218,7 +218,7 @@ def r2r_trials(frames: Sequence[NoisyFrame], cfa: CFA, seed: int = 0) -> list[Tr
     for frame in frames:
         images = torch.cat([frame.shots[:1], frame.signal])
         packed = bayer.pack(crop_to_cfa(images, frame.cfa, cfa)[:, None], cfa)
-        drawn = estimator.sample(packed.shape[1:], keyed_generator(seed, "held out", frame.name))
+        drawn = estimator.sample(packed.shape[1:], keyed_generator(0, "held out", frame.name))
         sample = estimator.apply(NoisyCrop(packed[:1], packed[1], frame.shot_var, frame.read_var), drawn)
         trials.append(Trial(sample.noisy[None], sample.clean[None], sample.variance[None]))
     return trials
