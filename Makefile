@@ -58,8 +58,9 @@ resolve: $(WHEEL)  ## what pip would install by constraints.txt, looked up on th
 clean:
 	rm -rf $(VENV) runs build dist site .cache *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
-$(BIN)/python:
+$(BIN)/python:  # the pip that comes with Python 3.11 takes three times as long to find the packages
 	$(PYTHON) -m venv $(VENV)
+	-$(BIN)/pip install --quiet --disable-pip-version-check --upgrade pip
 
 $(VENV)/.demo: setup.cfg pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) --editable .[raw,train,data]
