@@ -3,7 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := PYTHONWARNINGS=ignore $(BIN)/pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
-# The build backend warns of every editable installation. pip would take 40 s to compile 16,000 modules; Python compiles the few that it meets, and keeps them.
+# The build backend warns of every editable installation.
+# pip would take 40 s to compile 16,000 modules; Python compiles the few that it meets, and keeps them.
 export PYTHONDONTWRITEBYTECODE :=
 
 # pip evaluates environment markers for the Python that runs it, whatever --python-version says; uv does not.
