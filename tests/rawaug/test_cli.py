@@ -210,10 +210,15 @@ def test_bad_input_is_one_line(tmp_path: Path, refused: Callable[..., str], baye
         assert said in refused(*words)
 
 
-def test_whole_frames_take_memory_in_huge_pages_unless_told_otherwise(
+def test_networks_take_memory_in_huge_pages_unless_told_otherwise(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for command, given, expected in (("denoise", None, "1"), ("evaluate", "0", "0"), ("info", None, None)):
+    for command, given, expected in (
+        ("denoise", None, "1"),
+        ("run", None, "1"),
+        ("evaluate", "0", "0"),
+        ("info", None, None),
+    ):
         monkeypatch.setenv("THP_MEM_ALLOC_ENABLE", given or "")
         if given is None:
             monkeypatch.delenv("THP_MEM_ALLOC_ENABLE")
