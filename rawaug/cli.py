@@ -100,12 +100,12 @@ def _import(file: Path) -> None:
 
 
 def _keep_memory() -> None:
-    """Let PyTorch take memory in huge pages, and the C library keep freed blocks of up to 1 GiB for the next tile."""
+    """Let PyTorch take memory in huge pages, and the C library keep freed blocks of up to 512 MiB for the next tile."""
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # read when PyTorch first takes memory
     with suppress(AttributeError, OSError, TypeError):  # glibc alone has mallopt
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
-        mallopt(M_MMAP_THRESHOLD, 2**30)
+        mallopt(M_MMAP_THRESHOLD, 2**29)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
