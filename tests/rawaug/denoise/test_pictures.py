@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,13 @@ def test_the_shipped_network_sees_a_picture_upright_and_turned_by_a_quarter() ->
     assert torch.allclose(two(Noisy(seen)), ((one.run(seen) + turned) / 2).clamp(0.0, 1.0), atol=1e-5)
     assert (one.run(seen) - turned).abs().max() > 1e-3
     assert PictureDenoiser.of("NonLocalMeans@10").views == 1
+
+
+def test_bfloat16_changes_a_picture_by_less_than_two_codes() -> None:
+    full, given = PictureDenoiser.of("rawaug-srgb@10"), Noisy(noisy()[None])
+    assert not full.mixed
+    change = (replace(full, mixed=True)(given) - full(given)).abs().max()
+    assert 0.0 < change < 2 / 255
 
 
 def test_ffdnet_is_told_the_deviation_of_its_noise() -> None:
