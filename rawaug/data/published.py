@@ -30,7 +30,7 @@ from rawaug.data.development import develop_mosaic, develop_pair
 from rawaug.data.folders import RawFolder
 from rawaug.data.formats import read_npz
 from rawaug.data.pairs import LazyPairs, Pair, require_split
-from rawaug.files import files_below, files_in
+from rawaug.files import files_below, files_in, require_file
 from rawaug.io import read_picture, read_raw
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import read_plane
@@ -131,6 +131,7 @@ def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
             arrays = read_npz(file, lambda names: ["raw", "max_val"])
             numbers, stated = arrays["raw"], float(arrays["max_val"])
         else:
+            require_file(file)
             # mapped: one that claims more than the file holds takes no memory
             numbers, stated = np.lib.format.open_memmap(file, mode="r"), None
     if numbers.ndim != 3 or numbers.shape[2] != 4 or numbers.dtype.kind != "u" or not numbers.size:
