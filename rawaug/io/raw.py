@@ -249,7 +249,7 @@ def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
     white_balance = _white_balance(raw)
     other = getattr(raw, "other", None)  # rawpy 0.27 or newer
     return RawFrame(
-        mosaic=_normalised(raw.raw_image_visible, black, white),
+        mosaic=_normalised(raw.raw_image_visible, _black_of_sites(path, raw, black, tags), white),
         cfa=cfa,
         black=_of_planes(black, cfa),
         white=white,
@@ -264,7 +264,7 @@ def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
         color_known=color_known,
         gain_maps=tags.gain_maps,
         exposure=exposure_of(raw),
-        masked=measure_masked(raw.raw_image, _window(raw), cfa),
+        masked=None if tags.black_rows or tags.black_columns else measure_masked(raw.raw_image, _window(raw), cfa),
     )
 
 
@@ -283,10 +283,36 @@ def _black(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
         return black
     repeats = [len(cell) // side for side in tags.black.shape]
     exact = np.tile(tags.black.astype(np.float32), repeats)
-    if len(cell) == 2 and np.abs(exact - black).max() >= 1:
+    allowed = 2 if tags.black_rows or tags.black_columns else 1  # LibRaw rounds the means of rows and columns as well
+    if len(cell) == 2 and np.abs(exact - black).max() >= allowed:
         return black
+    rows, columns = _left_out(raw, tags)
+    return np.roll(exact, (-rows, -columns), axis=(0, 1))
+
+
+def _left_out(raw: Any, tags: TiffTags) -> tuple[int, int]:
+    """The rows and columns of a DNG's active area that the visible mosaic begins after, 0 or 1 of each."""
     rows, columns = raw.sizes.top_margin - tags.area[0], raw.sizes.left_margin - tags.area[1]
-    return np.roll(exact, (-rows, -columns), axis=(0, 1)) if {rows, columns} <= {0, 1} else exact
+    return (rows, columns) if {rows, columns} <= {0, 1} else (0, 0)
+
+
+def _black_of_sites(path: Path, raw: Any, black: np.ndarray, tags: TiffTags) -> np.ndarray:
+    """Levels ``(H, W)`` of a DNG whose rows or columns have their own; ``(2, 2)`` of all others."""
+    if not (tags.black_rows or tags.black_columns):
+        return black
+    (height, width), first = raw.raw_image_visible.shape, _left_out(raw, tags)
+    lines = []
+    for above, start, length in zip((tags.black_rows, tags.black_columns), first, (height, width), strict=True):
+        if above and len(above) != start + length:
+            lengths = f"black levels of {len(above)} lines, not {start + length}"
+            raise OSError(f"{path}: its TIFF tags are damaged ({lengths})")
+        lines.append(np.array(above or (0.0,) * (start + length), np.float32)[start:])
+    return np.asarray(_tiled(black, height, width) + lines[0][:, None] + lines[1])
+
+
+def _tiled(cell: np.ndarray, height: int, width: int) -> np.ndarray:
+    """A cell ``(n, n)`` again and again, ``(H, W)``."""
+    return np.tile(cell, (-(-height // len(cell)), -(-width // len(cell))))[:height, :width]
 
 
 def _of_planes(black: np.ndarray, cfa: str) -> tuple[float, float, float, float]:
@@ -299,11 +325,11 @@ def _of_planes(black: np.ndarray, cfa: str) -> tuple[float, float, float, float]
 
 
 def _normalised(numbers: np.ndarray, black: np.ndarray, white: float) -> Tensor:
-    """Digital numbers ``(H, W)`` to RAW float32 ``(1, H, W)``, a copy; ``black`` is that of the cell, ``(n, n)``."""
+    """Digital numbers ``(H, W)`` to RAW float32 ``(1, H, W)``, a copy; ``black`` is ``(n, n)`` or ``(H, W)``."""
     height, width = (side // 2 * 2 for side in numbers.shape)
-    if len(black) != 2:
-        numbers = numbers[:height, :width]
-        black = np.tile(black, (-(-height // len(black)), -(-width // len(black))))[:height, :width]
+    if black.shape != (2, 2):
+        black = black if black.shape == numbers.shape else _tiled(black, *numbers.shape)
+        numbers, black = numbers[:height, :width], black[:height, :width]
         return torch.from_numpy(np.minimum((numbers - black) / (white - black), 1, dtype=np.float32)[None])
     cells = numbers[:height, :width].astype(np.float32).reshape(height // 2, 2, width // 2, 2)
     cells -= black[None, :, None, :]

@@ -6,7 +6,7 @@ plane, with noise variance S y + O for a signal y whose black is 0 and white 1: 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from itertools import islice
@@ -24,7 +24,7 @@ MOST_PAGES = 64
 
 MAKE, MODEL, DNG_VERSION, _NOISE_PROFILE = 271, 272, 50706, 51041
 _CFA_REPEATS, _CFA_PATTERN = 33421, 33422
-_BLACK_REPEATS, _BLACK, _BLACK_DELTAS = 50713, 50714, {50715, 50716}
+_BLACK_REPEATS, _BLACK, _BLACK_DELTAS = 50713, 50714, (50716, 50715)
 ACTIVE_AREA = 50829
 OPCODE_LIST_2, OPCODE_LIST_3 = 51009, 51022
 CFA_PHOTOMETRIC, LINEAR_PHOTOMETRIC = 32803, 34892
@@ -41,6 +41,8 @@ class TiffTags:
     mosaic_end: int | None = None
     black: np.ndarray | None = None
     gain_maps: tuple[GainMap, ...] = ()
+    black_rows: Sequence[float] = ()
+    black_columns: Sequence[float] = ()
     area: tuple[int, int] = (0, 0)
     cfa: tuple[str, ...] | None = None
 
@@ -60,9 +62,11 @@ def read_tiff_tags(path: Path) -> TiffTags:
             profile = _noise_profile(pages)
             if mosaic is None:
                 return TiffTags(make, model, profile)
+            (above, rows), (beside, columns) = (_deltas(mosaic, code) for code in _BLACK_DELTAS)
+            black, maps = _black(mosaic, above + beside), _gain_maps(mosaic)
             end = max(map(sum, zip(mosaic.dataoffsets, mosaic.databytecounts, strict=True)), default=None)
             area = mosaic.tags.valueof(ACTIVE_AREA) or (0, 0)
-            return TiffTags(make, model, profile, end, _black(mosaic), _gain_maps(mosaic), area[:2], _cfa(mosaic))
+            return TiffTags(make, model, profile, end, black, maps, rows, columns, area[:2], _cfa(mosaic))
     except tifffile.TiffFileError:
         return TiffTags()
 
@@ -125,14 +129,23 @@ def _numbers(tag: Any) -> Any:
         return values[0::2] / values[1::2]
 
 
-def _black(mosaic: Any) -> np.ndarray | None:
-    """Levels of a cell, of any size that the tags give; None where rows or columns have their own, as LibRaw has those
-    in its levels.
-    """
+def _deltas(mosaic: Any, code: int) -> tuple[float, list[float]]:
+    """Offsets of the black level for each row or column of the active area: their mean, and what is left, if any."""
+    tag = mosaic.tags.get(code)
+    values: list[float] = [] if tag is None else _numbers(tag).tolist()
+    if not np.isfinite(values).all():
+        raise ValueError(f"tag {code}: black levels that are not finite")
+    mean = sum(values) / max(1, len(values))
+    left = [value - mean for value in values]
+    return mean, left if any(left) else []
+
+
+def _black(mosaic: Any, more: float) -> np.ndarray | None:
+    """Levels of a cell, of any size that the tags give."""
     tag = mosaic.tags.get(_BLACK)
-    if tag is None or any(code in mosaic.tags for code in _BLACK_DELTAS):
-        return None
-    levels = _numbers(tag)
+    if tag is None:
+        return np.full((1, 1), more) if more else None
+    levels = _numbers(tag) + more
     rows, columns = mosaic.tags.valueof(_BLACK_REPEATS) or (1, 1)
     return levels.reshape(rows, columns) if len(levels) == rows * columns else None
 

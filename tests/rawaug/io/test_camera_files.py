@@ -109,10 +109,31 @@ def test_exposure_bias_brightens_nothing_and_is_kept(tmp_path: Path, bayer_dng: 
         assert tuple(file.pages.first.tags["BaselineExposure"].value) == (-3, 2)
 
 
-def test_black_levels_of_rows_count_as_their_mean(tmp_path: Path, bayer_dng: Dng) -> None:
-    extra = [(50716, SRATIONAL, 32, (4, 1, 8, 1) * 16, True)]
-    path = bayer_dng(tmp_path / "a.dng", numbers_of(CFA.RGGB, 32, 48), black=(BLACK,), white=WHITE, extra=extra)
+@pytest.mark.parametrize("along", ["rows", "columns", "both"])
+def test_black_levels_of_rows_and_columns_are_taken_off(tmp_path: Path, bayer_dng: Dng, along: str) -> None:
+    rng, (height, width) = np.random.default_rng(0), (48, 64)
+    rows = rng.integers(-24, 40, height) if along != "columns" else np.zeros(height, int)
+    columns = rng.integers(-24, 40, width) if along != "rows" else np.zeros(width, int)
+    per_site = BLACK + rows[:, None] + columns
+    signal = (numbers_of(CFA.GRBG, height, width).astype(int) - BLACK) / (WHITE - BLACK)
+    numbers = (signal * (WHITE - per_site) + per_site).round().astype(np.uint16)
+    deltas = [(50716, rows, "rows"), (50715, columns, "columns")]
+    extra = [(code, SRATIONAL, len(values), tuple(n for v in values for n in (int(v), 1)), True)
+             for code, values, name in deltas if along in (name, "both")]  # fmt: skip
+    path = bayer_dng(tmp_path / "a.dng", numbers, "GRBG", black=(BLACK,), white=WHITE, extra=extra)
     frame = read_raw(path)
-    assert frame.black == (BLACK + 6,) * 4
+    assert np.abs(frame.mosaic[0].numpy() - signal).max() < 0.6 / (WHITE - BLACK), "bands are left"
+    mean = BLACK + rows.mean() + columns.mean()
+    assert frame.black == pytest.approx((mean,) * 4, abs=1e-3)
     write_dng(tmp_path / "b.dng", frame, source=path)
-    assert torch.allclose(read_raw(tmp_path / "b.dng").mosaic, frame.mosaic, atol=0.5 / WHITE)
+    assert (read_raw(tmp_path / "b.dng").mosaic - frame.mosaic).abs().max() < 0.6 / (WHITE - BLACK)
+
+
+def test_black_levels_of_another_number_of_rows_are_refused(tmp_path: Path, bayer_dng: Dng) -> None:
+    extra = [(50716, SRATIONAL, 5, (1, 1) * 5, True)]
+    path = bayer_dng(tmp_path / "a.dng", numbers_of(CFA.RGGB, 32, 48), black=(BLACK,), white=WHITE, extra=extra)
+    assert read_raw(path).black == (BLACK + 1,) * 4, "equal for all rows: one level"
+    extra = [(50716, SRATIONAL, 5, (1, 1, 2, 1) + (1, 1) * 3, True)]
+    path = bayer_dng(tmp_path / "b.dng", numbers_of(CFA.RGGB, 32, 48), black=(BLACK,), white=WHITE, extra=extra)
+    with pytest.raises(OSError, match=r"b\.dng: its TIFF tags are damaged \(black levels of"):
+        read_raw(path)
