@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from PIL import Image
 
 from rawaug.bayer import CFA, pack
 from rawaug.data import check, open_pairs
-from rawaug.data.published import CAMERAS, Rawir, Rgb2Raw, Zurich, fivek_numbers, fivek_pairs
+from rawaug.data.published import CAMERAS, Rawir, Rgb2Raw, Zurich, fivek_numbers, fivek_pairs, read_packed
 from rawaug.io import develop, write_picture
 from rawaug.io.pictures import recode_jpeg
 
@@ -291,3 +292,13 @@ def test_what_is_missing_is_named(tmp_path: Path, bayer_dng: Callable[..., Path]
     bayer_dng(tmp_path / "Scene_0002" / "Scene_0002_ISO200_1.ARW", np.full((32, 32), 99, np.uint16))
     with pytest.raises(FileNotFoundError, match="gt: has no RAW file at ISO 100; download it too"):
         open_pairs(f"rawbench:{tmp_path}")
+
+
+def test_a_pipe_in_the_place_of_packed_raw_is_refused_and_not_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.npy")
+    keep = os.open(tmp_path / "a.npy", os.O_RDWR | os.O_NONBLOCK)  # so that opening it to read would not wait
+    try:
+        with pytest.raises(OSError, match=r"a\.npy.*must be a regular file"):
+            read_packed(tmp_path / "a.npy", tmp_path / "a.png", None)
+    finally:
+        os.close(keep)
