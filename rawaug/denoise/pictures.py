@@ -8,7 +8,8 @@ squares of 16 x 16, which texture hardly moves. The estimate is unsure, since no
 network does best when it is told the geometric mean of it and a usual level K; and a picture of which no more than D is
 taken away is clean. K and D are chosen on validation pictures. The strength s is 1 unless the user says otherwise.
 FFDNet, which needs a level, is told scikit-image's estimate. A network of this kind sees the picture twice, upright and
-turned by a quarter, and the mean is taken: half of what the self-ensemble gains, the mean of eight turns as for RAW.
+turned by a quarter, estimates the level of each, and the mean is taken: half of what the self-ensemble gains, the mean
+of eight turns as for RAW.
 """
 
 from __future__ import annotations
