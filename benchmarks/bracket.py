@@ -36,8 +36,8 @@ from rawaug import bayer
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.folders import RAW_EXTENSIONS, files_in  # type: ignore[attr-defined]
 from rawaug.data.pairs import Pair
-from rawaug.denoise.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
-from rawaug.denoise.levels import UnknownNoise, find_levels
+from rawaug.denoising.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
+from rawaug.denoising.levels import UnknownNoise, find_levels
 from rawaug.evaluation.scores import Denoiser, NoisyInput, print_rows
 from rawaug.io import RawFrame, read_raw
 from rawaug.progress import progress

@@ -21,7 +21,7 @@ from rawaug.bayer import CFA
 from rawaug.data import DemoCamera, open_pairs
 from rawaug.data.demo import FRAME
 from rawaug.data.pairs import Pair
-from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import PANEL, Panels, panels_of, save_picture
 from rawaug.evaluation.trials import trial_of
 from rawaug.noise import NoiseModel, noise_model

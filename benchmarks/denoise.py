@@ -22,8 +22,8 @@ from benchmarks.damage import small_frame
 from benchmarks.measure import arguments, fastest, finish, memory_used, show, start
 from denoisers.files import DEFAULT
 from rawaug import bayer
-from rawaug.denoise.denoiser import RawDenoiser
-from rawaug.denoise.frames import denoise_file
+from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.denoising.frames import denoise_file
 from rawaug.io import write_dng
 
 

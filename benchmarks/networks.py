@@ -29,7 +29,7 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.folders import Cached
 from rawaug.data.pairs import Pair
-from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import group_rows, score
 from rawaug.evaluation.trials import trial_of
 from rawaug.noise import noise_model

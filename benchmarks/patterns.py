@@ -22,7 +22,7 @@ from denoisers import NonLocalMeans
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pairs import Binned, Middles, Pair
-from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import compare, print_rows, to_domain
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.demosaicing import libraw_demosaic, mosaic_of, mosaic_trial

@@ -26,7 +26,7 @@ from torch import Tensor
 from benchmarks.measure import parser
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
-from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import Row, mean_and_spread, print_rows, score
 from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.recipe import find_recipe, read_recipe

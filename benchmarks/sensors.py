@@ -22,8 +22,8 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pairs import centre
-from rawaug.denoise.corrections import Corrections
-from rawaug.denoise.denoiser import Noisy, RawDenoiser
+from rawaug.denoising.corrections import Corrections
+from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.evaluation.scores import Denoiser, NoisyInput, print_rows
 from rawaug.io import RawFrame
 from rawaug.io.masked import measure_masked

@@ -18,8 +18,8 @@ from torch import Tensor
 from benchmarks.measure import parser
 from rawaug import bayer
 from rawaug.data.development import render_raw
-from rawaug.denoise.denoiser import Noisy, RawDenoiser
-from rawaug.denoise.levels import find_levels
+from rawaug.denoising.denoiser import Noisy, RawDenoiser
+from rawaug.denoising.levels import find_levels
 from rawaug.io import RawFrame, read_raw, write_picture
 
 SIDE, MARGIN, GAP = 356, 134, 8

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rawaug.bayer import CFA as CFA
     from rawaug.camera.fit import fit as fit
-    from rawaug.denoise.denoiser import RawDenoiser as RawDenoiser
-    from rawaug.denoise.frames import denoise as denoise
+    from rawaug.denoising.denoiser import RawDenoiser as RawDenoiser
+    from rawaug.denoising.frames import denoise as denoise
     from rawaug.isp.config import ISPConfig as ISPConfig
     from rawaug.isp.config import ISPParams as ISPParams
     from rawaug.isp.config import ISPResult as ISPResult
@@ -38,8 +38,8 @@ __version__ = "0.1.0"
 _PUBLIC = {
     "rawaug.bayer": ("CFA",),
     "rawaug.camera.fit": ("fit",),
-    "rawaug.denoise": ("denoise",),
-    "rawaug.denoise.denoiser": ("RawDenoiser",),
+    "rawaug.denoising.denoiser": ("RawDenoiser",),
+    "rawaug.denoising.frames": ("denoise",),
     "rawaug.isp.config": ("ISPConfig", "ISPParams", "ISPResult"),
     "rawaug.isp.model": ("DictionaryISP",),
     "rawaug.plugin.augment": ("ISPModel", "RawAugment"),
@@ -60,7 +60,7 @@ def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = import_module(_MODULE_OF[name])
-    value = globals()[name] = module if name == "denoise" else getattr(module, name)
+    value = globals()[name] = getattr(module, name)
     return value
 
 

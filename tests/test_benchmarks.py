@@ -11,7 +11,7 @@ import torch
 
 from benchmarks import augment, binning, crops, denoise, measure, patterns, sensors, synth
 from rawaug.data.demo import FRAME
-from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import NOISY
 from rawaug.io import read_picture
 

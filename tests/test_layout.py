@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 FILES = sorted(file.relative_to(ROOT) for part in ("rawaug", "denoisers") for file in (ROOT / part).rglob("*.py"))
 BASE = {"bayer", "camera_names", "errors", "files", "metrics", "progress", "registry", "seeding"}
 CAMERA = BASE | {"isp", "noise", "kernels", "denoisers"}
-PRODUCT = CAMERA | {"plugin", "data", "io", "synthesis", "camera", "denoise", "evaluation", "training"}
+PRODUCT = CAMERA | {"plugin", "data", "io", "synthesis", "camera", "denoising", "evaluation", "training"}
 MAY_IMPORT: dict[str, set[str]] = {
     "bayer": {"seeding"},
     "camera_names": set(),
@@ -36,10 +36,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "plugin": CAMERA | {"io"},
     "synthesis": CAMERA | {"plugin", "data", "io"},
     "camera": CAMERA | {"data", "io"},
-    "denoise": CAMERA | {"io"},
-    "evaluation": CAMERA | {"plugin", "data", "io", "denoise"},
-    "training": CAMERA | {"plugin", "data", "io", "denoise", "evaluation"},
-    "explore": CAMERA | {"plugin", "data", "io", "denoise", "evaluation"},
+    "denoising": CAMERA | {"io"},
+    "evaluation": CAMERA | {"plugin", "data", "io", "denoising"},
+    "training": CAMERA | {"plugin", "data", "io", "denoising", "evaluation"},
+    "explore": CAMERA | {"plugin", "data", "io", "denoising", "evaluation"},
     "commands": PRODUCT | {"explore", "experiment"},
     "experiment": PRODUCT,
     "paper": PRODUCT | {"experiment"},

@@ -12,8 +12,8 @@ from rawaug.commands import YAML
 from rawaug.data import open_pairs
 from rawaug.data.pairs import Binned, SomePairs
 from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
-from rawaug.denoise.denoiser import RawDenoiser, shipped_of_mosaics
-from rawaug.denoise.pictures import PictureDenoiser
+from rawaug.denoising.denoiser import RawDenoiser, shipped_of_mosaics
+from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.evaluation.benchmark import (
     TOLD,
     benchmark,

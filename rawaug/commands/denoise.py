@@ -8,10 +8,10 @@ from typing import Annotated
 
 from denoisers.files import DEFAULT, JOINT
 from rawaug.commands import YAML
-from rawaug.denoise.corrections import Correction, Corrections
-from rawaug.denoise.denoiser import RawDenoiser, require_classical
-from rawaug.denoise.frames import DenoisedFolder, denoise_file, denoise_folder
-from rawaug.denoise.pictures import PICTURES, PictureDenoiser, denoise_picture, denoise_pictures
+from rawaug.denoising.corrections import Correction, Corrections
+from rawaug.denoising.denoiser import RawDenoiser, require_classical
+from rawaug.denoising.frames import DenoisedFolder, denoise_file, denoise_folder
+from rawaug.denoising.pictures import PICTURES, PictureDenoiser, denoise_picture, denoise_pictures
 from rawaug.errors import escape
 from rawaug.files import files_below, require_writable, write_json
 from rawaug.io.pictures import PICTURE_FORMATS

@@ -18,8 +18,8 @@ from rawaug.data.folders import Kept, Readable
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import Binned
 from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
-from rawaug.denoise.denoiser import RawDenoiser, require_classical
-from rawaug.denoise.pictures import PictureDenoiser
+from rawaug.denoising.denoiser import RawDenoiser, require_classical
+from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.evaluation.page import Page, select_for_page
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, print_pictures
 from rawaug.evaluation.scores import NOISY, Row, group_rows, panels_of, print_scores, require_numbers, score, summary

@@ -20,7 +20,7 @@ import denoisers
 from denoisers.files import FOLDER, find_denoiser
 from rawaug.commands import YAML
 from rawaug.data import demo_pairs
-from rawaug.denoise.foreign import feeds, session_of
+from rawaug.denoising.foreign import feeds, session_of
 from rawaug.errors import extra
 from rawaug.evaluation.trials import trial_of
 from rawaug.files import find_weights, read_header, replacing

@@ -15,7 +15,7 @@ from torch import Tensor
 from rawaug.commands import YAML
 from rawaug.commands.denoise import chosen
 from rawaug.data.sidd import BLOCKS, SiddBenchmark, write_submission
-from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.files import require_writable
 from rawaug.io import RawFrame
 from rawaug.noise import estimate_noise

@@ -20,7 +20,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from rawaug import bayer
 from rawaug.data.pairs import Pair, centre
-from rawaug.denoise.denoiser import Noisy, RawDenoiser
+from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.evaluation.scores import METRICS, NOISY, Panels, group_rows, join_figures, panels_of, score, summary
 from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise, raw_trial
 from rawaug.files import digest

@@ -21,7 +21,7 @@ from torch import Tensor
 from denoisers.network import PACKED
 from rawaug import bayer
 from rawaug.data.pairs import centre
-from rawaug.denoise.denoiser import Noisy
+from rawaug.denoising.denoiser import Noisy
 from rawaug.errors import escape, extra
 from rawaug.evaluation.trials import Trial
 from rawaug.metrics import psnr, ssim, worst_and_best_quarter

@@ -24,7 +24,7 @@ from rawaug.bayer import CFA, crop_to_cfa, noise_variance
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.folders import Cached
 from rawaug.data.pairs import Pair, SomePairs
-from rawaug.denoise.denoiser import Levels, Noisy
+from rawaug.denoising.denoiser import Levels, Noisy
 from rawaug.noise import NoiseModel, own_noise
 from rawaug.seeding import keyed_generator
 

@@ -34,7 +34,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.development import exposure_of, render_rgb
 from rawaug.data.pairs import Pair
-from rawaug.denoise.denoiser import Noisy, RawDenoiser
+from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.errors import extra
 from rawaug.evaluation.scores import NOISY, group_rows, print_table, require_numbers, score, summary
 from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise, make_trials

@@ -22,7 +22,7 @@ from rawaug.bayer import CFA
 from rawaug.camera.fit import fit
 from rawaug.data.folders import reports
 from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, stamps
-from rawaug.denoise.denoiser import RawDenoiser, require_classical
+from rawaug.denoising.denoiser import RawDenoiser, require_classical
 from rawaug.errors import extra
 from rawaug.evaluation.page import Page, plot_curves, select_for_page
 from rawaug.evaluation.scores import (

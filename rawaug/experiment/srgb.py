@@ -27,8 +27,8 @@ from rawaug import bayer
 from rawaug.bayer import noise_variance
 from rawaug.data.pairs import Pair
 from rawaug.data.picture_pairs import PicturePair
-from rawaug.denoise.denoiser import Levels, Noisy, RawDenoiser
-from rawaug.denoise.pictures import PictureDenoiser
+from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser
+from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.evaluation.page import Figure, Page, find_detail
 from rawaug.evaluation.picture_trials import picture_trials
 from rawaug.evaluation.scores import NoisyInput, Panels, Row, panels_of, print_rows, score

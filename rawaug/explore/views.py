@@ -23,8 +23,8 @@ from torch import Tensor
 from denoisers.files import DEFAULT
 from denoisers.network import PACKED
 from rawaug.bayer import CFA, pattern
-from rawaug.denoise.denoiser import Noisy, RawDenoiser
-from rawaug.denoise.pictures import PICTURES, PictureDenoiser
+from rawaug.denoising.denoiser import Noisy, RawDenoiser
+from rawaug.denoising.pictures import PICTURES, PictureDenoiser
 from rawaug.explore import figures
 from rawaug.explore.figures import Example
 from rawaug.io import encode_srgb, read_picture

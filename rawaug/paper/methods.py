@@ -28,7 +28,7 @@ from rawaug.camera.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
 from rawaug.data import open_pairs
 from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair, Sample, SomePairs
-from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import Row, score
 from rawaug.evaluation.trials import trial_of
 from rawaug.files import find_weights, write_json

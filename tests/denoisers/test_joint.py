@@ -15,7 +15,7 @@ from denoisers import DRUNet, JointDRUNet, SelfEnsemble, denoise_tiles
 from denoisers.domains import DOMAINS, fit_levels
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.denoise.denoiser import Noisy, RawDenoiser
+from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.training.config import DenoiserConfig
 from rawaug.training.state import first_network
 

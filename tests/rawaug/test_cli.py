@@ -56,7 +56,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
         raise ValueError("killed before the self-ensemble")
 
     with monkeypatch.context() as patch:
-        patch.setattr("rawaug.denoise.denoiser.denoisers.SelfEnsemble", no_views)
+        patch.setattr("rawaug.denoising.denoiser.denoisers.SelfEnsemble", no_views)
         assert "killed before" in refused(*command, "--quiet")
     plain = json.loads((place / "evaluation.json").read_text())
     assert plain["plain"]["psnr"] > 20 and "self_ensemble" not in plain  # written as it came

@@ -17,8 +17,8 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.camera.fit import fit, measure_camera_noise
 from rawaug.data.pairs import Pair
-from rawaug.denoise.denoiser import RawDenoiser
-from rawaug.denoise.levels import find_levels, load_noise
+from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.denoising.levels import find_levels, load_noise
 from rawaug.io import RawFrame
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, camera_law, estimate_noise, noise_model
 from rawaug.plugin.augment import noise_for

@@ -15,8 +15,8 @@ from denoisers.domains import fit_levels
 from rawaug.bayer import CFA, noise_variance
 from rawaug.cli import main
 from rawaug.commands.export import export, write_onnx
-from rawaug.denoise.denoiser import RawDenoiser
-from rawaug.denoise.foreign import session_of
+from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.denoising.foreign import session_of
 from rawaug.errors import MissingExtra
 from rawaug.io import RawFrame
 

@@ -29,7 +29,7 @@ from rawaug.data import (
 )
 from rawaug.data.formats import read_array
 from rawaug.data.sidd import HELD_BACK, PHONES, SiddBlocks, SiddFrames, SiddPlusBlocks, phone_of
-from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.io import RawFrame, write_picture
 from rawaug.io.pictures import view_of_orientation
 from rawaug.isp.config import ISPConfig

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Binned, Middles, Pair
-from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import Row, score, summary
 from rawaug.evaluation.trials import Measured, Trial, added_noise_note, own_noise_note, trial_of
 from rawaug.noise import noise_model

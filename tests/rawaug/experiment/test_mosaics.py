@@ -16,7 +16,7 @@ from rawaug.bayer import pattern
 from rawaug.cli import main
 from rawaug.data import demo_pairs
 from rawaug.data.pairs import Pair
-from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import NOISY, score
 from rawaug.experiment.demosaicing import MosaicRecipe, full_colour, libraw_demosaic, mosaic_trial, planes_trial
 from rawaug.experiment.recipe import ArmConfig

@@ -13,8 +13,8 @@ from rawaug.bayer import pack
 from rawaug.cli import main
 from rawaug.data import demo_pairs
 from rawaug.data.pairs import Pair
-from rawaug.denoise.denoiser import RawDenoiser
-from rawaug.denoise.pictures import PictureDenoiser
+from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.evaluation.page import read_log
 from rawaug.evaluation.scores import score, to_domain
 from rawaug.evaluation.trials import Trial

@@ -10,7 +10,7 @@ import torch
 import denoisers
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
-from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.denoising import change_cfa
 from rawaug.isp.config import ISPConfig

@@ -27,8 +27,8 @@ from torch.nn import functional as F
 import denoisers
 from denoisers.files import find_denoiser, list_shipped
 from rawaug import bayer
-from rawaug.denoise.denoiser import CPU, Noisy, progress_by
-from rawaug.denoise.foreign import AGAIN, load_published
+from rawaug.denoising.denoiser import CPU, Noisy, progress_by
+from rawaug.denoising.foreign import AGAIN, load_published
 from rawaug.errors import extra
 from rawaug.files import files_in, read_tensors, require_file, require_writable
 from rawaug.io.pictures import PICTURE_FORMATS, StoredPicture, read_stored, write_stored

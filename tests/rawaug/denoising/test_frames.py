@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import inspect
 import json
 import multiprocessing
 import sys
@@ -20,10 +21,10 @@ import rawaug
 from rawaug.bayer import CFA, mosaic, pack, unpack
 from rawaug.cli import main
 from rawaug.commands.denoise import run
-from rawaug.denoise.corrections import Corrections
-from rawaug.denoise.denoiser import Noisy, RawDenoiser
-from rawaug.denoise.frames import denoise_file, denoise_folder
-from rawaug.denoise.levels import find_levels
+from rawaug.denoising.corrections import Corrections
+from rawaug.denoising.denoiser import Noisy, RawDenoiser
+from rawaug.denoising.frames import denoise_file, denoise_folder
+from rawaug.denoising.levels import find_levels
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng
 from rawaug.io.masked import MaskedPixels
 from rawaug.noise import noise_levels
@@ -100,6 +101,10 @@ def test_a_denoiser_that_changes_nothing_gives_the_source_back(tmp_path: Path, b
         assert getattr(before, key) == getattr(after, key), key
     assert torch.equal(before.color_matrix, after.color_matrix)
     assert after.noise_profile is None
+
+
+def test_help_is_about_the_function() -> None:
+    assert inspect.isfunction(rawaug.denoise) and "source: a RAW file" in (inspect.getdoc(rawaug.denoise) or "")
 
 
 def test_greens_that_differ_are_balanced_and_kept_on_request(
@@ -199,7 +204,7 @@ def test_a_strength_below_1_leaves_that_much_of_the_noise(
 def test_in_bfloat16_a_network_of_dense_convolutions_does_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     frame, results = gradient(), []
     for fast in (False, True):
-        monkeypatch.setattr("rawaug.denoise.denoiser.has_fast_bfloat16", lambda device, fast=fast: fast)
+        monkeypatch.setattr("rawaug.denoising.denoiser.has_fast_bfloat16", lambda device, fast=fast: fast)
         results.append(RawDenoiser.of("rawaug-base", "cpu", "auto").frame(frame, (1e-3, 1e-5)))
     assert results[1].dtype == torch.float32 and not torch.equal(*results)
     assert (results[0] - results[1]).std() < 0.03 * (results[0] - frame.mosaic).std()
@@ -247,7 +252,7 @@ def test_a_full_disk_ends_a_folder_in_one_line(
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
         write_dng(path, *rest, **colours)
 
-    monkeypatch.setattr("rawaug.denoise.frames.write_dng", write)
+    monkeypatch.setattr("rawaug.denoising.frames.write_dng", write)
     assert main(["denoise", str(source), str(out), "--denoiser", str(identity)]) == 2
     said = capsys.readouterr().err.strip().splitlines()
     assert "b.dng" in said[-1] and "No space left on device" in said[-1] and "c.dng" not in str(said)

@@ -14,8 +14,8 @@ from rawaug import bayer
 from rawaug.commands.denoise import is_picture
 from rawaug.commands.denoise import run as denoise
 from rawaug.data.picture_pairs import open_picture_pairs
-from rawaug.denoise.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
-from rawaug.denoise.pictures import PictureDenoiser, denoise_pictures, estimate_level
+from rawaug.denoising.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
+from rawaug.denoising.pictures import PictureDenoiser, denoise_pictures, estimate_level
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, register
 from rawaug.io.pictures import read_picture, write_picture
 

@@ -3,7 +3,7 @@ r"""RAW files to denoised DNGs, one or a folder of them, and frames in memory.
     x = f(y, shot_var max(y, 0) + read_var),    d = round(clip(x, 0 <= d, x <= 1) (white - black) + black)
 
 on the mosaic as the sensor gave it, before any gain map. The result has the source's levels, colour, lens corrections,
-orientation and EXIF and differs from it by noise, and by errors of the sensor (:mod:`rawaug.denoise.corrections`); its
+orientation and EXIF; it differs by noise and by errors of the sensor (:mod:`rawaug.denoising.corrections`). Its
 NoiseProfile tag is gone with the noise, so that a RAW developer does not smooth once more. A network that demosaics as
 well gives camera RGB in a linear DNG. With a strength s below 1 the result is y + s (d - y): (1 - s)^2 of the noise's
 variance is left, and NoiseProfile says so.
@@ -25,9 +25,9 @@ from torch import Tensor
 
 from denoisers.files import DEFAULT
 from rawaug import bayer
-from rawaug.denoise.corrections import Corrected, Correction, Corrections
-from rawaug.denoise.denoiser import RawDenoiser
-from rawaug.denoise.levels import Noise, Shots, UnknownNoise, as_json, find_levels, load_noise
+from rawaug.denoising.corrections import Corrected, Correction, Corrections
+from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.denoising.levels import Noise, Shots, UnknownNoise, as_json, find_levels, load_noise
 from rawaug.files import files_below, files_in, one_at_a_time, require_file, require_same_settings, require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
 from rawaug.io.dng import LINEAR_WHITE
@@ -85,11 +85,11 @@ def denoise(
         source: a RAW file of any kind that :func:`rawaug.io.read_raw` reads, or a frame.
         out: a DNG to write as well; None for none.
         denoiser: whatever :meth:`rawaug.RawDenoiser.of` takes: a shipped name, a file, a network, a function, ...
-        noise: where the noise levels come from, see :data:`rawaug.denoise.levels.Noise`.
+        noise: where the noise levels come from, see :data:`rawaug.denoising.levels.Noise`.
         strength: 1 removes the noise, 0.7 leaves 30% of it, 0 changes nothing.
         self_ensemble: average eight views, at eight times the cost.
         greens, black: ``"keep"`` leaves greens that differ, and the file's black level where masked pixels tell
-            another one; see :class:`rawaug.denoise.corrections.Corrections`.
+            another one; see :class:`rawaug.denoising.corrections.Corrections`.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         overwrite: replace ``out`` if it exists.
 

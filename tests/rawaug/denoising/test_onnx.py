@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.denoise.denoiser import Noisy, RawDenoiser
+from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.io import RawFrame, write_dng
 
 helper = pytest.importorskip("onnx.helper", reason="pip install rawaug[export]")

@@ -27,7 +27,7 @@ from denoisers.mosaic import BayerAdapter, MosaicDRUNet, denoise_mosaic
 from denoisers.network import PACKED
 from rawaug import bayer
 from rawaug.bayer import CFA, crop_to_cfa, noise_variance
-from rawaug.denoise.foreign import AGAIN, STRIDE, BiasFreeDnCNN, OnnxNetwork, load_published
+from rawaug.denoising.foreign import AGAIN, STRIDE, BiasFreeDnCNN, OnnxNetwork, load_published
 from rawaug.files import parse_object, read_header, read_tensors, sha256
 from rawaug.io import RawFrame
 from rawaug.kernels.runtime import find_device, has_fast_bfloat16

@@ -16,8 +16,8 @@ from torch.nn import functional as F
 import denoisers
 from rawaug.bayer import CFA, pack, unpack
 from rawaug.commands.benchmark import named
-from rawaug.denoise.denoiser import Noisy, RawDenoiser
-from rawaug.denoise.foreign import BiasFreeDnCNN
+from rawaug.denoising.denoiser import Noisy, RawDenoiser
+from rawaug.denoising.foreign import BiasFreeDnCNN
 from rawaug.experiment.demosaicing import JointRecipe
 from rawaug.experiment.recipe import ArmConfig, DataConfig
 from rawaug.registry import EXPERIMENTS
