@@ -2,7 +2,7 @@ r"""What the methods that the dictionary ISP is compared with have in common, an
 
 ``y = mosaic(u(x))``, u being the method: sRGB ``x`` ``(B, 3, H, W)`` becomes linear camera colour of the same size, of
 which the mosaic keeps one channel a site. Whatever a method predicts, RAW leaves it within [0, 1]; training sees the
-values as they are.
+values as they are. Some methods also render, ``x = f(y)``.
 
 Networks are trained by Adam, each with its own loss, on random crops of the pairs, which start where the frame's CFA is
 that of the model, so frames of any pattern train one model. The learning rate falls to 0 by half a cosine over the
@@ -15,8 +15,9 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
@@ -33,6 +34,8 @@ from rawaug.seeding import keyed_generator
 
 CLIP_NORM = 1.0
 """The gradient's largest norm. Short fits need high rates, at which the U-Net diverges without this limit."""
+CURVE_POINTS = 10
+"""Number of equal parts of a training whose mean losses are recorded, so that one can see whether it had ended."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +58,20 @@ class Training:
     seed: int = 0
     progress: bool = True
 
+    def require_budget(self) -> None:
+        """Raise ValueError unless seconds or steps are set and above 0."""
+        limits = [limit for limit in (self.seconds, self.steps) if limit is not None]
+        if not limits or min(limits) <= 0:
+            raise ValueError(f"give seconds or steps above 0, got {self.seconds} and {self.steps}")
+
     def share_done(self, seconds: float, steps: int) -> float:
         """How far the training has come, from 0 to 1: the share of the time or of the steps, whichever is larger."""
-        by_time = 0.0 if self.seconds is None or not steps else seconds / self.seconds  # one step is done in any case
-        return max(by_time, 0.0 if self.steps is None else steps / self.steps)
+        if steps == 0:  # one step is done in any case
+            return 0.0
+
+        by_time = 0.0 if self.seconds is None else seconds / self.seconds
+        by_steps = 0.0 if self.steps is None else steps / self.steps
+        return max(by_time, by_steps)
 
 
 class BaselineISP(nn.Module, ABC):
@@ -67,10 +80,12 @@ class BaselineISP(nn.Module, ABC):
     The ``setting`` of a pass is what the method may know of a shot, such as its gains; None leaves it to its own.
 
     Args:
-        cfa: the pattern of the RAW that it makes.
+        cfa: the pattern of the RAW that it makes and takes.
     """
 
     name: ClassVar[str]
+    renders: ClassVar[bool] = False
+    """Whether the method also has a pass from RAW to sRGB."""
 
     def __init__(self, cfa: CFA | str = "RGGB") -> None:
         super().__init__()
@@ -85,9 +100,9 @@ class BaselineISP(nn.Module, ABC):
         """sRGB ``(B, 3, H, W)`` to a mosaic ``(B, 1, H, W)`` under a random setting, if the method has any to draw."""
         return self.reverse(srgb)
 
-    def learn(self, pairs: Sequence[FramePair], training: Training) -> tuple[int, float]:
-        """Fit to the pairs and return the number of steps and the last loss; by default there is nothing to fit."""
-        return 0, math.nan
+    def learn(self, pairs: Sequence[FramePair], training: Training) -> list[float]:
+        """Fit to the pairs and return the loss of each step; by default there is nothing to fit."""
+        return []
 
     @abstractmethod
     def unprocess(self, srgb: Tensor, setting: Any = None) -> Tensor:
@@ -95,14 +110,28 @@ class BaselineISP(nn.Module, ABC):
 
     def reverse(self, srgb: Tensor, setting: Any = None) -> Tensor:
         """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides, to the mosaic ``(B, 1, H, W)`` in [0, 1]."""
-        return bayer.mosaic(self.unprocess(as_float(srgb), setting).clamp(0.0, 1.0), self.cfa)
+        camera_colour = self.unprocess(as_float(srgb), setting)
+        return bayer.mosaic(camera_colour.clamp(0.0, 1.0), self.cfa)
+
+    def render(self, raw: Tensor, setting: Any = None) -> Tensor:
+        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``, not clipped; ValueError if the method cannot."""
+        raise ValueError(f"{self.name} only converts sRGB to RAW")
+
+    def forward(self, raw: Tensor, setting: Any = None) -> Tensor:
+        """RAW mosaic ``(B, 1, H, W)`` in :attr:`cfa` to sRGB ``(B, 3, H, W)`` in [0, 1]."""
+        return self.render(raw, setting).clamp(0.0, 1.0)
+
+    def cycle(self, srgb: Tensor) -> Tensor:
+        """sRGB ``(B, 3, H, W)`` to RAW and back to sRGB of the same shape."""
+        return self.forward(self.reverse(srgb))
 
 
 class Crops(NamedTuple):
-    """A training batch, in the CFA of the model: sRGB ``(B, 3, H, W)``, mosaics ``(B, 1, H, W)``."""
+    """A training batch, in the CFA of the model: sRGB ``(B, 3, H, W)``, mosaics ``(B, 1, H, W)``, gains ``(B, 3)``."""
 
     srgb: Tensor
     raw: Tensor
+    white_balance: Tensor
 
 
 class CropTrainedISP(BaselineISP):
@@ -117,40 +146,55 @@ class CropTrainedISP(BaselineISP):
 
     def unprocess(self, srgb: Tensor, setting: Any = None) -> Tensor:
         """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape, by ``reverse_network``."""
-        made: Tensor = self.reverse_network(srgb)
-        return made
+        camera_colour: Tensor = self.reverse_network(srgb)
+        return camera_colour
 
-    def loss(self, crops: Crops) -> Tensor:
-        """The :meth:`raw_error` of a batch, which training lowers."""
-        return self.raw_error(bayer.mosaic(self.unprocess(crops.srgb), self.cfa), crops.raw)
+    def prepare(self, pairs: Sequence[FramePair]) -> None:
+        """Set from the pairs what descent does not learn; called once, before training."""
+
+    def loss(self, crops: Crops, share_done: float = 1.0) -> Tensor:
+        """The scalar that training lowers: by default :meth:`raw_error`.
+
+        Args:
+            crops: the batch.
+            share_done: how far the training has come, from 0 to 1, for methods that train in two phases.
+        """
+        predicted = bayer.mosaic(self.unprocess(crops.srgb), self.cfa)
+        return self.raw_error(predicted, crops.raw)
 
     def raw_error(self, predicted: Tensor, raw: Tensor) -> Tensor:
         """The error of predicted mosaics ``(B, 1, H, W)``, a scalar: by default l1."""
         return F.l1_loss(predicted, raw)
 
-    def learn(self, pairs: Sequence[FramePair], training: Training) -> tuple[int, float]:
+    def learn(self, pairs: Sequence[FramePair], training: Training) -> list[float]:
         """Train on crops; ValueError if there is no budget, or a pair is too small or not registered."""
-        given = [limit for limit in (training.seconds, training.steps) if limit is not None]
-        if not given or min(given) <= 0:
-            raise ValueError(f"give seconds or steps above 0, got {training.seconds} and {training.steps}")
+        training.require_budget()
         require_crops(pairs, training.crop)
+        self.prepare(pairs)
         self.train()
+
         parameters = [parameter for parameter in self.parameters() if parameter.requires_grad]
-        start, done, value = time.perf_counter(), 0, math.nan
-        descent = adam(
-            parameters,
-            self.learning_rate,
-            lambda step: self.loss(random_crops(pairs, self.cfa, training, step, parameters[0].device)),
-            lambda step: training.share_done(time.perf_counter() - start, step),
-            clip_norm=CLIP_NORM,
-        )
+        device = parameters[0].device
+        start = time.perf_counter()
+
+        def spent(step: int) -> float:
+            return training.share_done(time.perf_counter() - start, step)
+
+        def loss(step: int) -> Tensor:
+            crops = random_crops(pairs, self.cfa, training, step, device)
+            return self.loss(crops, spent(step))
+
+        descent = adam(parameters, self.learning_rate, loss, spent, clip_norm=CLIP_NORM)
         bar = progress_bar(
             descent, label=f"fit {self.name}", unit="step", total=training.steps, shown=training.progress
         )
-        for loss in bar:
-            done, value = done + 1, loss.item()
-            bar.set_postfix_str(f"loss {value:.2e}, {time.perf_counter() - start:.0f} s", refresh=False)
-        return done, value
+
+        losses = []
+        for value in bar:
+            losses.append(value.item())
+            seconds = time.perf_counter() - start
+            bar.set_postfix_str(f"loss {losses[-1]:.2e}, {seconds:.0f} s", refresh=False)
+        return losses
 
 
 def require_crops(pairs: Sequence[FramePair], side: int) -> None:
@@ -158,8 +202,9 @@ def require_crops(pairs: Sequence[FramePair], side: int) -> None:
     for pair in pairs:
         if not pair.registered:
             raise ValueError(f"{pair.name}: RAW and sRGB are not registered pixel by pixel, which crops need")
-        if min(pair.raw.shape[-2:]) < side + 2:
-            height, width = pair.raw.shape[-2:]
+
+        height, width = pair.raw.shape[-2:]
+        if min(height, width) < side + 2:
             raise ValueError(f"{pair.name}: {height} x {width} is smaller than {side + 2}; use a smaller crop")
 
 
@@ -176,32 +221,64 @@ def random_crops(
         device: where the batch is put.
     """
     generator = keyed_generator(training.seed, "baseline crops", step)
-    crop = bayer.RandomCrop(training.crop)
+    random_crop = bayer.RandomCrop(training.crop)
+    chosen = torch.randint(len(pairs), (training.batch,), generator=generator).tolist()
 
-    def draw() -> Iterator[Crops]:
-        for k in torch.randint(len(pairs), (training.batch,), generator=generator).tolist():
-            pair = pairs[k]
-            srgb, raw = (bayer.crop_to_cfa(image, CFA(pair.cfa), cfa) for image in (pair.srgb, pair.raw))
-            corner = crop.sample(raw.shape[-2], raw.shape[-1], generator)
-            yield Crops(as_float(crop.apply(srgb, corner)), crop.apply(raw, corner))
+    crops = []
+    for index in chosen:
+        pair = pairs[index]
+        srgb = bayer.crop_to_cfa(pair.srgb, CFA(pair.cfa), cfa)
+        raw = bayer.crop_to_cfa(pair.raw, CFA(pair.cfa), cfa)
+        corner = random_crop.sample(raw.shape[-2], raw.shape[-1], generator)
 
-    return Crops(*(torch.stack(values).to(device) for values in zip(*draw(), strict=True)))
+        srgb_crop = as_float(random_crop.apply(srgb, corner))
+        raw_crop = random_crop.apply(raw, corner)
+        crops.append(Crops(srgb_crop, raw_crop, torch.tensor(pair.white_balance)))
+
+    stacked = (torch.stack(values).to(device) for values in zip(*crops, strict=True))
+    return Crops(*stacked)
 
 
 Model = TypeVar("Model", bound=BaselineISP)
 
 
 def fit_baseline(model: Model, pairs: Sequence[FramePair], training: Training) -> Model:
-    """Fit a method in place and return it in eval mode; ``model.info`` records frames, steps, seconds and loss.
+    """Fit a method in place and return it in eval mode.
 
-    UPI as published has nothing to fit; tuned UPI is solved in closed form, whatever the budget.
+    ``model.info`` records the frames, the seed, the number of steps, the seconds and, of a network, ``loss``, the last
+    one, and ``curve``, the mean losses of ten equal parts of the training. UPI as published has nothing to fit; tuned
+    UPI is solved in closed form, whatever the budget.
     """
     if not pairs:
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")
+
     start = time.perf_counter()
-    done, loss = model.learn(pairs, training)
-    model.info = {"frames": [frame.name for frame in pairs], "seed": training.seed, "steps": done}
-    model.info["seconds"] = round(time.perf_counter() - start, 2)
-    if not math.isnan(loss):
-        model.info["loss"] = loss
+    losses = model.learn(pairs, training)
+    seconds = time.perf_counter() - start
+
+    model.info = {
+        "frames": [frame.name for frame in pairs],
+        "seed": training.seed,
+        "steps": len(losses),
+        "seconds": round(seconds, 2),
+    }
+    if losses and math.isfinite(losses[-1]):
+        model.info["loss"] = losses[-1]
+        model.info["curve"] = mean_curve(losses)
     return model.eval()
+
+
+def mean_curve(losses: Sequence[float], points: int = CURVE_POINTS) -> list[float]:
+    """Mean losses of equal parts of a training; of one shorter than ``points`` steps, the losses themselves.
+
+    Example:
+        >>> mean_curve([4.0, 2.0, 1.0, 1.0], points=2)
+        [3.0, 1.0]
+    """
+    points = min(points, len(losses))
+    curve = []
+    for part in range(points):
+        begin = part * len(losses) // points
+        end = (part + 1) * len(losses) // points
+        curve.append(fmean(losses[begin:end]))
+    return curve

@@ -134,7 +134,7 @@ class TunedUPI(SmoothstepISP):
         """The fitted matrix and gains for each of ``batch`` pictures."""
         return UPIParams(self.matrix.expand(batch, 3, 3), self.gains.expand(batch, 3))
 
-    def learn(self, pairs: Sequence[FramePair], training: Training) -> tuple[int, float]:
+    def learn(self, pairs: Sequence[FramePair], training: Training) -> list[float]:
         """Fit to pairs of any CFA, registered or not; ValueError if the best matrix turns white black."""
         moments = Moments.of(sample_pixels(pairs, PIXELS, training.seed).pixels)
         product = moments.solve(torch.ones(len(moments.energy)).double())
@@ -145,7 +145,7 @@ class TunedUPI(SmoothstepISP):
             raise ValueError("tuned UPI: the pairs fit only with negative gains; give frames with more colours")
         self.gains.copy_(1.0 / sums)
         self.matrix.copy_(product / sums[:, None])
-        return 1, math.nan
+        return [math.nan]
 
 
 class Moments(NamedTuple):

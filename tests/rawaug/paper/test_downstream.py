@@ -20,7 +20,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.paper import methods
 from rawaug.paper.baselines import UPI
-from rawaug.paper.baselines.networks import UNetISP
+from rawaug.paper.baselines.unet import UNetISP
 from rawaug.paper.methods import DownstreamConfig, MadeCrops, psnr_d
 from rawaug.training.config import DenoiserConfig
 

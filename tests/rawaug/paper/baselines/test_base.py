@@ -17,11 +17,14 @@ from rawaug.paper.baselines import (
     UPI,
     BaselineISP,
     CycleISP,
+    InvertibleGrey,
+    InvISP,
+    JpegInvISP,
     TunedUPI,
     UNetISP,
     fit_baseline,
 )
-from rawaug.paper.baselines.base import CropTrainedISP, Training, random_crops
+from rawaug.paper.baselines.base import CropTrainedISP, Training, mean_curve, random_crops
 from rawaug.paper.methods import reverse_parameters
 
 SMALL: dict[str, dict[str, Any]] = {
@@ -29,20 +32,26 @@ SMALL: dict[str, dict[str, Any]] = {
     "upi-tuned": {},
     "unet": {"width": 4},
     "cycleisp": {"features": 8, "groups": 1, "blocks": 1},
+    "invisp": {"blocks": 2, "growth": 4},
+    "invisp-jpeg": {"blocks": 2, "growth": 4},
+    "invgrey": {"features": 4, "blocks": 1},
 }
+NETWORKS = [name for name in SMALL if not name.startswith("upi")]
 
 
 def small(name: str, cfa: CFA | str = "RGGB") -> BaselineISP:
     return BASELINES[name](cfa, **SMALL[name])
 
 
-@pytest.mark.parametrize(("method", "millions"), [(UNetISP, 11.77), (CycleISP, 3.14)])
+@pytest.mark.parametrize(
+    ("method", "millions"), [(UNetISP, 11.77), (CycleISP, 3.14), (InvISP, 1.41), (InvertibleGrey, 0.74)]
+)
 def test_published_number_of_parameters(method: type[BaselineISP], millions: float) -> None:
     with torch.device("meta"):
         assert reverse_parameters(method()) / 1e6 == pytest.approx(millions, abs=0.02)
 
 
-@pytest.mark.parametrize("name", ["unet", "cycleisp"])
+@pytest.mark.parametrize("name", NETWORKS)
 def test_weights_come_from_the_seed_alone(name: str) -> None:
     before = torch.get_rng_state()
     first, same, other = (BASELINES[name](seed=seed, **SMALL[name]) for seed in (1, 1, 2))
@@ -67,6 +76,10 @@ def test_every_method_makes_raw_through_one_interface(name: str) -> None:
 TINY: list[tuple[type[CropTrainedISP], dict[str, Any]]] = [
     (UNetISP, {"width": 4}),
     (CycleISP, {"features": 8, "groups": 1, "blocks": 1}),
+    (CycleISP, {"features": 8, "groups": 1, "blocks": 1, "both": False}),
+    (InvISP, {"blocks": 2, "growth": 4}),
+    (JpegInvISP, {"blocks": 2, "growth": 4}),
+    (InvertibleGrey, {"features": 8, "blocks": 1}),
 ]
 QUICK = Training(crop=32, batch=2, progress=False)
 
@@ -78,10 +91,12 @@ def test_a_few_steps_lower_the_loss(
     monkeypatch.setattr(method, "learning_rate", 3e-3)
     model = method("BGGR", **settings)
     crops = random_crops(exact_pairs, model.cfa, Training(crop=32, seed=99), 0)
+    model.prepare(exact_pairs)
     before = model.loss(crops).item()
     fit_baseline(model, exact_pairs, replace(QUICK, steps=15))
     assert model.loss(crops).item() < 0.9 * before
     assert model.info["steps"] == 15 and model.info["seconds"] > 0.0 and model.info["loss"] > 0.0
+    assert len(model.info["curve"]) == 10
     assert not model.training
 
 
@@ -109,7 +124,24 @@ def test_crops_of_any_pattern_arrive_in_that_of_the_model(cfa: CFA, exact_pairs:
     for step in range(4):
         crops = random_crops(mirrors, cfa, Training(crop=94), step)
         assert torch.equal(bayer.mosaic(crops.srgb, cfa), crops.raw)
-        assert crops.raw.shape == (4, 1, 94, 94)
+        assert crops.raw.shape == (4, 1, 94, 94) and crops.white_balance.shape == (4, 3)
+
+
+def test_methods_that_cannot_render_say_so(exact_pairs: list[Pair]) -> None:
+    raw = exact_pairs[0].raw[None]
+    for name in SMALL:
+        model = small(name, "GRBG")
+        if model.renders:
+            picture = model(raw, exact_pairs[0].srgb[None] if name == "cycleisp" else None)
+            assert picture.shape == (1, 3, 96, 128) and picture.min() >= 0.0 and picture.max() <= 1.0
+        else:
+            with pytest.raises(ValueError, match="only converts sRGB to RAW"):
+                model(raw)
+
+
+def test_the_curve_of_a_training_has_the_means_of_its_parts() -> None:
+    assert mean_curve([3.0, 2.0], points=10) == [3.0, 2.0]
+    assert mean_curve([6.0, 4.0, 2.0, 2.0, 1.0, 1.0], points=3) == [5.0, 2.0, 1.0]
 
 
 def test_what_cannot_be_fitted_is_refused(exact_pairs: list[Pair]) -> None:

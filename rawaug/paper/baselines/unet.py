@@ -1,0 +1,32 @@
+r"""The plain U-Net, ``y = mosaic(x + U(x))``, trained end to end with l1.
+
+The published size is 11.77 M parameters. That is UPI's U-Net with three channels in and out (five scales of three
+convolutions, 32 to 512 features, bilinear interpolation up: 11,774,979 parameters), so the one in
+:mod:`denoisers.networks` is used. That the paper's U-Net is this one is concluded from the number of parameters.
+Source: Ronneberger et al., MICCAI 2015; Conde et al., AAAI 2022.
+"""
+
+from __future__ import annotations
+
+from denoisers.networks import PUBLISHED_WIDTH, UNet
+from rawaug.bayer import CFA
+from rawaug.paper.baselines.base import CropTrainedISP
+from rawaug.registry import BASELINES
+
+
+@BASELINES.register("unet")
+class UNetISP(CropTrainedISP):
+    """The U-Net.
+
+    Args:
+        cfa: the pattern of the RAW that it makes.
+        width: number of features in the first scale.
+        seed: decides the initial weights.
+    """
+
+    name = "unet"
+    learning_rate = 1e-3
+
+    def __init__(self, cfa: CFA | str = "RGGB", width: int = PUBLISHED_WIDTH, seed: int = 0) -> None:
+        super().__init__(cfa)
+        self.reverse_network = UNet(width, channels=3, variance_map=False, seed=seed)
