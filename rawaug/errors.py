@@ -42,7 +42,7 @@ def extra(name: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise MissingExtra(f"{str(error.name).split('.')[0]} is not installed; {how_to_install(name)}") from None
+        raise MissingExtra(f"{(error.name or name).split('.')[0]} is not installed; {how_to_install(name)}") from None
 
 
 def how_to_install(name: str) -> str:

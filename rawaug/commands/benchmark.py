@@ -109,7 +109,7 @@ def run(
         page.add("Quality and cost", figures=[chart])
         page.add("Pictures", texts=[f"Noise: {display_strength(strengths)}, levels told; PSNR of RAW."])
         for panels in crops(everyone, found, ON_PAGE):
-            page.add_frame(panels)
+            page.add_frame(panels, crop)
         settings = {"denoisers": denoisers, "data": data, "bin": bin, "count": count, "crop": crop, "seed": seed}
         settings |= {"noise": noise, "iso": iso}
         print(f"page: {page.write(Path(report), settings)}")

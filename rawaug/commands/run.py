@@ -57,6 +57,9 @@ def run(
     given = [_in_full(key, value) for key, value in _given(changes)]
     whole = _without_old_settings(content, given)
     for key, value in given:
+        if key == "arms" and isinstance(value, (str, list)):
+            whole["arms"] = keep_arms(whole.get("arms") or {}, value)
+            continue
         whole = _with(whole, settings_of(kind), key.split("."), value)
     settings = with_values(settings_of(kind), whole, file)
     if isinstance(settings, Recipe):
@@ -65,6 +68,20 @@ def run(
         plan.dry_run(kind, settings, overwrite)
     else:
         EXPERIMENTS[kind](settings, overwrite)
+
+
+def keep_arms(arms: Mapping[str, Any], names: str | Sequence[str]) -> dict[str, Any]:
+    """The arms of a recipe that ``--arms NAME`` or ``--arms '[NAME, NAME]'`` keeps, in the recipe's order.
+
+    Raises:
+        ValueError: if a name is none of the recipe's arms.
+    """
+    wanted = [names] if isinstance(names, str) else list(names)
+    for name in wanted:
+        if name not in arms:
+            raise ValueError(f"arms: {name} is none of {', '.join(arms)}{suggest(name, arms)}")
+
+    return {name: arm for name, arm in arms.items() if name in wanted}
 
 
 def with_values(settings: type[Any], content: Mapping[str, Any], source: object) -> Any:

@@ -31,9 +31,10 @@ from rawaug.evaluation.scores import (
     levels_note,
     new_figure,
     table_of,
-    verdict,
 )
+from rawaug.evaluation.table_files import write_tables
 from rawaug.evaluation.trials import Trial, own_noise_note
+from rawaug.evaluation.verdict import verdict
 from rawaug.io.pictures import encode_png
 
 WINDOW = 64
@@ -111,7 +112,7 @@ class Page:
             named = noise if isinstance(noise, str) else json.dumps(noise)
             about["Noise"] = f"as captured with the frames, else {named}; {levels_range(first)}".rstrip("; ")
         page = cls(title)
-        _, page.lead = verdict(results, others)
+        page.lead = verdict(results, others).sentence
         page.add(terms={name: text for name, text in about.items() if text})
         if arms:
             page.add("Methods", terms=arms)
@@ -128,8 +129,13 @@ class Page:
         """Add pictures of the curves of a training, by title."""
         self.add("Training", figures=[Figure(png, title, "curve") for title, png in pngs.items()])
 
-    def add_frame(self, row: Panels) -> None:
-        """Add a frame: its most detailed window in every image, and the whole of the clean one."""
+    def add_frame(self, row: Panels, crop: int | None = None) -> None:
+        """Add a frame: its most detailed window in every image, and the whole of the clean one.
+
+        Args:
+            row: the images of the frame.
+            crop: the side in pixels of the middle to which larger frames were cut; None if none was.
+        """
         first = not any(part["heading"] == "Pictures" for part in self.parts)
         clean = row.trial.clean
         side = WINDOW if clean.shape[1] == PACKED else 2 * WINDOW
@@ -139,15 +145,17 @@ class Page:
         for name, image in row.images.items():
             png = encode_png(row.show(image[..., top : top + side, left : left + side]))
             figures.append(Figure(png, name, "window", ", ".join(filter(None, [name, row.captions.get(name)]))))
+        height, width = whole.shape[-2:]
+        part = name_part(height, width, crop)
         scale = min(1.0, WHOLE / whole.shape[-1])
         if scale < 1.0:
             whole = F.interpolate(whole[None], scale_factor=scale, mode="area")[0]
-        caption = f"whole frame, clean; window at row {pixels * top}, column {pixels * left}"
-        figures.append(Figure(encode_png(whole), "whole frame", caption=caption))
+        caption = f"{part}, clean; window at row {pixels * top}, column {pixels * left}"
+        figures.append(Figure(encode_png(whole), part, caption=caption))
         self.add("Pictures" if first else "", name=row.trial.frame, figures=figures)
 
     def write(self, path: Path, settings: Mapping[str, Any]) -> Path:
-        """Write the page, which ends with the settings of the run; the path."""
+        """Write the page, which ends with the settings of the run, and its tables beside it; the path of the page."""
         import yaml
         from jinja2 import Environment, PackageLoader
 
@@ -158,7 +166,21 @@ class Page:
         text = template.render(title=self.title, lead=self.lead, parts=self.parts, settings=shown)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8", errors="backslashreplace")
+        write_tables(path, self.parts)
         return path
+
+
+def name_part(height: int, width: int, crop: int | None) -> str:
+    """How much of a frame is shown, with its size in pixels.
+
+    Example:
+        >>> name_part(512, 512, crop=512)
+        'middle, 512 x 512'
+        >>> name_part(288, 448, crop=512)
+        'whole frame, 448 x 288'
+    """
+    cut = crop is not None and max(height, width) >= crop
+    return f"{'middle' if cut else 'whole frame'}, {width} x {height}"
 
 
 def command_line() -> str:

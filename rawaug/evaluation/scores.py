@@ -272,8 +272,6 @@ ACROSS = 4
 """Panels side by side, at most: more make captions too small to read on a page."""
 WIDTH = 140
 """Columns of a printed table where stdout is no terminal."""
-MATTERS = 0.05
-"""The gain in dB below which an arm is not preferred to a denoiser that needs no training."""
 
 FIGURES = {
     "psnr": "PSNR (dB)",
@@ -391,43 +389,6 @@ def _cell(key: str, values: Sequence[float]) -> str:
     if len(values) > 1 and key != "own_noise":
         return mean_and_spread(values, _digits(key))
     return format_figure(key, statistics.fmean(values) if values else None)
-
-
-INPUT = "the noisy input"
-
-
-def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
-    """The method to use, which is an arm, one of the others or :data:`INPUT`; and the reason in a line.
-
-    The arm of the highest mean PSNR is compared with the best of the others, or with the noisy input. Both are empty
-    if nothing has a PSNR.
-    """
-    means = {arm: statistics.fmean(found) for arm, runs in results.items() if (found := _values(runs, "plain", "psnr"))}
-    if not means:
-        return "", ""
-    arm = max(means, key=means.__getitem__)
-    runs = [run["plain"] for run in results[arm]]
-    noisy = {key.removesuffix("_noisy"): value for key, value in runs[0].items() if key.endswith("_noisy")}
-    noisy["images"] = [{"psnr": image.get("psnr_noisy")} for image in runs[0]["images"]]
-    scored = {name: scores for name, scores in others.items() if "psnr" in scores} or {INPUT: noisy}
-    other = max(scored, key=lambda name: scored[name]["psnr"])
-    gains = [run["psnr"] - scored[other]["psnr"] for run in runs if "psnr" in run]
-    gain = statistics.fmean(gains)
-    said = [f"{arm}, the best arm, scores {abs(gain):.2f} dB {'more' if gain >= 0 else 'less'}"]
-    if better := gain >= MATTERS:
-        said = [f"{gain:+.2f} dB over {other}"]
-    if len(gains) > 1:
-        spread = statistics.stdev(gains)
-        said += [f"{'within' if abs(gain) <= spread else 'more than'} the noise of the seeds (± {spread:.2f} dB)"]
-    else:
-        pairs = list(zip(runs[0]["images"], scored[other]["images"], strict=False))
-        higher = sum((one.get("psnr") or 0.0) > (two.get("psnr") or 0.0) for one, two in pairs)
-        said += [f"higher on {higher} of {len(pairs)} frames, one seed"]
-    if "psnr_srgb" in scored[other] and all("psnr_srgb" in run for run in runs):
-        developed = statistics.fmean(run["psnr_srgb"] for run in runs) - scored[other]["psnr_srgb"]
-        said += [f"{developed:+.2f} dB after development"]
-    chosen = arm if better else other
-    return chosen, f"Use {chosen}: {', '.join(said)}."
 
 
 def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str]]) -> None:

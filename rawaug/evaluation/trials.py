@@ -25,6 +25,7 @@ from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.folders import Cached
 from rawaug.data.pairs import Pair, SomePairs
 from rawaug.denoising.denoiser import Levels, Noisy
+from rawaug.evaluation.verdict import CLEANER_TEST
 from rawaug.noise import NoiseModel, own_noise
 from rawaug.seeding import keyed_generator
 
@@ -155,8 +156,10 @@ MUCH = 0.1
 """Share of the squared error above which a line warns of the references' own noise."""
 MOST_MEASURED = 12
 """Frames whose own noise is measured, evenly spaced; one of 12 megapixels takes seconds."""
+MOST_TARGETS = 3
+"""The number of training frames whose own noise is measured."""
 SHOWN = 4
-ADVICE = "bin the references (bin 4), or add the noise of a higher ISO"
+ADVICE = CLEANER_TEST
 
 
 class Measured(SomePairs):
@@ -198,4 +201,38 @@ def added_noise_note(trials: Iterable[Trial]) -> str:
     return (
         f"the test frames' own noise has {own / added:.0%} of the variance of the noise added to them: a perfect "
         f"denoiser would score {-10.0 * math.log10(own):.1f} dB; {ADVICE}"
+    )
+
+
+def training_noise_note(pairs: Sequence[Pair], noise: NoiseModel, arms: Sequence[str]) -> str:
+    """A line that warns of clean training frames with much noise of their own, which a network learns to keep.
+
+    Args:
+        pairs: the training frames. Those with a noisy capture are left out, since its noise is another one.
+        noise: what is added to the others.
+        arms: the names of the arms that train on them.
+
+    Returns:
+        The line; empty if there are no such frames or arms, or their noise is weak or cannot be measured.
+    """
+    targets = [pair for pair in pairs if pair.noisy is None]
+    count = min(MOST_TARGETS, len(targets)) if arms else 0
+
+    shares = []
+    for k in range(count):
+        pair = targets[k * len(targets) // count]
+        levels = pair.own_noise or own_noise(pair.raw, pair.cfa)
+        if levels is None:
+            continue
+        clean = bayer.pack(pair.raw[None], pair.cfa)
+        params = noise.sample(1, keyed_generator(0, "training noise", pair.name))
+        shares.append((noise_variance(clean, *levels).mean() / noise.variance(clean, params).mean()).item())
+
+    share = fmean(shares) if shares else 0.0
+    if share <= MUCH:
+        return ""
+
+    return (
+        f"the clean training frames' own noise has {share:.0%} of the variance of the noise added to them: training on "
+        f"them ({', '.join(arms)}) teaches to keep it; use noisy and clean captures (pairs:PATH), or augmented: 1"
     )

@@ -39,7 +39,7 @@ from rawaug.errors import extra
 from rawaug.evaluation.scores import NOISY, group_rows, print_table, require_numbers, score, summary
 from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise, make_trials
 from rawaug.experiment.denoising import Results, TrainingRun
-from rawaug.experiment.recipe import Recipe
+from rawaug.experiment.recipe import NoiseSetting, Recipe
 from rawaug.files import fingerprint, write_json
 from rawaug.io import RawFrame, write_dng
 from rawaug.isp.model import DictionaryISP
@@ -162,7 +162,7 @@ class FullColourRecipe(Recipe):
     """
 
     together: ClassVar[bool] = True
-    test_noise: tuple[float, float] | str = "cycleisp_sidd"
+    test_noise: NoiseSetting = "cycleisp_sidd"
 
     @property
     def validation_noise(self) -> object:

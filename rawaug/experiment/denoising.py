@@ -37,9 +37,9 @@ from rawaug.evaluation.scores import (
     save_picture,
     score,
     summary,
-    verdict,
 )
-from rawaug.evaluation.trials import Trial, added_noise_note, make_trials, own_noise_note, trial_of
+from rawaug.evaluation.trials import Trial, added_noise_note, make_trials, own_noise_note, training_noise_note, trial_of
+from rawaug.evaluation.verdict import verdict
 from rawaug.experiment.plan import claim, name_given_pairs, plan_data, require_free, require_usable, run_folder
 from rawaug.experiment.recipe import ArmConfig, Recipe
 from rawaug.files import find_weights, fingerprint, one_at_a_time, sha256, write_json
@@ -111,11 +111,12 @@ class TrainingRun:
     noise: NoiseModel
     frames: Mapping[str, Sequence[Any]]
     trials: Sequence[Trial]
+    noise_note: str
 
     def __init__(self, recipe: Recipe, overwrite: bool, given: Mapping[str, Sequence[Pair]]) -> None:
         recipe = name_given_pairs(recipe, given)
         require_free(recipe, overwrite)
-        require_trainable(recipe.device, recipe.devices, recipe.train.precision)
+        require_trainable(recipe.device, recipe.devices, recipe.train.precision, recipe.train.logger)
         self.recipe, self.data, self.overwrite = recipe, recipe.data, overwrite
         self.folder, self.seeds = run_folder(recipe), range(recipe.seed, recipe.seed + recipe.seeds)
         self.classical = find_classical(recipe.classical, shown=_leads())
@@ -170,7 +171,14 @@ class TrainingRun:
         self.frames = {part: frames_of(self.recipe, pairs, self.isp) for part, pairs in parts.items()}
         if _leads() and not self.models:
             _say(added_noise_note(self.trials))
+            self.noise_note = training_noise_note(self.pairs, self.noise, self._arms_with_clean_targets())
+            _say(self.noise_note)
             _say(faintness_note(self.frames["pairs"]) if self.recipe.self_supervised else "")
+
+    def _arms_with_clean_targets(self) -> list[str]:
+        """The arms that train on clean real frames."""
+        arms = self.recipe.arms.items()
+        return [name for name, arm in arms if arm.sees_clean and arm.augmented < 1.0]
 
     def arm_folder(self, arm: str, seed: int) -> Path:
         """The folder of an arm's weights, log and scores."""
@@ -302,14 +310,14 @@ class TrainingRun:
         settings = f"real pairs: {len(self.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
         title = f"{recipe.name} tested on {self.data.test} ({settings}){self.compared_in}"
         use = self.usage(others)
-        facts = {"Noise": recipe.noise, "To use it": use[-1].partition(": ")[2]}
+        facts = {"Noise": recipe.noise, "To use it": use[-1].partition(": ")[2], "Training frames": self.noise_note}
         everyone = [*self.others, *(self.denoiser(arm) for arm in self.models)]
         named = {one.name for one in everyone}
         about = {name: text for name, text in methods_of(recipe).items() if name in named}
         page = Page.of_scores(title, results, others, facts, about)
         picture = self._draw(page, everyone)
         print_table(results, title, others)
-        _say(page.lead, own_noise_note(first_runs(results, others)))
+        _say(page.lead, own_noise_note(first_runs(results, others)), self.noise_note)
         print(f"table: {file}\npicture: {picture}\npage: {self.folder / 'report.html'}")
         _say(*reports(self.pictures), *self.unreadable, *use)
         require_numbers(
@@ -327,7 +335,7 @@ class TrainingRun:
         rows: list[Panels] = []
         for trial in select_for_page(self.trials):
             row = panels_of(shown, trial, self.input)
-            page.add_frame(row)
+            page.add_frame(row, self.data.test_crop)
             rows += [row] if len(rows) < SHOWN else []
         page.write(self.folder / "report.html", asdict(self.recipe))
         return save_picture(rows, self.folder / "picture.png")
@@ -341,7 +349,9 @@ class TrainingRun:
         """The files of weights, and the command that uses what the verdict names; of an arm the best seed's."""
         files = {(arm, s): self.arm_folder(arm, s) / "denoiser.safetensors" for arm in self.results for s in self.seeds}
         lines = [f"denoiser, {arm}: {file}" for (arm, _), file in files.items()]
-        best, _ = verdict(self.results, others)
+        best = verdict(self.results, others).use
+        if not best:
+            return [*lines, "to use: nothing is recommended, as the verdict says"]
         if best in self.results:
             runs = [run["plain"].get("psnr", 0.0) for run in self.results[best]]
             what = f"--denoiser {files[best, self.seeds[runs.index(max(runs))]]}"

@@ -6,13 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator
 
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import OWN_PICTURES, Pair
 from rawaug.files import require_file, yaml_value
 from rawaug.isp.fit import FitConfig
 from rawaug.kernels.runtime import find_device
+from rawaug.noise import noise_model
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.targets import Srgb, Target
 from rawaug.registry import ESTIMATORS, EXPERIMENTS, SRGB_NOISE, require_between, split_spec, suggest
@@ -23,6 +26,10 @@ SHORT_CROP = 256
 """Side in pixels of the middles of frames that a dry run uses."""
 HELD_OUT = "auto"
 """The value of ``data.validation`` for a part of ``data.pairs``."""
+USUAL = "usual"
+"""The value of ``data.validation`` that :class:`DataConfig` replaces by the one that suits ``data.pairs``."""
+DEMO = "demo:"
+"""What the names of the built-in, simulated frames begin with."""
 _PAIRS = "pairs:"
 MOST_BYTES, MOST_LEVELS = 2**16, 50
 _BOUNDS: dict[str, tuple[float, float]] = {
@@ -31,6 +38,17 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "bin": (1, 16),
     "max_pixels": (4, 2**40),
 }
+
+
+def _require_noise_form(value: Any) -> Any:
+    """Refuse what is neither a name, a list nor a mapping, in the words of :func:`rawaug.noise.noise_model`."""
+    if not isinstance(value, (str, list, tuple, Mapping)):
+        noise_model(value)
+    return value
+
+
+NoiseSetting = Annotated[tuple[float, float] | str | list[str] | dict[str, Any], BeforeValidator(_require_noise_form)]
+"""The noise of a recipe, as :func:`rawaug.noise.noise_model` takes it."""
 
 
 @dataclass
@@ -49,7 +67,7 @@ class DataConfig(PairSettings):
         max_pixels: larger pictures, those of pairs and PNG mosaics too, are refused; null for 2^26.
         validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
             fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
-            and keeps the final weights.
+            and keeps the final weights; usual is demo:validation where ``pairs`` is the demo's or null, else auto.
         validation_count: number of pairs to use; null for all.
         validation_crop: side of the central crop used of each validation frame; null for the whole frame.
         test: test pairs; no earlier stage sees them.
@@ -65,7 +83,7 @@ class DataConfig(PairSettings):
     pictures: str | list[str] = "demo:"
     memory_mb: int = 0
     max_pixels: int | None = None
-    validation: str | None = "demo:validation"
+    validation: str | None = USUAL
     validation_count: int | None = None
     validation_crop: int | None = 512
     test: str = "demo:test"
@@ -77,6 +95,11 @@ class DataConfig(PairSettings):
         for key, (least, most) in _BOUNDS.items():
             if getattr(self, key) is not None:
                 require_between(f"data.{key}", getattr(self, key), least, most)
+
+        if self.validation == USUAL:
+            own_frames = self.pairs is not None and not self.pairs.startswith(DEMO)
+            self.validation = HELD_OUT if own_frames else "demo:validation"
+
         if self.validation == HELD_OUT and self.pairs is None:
             raise ValueError("data.validation: auto holds out a part of data.pairs, which is null; set one of them")
         if not self.pictures:
@@ -183,7 +206,7 @@ class Recipe:
     data: DataConfig = field(default_factory=DataConfig)
     isp: FitConfig = field(default_factory=FitConfig)
     camera: str | None = None
-    noise: tuple[float, float] | str | list[str] | dict[str, Any] = "cycleisp_sidd"
+    noise: NoiseSetting = "cycleisp_sidd"
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     arms: dict[str, ArmConfig] = field(default_factory=dict)

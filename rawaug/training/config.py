@@ -11,6 +11,9 @@ from rawaug.registry import DENOISERS, LOSSES, require_between
 MOST = 2**31
 """The largest number of steps, samples or processes that a setting may have."""
 
+VALIDATIONS = 5
+"""Validations of a short training, which are the points of its curves."""
+
 Weighing = Literal["linear", "normalised", "stabilised", "mixed", "relative"]
 """How the loss weighs light and shade; :mod:`rawaug.training.estimators` has the formulas."""
 
@@ -51,12 +54,14 @@ class TrainConfig:
             see :mod:`rawaug.training.estimators`.
         ema: decay of the running average of the weights, which are validated and saved; 0 disables it.
         clip_norm: gradient norm limit; 0 disables it.
-        validate_every: steps between validations; the best weights are kept.
+        validate_every: steps between validations; the best weights are kept. A training of no more steps than that is
+            validated five times.
         checkpoint_every: steps between checkpoints, from which a killed run resumes.
         workers: processes that prepare samples; 0 prepares them in the training process.
         precision: Fabric's, such as 32-true or bf16-mixed.
         channels_last: memory format of the network.
         compile: torch.compile the network.
+        logger: where loss and validation are logged besides ``log.csv``: tensorboard, wandb or csv; null for nowhere.
     """
 
     steps: int = 1500
@@ -76,6 +81,7 @@ class TrainConfig:
     precision: str = "32-true"
     channels_last: bool = True
     compile: bool = False
+    logger: Literal["tensorboard", "wandb", "csv"] | None = None
 
     def __post_init__(self) -> None:
         for key in ("steps", "batch", "halve_every", "validate_every", "checkpoint_every"):
@@ -93,8 +99,16 @@ class TrainConfig:
         if not 0.0 <= self.ema < 1.0:
             raise ValueError(f"train.ema must be in [0, 1), got {self.ema}")
 
+    @property
+    def validation_period(self) -> int:
+        """Steps between validations. A training too short for two of them has :data:`VALIDATIONS`."""
+        if self.steps > self.validate_every:
+            return self.validate_every
 
-SAME_WEIGHTS = frozenset({"workers", "compile", "checkpoint_every"})
+        return max(1, self.steps // VALIDATIONS)
+
+
+SAME_WEIGHTS = frozenset({"workers", "compile", "checkpoint_every", "logger"})
 """Keys of :class:`TrainConfig` that change how fast the weights are found, not which."""
 
 

@@ -103,7 +103,7 @@ def train(
     """
     estimator = estimator or Supervised()
     norm: Criterion = LOSSES.make(config.loss)
-    fabric = launch(device, devices, config.precision)
+    fabric = launch(device, devices, config.precision, make_loggers(config.logger, folder, label))
     folder.mkdir(parents=True, exist_ok=True)
     state = TrainingState(first_network(network, seed), config)
     state.load(folder / "last.pt", key)
@@ -116,7 +116,9 @@ def train(
         sample = type(batch)(*(x.to(fabric.device, memory_format=state.layout) for x in batch))
         loss = estimator.loss(model, sample, weigh_loss(norm, config.weigh, sample), step / config.steps)
         learning_rate = state.update(loss)
-        looks, saves = (step % n == 0 or step == config.steps for n in (config.validate_every, config.checkpoint_every))
+        last = step == config.steps
+        looks = last or step % config.validation_period == 0
+        saves = last or step % config.checkpoint_every == 0
         if looks or saves:
             state.losses = fabric.all_reduce(state.losses, reduce_op="mean")
         if looks:
@@ -127,9 +129,12 @@ def train(
             row["samples_per_second"] = (step - start) * stream.batch / (time.perf_counter() - began)
             if journal is not None:
                 journal.log(step, **row)
+            fabric.log_dict(row, step)
             bar.set_postfix_str(_status(row, state.best["step"]), refresh=False)
         if saves and journal is not None:
             state.save(folder / "last.pt", key)
+    for logger in fabric.loggers:
+        logger.finalize("success")
     return estimator.correct_network(state.best_network(label)).eval()
 
 
@@ -168,8 +173,8 @@ def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> d
     return scores | ({"psnr_srgb": fmean(srgb)} if len(srgb) == len(frames) else {})
 
 
-def require_trainable(device: str, devices: int, precision: str) -> None:
-    """Raise ValueError or ImportError if a training's libraries, device or precision are not there."""
+def require_trainable(device: str, devices: int, precision: str, logger: str | None = None) -> None:
+    """Raise ValueError or ImportError if a training's libraries, device, precision or logger are not there."""
     with extra("train"):
         for name in ("matplotlib", "skimage", "PIL"):
             import_module(name)
@@ -179,13 +184,45 @@ def require_trainable(device: str, devices: int, precision: str) -> None:
     if ":" in device:
         raise ValueError(f"device {device!r}: give the kind, such as cuda, and choose the GPU by CUDA_VISIBLE_DEVICES")
     find_device(device, count=devices)
+    make_loggers(logger, Path(), label="")
     try:
         Fabric(accelerator="cpu", devices=1, precision=precision)
     except (ModuleNotFoundError, ValueError) as error:
         raise ValueError(f"train.precision: {' '.join(str(error).split())}") from None
 
 
-def launch(device: str, devices: int, precision: str) -> Any:
+def make_loggers(kind: str | None, folder: Path, label: str) -> list[Any]:
+    """The loggers of Fabric that ``train.logger`` names.
+
+    Args:
+        kind: tensorboard, wandb, csv, or None for none.
+        folder: gets the logs, in a subfolder named after the kind.
+        label: the name of a run in Weights & Biases.
+
+    Raises:
+        MissingExtra: if the library of the logger is not installed.
+    """
+    if kind is None:
+        return []
+
+    if kind == "csv":
+        from lightning_fabric.loggers import CSVLogger
+
+        return [CSVLogger(folder, name="", version=kind, flush_logs_every_n_steps=1)]
+
+    if kind == "tensorboard":
+        from lightning_fabric.loggers import TensorBoardLogger
+
+        with extra("tensorboard"):
+            return [TensorBoardLogger(folder, name="", version=kind)]
+
+    with extra("wandb"):
+        from wandb.integration.lightning.fabric import WandbLogger
+
+    return [WandbLogger(name=label, save_dir=folder, project="rawaug")]
+
+
+def launch(device: str, devices: int, precision: str, loggers: Sequence[Any] = ()) -> Any:
     """Start Fabric in the processes that torchrun or ``fabric run`` started, or in those that it starts itself."""
     with extra("train"):
         from lightning_fabric import Fabric
@@ -194,7 +231,7 @@ def launch(device: str, devices: int, precision: str) -> Any:
     if torch.distributed.is_torchelastic_launched():
         devices = int(os.environ["LOCAL_WORLD_SIZE"])
         nodes = int(os.environ["WORLD_SIZE"]) // devices
-    fabric: Any = Fabric(accelerator=device, devices=devices, num_nodes=nodes, precision=precision)
+    fabric: Any = Fabric(accelerator=device, devices=devices, num_nodes=nodes, precision=precision, loggers=loggers)
     if os.environ.get("LT_CLI_USED") != "1":  # ``fabric run`` has launched it
         fabric.launch()
     return fabric

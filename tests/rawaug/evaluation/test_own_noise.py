@@ -13,7 +13,7 @@ from rawaug.bayer import CFA
 from rawaug.data.pairs import Binned, Middles, Pair
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import Row, score, summary
-from rawaug.evaluation.trials import Measured, Trial, added_noise_note, own_noise_note, trial_of
+from rawaug.evaluation.trials import Measured, Trial, added_noise_note, own_noise_note, training_noise_note, trial_of
 from rawaug.noise import noise_model
 
 SHOT, READ = 1e-4, 2e-6
@@ -66,3 +66,11 @@ def test_noise_as_weak_as_the_references_own_is_said() -> None:
     assert added_noise_note([]) == added_noise_note([trial(1e-5, 1e-3)]) == ""
     said = added_noise_note([trial(2e-5, 2e-5)])
     assert "100% of the variance" in said and "would score 47.0 dB" in said
+
+
+def test_training_on_noisy_references_is_said_to_teach_their_noise(reference: Pair) -> None:
+    as_strong, stronger = noise_model((SHOT, READ)), noise_model((100 * SHOT, 100 * READ))
+    assert "real" in training_noise_note([reference], as_strong, ["real"])
+    assert training_noise_note([reference], stronger, ["real"]) == ""
+    assert training_noise_note([reference], as_strong, []) == training_noise_note([], as_strong, ["real"]) == ""
+    assert training_noise_note([replace(reference, noisy=reference.raw)], as_strong, ["real"]) == ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import csv
 import io
 import re
 from html import unescape
@@ -17,8 +18,9 @@ from PIL import Image
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.page import WINDOW, Page, find_detail, plot_curves
+from rawaug.evaluation.page import WINDOW, Page, find_detail, name_part, plot_curves
 from rawaug.evaluation.scores import Panels
+from rawaug.evaluation.table_files import latex_table
 from rawaug.evaluation.trials import raw_trial
 
 
@@ -86,3 +88,19 @@ def test_a_curve_of_one_point_is_seen(tmp_path: Path) -> None:
         pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
         legend_alone = 60  # pixels of the line beside the arm's name
         assert (pixels == (31, 119, 180)).all(axis=2).sum() > legend_alone + 20
+
+
+def test_its_tables_lie_beside_it_as_csv_and_latex(page: str, tmp_path: Path) -> None:
+    with (tmp_path / "new" / "report_scores.csv").open(newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head[1] == "PSNR (dB)" and [row[:2] for row in rows if row[0] == "real"] == [["real", "40.12"]]
+    text = (tmp_path / "new" / "report_scores.tex").read_text()
+    assert "\\textbf{40.12}" in text and text.count("\\\\") == len(rows) + 1
+    assert (tmp_path / "new" / "report_every_image.tex").is_file()
+    assert latex_table(["", "a_b"], {"50 % & more": ["1"]}).count("\\") > 6
+
+
+def test_a_middle_is_not_called_a_whole_frame(page: str) -> None:
+    assert "whole frame, 800 x 200, clean" in page
+    assert name_part(512, 512, crop=512) == "middle, 512 x 512"
+    assert name_part(300, 512, crop=512) == "middle, 512 x 300"

@@ -14,8 +14,9 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.scores import Panels, mean_and_spread, print_table, save_picture, verdict
+from rawaug.evaluation.scores import Panels, mean_and_spread, print_table, save_picture
 from rawaug.evaluation.trials import raw_trial
+from rawaug.evaluation.verdict import verdict
 
 
 @pytest.fixture
@@ -71,3 +72,43 @@ def test_the_table_names_every_arm(capsys: pytest.CaptureFixture[str]) -> None:
     print_table({"real": [{"plain": scores, "self_ensemble": {**scores, "psnr": 40.5}}]}, "title")
     text = capsys.readouterr().out
     assert "noisy input" in text and "33.00" in text and "real" in text and "40.50" in text
+
+
+def with_own_noise(psnr: float, own_psnr: float, noisy_psnr: float, **more: float) -> dict[str, Any]:
+    """A summary on references whose own noise is as strong as an error of ``own_psnr``."""
+    share = 10.0 ** ((psnr - own_psnr) / 10.0)
+    image = {"psnr": psnr, "psnr_noisy": noisy_psnr, "own_noise": share}
+    return {"psnr": psnr, "own_noise": share, "images": [image, image], **more}
+
+
+@pytest.mark.parametrize(
+    ("mine", "other", "noisy", "use"),
+    [
+        (50.0, 48.0, 47.3, ""),  # more than a perfect denoiser, which scores 47.3
+        (45.0, 48.0, 47.3, ""),  # so does the other
+        (46.8, 46.0, 47.3, ""),  # less, but the lead may be kept noise
+        (46.8, 43.0, 47.3, "mine"),  # no denoiser gains so much by keeping it
+        (46.8, 46.0, 30.0, "mine"),  # strong noise hides that of the references
+    ],
+)
+def test_nothing_is_recommended_where_the_references_noise_decides(
+    mine: float, other: float, noisy: float, use: str
+) -> None:
+    results = {"mine": [{"plain": with_own_noise(mine, 47.3, noisy)}]}
+    result = verdict(results, {"NLM": with_own_noise(other, 47.3, noisy)})
+    assert result.use == use
+    assert use or ("pairs:PATH" in result.sentence and "bin 4" in result.sentence)
+
+
+@pytest.mark.parametrize(
+    ("gain", "developed", "use"),
+    [(0.11, -0.13, ""), (-0.3, 0.2, ""), (0.01, 0.4, ""), (0.11, 0.0, "mine"), (-0.3, -0.2, "NLM"), (0.0, 0.0, "NLM")],
+)
+def test_nothing_is_recommended_while_raw_and_developed_scores_disagree(
+    gain: float, developed: float, use: str
+) -> None:
+    def scores(more: float, more_srgb: float) -> dict[str, Any]:
+        return {"psnr": 40.0 + more, "psnr_srgb": 30.0 + more_srgb, "images": [{"psnr": 40.0 + more}]}
+
+    result = verdict({"mine": [{"plain": scores(gain, developed)}]}, {"NLM": scores(0.0, 0.0)})
+    assert result.use == use and bool(use) == result.sentence.startswith("Use ")

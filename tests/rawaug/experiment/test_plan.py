@@ -192,3 +192,13 @@ def test_an_arm_has_a_rate_and_a_weighing_of_its_own_and_at_most_its_own_steps()
     assert (b.steps, b.learning_rate, b.weigh) == (10, 3e-4, "stabilised")
     with pytest.raises(ValueError, match="steps must be a whole number from 1"):
         ArmConfig(steps=0)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "validation"),
+    [("demo:train", "demo:validation"), (None, "demo:validation"), ("pairs:x", "auto"), ("RAW_DIR", "auto")],
+)
+def test_own_frames_are_validated_on_themselves(pairs: str | None, validation: str) -> None:
+    assert DataConfig(pairs=pairs).validation == validation
+    assert DataConfig(pairs=pairs, validation=None).validation is None
+    assert DataConfig(pairs=pairs, validation="demo:validation").validation == "demo:validation"

@@ -169,7 +169,7 @@ def test_null_is_taken_where_the_types_have_it() -> None:
     recipe = with_values(settings_of("training"), content, "mine")
     assert recipe.steps is None and recipe.network_of("real") == recipe.denoiser
     for key in ("data", "isp", "train", "arms", "device", "seed", "out", "views", "noise"):
-        with pytest.raises(ValueError, match=f"^mine: {key}: .* got None"):
+        with pytest.raises(ValueError, match=f"^mine: {key}.* got None"):
             with_values(settings_of("training"), {key: None}, "mine")
     with pytest.raises(ValueError, match=r"^mine: arms\.real\.denoiser\.name: .* got None"):
         with_values(settings_of("training"), {"arms": {"real": {"denoiser": {"name": None}}}}, "mine")

@@ -13,7 +13,7 @@ import torch
 from rawaug.bayer import CFA
 from rawaug.commands.run import run
 from rawaug.data import demo_pairs
-from rawaug.evaluation.scores import verdict
+from rawaug.evaluation.verdict import verdict
 from rawaug.experiment import plan
 from rawaug.experiment.denoising import TrainingRun
 from rawaug.registry import DENOISERS
@@ -97,3 +97,17 @@ def test_frames_with_next_to_no_noise_are_named_before_training() -> None:
     clean = [NoisyFrame("a", mosaic, 1e-5, 1e-7, CFA.RGGB)]
     assert "next to no noise (56.8 dB PSNR)" in faintness_note(clean)
     assert faintness_note([NoisyFrame("a", mosaic, 1e-3, 1e-5, CFA.RGGB)]) == faintness_note([]) == ""
+
+
+def test_arms_keeps_only_those_that_are_named(given: list[Any]) -> None:
+    run("unsupervised", "--arms", "noisier", dry_run=True)
+    assert list(given[-1].arms) == ["noisier"] and given[-1].arms["noisier"].augmented == 0.5
+    run("unsupervised", "--arms", "[r2r, noisier]", "--arms.r2r.augmented", "1", dry_run=True)
+    assert list(given[-1].arms) == ["noisier", "r2r"] and given[-1].arms["r2r"].augmented == 1.0
+    with pytest.raises(ValueError, match=r"nearest: noisier"):
+        run("unsupervised", "--arms", "noisiest", dry_run=True)
+
+
+def test_noise_that_is_a_number_is_refused_as_in_python() -> None:
+    with pytest.raises(ValueError, match=r"noise must be a name or a pair \(shot_var, read_var\)"):
+        run("fewshot", "--noise", "-1", dry_run=True)

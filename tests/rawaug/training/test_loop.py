@@ -16,6 +16,7 @@ import torch
 
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
+from rawaug.evaluation.page import read_log
 from rawaug.evaluation.trials import Trial, trial_of
 from rawaug.noise import noise_model
 from rawaug.training import loop
@@ -198,3 +199,17 @@ def test_the_log_has_the_rows_of_this_run_alone(tmp_path: Path) -> None:
             journal.log(step, loss=loss, learning_rate=1e-3)
     rows = (tmp_path / "log.csv").read_text().splitlines()
     assert [row.split(",")[:2] for row in rows[1:]] == [["1", "0.5"], ["2", "0.5"], ["3", "0.25"], ["4", "0.25"]]
+
+
+def test_a_short_training_has_a_curve_and_a_long_one_its_own_period() -> None:
+    assert replace(CONFIG, steps=100, validate_every=100).validation_period == 20
+    assert replace(CONFIG, steps=3, validate_every=100).validation_period == 1
+    assert replace(CONFIG, steps=200, validate_every=100).validation_period == 100
+
+
+def test_fabric_logs_what_the_journal_has(stream: TrainingStream, validation: list[Trial], tmp_path: Path) -> None:
+    config = replace(CONFIG, steps=4, validate_every=2, logger="csv")
+    loop.train(stream, validation, NETWORK, config, tmp_path, device="cpu")
+    journal, logged = (read_log(tmp_path / name) for name in ("log.csv", "csv/metrics.csv"))
+    assert [row["step"] for row in logged] == [row["step"] for row in journal] == ["2", "4"]
+    assert [float(row["psnr"]) for row in logged] == pytest.approx([float(row["psnr"]) for row in journal], rel=1e-5)

@@ -1,0 +1,104 @@
+r"""The tables of a page as files of their own: CSV for a spreadsheet or a script, LaTeX for a paper.
+
+``report.html`` has ``report_scores.csv`` and ``report_scores.tex`` beside it, and so on for each of its tables. The
+LaTeX needs no package; the best figures are bold.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rawaug.errors import escape
+
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "±": r"$\pm$",
+}
+
+
+def write_tables(page: Path, parts: Iterable[Mapping[str, Any]]) -> list[Path]:
+    """Write each table of a page as CSV and as LaTeX beside it.
+
+    Args:
+        page: the path of the page, after which the files are named.
+        parts: the parts of the page, see :meth:`rawaug.evaluation.page.Page.add`. Those without ``rows`` are no tables.
+
+    Returns:
+        The paths of the files.
+    """
+    paths = []
+    for part in parts:
+        if not part.get("rows"):
+            continue
+
+        name = re.sub(r"[^a-z0-9]+", "_", part["heading"].lower()).strip("_") or "table"
+        path = page.with_name(f"{page.stem}_{name}.csv")
+        write_csv(path, part["head"], part["rows"])
+        paths.append(path)
+
+        path = path.with_suffix(".tex")
+        path.write_text(latex_table(part["head"], part["rows"], part["best"]), encoding="utf-8")
+        paths.append(path)
+
+    return paths
+
+
+def write_csv(path: Path, head: Sequence[str], rows: Mapping[str, Sequence[str]]) -> None:
+    """Write a table with the names of its columns in ``head`` and its cells by the name of a row."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(head)
+        for name, cells in rows.items():
+            writer.writerow([escape(name), *cells])
+
+
+def latex_table(head: Sequence[str], rows: Mapping[str, Sequence[str]], best: Collection[tuple[str, int]] = ()) -> str:
+    r"""A table as a ``tabular`` of LaTeX.
+
+    Args:
+        head: the names of the columns.
+        rows: the cells by the name of a row.
+        best: (row, column) of the cells in bold, columns being counted from 0 behind the name.
+
+    Example:
+        >>> print(latex_table(["", "PSNR"], {"my_arm": ["40.1 ± 0.2"]}, {("my_arm", 0)}))
+        \begin{tabular}{lr}
+        \hline
+         & PSNR \\
+        \hline
+        my\_arm & \textbf{40.1 $\pm$ 0.2} \\
+        \hline
+        \end{tabular}
+        <BLANKLINE>
+    """
+    lines = [rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}", r"\hline", _line(head), r"\hline"]
+    for name, cells in rows.items():
+        texts = [_escape_latex(name)]
+        for column, cell in enumerate(cells):
+            text = _escape_latex(cell)
+            texts.append(rf"\textbf{{{text}}}" if (name, column) in best else text)
+        lines.append(" & ".join(texts) + r" \\")
+
+    lines += [r"\hline", r"\end{tabular}", ""]
+    return "\n".join(lines)
+
+
+def _line(cells: Sequence[str]) -> str:
+    return " & ".join(map(_escape_latex, cells)) + r" \\"
+
+
+def _escape_latex(text: str) -> str:
+    return "".join(_LATEX.get(character, character) for character in escape(text))

@@ -1,0 +1,180 @@
+r"""The verdict of a comparison: which method to use, or why the test cannot say.
+
+A photograph that serves as the clean reference, :math:`r = x + m`, has noise m of its own, of variance n. The test adds
+noise w of variance v. A perfect denoiser returns x and scores n; a method that keeps some of m scores better than that,
+down to
+
+.. math:: \min_h \operatorname{E} (h (m + w) - m)^2 = \frac{n v}{n + v},
+
+so that up to :math:`n - n v / (n + v) = n^2 / (n + v)` of any difference between two methods may be kept noise. Where
+the best method scores more than a perfect denoiser, or leads by less than that, the test decides nothing. Nor does it
+where one method leads in RAW and the other after development.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from statistics import fmean, stdev
+from typing import Any, NamedTuple
+
+MATTERS = 0.05
+"""The smallest gain in dB for which a trained arm is preferred to a method that needs no training."""
+
+INPUT = "the noisy input"
+"""The name of the noisy input where no other method was scored."""
+
+CLEANER_TEST = "bin the references (bin 4), or add the noise of a higher ISO"
+"""What makes a test less sensitive to the noise of its references."""
+
+Summary = Mapping[str, Any]
+"""The scores of one method, see :func:`rawaug.evaluation.scores.summary`."""
+
+
+class Verdict(NamedTuple):
+    """What a comparison recommends.
+
+    Attributes:
+        use: the name of the recommended method; empty if nothing is recommended.
+        sentence: the recommendation or the reason why there is none; empty if nothing has a PSNR.
+    """
+
+    use: str
+    sentence: str
+
+
+def verdict(results: Mapping[str, Sequence[Mapping[str, Summary]]], others: Mapping[str, Summary]) -> Verdict:
+    """Compare the arm of the highest mean PSNR with the best of the other methods.
+
+    Args:
+        results: by arm, one entry a seed, with the summary ``plain``.
+        others: summaries of methods that were not trained, by name. Without any, the arm is compared with the noisy
+            input.
+
+    Returns:
+        The recommendation, which names an arm, one of the others or :data:`INPUT`, or nothing.
+    """
+    runs_by_arm = {}
+    for arm, runs in results.items():
+        scored = [run["plain"] for run in runs if "psnr" in run["plain"]]
+        if scored:
+            runs_by_arm[arm] = scored
+
+    if not runs_by_arm:
+        return Verdict("", "")
+
+    arm = max(runs_by_arm, key=lambda name: _mean(runs_by_arm[name], "psnr"))
+    runs = runs_by_arm[arm]
+
+    rivals = {name: summary for name, summary in others.items() if "psnr" in summary}
+    if not rivals:
+        rivals = {INPUT: _of_input(runs[0])}
+
+    rival = max(rivals, key=lambda name: rivals[name]["psnr"])
+    gain = _mean(runs, "psnr") - rivals[rival]["psnr"]
+    gain_srgb = _gain_srgb(runs, rivals[rival])
+
+    doubt = _kept_noise(arm, runs, rival, rivals[rival]) or _disagreement(arm, rival, gain, gain_srgb)
+    if doubt:
+        return Verdict("", f"No recommendation: {doubt}.")
+
+    use = arm if gain >= MATTERS else rival
+    reasons = [f"{gain:+.2f} dB over {rival}"]
+    if use == rival:
+        more_or_less = "more" if gain >= 0 else "less"
+        reasons = [f"{arm}, the best arm, scores {abs(gain):.2f} dB {more_or_less}"]
+
+    reasons.append(_how_sure(runs, rivals[rival], gain))
+    if gain_srgb is not None:
+        reasons.append(f"{gain_srgb:+.2f} dB after development")
+
+    return Verdict(use, f"Use {use}: {', '.join(reasons)}.")
+
+
+def _mean(runs: Sequence[Summary], key: str) -> float:
+    return fmean(run[key] for run in runs)
+
+
+def _of_input(summary: Summary) -> dict[str, Any]:
+    """The scores of the noisy input, which every summary holds beside its own."""
+    scores: dict[str, Any] = {}
+    for key, value in summary.items():
+        if key.endswith("_noisy"):
+            scores[key.removesuffix("_noisy")] = value
+
+    scores["images"] = [{"psnr": image.get("psnr_noisy")} for image in summary["images"]]
+    return scores
+
+
+def _gain_srgb(runs: Sequence[Summary], rival: Summary) -> float | None:
+    """The mean gain over the rival after development; None where something was not developed."""
+    if not all("psnr_srgb" in scores for scores in (*runs, rival)):
+        return None
+
+    return _mean(runs, "psnr_srgb") - float(rival["psnr_srgb"])
+
+
+def _how_sure(runs: Sequence[Summary], rival: Summary, gain: float) -> str:
+    """A clause that compares the gain with the spread of the seeds, or counts frames if there is one seed."""
+    if len(runs) > 1:
+        spread = stdev(run["psnr"] for run in runs)
+        relation = "within" if abs(gain) <= spread else "more than"
+        return f"{relation} the noise of the seeds (± {spread:.2f} dB)"
+
+    pairs = list(zip(runs[0]["images"], rival["images"], strict=False))
+    higher = sum((image.get("psnr") or 0.0) > (other.get("psnr") or 0.0) for image, other in pairs)
+    return f"higher on {higher} of {len(pairs)} frames, one seed"
+
+
+def _disagreement(arm: str, rival: str, gain: float, gain_srgb: float | None) -> str:
+    """Why RAW and developed scores decide nothing together; empty where they agree."""
+    if gain_srgb is None:
+        return ""
+
+    opposed = round(gain, 2) * round(gain_srgb, 2) < 0
+    only_developed = abs(gain) < MATTERS <= gain_srgb
+    if not (opposed or only_developed):
+        return ""
+
+    return (
+        f"{arm} against {rival} gains {gain:+.2f} dB in RAW but {gain_srgb:+.2f} dB after development; "
+        "more test frames (data.test) or seeds (seeds: 3) would decide"
+    )
+
+
+def _kept_noise(arm: str, runs: Sequence[Summary], rival: str, other: Summary) -> str:
+    """Why the references' own noise leaves the comparison open; empty where it does not."""
+    best = max(runs, key=lambda run: run["psnr"])
+    name, scores = (arm, best) if best["psnr"] >= other["psnr"] else (rival, other)
+    own, added = noise_of_references(scores)
+    if own is None:
+        return ""
+
+    decides = f"to decide, {CLEANER_TEST}, or test on noisy and clean captures (pairs:PATH)"
+    if scores["own_noise"] > 1.0:
+        return (
+            f"{name} scores {scores['psnr']:.2f} dB and a perfect denoiser would score {-10 * math.log10(own):.1f} dB "
+            f"on these references, whose noise it has kept; {decides}"
+        )
+
+    errors = [10.0 ** (-one["psnr"] / 10.0) for one in (best, other)]
+    gap = abs(errors[0] - errors[1])
+    by_keeping = own**2 / (own + added) if added is not None else 0.0
+    if abs(best["psnr"] - other["psnr"]) >= MATTERS and gap <= by_keeping:
+        return f"{arm} and {rival} differ by no more than a method gains by keeping the references' noise; {decides}"
+
+    return ""
+
+
+def noise_of_references(summary: Summary) -> tuple[float | None, float | None]:
+    """The mean variance of the references' own noise and that of the noise added to them; None if not known."""
+    own = []
+    added = []
+    for image in summary["images"]:
+        if "own_noise" not in image:
+            continue
+        own.append(image["own_noise"] * 10.0 ** (-image["psnr"] / 10.0))
+        if "psnr_noisy" in image:
+            added.append(10.0 ** (-image["psnr_noisy"] / 10.0))
+
+    return fmean(own) if own else None, fmean(added) if added else None
