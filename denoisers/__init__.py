@@ -8,10 +8,9 @@ from denoisers.files import build, from_pretrained, load, save
 from denoisers.inference import SelfEnsemble, denoise_tiles
 from denoisers.joint import JointDRUNet
 from denoisers.mosaic import MosaicDRUNet
-from denoisers.network import Denoiser
+from denoisers.network import DENOISERS, Denoiser
 from denoisers.networks import DHDN, DnCNN, DRUNet, FFDNet, NAFNet, UNet
 from denoisers.published import PMRID, CycleISPDenoiser
-from rawaug.registry import DENOISERS
 
 __all__ = [
     "BM3D", "DENOISERS", "DHDN", "PMRID", "CycleISPDenoiser", "DRUNet", "Denoiser", "DnCNN", "FFDNet",

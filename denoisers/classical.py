@@ -20,7 +20,10 @@ from torch import Tensor
 from denoisers.domains import fit_levels
 from rawaug.bayer import noise_variance
 from rawaug.errors import how_to_install
-from rawaug.registry import FILTERS
+from rawaug.registry import Registry
+
+FILTERS = Registry("classical filter", "rawaug.filters", "denoisers")
+"""The filters by name: subclasses of :class:`Classical`."""
 
 Planes = np.ndarray[Any, np.dtype[np.float32]]
 

@@ -2,8 +2,8 @@
 
 A file is safetensors with string metadata that say how to build the network again: ``{"format": "rawaug", "kind":
 "denoiser", "model": "UNet", "config": <JSON: the constructor's arguments>, "info": <JSON: anything else>}``. Nothing in
-it is code; only the classes in :data:`rawaug.registry.DENOISERS` can be named. Shipped weights have a model card beside
-them, and ``recipes/base.yaml`` trained them.
+it is code; only the classes in :data:`denoisers.network.DENOISERS` can be named. Shipped weights have a model card
+beside them, and ``recipes/base.yaml`` trained them.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ from typing import Any
 
 import torch
 
-from denoisers.network import Denoiser
+from denoisers.network import DENOISERS, Denoiser
 from rawaug.files import parse_object, read_tensors, write_tensors
-from rawaug.registry import DENOISERS
 
 FORMAT, KIND = "rawaug", "denoiser"
 MOST_WEIGHTS = 2**30

@@ -15,10 +15,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.network import PACKED, conv, require_bounded
+from denoisers.network import DENOISERS, PACKED, conv, require_bounded
 from denoisers.networks import DRUNet, ResidualBlock
 from rawaug.bayer import CFA, demosaicing_stencils
-from rawaug.registry import DENOISERS
 
 RGB = 3
 REACH = 2

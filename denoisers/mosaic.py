@@ -21,10 +21,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from denoisers.domains import DOMAINS, fit_levels
-from denoisers.network import DEFECT, PACKED, Denoiser, conv, pad_to_multiple, smooth_correction
+from denoisers.network import DEFECT, DENOISERS, PACKED, Denoiser, conv, pad_to_multiple, smooth_correction
 from denoisers.networks import CONTEXT, DRUNet
 from rawaug import bayer
-from rawaug.registry import DENOISERS
 
 RGB = 3
 SITES = 4

@@ -30,7 +30,10 @@ from torch.nn import functional as F
 
 from denoisers.domains import DOMAINS, fit_levels
 from rawaug import bayer
-from rawaug.registry import require_between
+from rawaug.registry import Registry, require_between
+
+DENOISERS = Registry("denoiser", "rawaug.denoisers", "denoisers")
+"""The networks by name: subclasses of :class:`Denoiser`."""
 
 PACKED = 4
 """Channels of packed RAW: R, Gr, Gb, B."""

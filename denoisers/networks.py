@@ -11,8 +11,18 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.network import LEAK, MOST_SCALES, RESIDUAL_GAIN, Denoiser, Shared, conv, require_bounded, require_width
-from rawaug.registry import DENOISERS, require_between
+from denoisers.network import (
+    DENOISERS,
+    LEAK,
+    MOST_SCALES,
+    RESIDUAL_GAIN,
+    Denoiser,
+    Shared,
+    conv,
+    require_bounded,
+    require_width,
+)
+from rawaug.registry import require_between
 
 PUBLISHED_WIDTH = 32
 """Features of the U-Net's first scale in the paper."""

@@ -20,8 +20,7 @@ from typing import ClassVar, Unpack
 import torch
 from torch import Tensor, nn
 
-from denoisers.network import RESIDUAL_GAIN, Denoiser, Shared, conv, require_bounded, require_width
-from rawaug.registry import DENOISERS
+from denoisers.network import DENOISERS, RESIDUAL_GAIN, Denoiser, Shared, conv, require_bounded, require_width
 
 PUBLISHED_WIDTH = 16
 BLOCKS = (2, 2, 4, 4)

@@ -8,6 +8,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from rawaug.version import __version__
+
 if TYPE_CHECKING:
     from rawaug.bayer import CFA as CFA
     from rawaug.camera.fit import fit as fit
@@ -32,8 +34,6 @@ if TYPE_CHECKING:
     from rawaug.plugin.targets import Burst as Burst
     from rawaug.plugin.targets import Srgb as Srgb
     from rawaug.synthesis.folder import synth as synth
-
-__version__ = "0.1.0"
 
 _PUBLIC = {
     "rawaug.bayer": ("CFA",),

@@ -20,9 +20,9 @@ from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
-from rawaug import __version__
 from rawaug.errors import MissingExtra, escape, resource_error, strip_traceback
 from rawaug.progress import hide_progress
+from rawaug.version import __version__
 
 BAD_INPUT = 2
 COMMANDS = {

@@ -227,28 +227,3 @@ def _of_type(value: Any, parameter: inspect.Parameter, label: str) -> Any:
     if expected is not None and (not isinstance(value, expected) or (isinstance(value, bool) and bool not in expected)):
         raise ValueError(f"{label} must be {expected[-1].__name__}, got {value!r}")
     return value
-
-
-DENOISERS = Registry("denoiser", "rawaug.denoisers", "denoisers")
-"""Networks: subclasses of :class:`denoisers.Denoiser`."""
-FILTERS = Registry("classical filter", "rawaug.filters", "denoisers")
-"""Subclasses of :class:`denoisers.classical.Classical`."""
-NOISE = Registry("noise", "rawaug.noise", "rawaug.noise", "rawaug.camera")
-"""Subclasses of :class:`rawaug.noise.NoiseModel`; presets and cameras have names in :mod:`rawaug.noise.cameras`."""
-SRGB_NOISE = Registry("noise on sRGB", "rawaug.srgb_noise", "rawaug.training")
-"""Models of :class:`rawaug.training.srgb_noise.SrgbNoise`."""
-DATASETS = Registry("kind of data", "rawaug.datasets", "rawaug.data")
-"""``reader(path, split) -> Sequence[Pair]``; what ``kind:path`` opens as pairs."""
-PICTURES = Registry("kind of pictures", "rawaug.pictures", "rawaug.data")
-"""``reader(path, min_side) -> sequence of sRGB (3, H, W)``; what ``kind:path`` opens as pictures."""
-ESTIMATORS = Registry("estimator", "rawaug.estimators", "rawaug.training")
-"""Subclasses of :class:`rawaug.training.estimators.Supervised`: what a training step learns from."""
-LOSSES = Registry("loss", "rawaug.losses", "rawaug.training")
-"""Classes whose instances compare: ``loss(denoised, target) -> scalar``."""
-BASELINES = Registry("baseline", "rawaug.baselines", "rawaug.paper.baselines")
-"""Subclasses of :class:`rawaug.paper.baselines.base.BaselineISP`."""
-STAGES = Registry("stage", "rawaug.stages", "rawaug.isp")
-"""Subclasses of :class:`rawaug.isp.stages.Stage`, what an ISP is made of."""
-EXPERIMENTS = Registry("experiment", "rawaug.experiments", "rawaug.experiment", "rawaug.paper")
-"""``run(settings, overwrite)``, named by a recipe's key ``experiment``; ``settings`` is a dataclass of its keys, whose
-method ``shortest()`` gives the settings with one step of everything."""

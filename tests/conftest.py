@@ -22,12 +22,19 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
-from rawaug import registry
+from denoisers.classical import FILTERS
+from denoisers.network import DENOISERS
 from rawaug.data import demo_pairs, demo_pictures
-from rawaug.data.pairs import Pair
+from rawaug.data.pairs import DATASETS, PICTURES, Pair
+from rawaug.experiment.recipe import EXPERIMENTS
 from rawaug.files import digest
 from rawaug.isp import fast
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.stages import STAGES
+from rawaug.noise.models import NOISE
+from rawaug.paper.baselines.base import BASELINES
+from rawaug.registry import Registry
+from rawaug.training.estimators import ESTIMATORS, LOSSES
 
 torch.set_num_threads(1)
 settings.register_profile("rawaug", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -109,9 +116,9 @@ def camera_files() -> Path:
 
 
 @pytest.fixture
-def registries(monkeypatch: pytest.MonkeyPatch) -> list[registry.Registry]:
+def registries(monkeypatch: pytest.MonkeyPatch) -> list[Registry]:
     """All registries, with the built-in things in them; what a test registers is forgotten after it."""
-    kinds = [kind for kind in vars(registry).values() if isinstance(kind, registry.Registry)]
+    kinds = [BASELINES, DATASETS, DENOISERS, ESTIMATORS, EXPERIMENTS, FILTERS, LOSSES, NOISE, PICTURES, STAGES]
     for kind in kinds:
         monkeypatch.setattr(kind, "_things", {name: kind[name] for name in kind})
     return kinds
@@ -123,14 +130,14 @@ def _middles(split: str) -> list[Pair]:
 
 
 @pytest.fixture
-def tiny(registries: list[registry.Registry]) -> None:
+def tiny(registries: list[Registry]) -> None:
     """``tiny:SPLIT``: the middle of two shots by the demo camera; ``tiny:``: a corner of four of its pictures."""
 
-    @registry.DATASETS.register("tiny")
+    @DATASETS.register("tiny")
     def pairs(path: str = "", split: str = "test") -> list[Pair]:
         return list(_middles(path or split))
 
-    @registry.PICTURES.register("tiny")
+    @PICTURES.register("tiny")
     def pictures(path: str = "", min_side: int = 2) -> list[torch.Tensor]:
         return [picture[:, :128, :160] for picture in demo_pictures(4)]
 
@@ -158,10 +165,10 @@ def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def unread(registries: list[registry.Registry]) -> str:
+def unread(registries: list[Registry]) -> str:
     """The name of a dataset that must not be opened."""
 
-    @registry.DATASETS.register("unread")
+    @DATASETS.register("unread")
     def opened(path: str = "", split: str = "") -> list[Pair]:
         pytest.fail("data was read")
 
@@ -169,11 +176,11 @@ def unread(registries: list[registry.Registry]) -> str:
 
 
 @pytest.fixture
-def given(registries: list[registry.Registry]) -> list[Pair]:
+def given(registries: list[Registry]) -> list[Pair]:
     """What is opened as ``"given:"``, whatever the split: a list to be filled."""
     pairs: list[Pair] = []
 
-    @registry.DATASETS.register("given")
+    @DATASETS.register("given")
     def opened(path: str = "", split: str = "") -> list[Pair]:
         return pairs
 

@@ -12,9 +12,8 @@ from rawaug.files import files_in
 from rawaug.io import read_raw
 from rawaug.io.raw import RAW_EXTENSIONS
 from rawaug.noise.estimate import estimate_dark_noise
-from rawaug.noise.models import Params, PoissonGaussianNoise, draw_seeds
+from rawaug.noise.models import NOISE, Params, PoissonGaussianNoise, draw_seeds
 from rawaug.noise.sensor import Range, draw_between, require_not_negative
-from rawaug.registry import NOISE
 
 
 @NOISE.register("DarkFrames")

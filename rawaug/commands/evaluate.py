@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from denoisers.files import FOLDER
-from rawaug import __version__
 from rawaug.camera.psnr_r import psnr_r
 from rawaug.commands import OPTIONS, YAML
 from rawaug.data import open_pairs
@@ -29,6 +28,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseSpec, noise_model
 from rawaug.progress import progress
 from rawaug.registry import Spec
+from rawaug.version import __version__
 
 
 def run(

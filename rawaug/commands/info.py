@@ -9,12 +9,12 @@ from typing import Any
 
 import denoisers
 from denoisers.files import FOLDER
-from rawaug import __version__
-from rawaug.camera_names import camera_key, similar_cameras
 from rawaug.files import find_weights, read_header, sha256
+from rawaug.isp.camera_names import camera_key, similar_cameras
 from rawaug.isp.cameras import load_cameras
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise.cameras import SPREAD, load_profiles, measured_ranges, profile_ends
+from rawaug.version import __version__
 
 _WITH_LEVELS = 3
 """So few cameras are listed with their levels."""

@@ -20,8 +20,8 @@ from rich.text import Text
 from rawaug.commands import value_of
 from rawaug.experiment import plan
 from rawaug.experiment.plan import settings_of, use_all_pairs
-from rawaug.experiment.recipe import Recipe, find_recipe, kind_of, read_recipe, recipe_list
-from rawaug.registry import EXPERIMENTS, suggest
+from rawaug.experiment.recipe import EXPERIMENTS, Recipe, find_recipe, kind_of, read_recipe, recipe_list
+from rawaug.registry import suggest
 
 SHARED = ("channels", "variance_map", "deviation", "domain")
 """Settings that all networks have: they say what a recipe's network is for."""

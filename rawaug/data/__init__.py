@@ -12,11 +12,11 @@ from rawaug.data.drawn import Shapes, dead_leaves
 from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder
-from rawaug.data.pairs import Binned, Pair
+from rawaug.data.pairs import DATASETS, PICTURES, Binned, Pair
 from rawaug.data.sidd import SiddBenchmark, write_submission
 
 __all__ = [
-    "Binned", "DemoCamera", "Pair", "PairFolder", "PictureFolder", "RawFolder", "Shapes", "SiddBenchmark",
-    "check", "dead_leaves", "demo_pairs", "demo_photographs", "demo_pictures", "open_pairs", "open_pictures",
-    "write_submission",
+    "DATASETS", "PICTURES", "Binned", "DemoCamera", "Pair", "PairFolder", "PictureFolder", "RawFolder", "Shapes",
+    "SiddBenchmark", "check", "dead_leaves", "demo_pairs", "demo_photographs", "demo_pictures", "open_pairs",
+    "open_pictures", "write_submission",
 ]  # fmt: skip

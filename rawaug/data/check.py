@@ -21,7 +21,7 @@ from torch import Tensor
 from rawaug.data.folders import PICTURE_EXTENSIONS, PictureFolder
 from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
-from rawaug.data.pairs import Lazy, Pair
+from rawaug.data.pairs import DATASETS, PICTURES, Lazy, Pair
 from rawaug.data.published import RAWIR_FOLDERS, Rawir, Zurich
 from rawaug.data.sidd import SiddBenchmark, SiddBlocks, SiddFrames, SiddPlusBlocks, is_scene
 from rawaug.errors import escape
@@ -29,7 +29,6 @@ from rawaug.files import files_below, files_in
 from rawaug.io import RawFrame, read_raw
 from rawaug.io.isolated import isolated
 from rawaug.io.raw import RAW_EXTENSIONS
-from rawaug.registry import DATASETS, PICTURES
 
 _SHOWN = 6
 _PAIRS = "pairs:"

@@ -25,10 +25,9 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, demosaic, mosaic
 from rawaug.data.drawn import dead_leaves
-from rawaug.data.pairs import Pair, require_split
+from rawaug.data.pairs import DATASETS, PICTURES, Pair, require_split
 from rawaug.errors import extra
 from rawaug.io import decode_srgb, encode_srgb, read_picture
-from rawaug.registry import DATASETS, PICTURES
 from rawaug.seeding import keyed_generator
 
 BLACK, WHITE = 512, 4095

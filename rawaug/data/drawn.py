@@ -27,8 +27,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from rawaug.data.pairs import PICTURES
 from rawaug.errors import extra
-from rawaug.registry import PICTURES
 from rawaug.seeding import derive_seed
 
 _OVERSAMPLING = 2

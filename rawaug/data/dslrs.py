@@ -23,13 +23,12 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, mosaic
-from rawaug.data.pairs import LazyPairs, Pair
+from rawaug.data.pairs import DATASETS, LazyPairs, Pair
 from rawaug.data.scenes import camera_in_light, draw_window, scene_files
 from rawaug.io import RawFrame
 from rawaug.io.dng import write_dng
 from rawaug.io.pictures import recode_jpeg
 from rawaug.io.raw import read_raw_and_develop
-from rawaug.registry import DATASETS
 from rawaug.seeding import keyed_generator
 
 FRAME = (512, 768)

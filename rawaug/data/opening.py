@@ -11,9 +11,9 @@ from torch.utils.data import ConcatDataset
 
 from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.pair_folder import require_no_pairs
-from rawaug.data.pairs import Binned, LazyPairs, Pair
+from rawaug.data.pairs import DATASETS, PICTURES, Binned, LazyPairs, Pair
 from rawaug.io.pictures import MAX_PIXELS
-from rawaug.registry import DATASETS, PICTURES, Registry, check_settings, suggest
+from rawaug.registry import Registry, check_settings, suggest
 
 _SPLITS = ("train", "validation", "test")
 

@@ -19,9 +19,8 @@ from rawaug.bayer import CFA
 from rawaug.data.development import UNKNOWN_COLOUR, develop_pair
 from rawaug.data.folders import RawFolder
 from rawaug.data.formats import READABLE, TWO_IN_ONE, parse_metadata, read_mosaic
-from rawaug.data.pairs import LazyPairs, Pair
+from rawaug.data.pairs import DATASETS, LazyPairs, Pair
 from rawaug.files import files_below
-from rawaug.registry import DATASETS
 
 NOISY, CLEAN = "*_noisy.*", "*_clean.*"
 """The naming of ``rawaug synth``."""

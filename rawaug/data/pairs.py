@@ -32,8 +32,15 @@ from rawaug.bayer import CFA, bin_mosaic, bin_mosaic_variance, crop_to_cfa, to_b
 from rawaug.files import digest
 from rawaug.io import RawFrame
 from rawaug.io.pictures import MAX_PIXELS, decode_srgb, encode_srgb
+from rawaug.registry import Registry
 
 T = TypeVar("T")
+
+DATASETS = Registry("kind of data", "rawaug.datasets", "rawaug.data")
+"""The readers of pairs by name: ``reader(path, split) -> Sequence[Pair]``, for ``kind:path``."""
+
+PICTURES = Registry("kind of pictures", "rawaug.pictures", "rawaug.data")
+"""The readers of pictures by name: ``reader(path, min_side)`` returns a sequence of sRGB ``(3, H, W)``."""
 
 
 @dataclass(frozen=True)

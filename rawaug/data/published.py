@@ -29,13 +29,12 @@ from rawaug.bayer import CFA, unpack
 from rawaug.data.development import develop_mosaic, develop_pair
 from rawaug.data.folders import RawFolder
 from rawaug.data.formats import read_npz
-from rawaug.data.pairs import LazyPairs, Pair, require_split
+from rawaug.data.pairs import DATASETS, LazyPairs, Pair, require_split
 from rawaug.files import files_below, files_in, require_file
 from rawaug.io import read_picture, read_raw
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import read_plane
 from rawaug.io.raw import RAW_EXTENSIONS
-from rawaug.registry import DATASETS
 
 _SPLITS: dict[str, Any] = json.loads(Path(__file__).with_name("fivek.json").read_text(encoding="utf-8"))
 CAMERAS = ("canon", "nikon")

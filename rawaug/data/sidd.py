@@ -35,11 +35,10 @@ from rawaug import bayer
 from rawaug.bayer import CFA, turn_back
 from rawaug.data.development import UNKNOWN_COLOUR, develop_pair, gains_from_neutral, srgb_from_camera
 from rawaug.data.formats import read_array, read_value, to_raw
-from rawaug.data.pairs import FrameLabel, Lazy, LazyPairs, Pair, measure_levels, measure_noise
+from rawaug.data.pairs import DATASETS, FrameLabel, Lazy, LazyPairs, Pair, measure_levels, measure_noise
 from rawaug.files import files_below, require_file
 from rawaug.io import RawFrame, read_picture
 from rawaug.io.pictures import view_of_orientation
-from rawaug.registry import DATASETS
 
 T = TypeVar("T")
 

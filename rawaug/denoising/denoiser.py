@@ -21,10 +21,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 import denoisers
-from denoisers.classical import Stabilised
+from denoisers.classical import FILTERS, Stabilised
 from denoisers.files import find_denoiser, list_shipped
 from denoisers.mosaic import BayerAdapter, MosaicDRUNet, denoise_mosaic
-from denoisers.network import PACKED
+from denoisers.network import DENOISERS, PACKED
 from rawaug import bayer
 from rawaug.bayer import CFA, crop_to_cfa, noise_variance
 from rawaug.denoising.foreign import AGAIN, STRIDE, BiasFreeDnCNN, OnnxNetwork, load_published
@@ -33,7 +33,7 @@ from rawaug.io import RawFrame
 from rawaug.kernels.runtime import find_device, has_fast_bfloat16
 from rawaug.noise import anscombe
 from rawaug.progress import progress
-from rawaug.registry import DENOISERS, FILTERS, Spec, spec_label, split_spec, suggest
+from rawaug.registry import Spec, spec_label, split_spec, suggest
 
 Levels = tuple[float, float]
 """(shot_var, read_var)."""

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 import denoisers
+from denoisers.classical import FILTERS
 from denoisers.files import find_denoiser, list_shipped
 from rawaug import bayer
 from rawaug.denoising.denoiser import CPU, Noisy, progress_by
@@ -34,7 +35,7 @@ from rawaug.files import files_in, read_tensors, require_file, require_writable
 from rawaug.io.pictures import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
 from rawaug.kernels.runtime import find_device, has_fast_bfloat16
 from rawaug.progress import progress
-from rawaug.registry import FILTERS, Spec, spec_label, suggest
+from rawaug.registry import Spec, spec_label, suggest
 
 PICTURES = "rawaug-srgb"
 """What denoises pictures where no denoiser is named."""

@@ -39,14 +39,13 @@ from rawaug.errors import extra
 from rawaug.evaluation.scores import NOISY, group_rows, print_table, require_numbers, score, summary
 from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise, make_trials
 from rawaug.experiment.denoising import Results, TrainingRun
-from rawaug.experiment.recipe import NoiseSetting, Recipe
+from rawaug.experiment.recipe import EXPERIMENTS, NoiseSetting, Recipe
 from rawaug.files import fingerprint, write_json
 from rawaug.io import RawFrame, write_dng
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.targets import Target
-from rawaug.registry import EXPERIMENTS
 from rawaug.seeding import derive_seed
 from rawaug.training.stream import MosaicCrops, TrainingStream
 

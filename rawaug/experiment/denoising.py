@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import denoisers
+from denoisers.classical import FILTERS
 from denoisers.files import find_denoiser
 from denoisers.network import Denoiser
 from rawaug.bayer import CFA
@@ -41,16 +42,16 @@ from rawaug.evaluation.scores import (
 from rawaug.evaluation.trials import Trial, added_noise_note, make_trials, own_noise_note, training_noise_note, trial_of
 from rawaug.evaluation.verdict import verdict
 from rawaug.experiment.plan import claim, name_given_pairs, plan_data, require_free, require_usable, run_folder
-from rawaug.experiment.recipe import ArmConfig, Recipe
+from rawaug.experiment.recipe import EXPERIMENTS, ArmConfig, Recipe
 from rawaug.files import find_weights, fingerprint, one_at_a_time, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import RawAugment, noise_for
 from rawaug.plugin.dataset import RawPairs
-from rawaug.registry import ESTIMATORS, EXPERIMENTS, FILTERS, Spec, spec_label, split_spec
+from rawaug.registry import Spec, spec_label, split_spec
 from rawaug.seeding import derive_seed
 from rawaug.training.config import weights_key
-from rawaug.training.estimators import SelfSupervised
+from rawaug.training.estimators import ESTIMATORS, SelfSupervised
 from rawaug.training.loop import require_trainable, train
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, drop_clean, faintness_note, noisy_frame, r2r_trials
 from rawaug.training.state import first_network, start_of

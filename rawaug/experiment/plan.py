@@ -31,11 +31,11 @@ from rawaug.data.pairs import (
 )
 from rawaug.data.picture_pairs import PicturePairs, is_picture_pairs, open_picture_pairs
 from rawaug.evaluation.trials import Measured
-from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
+from rawaug.experiment.recipe import EXPERIMENTS, HELD_OUT, DataConfig, Recipe
 from rawaug.files import LOCK, find_weights, require_writable, write_json
 from rawaug.isp.model import DictionaryISP
-from rawaug.registry import ESTIMATORS, EXPERIMENTS
 from rawaug.training.config import SAME_WEIGHTS
+from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.noisy_frames import noise_of
 
 MOST_HELD_OUT = 16

@@ -18,9 +18,16 @@ from rawaug.kernels.runtime import find_device
 from rawaug.noise import noise_model
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.targets import Srgb, Target
-from rawaug.registry import ESTIMATORS, EXPERIMENTS, SRGB_NOISE, require_between, split_spec, suggest
+from rawaug.registry import Registry, require_between, split_spec, suggest
 from rawaug.training.config import MOST, DenoiserConfig, TrainConfig, Weighing
-from rawaug.training.srgb_noise import Told
+from rawaug.training.estimators import ESTIMATORS
+from rawaug.training.srgb_noise import Told, noise_on_srgb
+
+EXPERIMENTS = Registry("experiment", "rawaug.experiments", "rawaug.experiment", "rawaug.paper")
+"""The experiments by the name in a recipe's key ``experiment``: functions ``run(settings, overwrite)``.
+
+``settings`` is a dataclass of the recipe's keys, whose method ``shortest()`` gives the settings of a dry run.
+"""
 
 SHORT_CROP = 256
 """Side in pixels of the middles of frames that a dry run uses."""
@@ -241,7 +248,7 @@ class Recipe:
         for label, arm in self.arms.items():
             try:
                 if arm.srgb_noise is not None:
-                    SRGB_NOISE.make(arm.srgb_noise)
+                    noise_on_srgb(arm.srgb_noise)
                 for key in ("srgb", "srgb_noise", "told"):
                     if getattr(arm, key) is not None and self.target != "srgb":
                         raise ValueError(f"{key} is for target 'srgb', not {self.target!r}; omit it")

@@ -34,7 +34,7 @@ from rawaug.evaluation.picture_trials import picture_trials
 from rawaug.evaluation.scores import NoisyInput, Panels, Row, panels_of, print_rows, score
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.denoising import Results, TrainingRun
-from rawaug.experiment.recipe import Recipe
+from rawaug.experiment.recipe import EXPERIMENTS, Recipe
 from rawaug.files import write_json
 from rawaug.io import RawFrame, develop, write_dng
 from rawaug.io.pictures import encode_png, write_picture
@@ -44,9 +44,9 @@ from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.targets import Target
 from rawaug.progress import progress
-from rawaug.registry import EXPERIMENTS, SRGB_NOISE, Spec, spec_label, split_spec
+from rawaug.registry import Spec, spec_label, split_spec
 from rawaug.seeding import derive_seed, keyed_generator
-from rawaug.training.srgb_noise import NoisyPictures, SrgbSamples
+from rawaug.training.srgb_noise import NoisyPictures, SrgbSamples, noise_on_srgb
 from rawaug.training.stream import PictureCrops, TrainingStream
 
 BLACK, WHITE = 8192.0, 65535.0
@@ -133,7 +133,7 @@ class SrgbRun(TrainingRun):
             augment = RawAugment(isp, self.noise, draw=own.draw, target=own.srgb or "srgb")
             camera = PictureCrops(RawPairs(self.pictures, augment, recipe.train.crop, zoom=own.zoom))
         if own.srgb_noise is not None:
-            drawn = NoisyPictures(self.pictures, SRGB_NOISE.make(own.srgb_noise), recipe.train.crop, own.zoom)
+            drawn = NoisyPictures(self.pictures, noise_on_srgb(own.srgb_noise), recipe.train.crop, own.zoom)
         samples = SrgbSamples(camera, drawn, own.srgb_share, own.told)
         return TrainingStream(None, samples, recipe.train.batch, 1.0, derive_seed(seed, "stream"))
 

@@ -34,12 +34,12 @@ from rawaug.isp.stages import frame_coordinates
 from rawaug.metrics import psnr
 from rawaug.noise import noise_levels, noise_names
 from rawaug.noise.cameras import ProfileLevels
+from rawaug.noise.models import NOISE
 from rawaug.plugin.augment import RawAugment, with_iso
 from rawaug.plugin.config import AugmentConfig, pair_generator
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.pictures import trim_to_even
 from rawaug.plugin.targets import Srgb
-from rawaug.registry import NOISE
 
 DRAWS = 8
 HEIGHT, WIDTH = 512, 768

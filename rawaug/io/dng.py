@@ -28,7 +28,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug import __version__
 from rawaug.bayer import pattern, plane_indices
 from rawaug.errors import extra
 from rawaug.files import replacing
@@ -46,6 +45,7 @@ from rawaug.io.tiff import (
     opened_tiff,
     tag_damage,
 )
+from rawaug.version import __version__
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 7, 10, 12
 _BEYOND_16_BITS = 65535.5

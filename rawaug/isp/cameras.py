@@ -30,7 +30,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rawaug.camera_names import find_camera
+from rawaug.isp.camera_names import find_camera
 from rawaug.registry import suggest
 
 Array = NDArray[np.float64]

@@ -30,7 +30,7 @@ class ISPConfig:
         encoder_widths: features of the encoders' three convolutions.
         cfa: pattern of the RAW it makes.
         stages: the stages in reverse order, of ``tone gamma colour gains shading`` and whatever else is registered in
-            :data:`rawaug.registry.STAGES`; ``curve`` stands in place of ``tone gamma``.
+            :data:`rawaug.isp.stages.STAGES`; ``curve`` stands in place of ``tone gamma``.
         encoders: whether encoders look at the picture; if not, there are only learned constant weights.
         attention: whether the shading stage has its attention mask.
         knee: where Brooks' inverse gains start to spare highlights; null for gains that each channel divides by alone.

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.camera_names import find_camera
 from rawaug.files import find_weights, parse_object, read_tensors, to_json, write_tensors
 from rawaug.isp import staged, stages
+from rawaug.isp.camera_names import find_camera
 from rawaug.isp.cameras import light_range, load_cameras
 from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
 from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weights

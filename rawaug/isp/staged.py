@@ -24,10 +24,9 @@ from torch import Tensor, nn
 from rawaug.bayer import CFA
 from rawaug.isp.config import ISPConfig, ISPParams
 from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, GainDictionary, nearest_in_hull
-from rawaug.isp.stages import Stage
+from rawaug.isp.stages import STAGES, Stage
 from rawaug.isp.tone import ToneCurve, ToneDictionary
 from rawaug.kernels.reference import apply_curves
-from rawaug.registry import STAGES
 from rawaug.seeding import derive_seed, initialise_from
 
 S = TypeVar("S", bound=Stage)

@@ -36,7 +36,10 @@ from torch import Tensor, nn
 
 from rawaug.isp.config import HIGHLIGHT_KNEE, ISPConfig, ISPParams
 from rawaug.kernels.reference import mask_frame
-from rawaug.registry import STAGES
+from rawaug.registry import Registry
+
+STAGES = Registry("stage", "rawaug.stages", "rawaug.isp")
+"""The stages of an ISP by name: subclasses of :class:`Stage`."""
 
 EPS = 1e-6
 """Floor under a power: keeps the gradient of x ** (1 / gamma) finite at black."""

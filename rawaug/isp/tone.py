@@ -23,9 +23,8 @@ import torch
 from torch import Tensor, nn
 
 from rawaug.isp.config import ISPConfig, ISPParams
-from rawaug.isp.stages import BatchParams, Stage
+from rawaug.isp.stages import STAGES, BatchParams, Stage
 from rawaug.kernels.reference import apply_curves
-from rawaug.registry import STAGES
 
 STEPS = 4
 """Entries of a table for each 8-bit level."""

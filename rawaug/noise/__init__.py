@@ -20,7 +20,7 @@ from rawaug.noise.estimate import (
     plot_noise,
 )
 from rawaug.noise.levels import EldLevels, FixedLevels, Iso, NoiseLevels, PmridLevels, Preset, SiddLevels
-from rawaug.noise.models import NoiseModel, Params, PoissonGaussianNoise, ShotReadModel, ShotReadNoise
+from rawaug.noise.models import NOISE, NoiseModel, Params, PoissonGaussianNoise, ShotReadModel, ShotReadNoise
 from rawaug.noise.sensor import (
     BlackOffset,
     ColourBias,
@@ -36,7 +36,7 @@ from rawaug.noise.sensor import (
 )
 
 __all__ = [
-    "BlackOffset", "CalibratedNoise", "ColourBias", "ColumnNoise", "Compose", "DefectPixels", "EldLevels",
+    "NOISE", "BlackOffset", "CalibratedNoise", "ColourBias", "ColumnNoise", "Compose", "DefectPixels", "EldLevels",
     "EldNoise", "FixedLevels", "GreenImbalance", "Iso", "IsoLevel", "MeasuredLevels", "NoiseEstimate",
     "NoiseLevels", "NoiseModel", "NoiseSpec", "Params", "PmridLevels", "PoissonGaussianNoise", "Preset",
     "Quantisation", "RowNoise", "SensorNoise", "ShotReadModel", "ShotReadNoise", "SiddLevels", "TukeyLambdaNoise",

@@ -13,9 +13,9 @@ names                                                                what       
 ``any camera``                                                       all profiles, each alike     as measured
 ===================================================================  ===========================  ============
 
-Anything in :data:`rawaug.registry.NOISE` goes by its name as well. ``{"name": ..., "settings": {...}}`` gives settings:
-``iso`` and ``poisson`` for a name of the table, the keyword arguments of its class for a model. CalibratedNoise needs
-no name: ``{"pair_psnr": 41.18}``.
+Anything in :data:`rawaug.noise.models.NOISE` goes by its name as well. ``{"name": ..., "settings": {...}}`` gives
+settings: ``iso`` and ``poisson`` for a name of the table, the keyword arguments of its class for a model.
+CalibratedNoise needs no name: ``{"pair_psnr": 41.18}``.
 
 *Profiles.* darktable has var = a y + b for 374 cameras by ISO. Its red and blue figures contain a white balance, so the
 green ones serve all channels. It measures after demosaicing, where noise has been averaged: for four cameras that ELD
@@ -50,7 +50,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from rawaug.camera_names import camera_key, find_camera
+from rawaug.isp.camera_names import camera_key, find_camera
 from rawaug.noise.levels import (
     EldLevels,
     FixedLevels,
@@ -65,8 +65,8 @@ from rawaug.noise.levels import (
     load_presets,
     log_uniform,
 )
-from rawaug.noise.models import NoiseModel, PoissonGaussianNoise, ShotReadNoise
-from rawaug.registry import NOISE, Spec, check_settings, split_spec, suggest
+from rawaug.noise.models import NOISE, NoiseModel, PoissonGaussianNoise, ShotReadNoise
+from rawaug.registry import Spec, check_settings, split_spec, suggest
 from rawaug.seeding import keyed_generator
 
 ANY_CAMERA = "any camera"

@@ -28,7 +28,11 @@ from rawaug.kernels import fastest
 from rawaug.kernels.reference import normals
 from rawaug.kernels.runtime import eager
 from rawaug.noise.levels import NoiseLevels
+from rawaug.registry import Registry
 from rawaug.seeding import derive_seed, keyed_generator
+
+NOISE = Registry("noise", "rawaug.noise", "rawaug.noise", "rawaug.camera")
+"""The noise models by name: subclasses of :class:`NoiseModel`; presets and cameras: :mod:`rawaug.noise.cameras`."""
 
 Params = dict[str, Tensor]
 """Parameters of a batch by name: tensors whose first dimension is B."""

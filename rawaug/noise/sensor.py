@@ -26,6 +26,7 @@ from torch import Tensor
 from rawaug.noise.cameras import noise_levels
 from rawaug.noise.levels import EldLevels, FixedLevels, Iso, NoiseLevels, log_uniform, normal, uniform
 from rawaug.noise.models import (
+    NOISE,
     NoiseModel,
     Params,
     PoissonGaussianNoise,
@@ -34,7 +35,7 @@ from rawaug.noise.models import (
     draw_seeds,
     per_picture,
 )
-from rawaug.registry import NOISE, require_between
+from rawaug.registry import require_between
 
 _NO_STEP = 1e-12  # replaces a quantum of 0, where nothing is rounded
 

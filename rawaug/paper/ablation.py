@@ -23,6 +23,7 @@ from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.scores import new_figure, print_rows
 from rawaug.experiment.plan import claim, require_free
+from rawaug.experiment.recipe import EXPERIMENTS
 from rawaug.files import write_json
 from rawaug.isp import staged
 from rawaug.isp.config import POINTWISE_STAGES
@@ -31,7 +32,6 @@ from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, frame_coordinates
 from rawaug.progress import progress
-from rawaug.registry import EXPERIMENTS
 
 YUV = ((0.299, 0.587, 0.114), (-0.14713, -0.28886, 0.436), (0.615, -0.51499, -0.10001))
 """The matrix from RGB to YUV of ITU-R BT.601."""

@@ -26,6 +26,7 @@ from rawaug.data.pairs import Pair, SomePairs, names_of, select_pairs, shared_fr
 from rawaug.evaluation.scores import mean_and_spread, print_rows
 from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.plan import claim, require_free, run_folder
+from rawaug.experiment.recipe import EXPERIMENTS
 from rawaug.files import fingerprint, write_json
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
@@ -47,7 +48,6 @@ from rawaug.paper.methods import (
 )
 from rawaug.plugin.pictures import trim_to_even
 from rawaug.progress import progress
-from rawaug.registry import EXPERIMENTS
 from rawaug.training.config import weights_key
 from rawaug.training.loop import require_trainable
 

@@ -20,7 +20,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from rawaug import __version__
 from rawaug.data.formats import write_npz, write_tiff
 from rawaug.files import digest, find_weights, read_header, replacing, sha256, write_tensors
 from rawaug.io import GainMap, RawFrame, read_picture, write_dng
@@ -31,6 +30,7 @@ from rawaug.plugin.config import AugmentConfig, pair_generator
 from rawaug.plugin.params import AugmentParams, RawPair, load_params
 from rawaug.plugin.pictures import trim_to_even
 from rawaug.plugin.targets import Target
+from rawaug.version import __version__
 
 LONGEST_STEM = 200
 """Bytes of a picture's name in those of its pairs, which have at most 255."""

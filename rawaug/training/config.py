@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from denoisers.network import DENOISERS
 from rawaug.files import fingerprint
-from rawaug.registry import DENOISERS, LOSSES, require_between
+from rawaug.registry import require_between
+from rawaug.training.estimators import LOSSES
 
 MOST = 2**31
 """The largest number of steps, samples or processes that a setting may have."""

@@ -52,7 +52,13 @@ from denoisers.domains import DOMAINS, fit_levels
 from denoisers.network import Denoiser
 from rawaug.bayer import noise_variance
 from rawaug.data.pairs import Sample
-from rawaug.registry import ESTIMATORS, LOSSES
+from rawaug.registry import Registry
+
+ESTIMATORS = Registry("estimator", "rawaug.estimators", "rawaug.training")
+"""The estimators by name: subclasses of :class:`Supervised`, which say what a training step learns from."""
+
+LOSSES = Registry("loss", "rawaug.losses", "rawaug.training")
+"""The losses by name: classes whose instances are called as ``loss(denoised, target) -> scalar``."""
 
 Criterion = Callable[[Tensor, Tensor], Tensor]
 """``criterion(denoised, target)``: two batches ``(B, 4, h, w)`` to a scalar."""

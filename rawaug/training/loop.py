@@ -30,9 +30,8 @@ from rawaug.files import replacing
 from rawaug.kernels.runtime import find_device
 from rawaug.metrics import psnr
 from rawaug.progress import progress
-from rawaug.registry import LOSSES
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.estimators import Criterion, Supervised, weigh_loss
+from rawaug.training.estimators import LOSSES, Criterion, Supervised, weigh_loss
 from rawaug.training.state import TrainingState, first_network
 from rawaug.training.stream import StepSampler, TrainingStream
 

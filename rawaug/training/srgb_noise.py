@@ -28,7 +28,7 @@ from rawaug.noise.models import Params, draw_normals, draw_seeds, per_picture, p
 from rawaug.plugin.dataset import crop_size, draw_patch
 from rawaug.plugin.finishing import blur
 from rawaug.plugin.targets import compress_jpeg
-from rawaug.registry import SRGB_NOISE, require_between
+from rawaug.registry import Spec, check_settings, require_between, split_spec, suggest
 from rawaug.seeding import keyed_generator
 from rawaug.training.stream import PictureCrops
 
@@ -36,7 +36,7 @@ _LUMA = torch.tensor([0.299, 0.587, 0.114], device="cpu")
 
 
 class SrgbNoise(Protocol):
-    """A model of :data:`rawaug.registry.SRGB_NOISE`."""
+    """A model of noise on sRGB; :func:`noise_on_srgb` makes one by its name."""
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         """Parameters of ``batch`` pictures."""
@@ -47,7 +47,6 @@ class SrgbNoise(Protocol):
         ...
 
 
-@SRGB_NOISE.register("Gaussian")
 class WhiteNoise:
     """White Gaussian noise of a standard deviation drawn uniformly between the limits ``sigma``, in units of 1/255."""
 
@@ -64,7 +63,6 @@ class WhiteNoise:
         return (srgb + per_picture(params["sigma"], srgb) * normals).clamp_(0.0, 1.0)
 
 
-@SRGB_NOISE.register("BSRGAN")
 class BsrganNoise:
     """Gaussian noise (white, grey, or correlated between the colours: 2, 2 and 1 of 5), some Poisson noise, JPEG.
 
@@ -110,7 +108,6 @@ class BsrganNoise:
         return compress_jpeg(noisy.clamp_(0.0, 1.0), params["quality"])
 
 
-@SRGB_NOISE.register("Coloured")
 class ColouredNoise:
     """Gaussian noise, white or blurred and partly the same in all colours, then JPEG in half of the pictures.
 
@@ -158,6 +155,27 @@ class ColouredNoise:
         if (stored := params["quality"] > 0).any():
             noisy[stored] = compress_jpeg(noisy[stored], params["quality"][stored], params["chroma_420"][stored])
         return noisy
+
+
+MODELS: dict[str, type[SrgbNoise]] = {"BSRGAN": BsrganNoise, "Coloured": ColouredNoise, "Gaussian": WhiteNoise}
+"""The models by the names that recipes use."""
+
+
+def noise_on_srgb(spec: Spec) -> SrgbNoise:
+    """Make a model of noise on sRGB from its name, or from ``{"name": ..., "settings": {...}}``.
+
+    Raises:
+        ValueError: if there is no such name or setting.
+
+    Example:
+        >>> noise_on_srgb({"name": "Gaussian", "settings": {"sigma": [0, 25]}}).sigma
+        (0, 25)
+    """
+    name, settings = split_spec(spec)
+    if name not in MODELS:
+        raise ValueError(f"noise on sRGB {name!r} is unknown; use one of {', '.join(MODELS)}{suggest(name, MODELS)}")
+    model = MODELS[name]
+    return model(**check_settings(f"noise on sRGB {name}", model, settings))
 
 
 def _mixing(basis: Tensor, scales: Tensor) -> Tensor:

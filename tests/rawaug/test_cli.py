@@ -14,12 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from denoisers.classical import FILTERS
 from rawaug.cli import COMMANDS, app, main
 from rawaug.commands.run import keys_of
 from rawaug.data import demo_pictures
 from rawaug.experiment.plan import settings_of
+from rawaug.experiment.recipe import EXPERIMENTS
 from rawaug.io import write_picture
-from rawaug.registry import EXPERIMENTS, FILTERS
 
 QUICK_FIT = ["--steps", "4", "--curve-steps", "10", "--prior-steps", "10", "--pixels", "512", "--batch", "128"]
 TINY = [
@@ -229,7 +230,7 @@ def test_networks_take_memory_in_huge_pages_unless_told_otherwise(
 def test_what_a_file_of_ones_own_registers_is_used_by_name(tmp_path: Path, refused: Callable[..., str]) -> None:
     (tmp_path / "own_filter.py").write_text(
         "from denoisers.classical import Classical\n"
-        "from rawaug.registry import FILTERS\n"
+        "from denoisers.classical import FILTERS\n"
         "@FILTERS.register('Nothing')\n"
         "class Nothing(Classical):\n"
         "    def denoise(self, planes):\n"

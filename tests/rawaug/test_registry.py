@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from denoisers.classical import FILTERS
+from rawaug.data.pairs import DATASETS
 from rawaug.experiment.recipe import ArmConfig
 from rawaug.noise import EldNoise, SensorNoise, noise_model
-from rawaug.registry import BASELINES, DATASETS, ESTIMATORS, FILTERS, LOSSES, Registry, split_spec
-from rawaug.training.estimators import R2R, Noisier
+from rawaug.paper.baselines.base import BASELINES
+from rawaug.registry import Registry, split_spec
+from rawaug.training.estimators import ESTIMATORS, LOSSES, R2R, Noisier
 
 
 def test_every_kind_finds_the_things_in_its_package() -> None:

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
-from rawaug.registry import STAGES, require_between
+from rawaug.isp.stages import STAGES
+from rawaug.registry import require_between
 
 MOST = 2**31
 """The most steps or pixels that a setting may ask for."""

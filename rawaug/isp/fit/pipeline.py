@@ -22,7 +22,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rawaug import __version__
 from rawaug.files import digest
 from rawaug.isp import stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
@@ -35,6 +34,7 @@ from rawaug.isp.stages import LensShading, Stage
 from rawaug.kernels.runtime import one_thread
 from rawaug.progress import progress as progress_of
 from rawaug.seeding import derive_seed
+from rawaug.version import __version__
 
 STANDARD_CURVES = ((2.2, 0.0), (2.4, 0.055 / 1.055), (1.0 / 0.45, 0.099 / 1.099))
 """gamma and toe a of a plain gamma camera, of sRGB (IEC 61966-2-1) and of ITU-R BT.709."""

@@ -15,13 +15,12 @@ invgrey     Xia et al., TOG 2018, as InvISP compares it  0.74 M       descent   
 Parameters are those of the reverse pass at the default, published size.
 """
 
-from rawaug.paper.baselines.base import BaselineISP, Training, fit_baseline
+from rawaug.paper.baselines.base import BASELINES, BaselineISP, Training, fit_baseline
 from rawaug.paper.baselines.cycleisp import CycleISP
 from rawaug.paper.baselines.invertible_grey import InvertibleGrey
 from rawaug.paper.baselines.invisp import InvISP, JpegInvISP
 from rawaug.paper.baselines.unet import UNetISP
 from rawaug.paper.baselines.upi import UPI, TunedUPI
-from rawaug.registry import BASELINES
 
 __all__ = [
     "BASELINES", "UPI", "BaselineISP", "CycleISP", "InvISP", "InvertibleGrey", "JpegInvISP", "Training", "TunedUPI",

@@ -30,7 +30,11 @@ from rawaug.isp.fit.descent import adam
 from rawaug.isp.fit.samples import FramePair
 from rawaug.isp.stages import as_float
 from rawaug.progress import progress as progress_bar
+from rawaug.registry import Registry
 from rawaug.seeding import keyed_generator
+
+BASELINES = Registry("baseline", "rawaug.baselines", "rawaug.paper.baselines")
+"""The baselines by name: subclasses of :class:`BaselineISP`."""
 
 CLIP_NORM = 1.0
 """The gradient's largest norm. Short fits need high rates, at which the U-Net diverges without this limit."""

@@ -22,8 +22,7 @@ from denoisers import published
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.stages import as_float
-from rawaug.paper.baselines.base import Crops, CropTrainedISP
-from rawaug.registry import BASELINES
+from rawaug.paper.baselines.base import BASELINES, Crops, CropTrainedISP
 from rawaug.seeding import derive_seed, initialise_from
 
 LOG_FLOOR = 1e-3

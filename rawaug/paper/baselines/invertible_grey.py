@@ -20,9 +20,8 @@ from torch import Tensor, nn
 
 from denoisers.network import pad_to_multiple
 from rawaug.bayer import CFA
-from rawaug.paper.baselines.base import Crops
+from rawaug.paper.baselines.base import BASELINES, Crops
 from rawaug.paper.baselines.invisp import CompressedISP
-from rawaug.registry import BASELINES
 from rawaug.seeding import derive_seed, initialise_from
 
 

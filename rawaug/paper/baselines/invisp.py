@@ -26,9 +26,8 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp import stages
 from rawaug.isp.fit.samples import FramePair
-from rawaug.paper.baselines.base import Crops, CropTrainedISP
+from rawaug.paper.baselines.base import BASELINES, Crops, CropTrainedISP
 from rawaug.paper.baselines.jpeg import jpeg
-from rawaug.registry import BASELINES
 from rawaug.seeding import derive_seed, initialise_from
 
 SCALE_CLAMP = 0.8

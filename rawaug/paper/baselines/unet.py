@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from denoisers.networks import PUBLISHED_WIDTH, UNet
 from rawaug.bayer import CFA
-from rawaug.paper.baselines.base import CropTrainedISP
-from rawaug.registry import BASELINES
+from rawaug.paper.baselines.base import BASELINES, CropTrainedISP
 
 
 @BASELINES.register("unet")

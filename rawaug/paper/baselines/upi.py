@@ -26,8 +26,7 @@ from rawaug.isp import stages
 from rawaug.isp.cameras import SRGB_TO_XYZ
 from rawaug.isp.config import HIGHLIGHT_KNEE
 from rawaug.isp.fit.samples import FramePair, PixelSamples, sample_pixels
-from rawaug.paper.baselines.base import BaselineISP, Training
-from rawaug.registry import BASELINES
+from rawaug.paper.baselines.base import BASELINES, BaselineISP, Training
 
 GAMMA = 2.2
 XYZ_TO_CAMERA = (

@@ -19,8 +19,7 @@ from rawaug.commands.benchmark import named
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.denoising.foreign import BiasFreeDnCNN
 from rawaug.experiment.demosaicing import JointRecipe
-from rawaug.experiment.recipe import ArmConfig, DataConfig
-from rawaug.registry import EXPERIMENTS
+from rawaug.experiment.recipe import EXPERIMENTS, ArmConfig, DataConfig
 from rawaug.training.config import DenoiserConfig
 
 LEVELS = (1.8e-3, 1.2e-5)

@@ -14,12 +14,11 @@ from rawaug.cli import main
 from rawaug.commands.run import with_values
 from rawaug.experiment import plan
 from rawaug.experiment.plan import settings_of
-from rawaug.experiment.recipe import ArmConfig, Recipe, find_recipe, kind_of, read_recipe
+from rawaug.experiment.recipe import EXPERIMENTS, ArmConfig, Recipe, find_recipe, kind_of, read_recipe
 from rawaug.isp.fit.samples import BLOCK
 from rawaug.paper.baselines import BASELINES
 from rawaug.paper.methods import FAMILIES, ROWS
 from rawaug.paper.reconstruction import Comparison
-from rawaug.registry import EXPERIMENTS
 from rawaug.training.config import TrainConfig, Weighing
 
 FOLDER = find_recipe("fewshot").parent

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 import torch
 
+from denoisers.network import DENOISERS
 from rawaug.bayer import CFA
 from rawaug.commands.run import run
 from rawaug.data import demo_pairs
 from rawaug.evaluation.verdict import verdict
 from rawaug.experiment import plan
 from rawaug.experiment.denoising import TrainingRun
-from rawaug.registry import DENOISERS
 from rawaug.training.noisy_frames import NoisyFrame, faintness_note, noise_of
 
 

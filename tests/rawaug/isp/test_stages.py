@@ -14,10 +14,9 @@ from rawaug.isp import stages
 from rawaug.isp.config import POINTWISE_STAGES, ISPConfig, ISPParams
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import Stage, Tables
+from rawaug.isp.stages import STAGES, Stage, Tables
 from rawaug.isp.tone import ToneDictionary, to_code, to_linear
 from rawaug.metrics import psnr
-from rawaug.registry import STAGES
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from rawaug.data.pairs import Sample
-from rawaug.registry import SRGB_NOISE
 from rawaug.training import srgb_noise
 from rawaug.training.srgb_noise import (
+    MODELS,
     BsrganNoise,
     ColouredNoise,
     NoisyPictures,
@@ -21,6 +21,7 @@ from rawaug.training.srgb_noise import (
     SrgbSamples,
     Told,
     WhiteNoise,
+    noise_on_srgb,
 )
 
 GREY = torch.full((6, 3, 128, 128), 0.5)
@@ -94,9 +95,9 @@ def test_jpeg_of_lower_quality_is_further_away() -> None:
     assert 0 < near < far / 2
 
 
-@pytest.mark.parametrize("name", list(SRGB_NOISE))
+@pytest.mark.parametrize("name", list(MODELS))
 def test_a_sample_replays_and_keeps_the_picture(name: str) -> None:
-    model = SRGB_NOISE.make(name)
+    model = noise_on_srgb(name)
     params = model.sample(6, torch.Generator().manual_seed(4))
     noisy = model.apply(GREY, params)
     assert torch.equal(noisy, model.apply(GREY, params)) and 0 <= noisy.min() < noisy.max() <= 1

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from rawaug.camera_names import camera_key, find_camera, similar_cameras
 from rawaug.cli import main
+from rawaug.isp.camera_names import camera_key, find_camera, similar_cameras
 from rawaug.isp.cameras import load_cameras
 from rawaug.noise.cameras import load_profiles, noise_levels
 
