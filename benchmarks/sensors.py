@@ -26,7 +26,6 @@ from rawaug.denoising.corrections import Corrections
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.evaluation.scores import Denoiser, NoisyInput, print_rows
 from rawaug.io import RawFrame
-from rawaug.io.masked import measure_masked
 from rawaug.noise import SensorNoise
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
@@ -38,23 +37,16 @@ SENSORS: dict[str, dict[str, Any]] = {
     "told half the variance": {"told": 0.5},
     "told twice the variance": {"told": 2.0},
     "black offset 2e-3, by colour 1e-3": {"black_offset_sd": 2e-3, "colour_bias_sd": 1e-3},
-    "the same, masked pixels known": {
-        "black_offset_sd": 2e-3,
-        "colour_bias_sd": 1e-3,
-        "correct": Corrections(greens="keep"),
-    },
     "row_var 2e-6": {"row_var": 2e-6},
     "row_var 1e-5": {"row_var": 1e-5},
     "heavy tails (Tukey lambda -0.2)": {"tukey_lambda": -0.2},
 }
 GREENS: dict[str, dict[str, Any]] = {
     "whole frames": {},
-    "whole frames, balanced": {"correct": Corrections(black="keep")},
+    "whole frames, balanced": {"correct": Corrections()},
     "greens differ by 1 %": {"green_imbalance": 0.01},
-    "greens differ by 1 %, balanced": {"green_imbalance": 0.01, "correct": Corrections(black="keep")},
+    "greens differ by 1 %, balanced": {"green_imbalance": 0.01, "correct": Corrections()},
 }
-BLACK, WHITE, MASKED = 32, 1023, 52
-"""Digital numbers, and columns of masked pixels, of the Canon files."""
 WEAK = ((2e-5, 1e-8), (1.6e-4, 1e-7), (6e-4, 1e-6))
 BRIGHT = ((2e-3, 1e-5), (1e-2, 1e-4))
 CLIPPED, BESIDE = 0.99, 3
@@ -72,18 +64,9 @@ def noisy_shots(
         params = noise.sample(1, keyed_generator(0, "sensors", name))
         noisy = noise.apply(clean, params)
         if correct is not None:
-            dark = noise.apply(torch.zeros(1, 4, clean.shape[-2], MASKED // 2), params)
-            noisy = corrected(noisy, dark, correct)
+            frame = RawFrame(bayer.unpack(noisy, CFA.RGGB)[0], CFA.RGGB)
+            noisy = bayer.pack(correct(frame)[0].mosaic[None], CFA.RGGB)
         yield clean, Noisy.of(noisy, (told * levels[0], told * levels[1]), CFA.RGGB)
-
-
-def corrected(noisy: Tensor, dark: Tensor, correct: Corrections) -> Tensor:
-    """Packed RAW ``(1, 4, h, w)``, masked pixels ``(1, 4, h, m)`` at its left, as ``rawaug denoise`` corrects it."""
-    wide = bayer.unpack(torch.cat([dark, noisy], -1), CFA.RGGB)[0, 0]
-    numbers = (wide * (WHITE - BLACK) + BLACK).round().numpy()
-    masked = measure_masked(numbers, (0, MASKED, numbers.shape[0], numbers.shape[1] - MASKED), CFA.RGGB)
-    frame = RawFrame(wide[None, :, MASKED:], CFA.RGGB, (BLACK,) * 4, WHITE, masked=masked)
-    return bayer.pack(correct(frame)[0].mosaic[None], CFA.RGGB)
 
 
 def balanced(clean: Tensor) -> Tensor:

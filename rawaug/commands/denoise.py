@@ -31,7 +31,6 @@ def run(
     linear: bool = False,
     self_ensemble: bool = False,
     greens: Correction = "auto",
-    black: Correction = "auto",
     device: str = "auto",
     preview: str | None = None,
     json: str | None = None,
@@ -55,8 +54,6 @@ def run(
         self_ensemble: average eight views of a network, at eight times the cost (rawaug-srgb averages two as it is).
         greens: auto makes the two greens of a Bayer sensor agree where they clearly differ, since demosaicing makes a
             maze of the difference; keep leaves them.
-        black: auto takes the black level from masked pixels, where the file has them, their margins agree and they tell
-            another level than its tags; keep takes that of the tags.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         preview: also write the result, developed by LibRaw, as this .jpg or .png.
         json: write to this file what was done to each RAW file: noise levels, corrections, seconds.
@@ -64,7 +61,7 @@ def run(
     """
     if is_picture(source):
         given = {"classical": classical, "linear": linear, "preview": preview}
-        given |= {"greens": greens != "auto", "black": black != "auto", "json": json}
+        given |= {"greens": greens != "auto", "json": json}
         if unfit := [name for name, value in given.items() if value] + ["noise"] * (noise != "auto"):
             options = ", ".join(f"--{name.replace('_', '-')}" for name in unfit)
             raise ValueError(f"{source}: is a developed picture; {options} is for RAW")
@@ -74,7 +71,7 @@ def run(
         return
     if json:
         require_writable(Path(json))
-    corrections = Corrections(greens, black)
+    corrections = Corrections(greens)
     made = chosen(denoiser, classical, self_ensemble, device, linear, strength)
     if not Path(source).is_dir():
         done = denoise_file(source, out, made, noise, corrections=corrections, preview=preview, overwrite=overwrite)

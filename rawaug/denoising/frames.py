@@ -75,7 +75,6 @@ def denoise(
     strength: float = 1.0,
     self_ensemble: bool = False,
     greens: Correction = "auto",
-    black: Correction = "auto",
     device: str = "auto",
     overwrite: bool = False,
 ) -> RawFrame:
@@ -88,8 +87,7 @@ def denoise(
         noise: where the noise levels come from, see :data:`rawaug.denoising.levels.Noise`.
         strength: 1 removes the noise, 0.7 leaves 30% of it, 0 changes nothing.
         self_ensemble: average eight views, at eight times the cost.
-        greens, black: ``"keep"`` leaves greens that differ, and the file's black level where masked pixels tell
-            another one; see :class:`rawaug.denoising.corrections.Corrections`.
+        greens: ``"keep"`` leaves greens that differ; see :class:`rawaug.denoising.corrections.Corrections`.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         overwrite: replace ``out`` if it exists.
 
@@ -110,7 +108,7 @@ def denoise(
     if out is not None:
         _require_new(Path(out), overwrite)
     frame = source if isinstance(source, RawFrame) else read_raw(source)
-    denoised, _, _ = _denoised(frame, made, load_noise(noise, made), Corrections(greens, black))
+    denoised, _, _ = _denoised(frame, made, load_noise(noise, made), Corrections(greens))
     if out is not None:
         _write(Path(out), denoised, None if isinstance(source, RawFrame) else Path(source))
     return denoised

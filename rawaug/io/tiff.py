@@ -6,9 +6,11 @@ plane, with noise variance S y + O for a signal y whose black is 0 and white 1: 
 
 from __future__ import annotations
 
+import logging
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -22,23 +24,69 @@ from rawaug.io.isolated import damage_as_os_error
 MOST_PAGES = 64
 """More than any RAW file has. Damaged offsets make circles of directories, in which a reader never ends."""
 
-MAKE, MODEL, DNG_VERSION, _NOISE_PROFILE = 271, 272, 50706, 51041
+MAKE, MODEL, ORIENTATION, DNG_VERSION, NOISE_PROFILE = 271, 272, 274, 50706, 51041
+_LINEARIZATION, _RAW_DIGEST, _NEW_RAW_DIGEST = 50712, 50972, 51111
 _CFA_REPEATS, _CFA_PATTERN = 33421, 33422
-_BLACK_REPEATS, _BLACK, _BLACK_DELTAS = 50713, 50714, (50716, 50715)
+_BLACK_REPEATS, _BLACK, _BLACK_COLUMNS, _BLACK_ROWS = 50713, 50714, 50715, 50716
 ACTIVE_AREA = 50829
 OPCODE_LIST_2, OPCODE_LIST_3 = 51009, 51022
 CFA_PHOTOMETRIC, LINEAR_PHOTOMETRIC = 32803, 34892
+LOSSLESS_JPEG = 7
 _RATIONALS = (5, 10)
+_DIGEST_BYTES = 16
+
+
+@dataclass(frozen=True)
+class StoredMosaic:
+    """How a DNG stores its mosaic.
+
+    Attributes:
+        size: height and width, margins included.
+        compression: TIFF's number; 1 is none, 7 lossless JPEG.
+        segments: offset and length in bytes of each strip or tile.
+        plain: whether the stored numbers are whole ones of 9 to 16 bits that no table translates.
+        digest: MD5 of the numbers, row by row (RawImageDigest); None if the file has none.
+        tiled_digest: MD5 of the digests of tiles of 256 x 256 (NewRawImageDigest); None if the file has none.
+    """
+
+    size: tuple[int, int]
+    compression: int
+    segments: tuple[tuple[int, int], ...]
+    plain: bool = True
+    digest: bytes | None = None
+    tiled_digest: bytes | None = None
+
+    @property
+    def end(self) -> int:
+        """Bytes that the file has at least."""
+        return max((offset + length for offset, length in self.segments), default=0)
 
 
 @dataclass(frozen=True)
 class TiffTags:
-    """Each field is None where the tag is missing or the file is not a TIFF."""
+    """Tags of a RAW file; each field has its default where the tag is missing or the file is not a TIFF.
+
+    Attributes:
+        make, model: of the camera.
+        noise_profile: (shot_var, read_var), the mean over planes.
+        noise_fault: what is wrong with a NoiseProfile that cannot be used; empty if nothing is.
+        orientations: EXIF's numbers, of every directory that states one.
+        compressions: TIFF's numbers, of every directory of a DNG.
+        mosaic: how a DNG stores its mosaic.
+        black: levels of a cell that repeats over the active area, ``(rows, columns)``.
+        gain_maps: a DNG's correction of the lens shading.
+        black_rows, black_columns: by how much the level of each row and column differs from their mean.
+        area: first row and column of the active area.
+        cfa: rows of the pattern's cell, in the letters R, G and B.
+    """
 
     make: str | None = None
     model: str | None = None
     noise_profile: tuple[float, float] | None = None
-    mosaic_end: int | None = None
+    noise_fault: str = ""
+    orientations: tuple[int, ...] = ()
+    compressions: tuple[int, ...] = ()
+    mosaic: StoredMosaic | None = None
     black: np.ndarray | None = None
     gain_maps: tuple[GainMap, ...] = ()
     black_rows: Sequence[float] = ()
@@ -54,21 +102,58 @@ def read_tiff_tags(path: Path) -> TiffTags:
 
     try:
         with opened_tiff(path) as tiff:
-            pages = all_pages(tiff)
-            make, model = (pages[0].tags.valueof(code) if pages else None for code in (MAKE, MODEL))
-            if not any(DNG_VERSION in page.tags for page in pages):
-                return TiffTags(make, model)
-            mosaic = main_mosaic(pages)
-            profile = _noise_profile(pages)
-            if mosaic is None:
-                return TiffTags(make, model, profile)
-            (above, rows), (beside, columns) = (_deltas(mosaic, code) for code in _BLACK_DELTAS)
-            black, maps = _black(mosaic, above + beside), _gain_maps(mosaic)
-            end = max(map(sum, zip(mosaic.dataoffsets, mosaic.databytecounts, strict=True)), default=None)
-            area = mosaic.tags.valueof(ACTIVE_AREA) or (0, 0)
-            return TiffTags(make, model, profile, end, black, maps, rows, columns, area[:2], _cfa(mosaic))
+            return _tags_of(all_pages(tiff))
     except tifffile.TiffFileError:
         return TiffTags()
+
+
+def _tags_of(pages: list[Any]) -> TiffTags:
+    if not pages:
+        return TiffTags()
+
+    make = pages[0].tags.valueof(MAKE)
+    model = pages[0].tags.valueof(MODEL)
+    orientations = tuple(int(page.tags.valueof(ORIENTATION)) for page in pages if ORIENTATION in page.tags)
+    if not any(DNG_VERSION in page.tags for page in pages):
+        return TiffTags(make, model, orientations=orientations)
+
+    profile, fault = _noise_profile(pages)
+    tags = TiffTags(make, model, profile, fault, orientations, tuple(int(page.compression) for page in pages))
+    page = main_mosaic(pages)
+    if page is None:
+        return tags
+
+    row_mean, rows = _deltas(page, _BLACK_ROWS)
+    column_mean, columns = _deltas(page, _BLACK_COLUMNS)
+    area = page.tags.valueof(ACTIVE_AREA) or (0, 0)
+    return replace(
+        tags,
+        mosaic=_stored_mosaic(page, pages[0]),
+        black=_black(page, row_mean + column_mean),
+        gain_maps=_gain_maps(page),
+        black_rows=rows,
+        black_columns=columns,
+        area=(area[0], area[1]),
+        cfa=_cfa(page),
+    )
+
+
+def _stored_mosaic(page: Any, first: Any) -> StoredMosaic:
+    return StoredMosaic(
+        size=(page.imagelength, page.imagewidth),
+        compression=int(page.compression),
+        segments=tuple(zip(page.dataoffsets, page.databytecounts, strict=True)),
+        plain=8 < page.bitspersample <= 16 and page.sampleformat == 1 and _LINEARIZATION not in page.tags,
+        digest=_digest(first, _RAW_DIGEST),
+        tiled_digest=_digest(first, _NEW_RAW_DIGEST),
+    )
+
+
+def _digest(page: Any, code: int) -> bytes | None:
+    value = page.tags.valueof(code)
+    if value is None or len(bytes(value)) != _DIGEST_BYTES or not any(bytes(value)):  # GoPros write zeros
+        return None
+    return bytes(value)
 
 
 @contextmanager
@@ -77,8 +162,24 @@ def opened_tiff(path: Path) -> Iterator[Any]:
     with extra("raw"):
         import tifffile
 
-    with tag_damage(path), tifffile.TiffFile(path) as tiff:
+    with _quiet_tifffile(), tag_damage(path), tifffile.TiffFile(path) as tiff:
         yield tiff
+
+
+@contextmanager
+def _quiet_tifffile() -> Iterator[None]:
+    """Keep tifffile's log lines of this thread away: what matters of a file is said by rawaug's own errors."""
+    logger = logging.getLogger("tifffile")
+    thread = threading.get_ident()
+
+    def is_of_others(record: logging.LogRecord) -> bool:
+        return record.thread != thread
+
+    logger.addFilter(is_of_others)
+    try:
+        yield
+    finally:
+        logger.removeFilter(is_of_others)
 
 
 def tag_damage(path: Path) -> AbstractContextManager[None]:
@@ -109,15 +210,24 @@ def main_mosaic(pages: list[Any]) -> Any:
     return max(mosaics, key=lambda page: page.imagelength * page.imagewidth, default=None)
 
 
-def _noise_profile(pages: list[Any]) -> tuple[float, float] | None:
+def _noise_profile(pages: list[Any]) -> tuple[tuple[float, float] | None, str]:
+    """The mean over planes of the first profile, and what is wrong with it if it cannot be used."""
     for page in pages:
-        values = page.tags.valueof(_NOISE_PROFILE)
-        if values:
-            shot_var, read_var = (sum(values[k::2]) / (len(values) // 2) for k in (0, 1))
-            if not (0 <= shot_var <= 1 and 0 <= read_var <= 1):
-                raise ValueError(f"NoiseProfile {shot_var:g}, {read_var:g}")
-            return shot_var, read_var
-    return None
+        tag = page.tags.get(NOISE_PROFILE)
+        if tag is None:
+            continue
+
+        values = np.ravel(tag.value).astype(np.float64)
+        if len(values) < 2 or len(values) % 2:
+            return None, f"has {len(values)} values, not pairs"
+
+        shot_vars, read_vars = values[0::2], values[1::2]
+        in_range = bool(((values >= 0) & (values <= 1)).all())  # False for NaN, too
+        if not in_range or not (shot_vars + read_vars > 0).all():
+            return None, f"is out of range: {', '.join(f'{value:g}' for value in values)}"
+        count = len(shot_vars)
+        return (sum(shot_vars.tolist()) / count, sum(read_vars.tolist()) / count), ""
+    return None, ""
 
 
 def _numbers(tag: Any) -> Any:
@@ -146,6 +256,8 @@ def _black(mosaic: Any, more: float) -> np.ndarray | None:
     if tag is None:
         return np.full((1, 1), more) if more else None
     levels = _numbers(tag) + more
+    if not np.isfinite(levels).all():
+        raise ValueError("BlackLevel: levels that are not finite")
     rows, columns = mosaic.tags.valueof(_BLACK_REPEATS) or (1, 1)
     return levels.reshape(rows, columns) if len(levels) == rows * columns else None
 

@@ -23,7 +23,7 @@ def write_dng(
     path: Path,
     numbers: np.ndarray,
     cfa: str | None = "RGGB",
-    black: Sequence[int] = (0,),
+    black: Sequence[int] | None = (0,),
     white: int = 4095,
     white_balance: Sequence[float] = (2.0, 1.0, 1.6),
     color_matrix: Sequence[Sequence[float]] | None = XYZ_TO_CAMERA,
@@ -32,7 +32,8 @@ def write_dng(
     extra: Sequence[tuple[Any, ...]] = (),
     **layout: Any,
 ) -> Path:
-    """Write uint16 ``(H, W)`` as a Bayer DNG, ``(H, W, 3)`` as a linear one; ``black`` is one level, or one a site.
+    """Write uint16 ``(H, W)`` as a Bayer DNG, ``(H, W, 3)`` as a linear one; ``black`` is one level, one a
+    site, or None where ``extra`` states it.
 
     ``layout`` is tifffile's: strips, tiles, byte order.
     """
@@ -43,13 +44,14 @@ def write_dng(
         (274, short, 1, orientation, True),
         (50706, byte, 4, bytes((1, 4, 0, 0)), True),
         (50708, text, 0, "Maker Model 1", True),
-        (50714, short, len(black), tuple(black), True),
         (50717, short, 1, white, True),
         (50728, rational, 3, _rationals([1 / gain for gain in white_balance], 10**6), True),
     ]
     if cfa is not None:
         tags += [(33421, short, 2, (2, 2), True), (33422, byte, 4, bytes("RGB".index(c) for c in cfa), True)]
-    if len(black) == 4:
+    if black is not None:
+        tags.append((50714, short, len(black), tuple(black), True))
+    if black is not None and len(black) == 4:
         tags.append((50713, short, 2, (2, 2), True))
     if color_matrix is not None:
         tags += [(50721, srational, 9, _rationals(np.ravel(color_matrix).tolist()), True), (50778, short, 1, 21, True)]

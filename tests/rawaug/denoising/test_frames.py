@@ -21,12 +21,10 @@ import rawaug
 from rawaug.bayer import CFA, mosaic, pack, unpack
 from rawaug.cli import main
 from rawaug.commands.denoise import run
-from rawaug.denoising.corrections import Corrections
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.denoising.frames import denoise_file, denoise_folder
 from rawaug.denoising.levels import find_levels
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng
-from rawaug.io.masked import MaskedPixels
 from rawaug.noise import noise_levels
 
 LEVELS = (1e-3, 1e-5)
@@ -385,21 +383,3 @@ def test_a_link_to_itself_is_refused_in_one_line(name: str, tmp_path: Path) -> N
     (tmp_path / name).symlink_to(tmp_path / name)
     with pytest.raises(OSError, match=rf"{name}: cannot be opened"):
         run(str(tmp_path / name), str(tmp_path / f"out-{name}"))
-
-
-def test_the_black_level_of_masked_pixels_is_used_where_it_is_clearly_another() -> None:
-    true = torch.full((1, 64, 64), 0.25)
-    black, masked = (512.0,) * 4, MaskedPixels((520.0, 515.0, 517.0, 512.0), error=0.1, spread=0.5, sites=10_000)
-    levels = unpack(torch.tensor(masked.black)[:, None, None].expand(4, 32, 32), CFA.GRBG)
-    numbers = true * (16383 - levels) + levels
-    numbers[0, :8] = 16383
-    frame = RawFrame((numbers - 512) / (16383 - 512), CFA.GRBG, black, 16383, masked=masked)
-    corrected, found = Corrections()(frame)
-    assert found.black_moved and corrected.black == black
-    assert (corrected.mosaic[0, 8:] - 0.25).abs().max() < 1e-6 and (corrected.mosaic[0, :8] == 1).all()
-    for kept, corrections in (
-        (frame, Corrections(black="keep")),
-        (dataclasses.replace(frame, masked=dataclasses.replace(masked, spread=9.0)), Corrections()),
-    ):
-        same, found = corrections(kept)
-        assert not found.black_moved and torch.equal(same.mosaic, kept.mosaic) and "not used" in str(found)

@@ -1,0 +1,76 @@
+"""CRW files, Canon's RAW of 1998 to 2004: what the camera says of the exposure, which LibRaw does not give.
+
+A CRW is a heap of records in heaps. A heap ends with the place of its directory, whose entries of ten bytes are a tag,
+a size and a place. ShotInfo (tag 0x102a) has the exposure in steps of 1/32, thirds rounded: the f-number is
+``2^(v / 2)`` and the exposure time ``2^-v``. Source: P. Harvey, "The Canon RAW (CRW) File Format".
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+_SIGNATURE = b"HEAPCCDR"
+_SHOT_INFO = 0x102A
+_HEAPS = (0x300A, 0x300B)
+"""The heap of the picture's properties, and that of the exposure in it."""
+_F_NUMBER, _SECONDS = 21, 22
+_MOST_ENTRIES, _DEEPEST = 1000, 4
+
+
+class ShotInfo(NamedTuple):
+    """The exposure that the camera made; None where it does not say."""
+
+    seconds: float | None
+    f_number: float | None
+
+
+def read_shot_info(path: Path) -> ShotInfo | None:
+    """The exposure in a CRW file; None if it is another kind of file, or does not say."""
+    with path.open("rb") as file:
+        header = file.read(14)
+        if header[6:] != _SIGNATURE or header[:2] not in (b"II", b"MM"):
+            return None
+        order = "<" if header[:2] == b"II" else ">"
+        (start,) = struct.unpack_from(order + "I", header, 2)
+        try:
+            values = _find_shot_info(file, order, start, path.stat().st_size, 0)
+        except struct.error:  # a damaged heap; what matters is the mosaic
+            return None
+
+    if values is None or len(values) <= _SECONDS:
+        return None
+    seconds, f_number = values[_SECONDS], values[_F_NUMBER]
+    return ShotInfo(
+        seconds=2.0 ** -_stops(seconds) if seconds else None,
+        f_number=2.0 ** (_stops(f_number) / 2) if f_number else None,
+    )
+
+
+def _find_shot_info(file: BinaryIO, order: str, start: int, end: int, depth: int) -> tuple[int, ...] | None:
+    """The numbers of ShotInfo in the heap from ``start`` to ``end``; None if it is not there."""
+    file.seek(max(0, end - 4))
+    (place,) = struct.unpack(order + "I", file.read(4))
+    file.seek(start + place)
+    (count,) = struct.unpack(order + "H", file.read(2))
+    entries = file.read(10 * min(count, _MOST_ENTRIES))
+
+    for tag, size, offset in struct.iter_unpack(order + "HII", entries):
+        if tag == _SHOT_INFO:
+            file.seek(start + offset)
+            data = file.read(min(size, 2 * _MOST_ENTRIES))
+            return struct.unpack(f"{order}{len(data) // 2}h", data[: len(data) // 2 * 2])
+        if tag in _HEAPS and depth < _DEEPEST:
+            values = _find_shot_info(file, order, start + offset, start + offset + size, depth + 1)
+            if values is not None:
+                return values
+    return None
+
+
+def _stops(value: int) -> float:
+    """Canon's steps of 1/32 as stops; 12 and 20 stand for thirds."""
+    whole, part = divmod(abs(value), 32)
+    part_of_stop = {12: 32 / 3, 20: 64 / 3}.get(part, float(part)) / 32
+    stops = whole + part_of_stop
+    return stops if value >= 0 else -stops

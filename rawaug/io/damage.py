@@ -1,0 +1,127 @@
+"""Whether the mosaic of a DNG is whole, where its decoder notices nothing.
+
+A hole in the middle of a file (a download that stopped, a failing card) decodes to numbers of some kind. Two things
+tell it. First, the MD5 of the mosaic, which Adobe's programs and this project write (RawImageDigest, NewRawImageDigest).
+Second, lossless JPEG: its code words have many lengths, so that the data of a damaged stream end before its pixels do,
+or after them. To see which, the last bytes of a stream are changed, others are put behind them, and it is decoded
+again: in a sound stream the last samples change, and no others do.
+
+Source: DNG specification 1.4, chapter 4; ITU-T T.81, annex H.
+"""
+
+from __future__ import annotations
+
+from hashlib import md5
+from pathlib import Path
+
+import numpy as np
+
+from rawaug.errors import extra
+from rawaug.io.tiff import LOSSLESS_JPEG, StoredMosaic
+
+_TILE = 256
+"""Side of the tiles of NewRawImageDigest."""
+_END = b"\xff\xd9"
+"""The marker at the end of a JPEG stream."""
+_CHANGED_BYTES, _MORE = (2, 16), b"\x5a\x33" * 32
+"""How many bytes are changed at the end of the data, more of them if the last two are padding; and what is put behind
+them, for a decoder that reads on."""
+
+
+def find_fault(path: Path, stored: StoredMosaic, numbers: np.ndarray | None) -> str:
+    """What is wrong with the mosaic of a DNG; empty if nothing is.
+
+    Args:
+        path: the file.
+        stored: how it stores the mosaic.
+        numbers: all digital numbers ``(H, W)`` as decoded, margins included; None if they are not at hand.
+    """
+    if numbers is not None and stored.plain and numbers.shape == stored.size:
+        if stored.tiled_digest is not None:
+            return "" if tiled_digest(numbers) == stored.tiled_digest else "its pixels do not match NewRawImageDigest"
+        if stored.digest is not None:
+            same = md5(_bytes(numbers), usedforsecurity=False).digest() == stored.digest
+            return "" if same else "its pixels do not match RawImageDigest"
+
+    if stored.compression == LOSSLESS_JPEG:
+        return _find_fault_in_streams(path, stored)
+    return ""
+
+
+def tiled_digest(numbers: np.ndarray) -> bytes:
+    """NewRawImageDigest of digital numbers ``(H, W)``: the MD5 of the MD5s of tiles of 256 x 256."""
+    height, width = numbers.shape
+    digests = md5(usedforsecurity=False)
+    for top in range(0, height, _TILE):
+        for left in range(0, width, _TILE):
+            tile = numbers[top : top + _TILE, left : left + _TILE]
+            digests.update(md5(_bytes(tile), usedforsecurity=False).digest())
+    return digests.digest()
+
+
+def _bytes(numbers: np.ndarray) -> bytes:
+    return np.ascontiguousarray(numbers, "<u2").tobytes()
+
+
+def _find_fault_in_streams(path: Path, stored: StoredMosaic) -> str:
+    samples = 0
+    count = len(stored.segments)
+    with path.open("rb") as file:
+        for number, (offset, length) in enumerate(stored.segments, 1):
+            file.seek(offset)
+            stream = file.read(length)
+            decoded = _decode(stream)
+            if decoded is None:
+                return f"part {number} of {count} cannot be decoded"
+            if not _ends_with_its_data(stream, decoded):
+                return f"the data of part {number} of {count} do not end with its pixels"
+            samples += decoded.size
+
+    height, width = stored.size
+    if samples < height * width:
+        return f"holds {samples} of {height * width} sites"
+    return ""
+
+
+def _decode(stream: bytes) -> np.ndarray | None:
+    """The samples of a lossless JPEG; None if no decoder takes it."""
+    with extra("raw"):
+        import imagecodecs
+
+    for decode in (imagecodecs.jpeg8_decode, imagecodecs.ljpeg_decode):
+        try:
+            return np.asarray(decode(stream))
+        except Exception:  # each codec has an error of its own
+            continue
+    return None
+
+
+def _ends_with_its_data(stream: bytes, decoded: np.ndarray) -> bool:
+    end = stream.rfind(_END)
+    if end < 0:
+        end = len(stream)
+
+    for count in _CHANGED_BYTES:
+        first = _first_change(stream, end, count, decoded)
+        if first is not None:
+            shortest_code_word = 1  # bit
+            most = 8 * (count + 1) // shortest_code_word
+            return decoded.size - first <= most
+    return False
+
+
+def _first_change(stream: bytes, end: int, count: int, decoded: np.ndarray) -> int | None:
+    """The first sample that changes with the last ``count`` bytes before ``end``; None if none does."""
+    with extra("raw"):
+        import imagecodecs
+
+    start = max(1, end - count)
+    if stream[start - 1] == 0xFF:  # what follows must not become a marker
+        start -= 1
+    others = bytes(0x5A if byte != 0x5A else 0x33 for byte in stream[start:end])
+    try:
+        again = imagecodecs.jpeg8_decode(stream[:start] + others + _MORE + _END)
+    except Exception:  # a kind of stream that only the other decoder takes
+        return decoded.size
+    changed = np.flatnonzero(again.ravel() != decoded.ravel())
+    return int(changed[0]) if changed.size else None

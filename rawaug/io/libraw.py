@@ -1,0 +1,204 @@
+"""RAW files opened and unpacked by LibRaw, whose complaints become one line that names the file.
+
+LibRaw writes what it finds damaged to the standard error stream and goes on. What it did not decode is then memory that
+it never wrote to, which may hold the pixels of the file before. So that stream is caught while LibRaw unpacks. Memory
+is filled with :data:`FILL` first, where the C library can do so (glibc), which tells the sites that were left out.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import tempfile
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rawaug.errors import extra
+from rawaug.files import require_file
+from rawaug.io.damage import find_fault
+from rawaug.io.pictures import require_utf8
+from rawaug.io.tiff import TiffTags, read_tiff_tags
+
+MAX_PIXELS = 200_000_000
+"""Larger mosaics are refused before they are decoded; the largest sensors have 150 million sites."""
+
+FILL = 0xFEFE
+"""The number that every site of a mosaic holds before it is decoded."""
+
+SMALLEST_GAP = 64
+"""Fewer sites of this number may be defects of the sensor."""
+
+KNOWN_PATTERNS = "Bayer, X-Trans and Quad-Bayer RAW is supported"
+
+_DEVELOPED = (b"\xff\xd8\xff", b"\x89PNG", b"RIFF", b"GIF8", b"\x00\x00\x00\x0cJXL", b"\xff\x0a")
+"""How files begin that hold a picture and never RAW: JPEG, PNG, WebP, GIF, JPEG XL."""
+
+_UNREAD_COMPRESSIONS = {52546: "JPEG XL (DNG 1.7)", 34892: "lossy JPEG", 8: "deflate", 32946: "deflate"}
+"""What LibRaw may fail to decode, by TIFF's number."""
+
+_COMPLAINT = re.compile(r": (Unexpected end of file|data corrupted at -?\d+)$")
+_M_PERTURB = -6
+"""glibc's parameter of ``mallopt``: new memory is filled with the complement of this byte."""
+
+
+@contextmanager
+def opened_raw(path: Path, unpack: bool = True) -> Iterator[tuple[Any, TiffTags]]:
+    """The file, its mosaic decoded if it is to be unpacked, and its TIFF tags.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        OSError: if LibRaw cannot read it, or it is truncated or damaged inside.
+        ValueError: if it is a developed picture, or too large.
+    """
+    with extra("raw"):
+        import rawpy
+
+    require_file(path, "RAW file")
+    require_utf8(path)
+    # rawpy warns of forks, which rendering on one thread makes safe
+    warnings.filterwarnings("ignore", "rawpy is being used in a process created by", RuntimeWarning)
+
+    try:
+        with caught_stderr():
+            opened = rawpy.imread(str(path))
+        with opened as raw:
+            tags = read_tiff_tags(path)
+            _require_size(path, raw, tags)
+            if unpack:
+                _unpack(path, raw, tags)
+            yield raw, tags
+    except rawpy.LibRawError as error:
+        raise _explained(path, error) from error
+    except NotImplementedError as error:  # rawpy's, of a mosaic without a repeating cell
+        raise ValueError(f"{path}: has no mosaic of a known pattern ({error}); {KNOWN_PATTERNS}") from error
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        raise OSError(f"{path}: its white balance or colour matrix is damaged ({error}); copy it again") from error
+
+
+def _require_size(path: Path, raw: Any, tags: TiffTags) -> None:
+    """Raise an error if the file is shorter than its tags say, or declares too many pixels."""
+    size = path.stat().st_size
+    if tags.mosaic is not None and tags.mosaic.end > size:
+        raise OSError(f"{path}: cannot be read as RAW: truncated, {size} of {tags.mosaic.end} bytes")
+
+    height, width = raw.sizes.raw_height, raw.sizes.raw_width
+    if height * width > MAX_PIXELS:
+        raise ValueError(f"{path}: declares {height} x {width} pixels, above the limit of {MAX_PIXELS}; copy it again")
+
+
+def _unpack(path: Path, raw: Any, tags: TiffTags) -> None:
+    """Decode the mosaic; OSError if a part of it is not there."""
+    with caught_stderr() as lines, _filled_memory() as filled:
+        raw.unpack()
+    if lines:
+        raise OSError(f"{path}: is damaged inside (LibRaw: {lines[0]}); copy it again")
+
+    numbers = None if is_stack(raw) else raw.raw_image
+    if tags.mosaic is not None:
+        fault = find_fault(path, tags.mosaic, numbers)
+        if fault:
+            raise OSError(f"{path}: is damaged inside ({fault}); copy it again")
+
+    if filled and numbers is not None and raw.white_level < FILL:
+        visible = raw.raw_image_visible
+        missing = int((visible == FILL).sum())
+        if missing >= SMALLEST_GAP:
+            raise OSError(f"{path}: is damaged inside ({missing} of {visible.size} sites are missing); copy it again")
+
+
+def is_stack(raw: Any) -> bool:
+    """Whether a file has all colours at every pixel."""
+    with extra("raw"):
+        import rawpy
+
+    return bool(raw.raw_type == rawpy.RawType.Stack)
+
+
+def _explained(path: Path, error: Any) -> Exception:
+    """LibRaw's error as one that says what the file is, where its content tells."""
+    with extra("raw"):
+        import rawpy
+
+    with path.open("rb") as file:
+        if file.read(12).startswith(_DEVELOPED):
+            return ValueError(f"{path}: this is a developed picture, not RAW; give the camera's RAW file")
+
+    reason = str(error)
+    if error.args and isinstance(error.args[0], bytes):
+        reason = error.args[0].decode("ascii", "replace")
+
+    try:
+        compressions = read_tiff_tags(path).compressions
+    except OSError:
+        compressions = ()
+    for number, name in _UNREAD_COMPRESSIONS.items():
+        if number in compressions and isinstance(error, rawpy.LibRawFileUnsupportedError):
+            advice = "convert it to a DNG in lossless JPEG, as Adobe DNG Converter writes it"
+            return ValueError(f"{path}: is compressed as {name}, which LibRaw does not read ({reason}); {advice}")
+
+    advice = "check that it is complete and from a supported camera"
+    return OSError(f"{path}: cannot be read as RAW (LibRaw: {reason}); {advice}")
+
+
+# -- the standard error stream and the memory of C code ----------------------------------------------------------------
+
+_stderr_lock = threading.Lock()
+
+
+def _renew_lock() -> None:
+    global _stderr_lock
+    _stderr_lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_renew_lock)  # another thread may have held it
+
+
+@contextmanager
+def caught_stderr() -> Iterator[list[str]]:
+    """Catch LibRaw's complaints, which are in the list after the block; other lines are passed on."""
+    complaints: list[str] = []
+    with _stderr_lock:
+        try:
+            terminal = os.dup(2)
+        except OSError:  # a process without a standard error stream
+            yield complaints
+            return
+
+        with tempfile.TemporaryFile() as file:
+            os.dup2(file.fileno(), 2)
+            try:
+                yield complaints
+            finally:
+                os.dup2(terminal, 2)
+                os.close(terminal)
+                file.seek(0)
+                for line in file.read().splitlines():
+                    complaint = _COMPLAINT.search(line.decode("utf-8", "replace"))
+                    if complaint:
+                        complaints.append(complaint[1])
+                    else:
+                        os.write(2, line + b"\n")
+
+
+@contextmanager
+def _filled_memory() -> Iterator[bool]:
+    """Have the C library fill new memory with :data:`FILL`; False where it cannot."""
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):
+        yield False
+        return
+
+    accepted = mallopt(_M_PERTURB, ~FILL & 0xFF)
+    try:
+        yield bool(accepted)
+    finally:
+        mallopt(_M_PERTURB, 0)

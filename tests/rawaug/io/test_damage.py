@@ -1,0 +1,140 @@
+"""DNGs that are damaged inside, whose decoder notices nothing, and gaps that hold another file's pixels."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+import pytest
+import tifffile
+import torch
+
+from rawaug.io import RawFrame, libraw, read_raw, write_dng
+from rawaug.io.damage import find_fault, tiled_digest
+from rawaug.io.libraw import FILL, SMALLEST_GAP
+from rawaug.io.tiff import StoredMosaic
+
+Dng = Callable[..., Path]
+STRIP_BYTES, DIGESTS = 279, (50972, 51111)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("whole") / "whole.dng"
+    picture = torch.rand(1, 1, 12, 16, generator=torch.Generator().manual_seed(0))
+    mosaic = 0.1 + 0.6 * torch.nn.functional.interpolate(picture, (192, 256), mode="bilinear")[0]
+    mosaic += 0.02 * torch.randn(mosaic.shape, generator=torch.Generator().manual_seed(1))
+    write_dng(path, RawFrame(mosaic.clamp(0, 1), "RGGB", (512.0,) * 4, 16383.0))
+    return path
+
+
+def without_digests(path: Path, out: Path) -> Path:
+    """Another copy, so that only the stream tells."""
+    shutil.copy(path, out)
+    with tifffile.TiffFile(out, mode="r+") as tiff:
+        for code in DIGESTS:
+            if code in tiff.pages.first.tags:
+                tiff.pages.first.tags[code].overwrite(bytes(16))
+    return out
+
+
+def strip_of(path: Path) -> tuple[int, int]:
+    with tifffile.TiffFile(path) as tiff:
+        page = tiff.pages.first
+        return page.dataoffsets[0], page.databytecounts[0]
+
+
+def overwrite(path: Path, part: float, data: bytes) -> Path:
+    """Put other data into the mosaic, from a part of its strip on."""
+    offset, length = strip_of(path)
+    content = bytearray(path.read_bytes())
+    start = offset + int(part * length)
+    content[start : start + len(data)] = data
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize("hole", [512, 4096])
+@pytest.mark.parametrize("part", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("filler", [0, 0x5A])
+def test_a_hole_in_the_stream_is_told(hole: int, part: float, filler: int, whole: Path, tmp_path: Path) -> None:
+    damaged = overwrite(without_digests(whole, tmp_path / "a.dng"), part, bytes([filler]) * hole)
+    with pytest.raises(OSError, match=r"a\.dng: is damaged inside"):
+        read_raw(damaged)
+
+
+def test_a_strip_of_a_few_bytes_is_told(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    damaged = without_digests(whole, tmp_path / "a.dng")
+    _, length = strip_of(damaged)
+    overwrite(damaged, 22 / length, b"\xff\xd9" + bytes(length - 24))
+    with tifffile.TiffFile(damaged, mode="r+") as tiff:
+        tiff.pages.first.tags[STRIP_BYTES].overwrite(22)
+    with pytest.raises(OSError, match="damaged inside"):
+        read_raw(damaged)
+
+    # without this check, no pixel of the file before stands in the gap
+    monkeypatch.setattr(libraw, "find_fault", lambda *_: "")
+    read_raw(whole)
+    with pytest.raises(OSError, match="sites are missing"):
+        read_raw(damaged)
+    monkeypatch.setattr(libraw, "SMALLEST_GAP", 2**31)
+    numbers = read_raw(damaged).mosaic * (16383 - 512) + 512
+    assert not torch.isclose(numbers, read_raw(whole).mosaic * (16383 - 512) + 512).any()
+
+
+def test_a_changed_bit_is_told_by_the_digest(whole: Path, bayer_dng: Dng, tmp_path: Path) -> None:
+    numbers = np.random.default_rng(0).integers(0, 4096, (300, 520)).astype(np.uint16)
+    digest = tiled_digest(numbers)
+    good = bayer_dng(tmp_path / "good.dng", numbers, extra=[(51111, 1, 16, digest, True)])
+    read_raw(good)
+    overwrite(good, 0.5, struct.pack("<H", int(numbers[150, 0]) ^ 1))
+    with pytest.raises(OSError, match="NewRawImageDigest"):
+        read_raw(good)
+    zeros = bayer_dng(tmp_path / "zeros.dng", numbers, extra=[(51111, 1, 16, bytes(16), True)])
+    read_raw(zeros)  # as GoPros write it
+
+
+def test_the_digest_is_that_of_adobes_programs() -> None:
+    numbers = (np.arange(300)[:, None] * 7 + np.arange(520) * 13).astype(np.uint16)
+    assert tiled_digest(numbers).hex() == "926eddda169b800e62fdc19114ea1d56"
+
+
+@pytest.mark.parametrize("kind", ["flat", "noise", "ramp", "16 bits"])
+@pytest.mark.parametrize("predictor", range(1, 8))
+@pytest.mark.parametrize("padding", [b"", b"\0" * 512])
+def test_sound_streams_of_any_kind_pass(kind: str, predictor: int, padding: bytes, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    numbers = {
+        "flat": np.full((64, 48, 2), 700, np.uint16),
+        "noise": rng.integers(0, 16384, (64, 48, 2)).astype(np.uint16),
+        "ramp": np.arange(64 * 96).reshape(64, 48, 2).astype(np.uint16),
+        "16 bits": rng.integers(0, 65536, (64, 48, 2)).astype(np.uint16),
+    }[kind]
+    stream = imagecodecs.jpeg8_encode(numbers, lossless=True, predictor=predictor, bitspersample=16)
+    (tmp_path / "a").write_bytes(b"12345678" + stream + padding)
+    stored = StoredMosaic((64, 96), 7, ((8, len(stream) + len(padding)),))
+    assert find_fault(tmp_path / "a", stored, None) == ""
+
+
+def test_a_gap_needs_more_than_defects_of_the_sensor(bayer_dng: Dng, tmp_path: Path) -> None:
+    numbers = np.full((32, 48), 1000, np.uint16)
+    numbers.ravel()[: SMALLEST_GAP - 1] = FILL
+    read_raw(bayer_dng(tmp_path / "a.dng", numbers))
+
+
+def test_libraws_complaints_are_errors_of_ours(whole: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = overwrite(without_digests(whole, tmp_path / "a.dng"), 0.5, b"\xff\xd0")  # a marker in the middle
+    with pytest.raises(OSError, match=r"a\.dng: .*LibRaw"):
+        read_raw(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_lines_of_others_reach_the_standard_error_stream(capfd: pytest.CaptureFixture[str]) -> None:
+    with libraw.caught_stderr() as complaints:
+        os.write(2, b"a.dng: data corrupted at 12\nof others\n")
+    assert complaints == ["data corrupted at 12"] and capfd.readouterr().err == "of others\n"
