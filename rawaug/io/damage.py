@@ -1,10 +1,10 @@
 """Whether the mosaic of a DNG is whole, where its decoder notices nothing.
 
 A hole in the middle of a file (a download that stopped, a failing card) decodes to numbers of some kind. Two things
-tell it. First, the MD5 of the mosaic, which Adobe's programs and this project write (RawImageDigest, NewRawImageDigest).
-Second, lossless JPEG: its code words have many lengths, so that the data of a damaged stream end before its pixels do,
-or after them. To see which, the last bytes of a stream are changed, others are put behind them, and it is decoded
-again: in a sound stream the last samples change, and no others do.
+tell it. The first is the MD5 of the mosaic, as Adobe's programs and this project write it (tags RawImageDigest and
+NewRawImageDigest). The second is lossless JPEG itself: its code words have many lengths, so that the data of a damaged
+stream end before its pixels do, or after them. To see which, the last bytes of a stream are changed, others are put
+behind them, and it is decoded again: in a sound stream the last samples change, and no others do.
 
 Source: DNG specification 1.4, chapter 4; ITU-T T.81, annex H.
 """
