@@ -18,7 +18,8 @@ from rawaug.bayer import CFA, crop_to_cfa, pack
 from rawaug.data import Binned, open_pairs
 from rawaug.data.pairs import SomePairs, centre
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
-from rawaug.evaluation.scores import Denoiser, NoisyInput, print_rows
+from rawaug.evaluation.scores import Denoiser, NoisyInput
+from rawaug.evaluation.tables import print_rows
 from rawaug.metrics import psnr
 from rawaug.noise import noise_model
 from rawaug.progress import progress

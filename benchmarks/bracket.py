@@ -38,7 +38,8 @@ from rawaug.data.folders import RAW_EXTENSIONS, files_in  # type: ignore[attr-de
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.levels import UnknownNoise, find_levels
-from rawaug.evaluation.scores import Denoiser, NoisyInput, print_rows
+from rawaug.evaluation.scores import Denoiser, NoisyInput
+from rawaug.evaluation.tables import print_rows
 from rawaug.io import RawFrame, read_raw
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator

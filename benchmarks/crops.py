@@ -22,7 +22,7 @@ from rawaug.data import DemoCamera, open_pairs
 from rawaug.data.demo import FRAME
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.evaluation.scores import PANEL, Panels, panels_of, save_picture
+from rawaug.evaluation.figures import PANEL, Panels, panels_of, save_picture
 from rawaug.evaluation.trials import trial_of
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.seeding import keyed_generator

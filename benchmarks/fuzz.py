@@ -45,7 +45,7 @@ from rawaug.commands.run import with_values
 from rawaug.data.formats import read_mosaic, read_value
 from rawaug.data.published import read_packed
 from rawaug.data.sidd import colour_of, mosaic_of
-from rawaug.evaluation.scores import print_rows
+from rawaug.evaluation.tables import print_rows
 from rawaug.experiment.plan import settings_of
 from rawaug.experiment.recipe import Recipe, kind_of, read_recipe
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng

@@ -23,7 +23,8 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pairs import Binned, Middles, Pair
 from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.evaluation.scores import compare, print_rows, to_domain
+from rawaug.evaluation.scores import compare, to_domain
+from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.demosaicing import libraw_demosaic, mosaic_of, mosaic_trial
 from rawaug.noise import anscombe, noise_model

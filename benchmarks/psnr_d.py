@@ -27,7 +27,8 @@ from benchmarks.measure import parser
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.evaluation.scores import Row, mean_and_spread, print_rows, score
+from rawaug.evaluation.scores import Row, score
+from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.recipe import find_recipe, read_recipe
 from rawaug.files import write_json

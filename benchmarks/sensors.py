@@ -24,7 +24,8 @@ from rawaug.data import open_pairs
 from rawaug.data.pairs import centre
 from rawaug.denoising.corrections import Corrections
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
-from rawaug.evaluation.scores import Denoiser, NoisyInput, print_rows
+from rawaug.evaluation.scores import Denoiser, NoisyInput
+from rawaug.evaluation.tables import print_rows
 from rawaug.io import RawFrame
 from rawaug.noise import SensorNoise
 from rawaug.progress import progress

@@ -25,9 +25,10 @@ from rawaug.evaluation.benchmark import (
     tables,
     trials,
 )
-from rawaug.evaluation.page import Figure, Page, plot_costs
+from rawaug.evaluation.figures import plot_costs
+from rawaug.evaluation.page import Figure, Page
 from rawaug.evaluation.picture_trials import picture_scores, print_pictures
-from rawaug.evaluation.scores import print_rows
+from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Measured, own_noise_note
 from rawaug.files import require_writable, write_json
 

@@ -19,9 +19,11 @@ from rawaug.data.pairs import Binned
 from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
 from rawaug.denoising.denoiser import RawDenoiser, require_classical
 from rawaug.denoising.pictures import PictureDenoiser
+from rawaug.evaluation.figures import panels_of
 from rawaug.evaluation.page import Page, select_for_page
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, print_pictures
-from rawaug.evaluation.scores import NOISY, Row, group_rows, panels_of, print_scores, require_numbers, score, summary
+from rawaug.evaluation.scores import NOISY, Row, group_rows, require_numbers, score, summary
+from rawaug.evaluation.tables import print_scores
 from rawaug.evaluation.trials import Measured, Trial, make_trials, own_noise_note, trial_of
 from rawaug.files import find_weights, read_header, require_writable, sha256, write_json
 from rawaug.isp.model import DictionaryISP

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import pattern
-from rawaug.evaluation.scores import new_figure
+from rawaug.evaluation.figures import new_figure
 from rawaug.explore.views import stage_pictures
 from rawaug.files import require_writable
 from rawaug.io import read_picture

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from rawaug.commands import OPTIONS, value_of
 from rawaug.errors import escape
-from rawaug.evaluation.scores import print_rows
+from rawaug.evaluation.tables import print_rows
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.config import AugmentConfig
 from rawaug.plugin.draw import Draw

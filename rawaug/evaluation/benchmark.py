@@ -21,7 +21,9 @@ from torch.utils.flop_counter import FlopCounterMode
 from rawaug import bayer
 from rawaug.data.pairs import Pair, centre
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
-from rawaug.evaluation.scores import METRICS, NOISY, Panels, group_rows, join_figures, panels_of, score, summary
+from rawaug.evaluation.figures import Panels, panels_of
+from rawaug.evaluation.scores import METRICS, NOISY, group_rows, score, summary
+from rawaug.evaluation.tables import join_figures
 from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise, raw_trial
 from rawaug.files import digest
 from rawaug.noise import FixedLevels, NoiseLevels, SensorNoise, ShotReadNoise, estimate_noise, noise_levels

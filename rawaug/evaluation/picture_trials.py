@@ -18,7 +18,8 @@ from torch import Tensor
 
 from rawaug.data.picture_pairs import PicturePair
 from rawaug.errors import extra
-from rawaug.evaluation.scores import NOISY, Denoiser, group_rows, print_rows, score, summary
+from rawaug.evaluation.scores import NOISY, Denoiser, group_rows, score, summary
+from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial, make_trials
 
 PUBLISHED, REGISTERED = "as published", "registered"

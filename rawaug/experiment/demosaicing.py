@@ -36,7 +36,8 @@ from rawaug.data.development import exposure_of, render_rgb
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.errors import extra
-from rawaug.evaluation.scores import NOISY, group_rows, print_table, require_numbers, score, summary
+from rawaug.evaluation.scores import NOISY, group_rows, require_numbers, score, summary
+from rawaug.evaluation.tables import print_table
 from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise, make_trials
 from rawaug.experiment.denoising import Results, TrainingRun
 from rawaug.experiment.recipe import EXPERIMENTS, NoiseSetting, Recipe

@@ -25,20 +25,10 @@ from rawaug.data.folders import reports
 from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, stamps
 from rawaug.denoising.denoiser import RawDenoiser, require_classical
 from rawaug.errors import extra
-from rawaug.evaluation.page import Page, plot_curves, select_for_page
-from rawaug.evaluation.scores import (
-    NOISY,
-    Panels,
-    Row,
-    first_runs,
-    group_rows,
-    panels_of,
-    print_table,
-    require_numbers,
-    save_picture,
-    score,
-    summary,
-)
+from rawaug.evaluation.figures import Panels, panels_of, plot_curves, save_picture
+from rawaug.evaluation.page import Page, select_for_page
+from rawaug.evaluation.scores import NOISY, Row, group_rows, require_numbers, score, summary
+from rawaug.evaluation.tables import first_runs, print_table
 from rawaug.evaluation.trials import Trial, added_noise_note, make_trials, own_noise_note, training_noise_note, trial_of
 from rawaug.evaluation.verdict import verdict
 from rawaug.experiment.plan import claim, name_given_pairs, plan_data, require_free, require_usable, run_folder

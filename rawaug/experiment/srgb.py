@@ -29,9 +29,11 @@ from rawaug.data.pairs import Pair
 from rawaug.data.picture_pairs import PicturePair
 from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser
 from rawaug.denoising.pictures import PictureDenoiser
-from rawaug.evaluation.page import Figure, Page, find_detail
+from rawaug.evaluation.figures import Panels, find_detail, panels_of
+from rawaug.evaluation.page import Figure, Page
 from rawaug.evaluation.picture_trials import picture_trials
-from rawaug.evaluation.scores import NoisyInput, Panels, Row, panels_of, print_rows, score
+from rawaug.evaluation.scores import NoisyInput, Row, score
+from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.denoising import Results, TrainingRun
 from rawaug.experiment.recipe import EXPERIMENTS, Recipe

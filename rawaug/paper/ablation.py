@@ -21,7 +21,8 @@ from rawaug.camera.psnr_r import psnr_r
 from rawaug.data import open_pairs
 from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.scores import new_figure, print_rows
+from rawaug.evaluation.figures import new_figure
+from rawaug.evaluation.tables import print_rows
 from rawaug.experiment.plan import claim, require_free
 from rawaug.experiment.recipe import EXPERIMENTS
 from rawaug.files import write_json

@@ -11,7 +11,7 @@ import torch
 from rawaug.commands.synth import print_synthesis
 from rawaug.data import PictureFolder, check
 from rawaug.errors import escape
-from rawaug.evaluation.scores import print_rows
+from rawaug.evaluation.tables import print_rows
 from rawaug.io import write_picture
 from rawaug.synthesis.folder import synth
 

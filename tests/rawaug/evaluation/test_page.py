@@ -18,8 +18,8 @@ from PIL import Image
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.page import WINDOW, Page, find_detail, name_part, plot_curves
-from rawaug.evaluation.scores import Panels
+from rawaug.evaluation.figures import WINDOW, Panels, find_detail, plot_curves
+from rawaug.evaluation.page import Page, name_part
 from rawaug.evaluation.table_files import latex_table
 from rawaug.evaluation.trials import raw_trial
 

@@ -19,7 +19,8 @@ from rawaug.cli import main
 from rawaug.commands.evaluate import run as evaluate
 from rawaug.data import Pair, demo_pairs
 from rawaug.denoising.denoiser import Noisy, RawDenoiser, require_classical
-from rawaug.evaluation.scores import NOISY, Row, compare, print_scores, score, summary
+from rawaug.evaluation.scores import NOISY, Row, compare, score, summary
+from rawaug.evaluation.tables import print_scores
 from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.denoising import find_classical
 from rawaug.io import write_picture

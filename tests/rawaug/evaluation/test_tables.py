@@ -14,7 +14,8 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.scores import Panels, mean_and_spread, print_table, save_picture
+from rawaug.evaluation.figures import Panels, save_picture
+from rawaug.evaluation.tables import mean_and_spread, print_table
 from rawaug.evaluation.trials import raw_trial
 from rawaug.evaluation.verdict import verdict
 

@@ -15,7 +15,7 @@ from rawaug.data import demo_pairs
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.denoising.pictures import PictureDenoiser
-from rawaug.evaluation.page import read_log
+from rawaug.evaluation.figures import read_log
 from rawaug.evaluation.scores import score, to_domain
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.recipe import ArmConfig, DataConfig

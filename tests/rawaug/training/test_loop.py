@@ -16,7 +16,7 @@ import torch
 
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
-from rawaug.evaluation.page import read_log
+from rawaug.evaluation.figures import read_log
 from rawaug.evaluation.trials import Trial, trial_of
 from rawaug.noise import noise_model
 from rawaug.training import loop

@@ -1,0 +1,215 @@
+"""Pictures of results: one trial through every denoiser, its most detailed window, and the curves of a training.
+
+RAW is shown by the fixed development of :mod:`rawaug.evaluation.scores`. Files are drawn by matplotlib.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from denoisers.network import PACKED
+from rawaug.data.pairs import centre
+from rawaug.errors import escape, extra
+from rawaug.evaluation.scores import NOISY, Denoiser, as_compared, to_domain
+from rawaug.evaluation.trials import Trial
+from rawaug.metrics import psnr
+
+WINDOW = 64
+"""Side of an enlarged window, in packed pixels."""
+
+PANEL = 256
+"""Largest side of a panel, in mosaic pixels: larger frames are shown as a crop of the centre."""
+
+CROP = 192
+"""Side of a crop at 100 %, in pixels."""
+
+ACROSS = 4
+"""Largest number of panels side by side: more make captions too small to read on a page."""
+
+CURVES = {"loss": "loss", "psnr": "validation PSNR (dB)", "psnr_srgb": "validation PSNR, sRGB (dB)"}
+"""Columns of a log that are plotted, with the titles of their plots."""
+
+Log = Sequence[Mapping[str, str]]
+"""The rows of a training's ``log.csv``."""
+
+
+@dataclass
+class Panels:
+    """One trial in pictures.
+
+    Attributes:
+        trial: of which these are.
+        images: ``(1, 4, h, w)`` or ``(1, 3, H, W)``, like the trial's noisy or clean one, by title; the clean one last.
+        captions: by title.
+    """
+
+    trial: Trial
+    images: dict[str, Tensor] = field(default_factory=dict)
+    captions: dict[str, str] = field(default_factory=dict)
+
+    def show(self, image: Tensor) -> Tensor:
+        """An image, or a part of one, ``(1, C, H, W)``, as sRGB ``(3, H, W)`` in [0, 1]."""
+        if self.trial.develop is None:
+            return image[0].clamp(0.0, 1.0)
+
+        return self.trial.develop(image)
+
+
+def panels_of(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOISY) -> Panels:
+    """The trial noisy, denoised by each, and clean; captions say the PSNR. ``noisy`` shows the noisy input."""
+    panels = Panels(trial)
+    clean = as_compared(trial.clean, trial)
+    titles = {"noisy": noisy} | {one.name: one for one in denoisers}
+
+    for title, denoiser in titles.items():
+        denoised = denoiser(trial.input_for(denoiser))
+        for name, image in to_domain(title, denoised, trial):
+            panels.images[name] = image
+            panels.captions[name] = f"{psnr(as_compared(image, trial), clean).item():.2f} dB"
+
+    panels.images["clean"] = trial.clean
+    panels.captions["clean"] = trial.frame
+    return panels
+
+
+def find_detail(image: Tensor, side: int = WINDOW) -> tuple[int, int]:
+    """Top and left of the window of ``side`` in which green is steepest, of ``(1, 4, h, w)`` or ``(1, 3, H, W)``."""
+    green = image[:, 1:-1].mean(1, keepdim=True).clamp_min(0.0).sqrt()
+    down = (green[..., 1:, :-1] - green[..., :-1, :-1]).abs()
+    right = (green[..., :-1, 1:] - green[..., :-1, :-1]).abs()
+    steep = down + right
+
+    size = [min(side, length) for length in steep.shape[-2:]]
+    means = F.avg_pool2d(steep, size, stride=4)
+    row, column = divmod(int(means.argmax()), means.shape[-1])
+    return 4 * row, 4 * column
+
+
+def crops_at_100(rows: Sequence[Panels]) -> Tensor:
+    """A row of crops of each trial, every image's where the clean one has most detail; sRGB ``(3, h, w)``."""
+    strips = []
+    for row in rows:
+        top, left = find_detail(row.trial.clean, CROP)
+        window = (..., slice(top, top + CROP), slice(left, left + CROP))
+        strips.append(torch.cat([row.show(image[window]) for image in row.images.values()], dim=-1))
+
+    return torch.cat(strips, dim=-2)
+
+
+def new_figure(width: float, height: float) -> Any:
+    """An empty figure of matplotlib's, its sides in inches; no display is needed."""
+    with extra("train"):
+        from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save_picture(rows: Sequence[Panels], path: Path) -> Path:
+    """Write the panels of each row as a picture, at most :data:`ACROSS` side by side; the path."""
+    columns = min(ACROSS, max(len(row.images) for row in rows))
+    heights = [-(-len(row.images) // columns) for row in rows]
+
+    figure = new_figure(2.1 * columns, 2.5 * sum(heights))
+    axes = figure.subplots(sum(heights), columns, squeeze=False)
+    for axis in axes.flat:
+        axis.set_axis_off()
+
+    first = 0
+    for row, height in zip(rows, heights, strict=True):
+        for axis, (title, image) in zip(axes[first:].flat, row.images.items(), strict=False):
+            side = PANEL // 2 if image.shape[1] == PACKED else PANEL
+            panel = row.show(centre(image, side, side, step=1))
+            axis.imshow(panel.permute(1, 2, 0).numpy(), interpolation="nearest")
+            caption = f"{escape(title)}\n{escape(row.captions.get(title, ''))}"
+            axis.set_title(caption, fontsize=9, parse_math=False)
+        first += height
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
+    return path
+
+
+# -- curves ------------------------------------------------------------------------------------------------------------
+
+
+def read_log(path: Path) -> Log:
+    """The rows of a training's ``log.csv``."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def plot_curves(logs: Mapping[str, Sequence[Path]]) -> dict[str, bytes]:
+    """Loss and validation PSNR over the steps as PNG files by title, from the ``log.csv`` of every seed of every arm.
+
+    The loss is the mean since the row before. A curve of one point is a dot. What no log has is left out.
+    """
+    rows: dict[tuple[str, int], Log] = {}
+    colours = {}
+    for k, (arm, paths) in enumerate(logs.items()):
+        colours[arm] = f"C{k % 10}"
+        for seed, path in enumerate(paths):
+            rows[arm, seed] = read_log(path)
+
+    pictures = {}
+    for key, title in CURVES.items():
+        if any(row.get(key) for log in rows.values() for row in log):
+            pictures[title] = _plot_curve(key, title, rows, colours)
+
+    return pictures
+
+
+def _plot_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colours: Mapping[str, str]) -> bytes:
+    figure = new_figure(5.2, 3.6)
+    axis = figure.subplots()
+
+    for (arm, seed), rows in logs.items():
+        points = [(int(row["step"]), float(row[key])) for row in rows if row.get(key)]
+        if not points:
+            continue
+        steps, values = zip(*points, strict=True)
+        marker = "o" if len(points) == 1 else ""
+        label = arm if seed == 0 else None
+        axis.plot(steps, values, marker=marker, color=colours[arm], linewidth=1.4, label=label)
+
+    axis.set(xlabel="step", ylabel=title, yscale="log" if key == "loss" else "linear")
+    axis.locator_params(axis="x", integer=True)
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(fontsize=8)
+
+    return _png(figure)
+
+
+def plot_costs(rows: Mapping[str, tuple[float | None, float, float]]) -> bytes:
+    """A PNG file with the PSNR of RAW and sRGB over GMAC a megapixel; a filter, which has none, is a dashed line.
+
+    ``rows`` has GMAC and the two PSNR by the name of a denoiser.
+    """
+    figure = new_figure(8.4, 3.6)
+    axes = figure.subplots(1, 2)
+
+    for k, title in enumerate(("RAW", "developed sRGB")):
+        for number, (name, (gmac, *psnr_values)) in enumerate(rows.items()):
+            style: dict[str, Any] = {"color": f"C{number % 10}", "label": name}
+            if gmac is None:
+                axes[k].axhline(psnr_values[k], linestyle="--", **style)
+            else:
+                axes[k].plot(gmac, psnr_values[k], "o", **style)
+        axes[k].set(xlabel="GMAC a megapixel", xscale="log", title=f"PSNR, {title} (dB)")
+
+    figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+    return _png(figure)
+
+
+def _png(figure: Any) -> bytes:
+    file = io.BytesIO()
+    figure.savefig(file, dpi=130)
+    return file.getvalue()

@@ -1,0 +1,230 @@
+"""Tables of scores: what their columns are, their cells, and how they are printed.
+
+A run has one entry a seed in the list of each arm: summaries by kind, ``plain`` and ``self_ensemble``, see
+:func:`rawaug.evaluation.scores.summary`. Several seeds make a mean and a standard deviation.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from rawaug.errors import escape
+from rawaug.evaluation.scores import METRICS
+
+WIDTH = 140
+"""Columns of a printed table where stdout is no terminal."""
+
+FIGURES = {
+    "psnr": "PSNR (dB)",
+    "ssim": "SSIM",
+    "psnr_srgb": "PSNR, sRGB",
+    "ssim_srgb": "SSIM, sRGB",
+    "own_noise": "own noise",
+}
+"""Headings by figure: of the mosaic, of its development, and the references' own share of the squared error."""
+
+Runs = Mapping[str, Sequence[Mapping[str, Any]]]
+"""For each arm a list with one entry a seed: summaries by kind, ``plain`` and ``self_ensemble``."""
+
+Columns = Mapping[str, tuple[str, str]]
+"""For each heading of a table the kind of summary, and the figure in it, that the column shows."""
+
+PLAIN: Columns = {name: ("plain", key) for key, name in FIGURES.items()}
+ENSEMBLE: Columns = {name: ("self_ensemble", key) for key, name in FIGURES.items()}
+QUARTERS: Columns = {
+    f"{FIGURES[key]}, {part} 25%": ("plain", f"{key}_{part}25") for key in METRICS for part in ("worst", "best")
+}
+PRINTED: Columns = {
+    "PSNR (dB)": ("plain", "psnr"),
+    "SSIM": ("plain", "ssim"),
+    "PSNR, self-ensemble": ("self_ensemble", "psnr"),
+    "SSIM, self-ensemble": ("self_ensemble", "ssim"),
+    **PLAIN,
+}
+
+
+class Table(NamedTuple):
+    """A table: its columns, cells by row, empty where a figure does not apply, and the best cells of columns."""
+
+    columns: list[str]
+    rows: dict[str, list[str]]
+    best: set[tuple[str, int]]
+
+
+def table_of(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, columns: Columns) -> Table:
+    """The noisy input, other denoisers and the arms, without columns and rows that have no figure."""
+    methods: dict[str, Sequence[Mapping[str, Any]]] = {"noisy input": [{"plain": _of_input(results)}]}
+    for name, scores in (others or {}).items():
+        methods[name] = [{"plain": scores}]
+    methods |= results
+
+    table = Table([], {}, set())
+    values_by_column = []
+    for head, (kind, key) in columns.items():
+        values = {name: _values(runs, kind, key) for name, runs in methods.items()}
+        if not any(values.values()):
+            continue
+        for name in _best_rows(key, values):
+            table.best.add((name, len(table.columns)))
+        table.columns.append(head)
+        values_by_column.append((key, values))
+
+    for name in methods:
+        cells = [_cell(key, values[name]) for key, values in values_by_column]
+        if any(cells):
+            table.rows[name] = cells
+
+    return table
+
+
+def _of_input(results: Runs) -> dict[str, Any]:
+    """The scores of the noisy input, which every summary holds beside its own."""
+    first_arm = next(iter(results.values()))
+    return {key.replace("_noisy", ""): value for key, value in first_arm[0]["plain"].items() if "_noisy" in key}
+
+
+def _best_rows(key: str, values: Mapping[str, Sequence[float]]) -> list[str]:
+    """The rows with the highest mean, as it is shown, in a column of several; none where less is better."""
+    means = {}
+    for name, column in values.items():
+        if column:
+            means[name] = round(statistics.fmean(column), _digits(key))
+
+    if len(means) < 2 or key == "own_noise":
+        return []
+
+    best = max(means.values())
+    return [name for name, mean in means.items() if mean == best]
+
+
+def first_runs(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    """The summary of every method by name; of an arm that of its first seed."""
+    return {**others, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
+
+
+# -- cells -------------------------------------------------------------------------------------------------------------
+
+
+def _values(runs: Sequence[Mapping[str, Any]], kind: str, key: str) -> list[float]:
+    return [run[kind][key] for run in runs if key in run.get(kind, {})]
+
+
+def _cell(key: str, values: Sequence[float]) -> str:
+    if len(values) > 1 and key != "own_noise":
+        return mean_and_spread(values, _digits(key))
+
+    return format_figure(key, statistics.fmean(values) if values else None)
+
+
+def _digits(key: str) -> int:
+    return 2 if "psnr" in key else 4
+
+
+def mean_and_spread(values: Sequence[float], digits: int) -> str:
+    """``mean``, or ``mean ± standard deviation`` of several values."""
+    mean = f"{statistics.fmean(values):.{digits}f}"
+    if len(values) < 2:
+        return mean
+
+    return f"{mean} ± {statistics.stdev(values):.{digits}f}"
+
+
+def format_figure(key: str, value: float | None) -> str:
+    """The figure of a metric as tables have it; empty if there is none."""
+    if value is None:
+        return ""
+
+    return f"{value:.0%}" if key == "own_noise" else f"{value:.{_digits(key)}f}"
+
+
+def join_figures(scores: Mapping[str, Any], first: str, second: str) -> str:
+    """Two figures in a cell; a dash stands for what is no number."""
+    cells = [format_figure(key, scores.get(key)) or "-" for key in (first, second)]
+    return " / ".join(cells)
+
+
+# -- printing ----------------------------------------------------------------------------------------------------------
+
+
+def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str]]) -> None:
+    """Print a table with a name and figures in each row, and a line between sections."""
+    from rich.console import Console
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    table = RichTable(title=Text(escape(title)))
+    for k, column in enumerate(head):
+        table.add_column(column, justify="right" if k else "left")
+
+    for rows in sections:
+        for row in rows:
+            table.add_row(*(Text(escape(cell)) for cell in row))  # Text: brackets are no markup
+        table.add_section()
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH)
+    console.print(table)
+
+
+def print_table(results: Runs, title: str, others: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+    """Print PSNR and SSIM of every method: in RAW plain and by self-ensemble, and developed.
+
+    ``results`` has one entry a seed in an arm's list, ``others`` a summary by name.
+    """
+    table = table_of(results, others, PRINTED)
+    rows = [[method, *cells] for method, cells in table.rows.items()]
+    print_rows(title, ["arm", *table.columns], rows)
+
+    first_arm = next(iter(results.values()))
+    note = levels_note(first_arm[0]["plain"])
+    if note:
+        print(note)
+
+
+def print_scores(result: Mapping[str, Any]) -> None:
+    """Print the table of ``rawaug evaluate`` from what ``--json`` writes."""
+    denoises = result["kind"] == "denoiser"
+    keys = ["psnr"]
+    title = "PSNR_r, RAW reconstruction"
+    if denoises:
+        keys = [key for key in FIGURES if key != "own_noise" or key in result]
+        title = "PSNR_d, RAW denoising"
+    if result.get("self_ensemble"):
+        title += f", self-ensemble of {result['views']} views"
+
+    images = []
+    for image in result["images"]:
+        mark = " *" if image.get("levels_from_clean") else ""
+        images.append([f"{image['name']}{mark}", *_figures(image, keys)])
+
+    means = []
+    for name, end in (("mean", ""), ("worst 25%", "_worst25"), ("best 25%", "_best25"), ("noisy", "_noisy")):
+        if f"psnr{end}" in result:
+            means.append([name, *_figures(result, keys, end)])
+    if "plain" in result:
+        means.append(["mean, without self-ensemble", *_figures(result["plain"], keys)])
+    for name, scores in result.get("classical", {}).items():
+        means.append([name, *_figures(scores, keys)])
+
+    head = ["image", *(FIGURES[key] for key in keys)]
+    print_rows(f"{title}: {result['data']}", head, images, means)
+    note = levels_note(result)
+    if note:
+        print(note)
+
+
+def _figures(scores: Mapping[str, Any], keys: Sequence[str], end: str = "") -> list[str]:
+    return [format_figure(key, scores.get(key + end)) for key in keys]
+
+
+def levels_note(summary: Mapping[str, Any]) -> str:
+    """A line on scores whose noise levels came from the clean frames; empty if there are none."""
+    flagged = summary.get("levels_from_clean")
+    if not flagged:
+        return ""
+
+    images = len(summary["images"])
+    return f"* noise levels of {flagged} of {images} images were measured against their clean frames"
