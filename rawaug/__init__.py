@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rawaug.isp.config import ISPParams as ISPParams
     from rawaug.isp.config import ISPResult as ISPResult
     from rawaug.isp.model import DictionaryISP as DictionaryISP
+    from rawaug.isp.own_cameras import Camera as Camera
     from rawaug.plugin.augment import ISPModel as ISPModel
     from rawaug.plugin.augment import RawAugment as RawAugment
     from rawaug.plugin.dataset import RawPairs as RawPairs
@@ -42,6 +43,7 @@ _PUBLIC = {
     "rawaug.denoising.frames": ("denoise",),
     "rawaug.isp.config": ("ISPConfig", "ISPParams", "ISPResult"),
     "rawaug.isp.model": ("DictionaryISP",),
+    "rawaug.isp.own_cameras": ("Camera",),
     "rawaug.plugin.augment": ("ISPModel", "RawAugment"),
     "rawaug.plugin.dataset": ("RawPairStream", "RawPairs"),
     "rawaug.plugin.draw": ("Draw",),

@@ -57,6 +57,41 @@ def yaml_value(text: str) -> Any:
         raise ValueError(f"not YAML: {' '.join(str(error).split())}") from None
 
 
+MOST_YAML_BYTES, MOST_YAML_LEVELS = 2**16, 50
+"""Limits of a YAML file of settings."""
+
+
+def read_yaml(file: str | Path, what: str) -> Any:
+    """Plain values of a YAML file of settings.
+
+    Args:
+        file: its path.
+        what: what it should be, for messages, such as ``"camera"``.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not YAML, too long or too deep, or uses aliases.
+    """
+    import yaml
+
+    require_file(file, what)
+    size = Path(file).stat().st_size
+    if size > MOST_YAML_BYTES:
+        raise ValueError(f"{file}: has {size} bytes, a {what} has at most {MOST_YAML_BYTES}")
+    try:
+        text = Path(file).read_text(encoding="utf-8")
+        depth = 0
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent):  # a few lines of them are billions of values
+                raise ValueError("uses aliases (*name); write the values out")
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MOST_YAML_LEVELS:
+                raise ValueError(f"is nested more than {MOST_YAML_LEVELS} levels deep")
+        return yaml_value(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"{file}: not a {what} ({' '.join(str(error).split())})") from None
+
+
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a path beside ``path``, which it replaces when the block ends without an error; two writers take turns."""

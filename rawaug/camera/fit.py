@@ -24,6 +24,7 @@ from rawaug.data.pairs import Pair, shared_frame
 from rawaug.io import RawFrame, read_raw
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.own_cameras import Camera, as_camera
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_dark_noise, estimate_noise, plot_noise
 from rawaug.noise.estimate import WORST_FIT
 
@@ -46,6 +47,7 @@ def fit(
     cfa: str | None = None,
     black: float | Sequence[float] | None = None,
     white: float | None = None,
+    camera: str | Path | Camera | None = None,
     **settings: Any,
 ) -> DictionaryISP:
     """Fit an ISP to your own camera.
@@ -62,6 +64,8 @@ def fit(
             ``isp.info["held_out"]``.
         state: file with the state of the fit, to resume it; removed at the end.
         cfa, black, white: of the files of ``pairs:PATH`` that do not state them, see :class:`rawaug.data.PairFolder`.
+        camera: figures of the camera to start from, a :class:`rawaug.Camera` or its YAML file, or a published camera by
+            its name. They decide where the colours of the frames do not.
         settings: of :class:`rawaug.isp.fit.FitConfig`.
 
     Frames that cannot be read, of those fitted and those held out, are left out; ``isp.info["unreadable"]`` has a line
@@ -91,7 +95,10 @@ def fit(
         watch = _Watch(others)
     frames = Readable(pairs)
     estimate = _measured_noise(frames, noise, dark)  # before the fit: what fails here fails early
-    isp = fit_isp(frames, FitConfig(**settings), progress, state, watch)
+    figures = None if camera is None else as_camera(camera)
+    isp = fit_isp(frames, FitConfig(**settings), progress, state, watch, figures)
+    if figures is not None:
+        isp.info["started_from"] = figures.name
     if watch is not None:
         watch(isp)
         isp.info["held_out"] = watch.scores

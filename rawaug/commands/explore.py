@@ -12,17 +12,18 @@ from rawaug.explore.page import build, make_server, open_socket, socket_url
 from rawaug.files import files_in
 
 
-def run(pictures: str | None = None, /, *, host: str = "127.0.0.1", port: int = 7860) -> None:
+def run(pictures: str | None = None, /, *, isp: str = "universal", host: str = "127.0.0.1", port: int = 7860) -> None:
     """Show pictures as RAW of any camera, on a page in the browser.
 
     Args:
         pictures: a picture, or a folder of them; built-in ones by default.
+        isp: ISP to open the page with: a shipped one by its name, a file, or the YAML file of a camera of your own.
         host: address to listen on; by default this machine alone can open the page.
         port: port to listen on.
     """
     with extra("explore"):  # one line that names all that the page needs, before the pictures ask for theirs
         import gradio  # noqa: F401
-    page = build(*choices(pictures))
+    page = build(*choices(pictures), isp=isp)
     with open_socket(host, port) as open_, suppress(KeyboardInterrupt):
         print(f"{socket_url(open_)} (Ctrl-C stops it)", flush=True)
         make_server(page).run(sockets=[open_])

@@ -25,6 +25,7 @@ def run(
     out: str,
     noise: Literal["auto", "on", "off"] = "auto",
     dark: str | None = None,
+    camera: str | None = None,
     mosaics: Annotated[MosaicSettings, OPTIONS] | None = None,
     config: Annotated[FitConfig, OPTIONS] | None = None,
 ) -> None:
@@ -38,6 +39,7 @@ def run(
         noise: measure the camera's noise at each ISO of the files; auto continues without it where the frames do
             not allow it.
         dark: folder of dark frames to measure the read variance.
+        camera: figures of the camera to start from, a YAML file or the name of a published camera.
         mosaics: CFA and levels of pairs:PATH.
         config: settings of the fit.
     """
@@ -55,6 +57,7 @@ def run(
             held_out=held_out,
             noise=noise,
             dark=dark,
+            camera=camera,
             **vars(mosaics or MosaicSettings()),
             **vars(config or FitConfig()),
         )

@@ -13,6 +13,7 @@ from rawaug.files import find_weights, read_header, sha256
 from rawaug.isp.camera_names import camera_key, similar_cameras
 from rawaug.isp.cameras import load_cameras
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.own_cameras import Camera, is_camera_file
 from rawaug.noise.cameras import SPREAD, load_profiles, measured_ranges, profile_ends
 from rawaug.version import __version__
 
@@ -24,7 +25,8 @@ def run(weights: str, /, *part: str, json: bool = False) -> None:
     """Describe a weights file, or list the known cameras: rawaug info cameras [PART].
 
     Args:
-        weights: a .safetensors file, or the name of a shipped ISP or denoiser; or the word cameras.
+        weights: a .safetensors file, the name of a shipped ISP or denoiser, or the YAML file of a camera of your own;
+            or the word cameras.
         part: of the names of the cameras to list, such as A7 III.
         json: print one JSON object, for programs; of an ISP with its tone curve at 256 codes, of cameras with their
             matrices.
@@ -80,6 +82,8 @@ def _level_row(iso: float, shot_var: tuple[float, float], read_var: tuple[float,
 
 def as_json(weights: str | Path) -> dict[str, Any]:
     """What ``rawaug info --json`` prints: of an ISP see :func:`rawaug.isp.model.DictionaryISP.description`."""
+    if is_camera_file(weights):
+        return camera_as_json(Camera.load(weights)) | {"file": str(weights), "version": __version__}
     path = find_weights(weights, FOLDER)
     content: dict[str, Any] = {"file": str(path), "sha256": sha256(path), "version": __version__}
     if read_header(path)["kind"] == "isp":
@@ -91,7 +95,9 @@ def as_json(weights: str | Path) -> dict[str, Any]:
 
 
 def describe(weights: str | Path) -> str:
-    """Kind, size, settings and, for an ISP, its atoms as numbers."""
+    """Kind, size, settings and, for an ISP, its atoms as numbers; the figures of a camera's YAML file."""
+    if is_camera_file(weights):
+        return describe_camera(Camera.load(weights))
     path = find_weights(weights, FOLDER)
     if read_header(path)["kind"] == "isp":
         return _describe_isp(path)
@@ -120,3 +126,40 @@ def _describe_isp(path: Path) -> str:
     lines += [f"  {text}" for stage in isp.ordered_stages if (text := stage.describe())]
     lines += [f"  {key}: {dumps(value)}" for key, value in isp.info.items()]
     return "\n".join(lines)
+
+
+def describe_camera(camera: Camera) -> str:
+    """The figures of a camera of one's own, as the package uses them: a line for each light and each ISO."""
+    lines = [f"{camera.name}: camera, {camera.cfa}"]
+    grid = f"black {camera.black_level:g}, white {camera.white:g} DN"
+    if camera.bits is not None:
+        grid += f", rounded to {camera.bits} bits"
+    lines.append(f"  {grid}" if camera.white != 1.0 else "  no digital numbers")
+
+    lines.append("  matrix from linear sRGB to white-balanced camera RGB, and gains, by light:")
+    for anchor in camera.anchors():
+        rows = [" ".join(f"{value:7.4f}" for value in row) for row in anchor.matrix.tolist()]
+        gains = " ".join(f"{value:.4f}" for value in anchor.gains.tolist())
+        lines.append(f"    {anchor.light:<5} ({1e6 / anchor.mired:.0f} K)  {' | '.join(rows)}   gains {gains}")
+
+    lines.append("  noise, variances with white = 1:" if camera.levels else "  noise: not stated")
+    for level in camera.levels:
+        at = "any ISO" if level.iso is None else f"ISO {level.iso:g}"
+        lines.append(f"    {at:<10}  shot_var {level.shot_var:.4g}   read_var {level.read_var:.4g}")
+
+    tone = "any of the ISP's" if camera.tone is None else dumps(camera.tone)
+    lines.append(f"  tone: {tone}")
+    return "\n".join(lines)
+
+
+def camera_as_json(camera: Camera) -> dict[str, Any]:
+    """The figures of a camera of one's own: as its file has them, by light, and by ISO as variances."""
+    lights = {}
+    for anchor in camera.anchors():
+        lights[anchor.light] = {
+            "kelvin": 1e6 / anchor.mired,
+            "srgb_to_camera": anchor.matrix.tolist(),
+            "gains": anchor.gains.tolist(),
+        }
+    levels = [level._asdict() for level in camera.levels]
+    return {"kind": "camera", "figures": camera.to_json(), "lights": lights, "noise": levels}

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator
 
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import OWN_PICTURES, Pair
-from rawaug.files import require_file, yaml_value
+from rawaug.files import read_yaml
 from rawaug.isp.fit import FitConfig
 from rawaug.kernels.runtime import find_device
 from rawaug.noise import noise_model
@@ -38,7 +38,6 @@ USUAL = "usual"
 DEMO = "demo:"
 """What the names of the built-in, simulated frames begin with."""
 _PAIRS = "pairs:"
-MOST_BYTES, MOST_LEVELS = 2**16, 50
 _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("count", "validation_count", "test_count"), (1, MOST)),
     **dict.fromkeys(("validation_crop", "test_crop"), (32, MOST)),
@@ -292,23 +291,7 @@ class Recipe:
 
 def read_recipe(file: str | Path) -> dict[str, Any]:
     """The keys and values of a YAML file; ValueError if it is no recipe, or has aliases or too many bytes."""
-    import yaml
-
-    require_file(file, "recipe")
-    if (size := Path(file).stat().st_size) > MOST_BYTES:
-        raise ValueError(f"{file}: has {size} bytes, a recipe at most {MOST_BYTES}")
-    try:
-        text = Path(file).read_text(encoding="utf-8")
-        depth = 0
-        for event in yaml.parse(text, Loader=yaml.SafeLoader):
-            if isinstance(event, yaml.AliasEvent):  # a few lines of them are billions of values
-                raise ValueError("uses aliases (*name); write the values out")
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > MOST_LEVELS:
-                raise ValueError(f"is nested more than {MOST_LEVELS} levels deep")
-        content = yaml_value(text) or {}
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"{file}: not a recipe ({' '.join(str(error).split())})") from None
+    content = read_yaml(file, "recipe") or {}
     if not isinstance(content, dict):
         raise ValueError(f"{file}: not a recipe: it must hold keys and values")
     return content

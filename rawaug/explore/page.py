@@ -108,13 +108,15 @@ def _code(look: Look) -> dict[str, str]:
     return {"python": views.python(look), "command": views.command(look)}
 
 
-def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
+def build(pictures: Sequence[Path], names: Sequence[str] | None = None, isp: str = "universal") -> Any:
     """Build the page as Gradio's Blocks.
 
     Args:
         pictures: files to choose from, besides uploaded ones.
         names: their names on the page; those of the files by default.
+        isp: the ISP that is chosen at first, by its name or path.
     """
+    views.load_isp(isp)  # raises here rather than on the page
     os.environ["GRADIO_ANALYTICS_ENABLED"] = "False"
     with extra("explore"):
         import gradio as gr
@@ -126,7 +128,7 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
         outputs: dict[str, Any] = {"message": gr.HTML(elem_id="message")}
         with gr.Row(elem_id="layout"):
             with gr.Column(scale=1, min_width=300, elem_id="controls"):
-                controls = _controls(gr, choices)
+                controls = _controls(gr, choices, isp)
             with gr.Column(scale=3, min_width=300, elem_id="views"), gr.Tabs(overflow_behavior="wrap"):
                 tabs = {name: _tab(gr, name, outputs) for name in (*VIEWS, DENOISE)}
                 with gr.Tab("Code"):
@@ -138,22 +140,24 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
     return page
 
 
-def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
-    isps, usual, made = sorted(file.stem for file in WEIGHTS.glob("*.safetensors")), AugmentConfig(), dict[str, Any]()
+def _controls(gr: Any, choices: Sequence[tuple[str, str]], isp: str) -> dict[str, Any]:
+    shipped = sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))
+    isps = shipped if isp in shipped else [isp, *shipped]
+    usual, made = AugmentConfig(isp), dict[str, Any]()
     cameras = sorted(set(load_cameras().names), key=str.casefold)
     whole = {"num_choices_shown": None}  # in a list that is shown in part, a retyped choice gives way to the first one
     with gr.Group():
         made["picture"] = gr.Dropdown(choices, value=choices[0][1] if choices else None, label="Picture", **whole)
         upload = gr.UploadButton("Open your own", size="sm", elem_id="upload")
     with gr.Group():
-        made["isp"] = gr.Dropdown(isps, value=usual.isp, label="ISP")
+        made["isp"] = gr.Dropdown(isps, value=isp, label="ISP")
         made["camera"] = gr.Dropdown([ANY, *cameras], value=ANY, label="Camera", **whole)
         made["light"] = gr.Dropdown([ANY, *(f"{k} K" for k in KELVINS), *LAMPS], value=ANY, label="Light", **whole)
-        made["tone"] = gr.Dropdown([ANY, *views.tone_names(usual.isp)], value=ANY, label="Tone curve", **whole)
+        made["tone"] = gr.Dropdown([ANY, *views.tone_names(isp)], value=ANY, label="Tone curve", **whole)
         made["draw_exposure"] = gr.Checkbox(True, label="Draw the exposure at random")
         made["exposure"] = gr.Slider(-4, 1, value=0, step=0.25, label="Exposure (stops)", interactive=False)
     with gr.Group():
-        made["noise"] = gr.Dropdown(views.noise_choices(usual.isp), value=usual.noise, label="Noise", **whole)
+        made["noise"] = gr.Dropdown(views.noise_choices(isp), value=usual.noise, label="Noise", **whole)
         made["iso"] = gr.Number(0, label="ISO", info=_about_iso(str(usual.noise)), interactive=False)
         made["cfa"] = gr.Dropdown([OWN, *PATTERNS], value=OWN, label="CFA")
         made["seed"] = gr.Number(FIRST_SEED, label="Seed", precision=0, minimum=0)

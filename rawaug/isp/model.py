@@ -17,13 +17,17 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
+from rawaug.bayer import CFA
 from rawaug.files import find_weights, parse_object, read_tensors, to_json, write_tensors
 from rawaug.isp import staged, stages
 from rawaug.isp.camera_names import find_camera
-from rawaug.isp.cameras import light_range, load_cameras
+from rawaug.isp.cameras import D65, gains_in_light, light_range, load_cameras, white_point
 from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
-from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weights
+from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weights, log_light
+from rawaug.isp.own_cameras import Camera, as_camera, is_camera_file, mired_of, weights_in_light
+from rawaug.isp.own_sampler import OwnCameraSampler, own_cameras
 from rawaug.isp.staged import StagedISP, thumbnail
+from rawaug.registry import suggest
 
 _ADVICE = "fit or copy it again"
 _INFINITE = ("colour.spread",)
@@ -88,6 +92,9 @@ class DictionaryISP(StagedISP):
         """
         if not isinstance(self.colour, CameraDictionary):
             return None
+        own = own_cameras(self.info)
+        if own:
+            return OwnCameraSampler(self.colour, own, self.config.tone_atoms, light, consistent)
         return CameraSampler(self.colour, self.config.tone_atoms, light_range(light), consistent)
 
     def choose(self, srgb: Tensor) -> ISPParams:
@@ -266,10 +273,14 @@ class DictionaryISP(StagedISP):
     def from_pretrained(cls, name: str | Path) -> DictionaryISP:
         """Load an ISP by the name of one that the package ships, or from a path.
 
+        The path of a camera's YAML file (:class:`rawaug.Camera`) gives ``universal`` with this camera.
+
         Raises:
             FileNotFoundError: if there is no such file or name.
             ValueError: if the file is not that of an ISP, or is damaged.
         """
+        if is_camera_file(name):
+            return restrict_to_cameras(cls.from_pretrained("universal"), name)
         path = find_weights(name)
         header, state = read_tensors(path, _ADVICE, _INFINITE)
         if header.get("kind") != "isp":
@@ -291,24 +302,114 @@ class DictionaryISP(StagedISP):
 
 
 @torch.no_grad()
-def restrict_to_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
-    """Make an ISP whose atoms are the published cameras of these names; tones and lights stay those of ``isp``.
+def restrict_to_cameras(
+    isp: DictionaryISP, names: str | Path | Camera | Sequence[str | Path | Camera]
+) -> DictionaryISP:
+    """Make an ISP whose atoms are some cameras; tones and lights stay those of ``isp``.
+
+    Args:
+        isp: of published cameras, such as ``universal``.
+        names: names of published cameras, cameras of your own (:class:`rawaug.Camera`) or paths of their YAML files.
 
     Raises:
+        FileNotFoundError: if a camera's file is missing.
         ValueError: if the atoms of ``isp`` are not published cameras, or a name is unknown.
     """
     if not isinstance(isp.colour, CameraDictionary):
         raise ValueError("a camera by name needs an ISP of published cameras, such as universal")
+    cameras = [names] if isinstance(names, (str, Path, Camera)) else list(names)
+    own = [as_camera(camera) for camera in cameras if isinstance(camera, Camera) or is_camera_file(camera)]
+    if own:
+        published = [camera for camera in cameras if not (isinstance(camera, Camera) or is_camera_file(camera))]
+        cfa = own[0].cfa  # the table of published cameras has no patterns
+        return _with_own_cameras(isp, [*own, *(replace(Camera.published(str(name)), cfa=cfa) for name in published)])
+
     listed = load_cameras()
-    known = [find_camera(name, listed.names) for name in ([names] if isinstance(names, str) else names)]
-    narrowed = DictionaryISP(replace(isp.config, colour_atoms=len(known), cameras=len(known), encoders=False))
-    kept = {key: value for key, value in isp.state_dict().items() if not _of_colour(key)}
-    own = {key: value for key, value in narrowed.state_dict().items() if _of_colour(key)}
-    narrowed.load_state_dict(kept | own)
+    known = [find_camera(str(name), listed.names) for name in cameras]
+    narrowed = _without_colour(isp, colour_atoms=len(known), cameras=len(known))
     assert isinstance(narrowed.colour, CameraDictionary)
     narrowed.colour.set_cameras(listed.select(known), torch.eye(len(known)))
     narrowed.info = {**isp.info, "cameras": known}
     return narrowed.to(isp.colour.matrices.device).eval()
+
+
+def _without_colour(isp: DictionaryISP, **changes: Any) -> DictionaryISP:
+    """An ISP with other colour atoms, and with ``tone_atoms`` other tone curves, which are yet to be set."""
+    other = DictionaryISP(replace(isp.config, encoders=False, **changes))
+    state = other.state_dict()
+    for key, value in isp.state_dict().items():
+        is_tone = key.startswith("stages.curve.")
+        if not _of_colour(key) and not (is_tone and "tone_atoms" in changes):
+            state[key] = value
+    other.load_state_dict(state)
+    return other
+
+
+def _with_own_cameras(isp: DictionaryISP, cameras: Sequence[Camera]) -> DictionaryISP:
+    """An ISP of cameras of one's own: an atom for each light of a camera."""
+    anchors = [camera.anchors() for camera in cameras]
+    count = sum(map(len, anchors))
+    patterns = {camera.cfa for camera in cameras}
+    if len(patterns) > 1:
+        raise ValueError(f"cameras have several patterns, {', '.join(sorted(patterns))}; give those of one pattern")
+    (mosaic,) = patterns
+    tones, curves = _tones_of(isp, cameras)
+    own = _without_colour(
+        isp,
+        colour_atoms=count,
+        cameras=len(cameras),
+        tone_atoms=len(curves),
+        cfa=mosaic if mosaic in CFA.__members__ else isp.config.cfa,
+    )
+    assert own.tone is not None
+    own.tone.curves.copy_(curves)
+
+    assert isinstance(own.colour, CameraDictionary)
+    daylight = white_point(D65)
+    known = torch.zeros(len(cameras), count)
+    atom = 0
+    for row, in_lights in enumerate(anchors):
+        by_day = weights_in_light([anchor.mired for anchor in in_lights], mired_of(daylight[None].numpy()))
+        known[row, atom : atom + len(in_lights)] = torch.from_numpy(by_day)[0].float()
+        for anchor in in_lights:
+            own.colour.matrices[atom] = anchor.matrix.float()
+            own.colour.light[atom] = log_light(gains_in_light(anchor.from_xyz, daylight)[None])[0].float()
+            atom += 1
+    own.colour.known.copy_(known)
+
+    own.info = {**isp.info, "cameras": [camera.name for camera in cameras]}
+    own.info["own_cameras"] = [camera.to_json() for camera in cameras]
+    own.info["tones"] = tones
+    own.info.pop("holds", None)
+    if mosaic not in CFA.__members__:
+        own.info["pattern"] = mosaic
+    if len(cameras) == 1 and cameras[0].noise_spec() is not None:
+        own.info["noise"] = cameras[0].noise_spec()
+    return own.to(isp.colour.matrices.device).eval()
+
+
+def _tones_of(isp: DictionaryISP, cameras: Sequence[Camera]) -> tuple[list[str], Tensor]:
+    """The names and inverse curves ``(K, 1021)`` that cameras are drawn with: theirs, and the ISP's where one has none.
+
+    Raises:
+        ValueError: if a camera names a curve that the ISP does not have.
+    """
+    assert isp.tone is not None
+    names = list(isp.info["tones"])
+    curves = dict(zip(names, isp.tone.curves, strict=True))
+    tones: dict[str, Tensor] = {}
+    for camera in cameras:
+        table = camera.inverse_curve(isp.tone.curves.shape[1])
+        if camera.tone is None:
+            tones |= curves
+        elif table is not None:
+            tones[camera.name] = table
+        elif camera.tone in curves:
+            tones[camera.tone] = curves[camera.tone]
+        else:
+            unknown = f"camera {camera.name!r}: tone {camera.tone!r:.80} is unknown"
+            raise ValueError(f"{unknown}; use points or one of {', '.join(names)}{suggest(camera.tone, names)}")
+    return list(tones), torch.stack(list(tones.values()))
 
 
 def _of_colour(key: str) -> bool:

@@ -42,6 +42,7 @@ import math
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from functools import cache, partial
 from importlib import resources
 from typing import Any, NamedTuple
@@ -65,7 +66,15 @@ from rawaug.noise.levels import (
     load_presets,
     log_uniform,
 )
-from rawaug.noise.models import NOISE, NoiseModel, PoissonGaussianNoise, ShotReadNoise
+from rawaug.noise.models import (
+    NOISE,
+    NoiseModel,
+    Params,
+    PoissonGaussianNoise,
+    ShotReadModel,
+    ShotReadNoise,
+    per_picture,
+)
 from rawaug.registry import Spec, check_settings, split_spec, suggest
 from rawaug.seeding import keyed_generator
 
@@ -259,6 +268,24 @@ class MeasuredLevels:
             return FixedLevels(*self.at(None)).sample(batch, generator)
         return interpolate_levels(self.table.to(device), log_uniform(self.limits, batch, generator))
 
+    def within(self, iso: float | tuple[float, float]) -> NoiseLevels:
+        """The law at one ISO, or between two; ValueError outside the measured range.
+
+        Example:
+            >>> law = MeasuredLevels([IsoLevel(100, 1e-4, 1e-7), IsoLevel(400, 4e-4, 1.6e-6)], "Maker Model")
+            >>> shot_var, _ = law.within((100, 200)).sample(1000, torch.Generator().manual_seed(0))
+            >>> bool(shot_var.max() < 2.001e-4)
+            True
+        """
+        if self.limits is None:
+            raise ValueError(f"the noise of {self.camera} was measured at no ISO; omit iso")
+        low, high = iso_limits(self.camera, iso, self.limits)
+        if low == high:
+            return FixedLevels(*self.at(low))
+        ends = [IsoLevel(end, *self.at(end)) for end in (low, high)]
+        between = [level for level in self.levels if level.iso is not None and low < level.iso < high]
+        return MeasuredLevels([ends[0], *between, ends[1]], self.camera)
+
     def spec(self) -> dict[str, Any]:
         """Write the law as a name with settings, which files of weights hold and :func:`noise_model` reads."""
         rows = [{key: value for key, value in level._asdict().items() if value is not None} for level in self.levels]
@@ -274,21 +301,113 @@ def camera_law(stored: Mapping[str, Any]) -> MeasuredLevels:
     return MeasuredNoise(**stored["settings"]).law
 
 
+class RoundedNoise(ShotReadNoise):
+    """Shot and read noise of RAW that is rounded to digital numbers.
+
+    Args:
+        levels: whose ``read_var`` contains the rounding, as it does where it is measured on RAW files.
+        quantum: step of the digital numbers, white = 1; None rounds nothing.
+
+    Raises:
+        ValueError: if the step is not in (0, 1).
+    """
+
+    def __init__(self, levels: NoiseLevels, quantum: float | None = None) -> None:
+        if quantum is not None and not 0.0 < quantum < 1.0:
+            raise ValueError(f"quantum must be between 0 and 1, got {quantum}")
+        self.quantum = quantum
+        super().__init__(levels)
+
+    def sample(self, batch: int, generator: torch.Generator) -> Params:
+        """Draw ``shot_var``, ``read_var`` (without the rounding), ``seed`` and, where RAW is rounded, ``quantum``."""
+        params = super().sample(batch, generator)
+        if self.quantum is not None:
+            quantum = torch.full_like(params["read_var"], self.quantum)
+            params["read_var"] = (params["read_var"] - quantum.square() / 12).clamp_min(0.0)
+            params["quantum"] = quantum
+        return params
+
+    def apply(self, clean: Tensor, params: Params) -> Tensor:
+        """Make noisy RAW ``(B, 4, h, w)``, rounded where the camera rounds; see :meth:`NoiseModel.apply`."""
+        noisy = super().apply(clean, params)
+        return _round_to(noisy, params) if "quantum" in params else noisy
+
+    def apply_with_variance(self, clean: Tensor, params: Params) -> tuple[Tensor, Tensor]:
+        """Make noisy RAW and its variance map, both ``(B, 4, h, w)``."""
+        if "quantum" not in params:
+            return super().apply_with_variance(clean, params)
+        noisy = self.apply(clean, params)
+        return noisy, self.variance(noisy, params)
+
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        """Add the noise to ``clean`` ``(B, 4, h, w)`` without the clip at white."""
+        noisy = super().disturb(clean, params, out)
+        return _round_to(noisy, params) if "quantum" in params else noisy
+
+    def variance(self, clean: Tensor, params: Params) -> Tensor:
+        """Compute ``shot_var max(clean, 0) + read_var``, ``(B, 4, h, w)``, where ``read_var`` contains the rounding."""
+        variance = super().variance(clean, params)
+        if "quantum" in params:
+            variance += per_picture(params["quantum"].square() / 12, clean)
+        return variance
+
+
 @NOISE.register("MeasuredNoise")
-class MeasuredNoise(ShotReadNoise):
+class MeasuredNoise(RoundedNoise):
     """Shot and read noise of a camera measured at several ISO values; each picture draws an ISO.
 
     Args:
         levels: for each ISO ``{iso, shot_var, read_var}``, besides ``r2`` and ``frames`` if known.
         camera: make and model.
+        quantum: as for :class:`RoundedNoise`.
+        iso: one ISO, or (lowest, highest), from which the levels are drawn; by default all that was measured.
+
+    Raises:
+        ValueError: if a level is incomplete, the step is not in (0, 1), or the ISO was not measured.
     """
 
-    def __init__(self, levels: Sequence[Mapping[str, Any]], camera: str = "unknown") -> None:
+    def __init__(
+        self,
+        levels: Sequence[Mapping[str, Any]],
+        camera: str = "unknown",
+        quantum: float | None = None,
+        iso: Iso = None,
+    ) -> None:
+        rows = []
         for row in levels:
             if not {"shot_var", "read_var"} <= row.keys() <= set(IsoLevel._fields):
                 raise ValueError(f"MeasuredNoise: a level is {{iso, shot_var, read_var}}, got {dict(row)}")
-        self.law = MeasuredLevels([IsoLevel(**{"iso": None, **row}) for row in levels], camera)
-        super().__init__(self.law)
+            rows.append(IsoLevel(**{"iso": None, **row}))
+
+        self.law = MeasuredLevels(rows, camera)
+        super().__init__(self.law if iso is None else self.law.within(iso), quantum)
+
+
+def measured_noise(specs: Sequence[Mapping[str, Any]], iso: Iso = None) -> RoundedNoise:
+    """The noise of one or several cameras, of which each picture draws one.
+
+    Args:
+        specs: laws as an ISP's file holds them.
+        iso: one ISO, limits, or None for what was measured.
+
+    Raises:
+        ValueError: if a law is none of a camera, or the cameras round to different digital numbers.
+    """
+    laws: list[NoiseLevels] = []
+    quanta = set()
+    for spec in specs:
+        law = camera_law(spec)
+        laws.append(law if iso is None else law.within(iso))
+        quanta.add(spec["settings"].get("quantum") if "settings" in spec else None)
+    if len(quanta) > 1:
+        raise ValueError("the cameras round to different digital numbers; give the noise of one, or leave out bits")
+    return RoundedNoise(laws[0] if len(laws) == 1 else MixedLevels(laws), quanta.pop())
+
+
+def _round_to(noisy: Tensor, params: Params) -> Tensor:
+    """Round RAW ``(B, 4, h, w)`` in place to multiples of the drawn steps."""
+    quantum = per_picture(params["quantum"], noisy)
+    return noisy.div_(quantum).round_().mul_(quantum)
 
 
 NoiseSpec = Spec | Sequence[float] | Sequence[str]
@@ -317,16 +436,20 @@ def noise_names() -> list[str]:
     return [*NOISE, *load_presets()["presets"], *camera_names(), ANY_CAMERA, *load_profiles().names]
 
 
-def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None) -> NoiseLevels:
+def noise_levels(spec: NoiseSpec | NoiseLevels | NoiseModel, *, iso: Iso = None) -> NoiseLevels:
     """Make the levels of a name, of a mixture of names, or fixed ones of (shot_var, read_var).
 
     Args:
-        spec: a preset or camera, several of which each picture draws one, or two variances, white = 1.
+        spec: a preset or camera, several of which each picture draws one, or two variances, white = 1; or a law of your
+            own, such as :class:`MeasuredLevels`, a model with one, or ``{name: MeasuredNoise, settings: ...}``.
         iso: of a camera: one ISO, limits, or None for its whole measured range.
 
     Raises:
         ValueError: if the name is unknown, has no law by ISO, or the ISO is outside the measured range.
     """
+    own = _own_law(spec)
+    if own is not None:
+        return _levels_at(own, iso)
     if isinstance(spec, str) and spec in _by_iso():
         return _by_iso()[spec](iso)
     if isinstance(spec, str) and spec not in load_presets()["presets"]:
@@ -341,6 +464,32 @@ def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None
     if 0 < fixed.shot_var < fixed.read_var:
         warn_of_swapped_levels(fixed.shot_var, fixed.read_var)
     return fixed
+
+
+def _own_law(spec: Any) -> NoiseLevels | None:
+    """The law of levels that is given as an object or as settings; None for names and pairs."""
+    if isinstance(spec, Mapping) and spec.get("name") == "MeasuredNoise":
+        model: MeasuredNoise = NOISE.make(spec)
+        return model.levels
+    if isinstance(spec, ShotReadModel):
+        return spec.levels
+    if isinstance(spec, NoiseModel):
+        raise ValueError(f"{type(spec).__name__} has more than levels of shot and read noise")
+    return spec if is_law(spec) else None
+
+
+def is_law(value: object) -> bool:
+    """Whether a value is a law of levels, such as :class:`MeasuredLevels`, and not a model of noise."""
+    return callable(getattr(value, "sample", None)) and not isinstance(value, NoiseModel)
+
+
+def _levels_at(law: NoiseLevels, iso: Iso) -> NoiseLevels:
+    """A law of one's own at an ISO, or between two."""
+    if iso is None:
+        return law
+    if not isinstance(law, MeasuredLevels):
+        raise ValueError(f"{type(law).__name__} does not depend on ISO; omit iso, or give MeasuredLevels")
+    return law.within(iso)
 
 
 @cache
@@ -363,12 +512,13 @@ def _of_profile(spec: str, iso: Iso) -> ProfileLevels:
     return ProfileLevels(spec, iso)
 
 
-def noise_model(spec: NoiseSpec | NoiseModel, *, iso: Iso = None, poisson: bool = False) -> NoiseModel:
+def noise_model(spec: NoiseSpec | NoiseLevels | NoiseModel, *, iso: Iso = None, poisson: bool = False) -> NoiseModel:
     """Make the noise model of a name or of (shot_var, read_var); a model is returned as it is.
 
     Args:
         spec: one of :func:`noise_names`, with settings as ``{"name": ..., "settings": {...}}``, a list of names (each
-            picture draws one), a pair of variances on the scale white = 1, or a :class:`NoiseModel`.
+            picture draws one), a pair of variances on the scale white = 1, a law such as :class:`MeasuredLevels`, or a
+            :class:`NoiseModel`.
         iso: of a camera: one ISO, limits, or None for its whole measured range.
         poisson: exact photon statistics instead of the Gaussian.
 
@@ -388,19 +538,37 @@ def noise_model(spec: NoiseSpec | NoiseModel, *, iso: Iso = None, poisson: bool 
     if isinstance(spec, Mapping) and "settings" not in spec:  # {name: DarkFrames, path: ...}
         spec = {"name": spec.get("name"), "settings": {key: spec[key] for key in spec if key != "name"}}
     if isinstance(spec, (str, Mapping)):
-        name, settings = split_spec(spec)
-        if _has_law(name) or name not in NOISE:
-            noise_levels(name)  # an unknown name is reported before its settings
-            options = check_settings(f"noise {name!r}", partial(_shot_read, name), settings)
-            return _shot_read(name, **{"iso": iso, "poisson": poisson, **options})
-        model: NoiseModel = NOISE.make(spec)
-    elif isinstance(spec, NoiseModel):
-        model = spec
-    else:
-        return _shot_read(spec, iso, poisson)
+        return _named_model(spec, iso, poisson)
+    if isinstance(spec, ShotReadModel) and iso is not None and not poisson:
+        return _model_at(spec, iso)
+    if isinstance(spec, NoiseModel):
+        if iso is not None or poisson:
+            raise ValueError(f"iso and poisson apply to levels by name, not to a noise model, {type(spec).__name__}")
+        return spec
+    return _shot_read(spec, iso, poisson)
+
+
+def _named_model(spec: Spec, iso: Iso, poisson: bool) -> NoiseModel:
+    name, settings = split_spec(spec)
+    if _has_law(name) or name not in NOISE:
+        noise_levels(name)  # an unknown name is reported before its settings
+        options = check_settings(f"noise {name!r}", partial(_shot_read, name), settings)
+        return _shot_read(name, **{"iso": iso, "poisson": poisson, **options})
+
+    if iso is not None and name in ("MeasuredNoise", "EldNoise"):
+        spec, iso = {"name": name, "settings": {**settings, "iso": iso}}, None
     if iso is not None or poisson:
-        raise ValueError("iso and poisson apply to noise given by name, not to a noise model")
+        raise ValueError(f"iso and poisson are for levels of a camera, not for {name}")
+    model: NoiseModel = NOISE.make(spec)
     return model
+
+
+def _model_at(model: ShotReadModel, iso: Iso) -> ShotReadModel:
+    """A copy of a model with a law by ISO, at one ISO or between two."""
+    law = model.law if isinstance(model, MeasuredNoise) else model.levels
+    other = copy(model)
+    other.levels = _levels_at(law, iso)
+    return other
 
 
 def _has_law(name: str) -> bool:
@@ -409,7 +577,7 @@ def _has_law(name: str) -> bool:
     return name in known or camera_key(name) in map(camera_key, (ANY_CAMERA, *load_profiles().names))
 
 
-def _shot_read(spec: str | Sequence[float] | Sequence[str], iso: Iso = None, poisson: bool = False) -> NoiseModel:
+def _shot_read(spec: NoiseSpec | NoiseLevels, iso: Iso = None, poisson: bool = False) -> NoiseModel:
     levels = noise_levels(spec, iso=iso)
     return PoissonGaussianNoise(levels) if poisson else ShotReadNoise(levels)
 

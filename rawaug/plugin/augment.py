@@ -27,13 +27,16 @@ from rawaug import bayer
 from rawaug.bayer import CFA, pattern
 from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP, restrict_to_cameras
+from rawaug.isp.own_cameras import Camera
+from rawaug.isp.own_sampler import own_cameras
 from rawaug.kernels.runtime import eager
-from rawaug.noise import Iso, NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
+from rawaug.noise import Iso, MeasuredLevels, NoiseLevels, NoiseModel, NoiseSpec, noise_model
+from rawaug.noise.cameras import is_law, measured_noise
 from rawaug.plugin.draw import Draw, SettingSampler
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import find_picture, get_picture, is_picture, replace_picture, to_rgb_batch, trim_to_even
 from rawaug.plugin.targets import Burst, Srgb, Target, keep_white
-from rawaug.registry import spec_label
+from rawaug.registry import check_settings, spec_label, split_spec
 from rawaug.seeding import keyed_generator, rank_key
 
 
@@ -44,9 +47,12 @@ class RawAugment(nn.Module):
     parameters (:meth:`sample`) and applies them (:meth:`apply`), on the device of the batch.
 
     Args:
-        isp: the camera; a frozen copy is taken, later changes do not reach it.
-        noise: name of a preset or a measured camera, (shot_var, read_var), a :class:`rawaug.noise.NoiseModel`, or
-            ``"camera"`` for the levels that were measured when the ISP was fitted.
+        isp: the camera; a frozen copy is taken, later changes do not reach it. A :class:`rawaug.Camera` stands for the
+            ISP ``universal`` with this camera.
+        noise: name of a preset or a measured camera, (shot_var, read_var), a law such as
+            :class:`rawaug.noise.MeasuredLevels`, a :class:`rawaug.noise.NoiseModel`, or ``"camera"`` for the levels
+            that were measured when the ISP was fitted, or that a :class:`rawaug.Camera` states.
+            By default those of the :class:`rawaug.Camera`, else ``"cycleisp_sidd"``.
         draw: how cameras, lights, tone curves and exposures are drawn.
         target: what the pair holds. ``"raw"``: noisy and clean RAW. ``"rgb"``: noisy RAW, and clean linear camera RGB
             ``(B, 3, H, W)`` of the full size, for demosaicing. ``"srgb"`` or an :class:`Srgb`: both as sRGB
@@ -73,8 +79,8 @@ class RawAugment(nn.Module):
 
     def __init__(
         self,
-        isp: DictionaryISP,
-        noise: NoiseSpec | NoiseModel = "cycleisp_sidd",
+        isp: DictionaryISP | Camera,
+        noise: NoiseSpec | NoiseLevels | NoiseModel | None = None,
         *,
         draw: Draw = Draw(),
         target: Target | Srgb = "raw",
@@ -83,6 +89,10 @@ class RawAugment(nn.Module):
         seed: int = 0,
     ) -> None:
         super().__init__()
+        isp = of_camera(isp) if isinstance(isp, Camera) else isp
+        if noise is None:
+            noise = usual_noise(isp)
+        cfa = isp.info.get("pattern") if cfa is None else cfa
         self.pattern = None if cfa is None else pattern(cfa)
         if self.pattern is not None and self.pattern.name in CFA.__members__:
             isp, self.pattern = deepcopy(isp), None
@@ -100,14 +110,14 @@ class RawAugment(nn.Module):
         self.seed = seed
         self._set_draws(noise, draw)
 
-    def _set_draws(self, noise: NoiseSpec | NoiseModel, draw: Draw) -> None:
+    def _set_draws(self, noise: NoiseSpec | NoiseLevels | NoiseModel, draw: Draw) -> None:
         self.settings = SettingSampler(draw, self.isp, self.baked)
         self.noise, self.noise_name = noise_for(self.isp, noise), _noise_name(noise)
         if self.pattern is not None and self.noise.by_plane:
             raise ValueError(f"this noise is one of planes R, Gr, Gb, B, which {self.pattern.name} does not have")
         self._calls = 0
 
-    def with_draws(self, noise: NoiseSpec | NoiseModel, draw: Draw = Draw()) -> RawAugment:
+    def with_draws(self, noise: NoiseSpec | NoiseLevels | NoiseModel, draw: Draw = Draw()) -> RawAugment:
         """An augmentation with the same ISP, pattern and target but with other draws; nothing is baked again.
 
         Args:
@@ -120,10 +130,10 @@ class RawAugment(nn.Module):
     @classmethod
     def from_pretrained(
         cls,
-        isp: str | Path | DictionaryISP,
-        noise: NoiseSpec | NoiseModel | None = None,
+        isp: str | Path | DictionaryISP | Camera,
+        noise: NoiseSpec | NoiseLevels | NoiseModel | None = None,
         *,
-        camera: str | Sequence[str] | None = None,
+        camera: str | Path | Camera | Sequence[str | Path | Camera] | None = None,
         iso: Iso = None,
         draw: Draw = Draw(),
         target: Target | Srgb = "raw",
@@ -134,10 +144,11 @@ class RawAugment(nn.Module):
         """Make an augmentation of a shipped ISP by its name, of an ISP's file, or of an ISP.
 
         Args:
-            isp: the name, path or ISP.
-            noise: as in the constructor. By default ``"cycleisp_sidd"``, or with ``iso`` that of ``camera``.
-            camera: maker and model of a published camera, or several, in place of the ISP's colour atoms; for an ISP of
-                published cameras, such as ``universal``.
+            isp: the name, path or ISP; or a :class:`rawaug.Camera`, or the path of its YAML file.
+            noise: as in the constructor; with ``iso``, by default that of ``camera``.
+            camera: maker and model of a published camera, a :class:`rawaug.Camera` of your own or the path of its YAML
+                file, or several of these, in place of the ISP's colour atoms; for an ISP of published cameras, such as
+                ``universal``.
             iso: ISO of the noise of a measured camera, or (lowest, highest); ``rawaug info cameras`` lists the measured
                 ranges. All of them by default.
             draw, target, burst, cfa, seed: as in the constructor.
@@ -155,11 +166,19 @@ class RawAugment(nn.Module):
               noise: Nikon D750 iso=800
               target: raw, RGGB
         """
-        usual = "cycleisp_sidd" if iso is None or camera is None else camera
-        known = isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp)
-        own = known if camera is None else restrict_to_cameras(known, camera)
-        noise = with_iso(usual if noise is None else noise, iso)
-        return cls(own, noise, draw=draw, target=target, burst=burst, cfa=cfa, seed=seed)
+        if isinstance(isp, Camera):
+            isp = of_camera(isp)
+        elif not isinstance(isp, DictionaryISP):
+            isp = DictionaryISP.from_pretrained(isp)
+        own = isp if camera is None else restrict_to_cameras(isp, camera)
+
+        if noise is None:
+            noise = usual_noise(own)
+            if iso is not None and noise != "camera" and camera is not None:
+                several = [camera] if isinstance(camera, (str, Path, Camera)) else camera
+                names = [str(name) for name in several]
+                noise = names[0] if len(names) == 1 else names
+        return cls(own, with_iso(noise, iso), draw=draw, target=target, burst=burst, cfa=cfa, seed=seed)
 
     @eager
     @torch.no_grad()
@@ -403,6 +422,18 @@ def freeze(module: M) -> M:
     return copy
 
 
+def of_camera(camera: Camera | str | Path) -> DictionaryISP:
+    """The ISP ``universal`` with a camera of one's own in place of the published ones."""
+    return restrict_to_cameras(DictionaryISP.from_pretrained("universal"), camera)
+
+
+def usual_noise(isp: DictionaryISP) -> str:
+    """The noise where none is given: that of the cameras of one's own, if each states one."""
+    cameras = own_cameras(isp.info)
+    stated = bool(cameras) and all(camera.levels for camera in cameras)
+    return "camera" if stated else "cycleisp_sidd"
+
+
 def _require_finite(raw: Tensor) -> None:
     """Refuse what damaged weights make; on the CPU only, elsewhere it would stall the device."""
     if raw.device.type == "cpu" and not math.isfinite(raw.numpy().min()):  # NumPy: PyTorch's threads die in a fork
@@ -414,31 +445,54 @@ def _float32(like: Tensor) -> torch.autocast:
     return torch.autocast(like.device.type, enabled=False)
 
 
-def _noise_name(noise: NoiseSpec | NoiseModel) -> str:
+def _noise_name(noise: NoiseSpec | NoiseLevels | NoiseModel) -> str:
     if isinstance(noise, str) or (isinstance(noise, Mapping) and "name" in noise):
         return spec_label(noise)
-    return type(noise).__name__ if isinstance(noise, NoiseModel) else str(noise)
+    if isinstance(noise, MeasuredLevels):
+        return noise.camera
+    return type(noise).__name__ if isinstance(noise, NoiseModel) or is_law(noise) else str(noise)
 
 
-def with_iso(noise: NoiseSpec | NoiseModel, iso: Iso) -> NoiseSpec | NoiseModel:
-    """The noise of a measured camera at an ISO, or between two; ValueError if it is not one of a camera by name."""
+def with_iso(noise: NoiseSpec | NoiseLevels | NoiseModel, iso: Iso) -> NoiseSpec | NoiseLevels | NoiseModel:
+    """The noise of a measured camera at an ISO, or between two; ValueError if it does not depend on the ISO."""
     if iso is None:
         return noise
-    if not isinstance(noise, str) or noise == "camera":
-        raise ValueError(f"iso is for the noise of a measured camera, not for {noise!r}; give its name, or omit iso")
-    return {"name": noise, "settings": {"iso": iso}}
+    if isinstance(noise, str):
+        return {"name": noise, "settings": {"iso": iso}}
+    return noise_model(noise, iso=iso)
 
 
-def noise_for(isp: DictionaryISP, noise: NoiseSpec | NoiseModel) -> NoiseModel:
+def noise_for(isp: DictionaryISP, noise: NoiseSpec | NoiseLevels | NoiseModel) -> NoiseModel:
     """The noise model that ``noise`` means for this ISP.
 
-    ``"camera"`` is the law in the ISP's file, at any ISO that was measured; ValueError if none was.
+    ``"camera"`` is the law in the ISP's file, at any ISO that was measured; ``{name: camera, settings: {iso: ...}}`` is
+    that law at an ISO. ValueError if there is none.
     """
-    if noise != "camera":
-        return noise_model(noise)
-    if "noise" not in isp.info:
+    if isinstance(noise, str) or (isinstance(noise, Mapping) and "name" in noise):
+        name, settings = split_spec(noise)
+        if name == "camera":
+            return measured_noise(_laws_of(isp), **check_settings("noise camera", _iso_of, settings))
+    return noise_model(noise)
+
+
+def _iso_of(iso: Iso = None) -> Iso:
+    """The settings of the noise ``camera``."""
+    return iso
+
+
+def _laws_of(isp: DictionaryISP) -> list[Mapping[str, Any]]:
+    """The noise laws in an ISP's file, one for each of its cameras; ValueError if one is missing."""
+    if "noise" in isp.info:
+        return [isp.info["noise"]]
+    laws: list[Mapping[str, Any]] = []
+    for camera in own_cameras(isp.info):
+        law = camera.noise_spec()
+        if law is None:
+            raise ValueError(f'noise "camera": camera {camera.name!r} states no noise; give noise= by name')
+        laws.append(law)
+    if not laws:
         raise ValueError('noise "camera": this ISP was fitted without measuring noise; fit it again or use a preset')
-    return ShotReadNoise(camera_law(isp.info["noise"]))
+    return laws
 
 
 class ISPModel:

@@ -7,10 +7,15 @@ from typing import Any, cast
 import torch
 from pydantic import TypeAdapter
 
+from rawaug.files import parse_object, to_json
+from rawaug.isp.own_cameras import Camera, as_camera, is_camera_file
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.targets import Burst, Srgb, Target
 from rawaug.seeding import keyed_generator
+
+USUAL_NOISE = "auto"
+"""The noise of the camera where its file states one, else ``cycleisp_sidd``."""
 
 
 def pair_generator(seed: int, name: str, number: int) -> torch.Generator:
@@ -24,8 +29,10 @@ class AugmentConfig:
 
     Args:
         isp: ISP file, or the name of a shipped ISP.
-        camera: maker and model of a published camera, in place of the ISP's cameras.
-        noise: a preset, a measured camera, camera (as measured by the fit), or [shot_var, read_var].
+        camera: maker and model of a published camera, or a YAML file with the figures of your own, in place of the
+            ISP's cameras.
+        noise: a preset, a measured camera, camera (as measured by the fit, or stated by your camera), or
+            [shot_var, read_var]. By default that of your camera where its file states one, else cycleisp_sidd.
         iso: ISO of a measured camera's noise, instead of a draw from its measured range.
         draw: how the camera settings are drawn.
         target: raw, rgb for clean linear camera RGB, or srgb for noisy and clean developed pictures.
@@ -35,7 +42,7 @@ class AugmentConfig:
 
     isp: str = "universal"
     camera: str | None = None
-    noise: tuple[float, float] | str = "cycleisp_sidd"
+    noise: tuple[float, float] | str = USUAL_NOISE
     iso: float | None = None
     draw: Draw = Draw()
     target: Target | Srgb = "raw"
@@ -45,10 +52,27 @@ class AugmentConfig:
     def __post_init__(self) -> None:
         if self.noise is None:
             raise ValueError("noise must be a name or a pair (shot_var, read_var) of variances, got None")
+        if self.camera is not None and (isinstance(self.camera, Camera) or is_camera_file(self.camera)):
+            # The figures count, not the file, which may change or lie elsewhere.
+            camera = as_camera(self.camera)
+            object.__setattr__(self, "camera", to_json(camera.to_json()))
+        if self.noise == USUAL_NOISE:
+            own = self.own_camera
+            object.__setattr__(self, "noise", "camera" if own is not None and own.levels else "cycleisp_sidd")
+
+    @property
+    def own_camera(self) -> Camera | None:
+        """The camera of one's own; None where the cameras are published ones, or a fitted one."""
+        if self.camera is not None and self.camera.startswith("{"):
+            return Camera.from_json(parse_object(self.camera))
+        return Camera.load(self.isp) if is_camera_file(self.isp) else None
 
     def make(self) -> RawAugment:
         """The augmentation of these settings; it raises what :meth:`rawaug.RawAugment.from_pretrained` raises."""
-        return RawAugment.from_pretrained(**vars(self))
+        settings = dict(vars(self))
+        if self.camera is not None and self.own_camera is not None:
+            settings["camera"] = self.own_camera
+        return RawAugment.from_pretrained(**settings)
 
     @property
     def target_name(self) -> Target:

@@ -30,6 +30,7 @@ from rawaug.isp.fit.descent import Descent, cycle_error, reading_error, train_en
 from rawaug.isp.fit.samples import FitFrames, FramePair, FrameSummary, PixelSamples, sample_pixels
 from rawaug.isp.fit.start import REACH_ATOMS, FrameColour, Tie, fit_fall_off, least_squares, set_dictionaries
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.own_cameras import Camera
 from rawaug.isp.stages import LensShading, Stage
 from rawaug.kernels.runtime import one_thread
 from rawaug.progress import progress as progress_of
@@ -52,6 +53,7 @@ def fit_isp(
     progress: bool = True,
     state: str | Path | None = None,
     report: Callable[[DictionaryISP], str] | None = None,
+    camera: Camera | None = None,
 ) -> DictionaryISP:
     """Fit a dictionary ISP to pairs of RAW and sRGB.
 
@@ -61,6 +63,7 @@ def fit_isp(
         progress: show progress bars.
         state: file with the state of the fit, to resume it; removed at the end.
         report: called with the ISP as it would be now, every 50 steps of stage 2; its text goes to the progress bar.
+        camera: figures of the camera, from which the frames' matrices start.
 
     Raises:
         ValueError: if there is no pair, a frame has too few unclipped pixels, or ``state`` cannot be read.
@@ -69,14 +72,14 @@ def fit_isp(
     reading = progress_of(pairs, label="read", unit="frame", shown=progress)
     frames = sample_pixels(reading, config.pixels, config.seed, config.noisy)
     path = None if state is None else Path(state)
-    descent = Descent(path, _key(config, frames), config.seed, progress)
+    descent = Descent(path, _key(config, frames, camera), config.seed, progress)
 
     def refit(some: FitFrames, part: str, config: FitConfig) -> DictionaryISP:
-        return _Fit(some, config, descent, part).fit_reverse()
+        return _Fit(some, config, descent, part, camera).fit_reverse()
 
     with one_thread():
         config, gain = with_better_tone(frames, config, refit)
-        fit = _Fit(frames, config, descent)
+        fit = _Fit(frames, config, descent, camera=camera)
         fit.fit_reverse(report)
         train_encoders(fit.isp, frames, config, descent, refit)
         fit.forward()
@@ -88,10 +91,11 @@ def fit_isp(
     return fit.isp.eval()
 
 
-def _key(config: FitConfig, frames: FitFrames) -> str:
+def _key(config: FitConfig, frames: FitFrames, camera: Camera | None) -> str:
     """Hash the settings and pixels that a kept state belongs to."""
     known = [(shot.name, shot.camera, shot.white_balance) for shot in frames.shots]
-    settings = repr((__version__, config, known)).encode()
+    start = () if camera is None else (camera,)
+    settings = repr((__version__, config, known, *start)).encode()
     return digest(settings, frames.pixels.srgb.numpy().tobytes(), frames.pixels.target.numpy().tobytes())
 
 
@@ -119,8 +123,13 @@ def new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
 class _Fit:
     """The ISP being fitted, with every frame's own colour; ``part`` ends the names of its stages."""
 
-    def __init__(self, frames: FitFrames, config: FitConfig, descent: Descent, part: str = "") -> None:
+    def __init__(
+        self, frames: FitFrames, config: FitConfig, descent: Descent, part: str = "", camera: Camera | None = None
+    ) -> None:
         self.samples, self.shots = frames
+        self.known_matrix: Tensor | None = None
+        if camera is not None:
+            self.known_matrix = torch.stack([camera.matrix_for(shot.white_balance) for shot in self.shots])
         self.config, self.descent, self.part = config, descent, part
         self.isp = new_isp(self.shots, config)
         self.tie = Tie(self.shots)
@@ -132,11 +141,14 @@ class _Fit:
         tried = []
         for curve in STANDARD_CURVES:
             self._start_coarse(*curve)
-            self.colour = FrameColour.from_product(least_squares(self._apply_curve(self.samples), self.samples))
+            self.colour = FrameColour.from_product(self._least_squares())
             tried.append((self._error(), curve, self.colour))
         _, curve, colour = min(tried, key=lambda one: one[0])
         self._start_coarse(*curve)
         return colour
+
+    def _least_squares(self) -> Tensor:
+        return least_squares(self._apply_curve(self.samples), self.samples, self.known_matrix)
 
     def _start_coarse(self, gamma: float, toe: float) -> None:
         for stage in self.isp.ordered_stages:

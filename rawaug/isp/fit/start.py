@@ -90,9 +90,17 @@ class Tie:
         return TIE * bounded.sum(1).mean()
 
 
+CAMERA_RIDGE = 1e-3
+"""Weight of a known camera's matrix in the start, as a share of the mean square of the colours."""
+
+
 @torch.no_grad()
-def least_squares(linear: Tensor, samples: PixelSamples) -> Tensor:
-    """Solve for ``M_f`` ``(F, 3, 3)``, which takes ``linear`` ``(F, 3, 1, P)`` to the readings, by least squares."""
+def least_squares(linear: Tensor, samples: PixelSamples, known_matrix: Tensor | None = None) -> Tensor:
+    """Solve for ``M_f`` ``(F, 3, 3)``, which takes ``linear`` ``(F, 3, 1, P)`` to the readings, by least squares.
+
+    Where the colours of a frame do not say, ``known_matrix`` ``(F, 3, 3)`` does, from linear sRGB to white-balanced
+    camera RGB: the ridge draws ``M_f`` to its rows, each times the gain that fits the readings best.
+    """
     x = linear[:, :, 0].double()
     y, known = samples.target[:, :, 0].double(), samples.known[:, :, 0].double()
     if (known.sum(2) < FEWEST_PIXELS).any():
@@ -100,8 +108,15 @@ def least_squares(linear: Tensor, samples: PixelSamples) -> Tensor:
         raise ValueError(f"frame {frame}: too few unclipped pixels to fit; use a better exposed frame or more pixels")
     moments = torch.einsum("fip,fjp,fcp->fcij", x, x, known)
     cross = torch.einsum("fip,fcp,fcp->fci", x, y, known)
-    ridge = 1e-9 * moments.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(3).double()
-    return torch.linalg.solve(moments + ridge, cross).float()
+    power = moments.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
+    if known_matrix is None:
+        return torch.linalg.solve(moments + 1e-9 * power * torch.eye(3).double(), cross).float()
+
+    rows = known_matrix.double()
+    gains = (rows * cross).sum(2) / torch.einsum("fci,fcij,fcj->fc", rows, moments, rows)
+    rows = gains[:, :, None] * rows
+    ridge = CAMERA_RIDGE * power * torch.eye(3).double()
+    return torch.linalg.solve(moments + ridge, cross + CAMERA_RIDGE * power[..., 0] * rows).float()
 
 
 @torch.no_grad()

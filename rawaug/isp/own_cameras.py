@@ -1,0 +1,548 @@
+r"""A camera of one's own, by the figures of its data sheet: no RAW file is needed.
+
+A camera is known in one light or several. In each it has a matrix C from linear sRGB to white-balanced camera RGB,
+whose rows sum to 1, and gains g (green 1) that make white grey. With S from linear sRGB to XYZ and B(L) Bradford's
+adaptation from the light's white point to D65, the matrix from XYZ under that light is
+
+.. math:: X = \mathrm{diag}(1 / g) \; C \; S^{-1} B(L) .
+
+Between two lights of colour temperatures :math:`T_1 < T < T_2` matrices are mixed linearly in mired, as the DNG
+specification does (Adobe, 1.7, "Mapping camera color space to CIE XYZ space"),
+
+.. math:: w_1 = \frac{1/T - 1/T_2}{1/T_1 - 1/T_2}, \qquad C = \sum_i w_i C_i, \qquad
+    g(L) = \frac{(X L)_G}{X L}, \quad X = \sum_i w_i X_i,
+
+and beyond the outermost light its matrix stays. So the gains of a light on the data sheet are exactly those stated.
+
+*Noise.* A gain of K digital numbers (DN) for an electron, read noise of :math:`\sigma` DN and V = white level - black
+level give the variances on the scale white = 1:
+
+.. math:: \mathrm{shot\_var} = K / V, \qquad \mathrm{read\_var} = \sigma^2 / V^2 .
+
+Where ``bits`` is given, RAW is rounded to whole DN. Noise that is measured on RAW files contains this rounding,
+a variance of :math:`1 / (12 V^2)`, so it is taken off ``read_var`` before the rounding adds it again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, asdict, dataclass, fields
+from numbers import Real
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA, PATTERNS
+from rawaug.files import read_yaml
+from rawaug.isp.cameras import (
+    LAMPS,
+    SRGB_TO_XYZ,
+    XYZ_TO_SRGB,
+    Array,
+    camera_from_srgb,
+    daylight,
+    gains_in_light,
+    load_cameras,
+    planckian,
+    white_point,
+)
+from rawaug.registry import suggest
+
+YAML_EXTENSIONS = (".yaml", ".yml")
+"""How the name of a camera's file ends."""
+
+ILLUMINANTS = {
+    "A": (0.44758, 0.40745),
+    "D50": (0.34567, 0.35850),
+    "D55": (0.33242, 0.34743),
+    "D65": (0.31271, 0.32902),
+    "D75": (0.29902, 0.31485),
+}
+"""Chromaticities (x, y) of CIE standard illuminants, 2 degree observer (CIE 15:2018, table T.3)."""
+
+MatrixKind = Literal["xyz_to_camera", "srgb_to_camera", "camera_to_srgb"]
+NoiseUnit = Literal["variance", "DN"]
+
+_BRADFORD = torch.tensor(
+    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]], dtype=torch.float64
+)
+_REFERENCE = "D65"
+_LARGEST_VAR = 0.2
+"""A shot_var above it means fewer than five electrons at white: such numbers are more likely in DN."""
+
+
+class Level(NamedTuple):
+    """The noise of a camera at one ISO: variances, white = 1; the ISO is None where it is not stated."""
+
+    iso: float | None
+    shot_var: float
+    read_var: float
+
+
+class Anchor(NamedTuple):
+    """A camera in one light of its data sheet.
+
+    Args:
+        light: the name of the light.
+        mired: a million over its correlated colour temperature in kelvin.
+        matrix: float64 ``(3, 3)``, from linear sRGB to white-balanced camera RGB, rows of sum 1.
+        gains: float64 ``(3,)``, green 1.
+        from_xyz: float64 ``(3, 3)``, X of this module.
+    """
+
+    light: str
+    mired: float
+    matrix: Tensor
+    gains: Tensor
+    from_xyz: Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera of your own, by the figures of its data sheet.
+
+    Args:
+        name: maker and model, for reports.
+        matrix: 3 x 3, or a mapping of lights to such matrices. A light is ``"A"``, ``"D50"``, ``"D55"``, ``"D65"``,
+            ``"D75"``, a lamp of :data:`rawaug.isp.cameras.LAMPS`, or a colour temperature in kelvin. A single matrix is
+            that of D65.
+        matrix_is: what the matrix does. ``"xyz_to_camera"``: CIE XYZ under the light to camera RGB before white
+            balance, as ColorMatrix in a DNG. ``"srgb_to_camera"``: linear sRGB to white-balanced camera RGB.
+            ``"camera_to_srgb"``: the opposite, the colour correction matrix of most ISPs.
+        white_balance: gains of R, G and B that make white grey, or a mapping of lights to them. They may be left out
+            with ``"xyz_to_camera"``, from which they follow.
+        cfa: pattern of the sensor.
+        black_level: in DN.
+        white_level: DN at which the sensor saturates; by default the largest number of ``bits``.
+        bits: depth of the RAW, 1 to 16; RAW is then rounded to whole DN. By default nothing is rounded.
+        noise: levels by ISO, each ``(shot_var, read_var)``, variances on the scale white = 1, or ``(K, sigma)`` in DN,
+            where ``noise_in`` says so; a mapping with these names says by itself what it is. A single level without an
+            ISO may be given as it is. None if unknown.
+        noise_in: unit of levels without names, ``"variance"`` or ``"DN"``.
+        tone: name of one of the ISP's tone curves, or points ``(linear light, value of the picture)``, both from 0 to 1
+            and ascending. By default any of the ISP's curves is drawn.
+
+    Raises:
+        ValueError: if a figure is missing, of another shape or out of range; the message names it.
+
+    Example:
+        >>> camera = Camera(
+        ...     "Maker M1",
+        ...     matrix=[[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.0, -0.6, 1.6]],
+        ...     matrix_is="camera_to_srgb",
+        ...     white_balance={"A": (1.3, 1.0, 2.6), "D65": (2.1, 1.0, 1.7)},
+        ...     cfa="GRBG",
+        ...     black_level=64,
+        ...     bits=10,
+        ...     noise={100: {"K": 0.12, "sigma": 1.1}, 800: {"K": 0.96, "sigma": 2.4}},
+        ... )
+        >>> [f"{variance:.3g}" for variance in camera.levels[0][1:]]
+        ['0.000125', '1.32e-06']
+    """
+
+    name: str
+    _: KW_ONLY
+    matrix: Any
+    matrix_is: MatrixKind
+    white_balance: Any = None
+    cfa: str = "RGGB"
+    black_level: float = 0.0
+    white_level: float | None = None
+    bits: int | None = None
+    noise: Any = None
+    noise_in: NoiseUnit = "variance"
+    tone: Any = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name.strip():
+            raise ValueError(f"a camera needs a name, got {self.name!r:.100}")
+
+        # Whatever was given is kept as plain values, so that a camera can be printed, compared and stored.
+        object.__setattr__(self, "matrix", _plain(self.matrix))
+        object.__setattr__(self, "white_balance", _plain(self.white_balance))
+        object.__setattr__(self, "noise", _plain(self.noise))
+        object.__setattr__(self, "tone", _plain(self.tone))
+
+        self._check_choices()
+        self._check_grid()
+        self.anchors()  # raises for matrices and gains
+        self._check_levels()
+        self.inverse_curve(2)  # raises for points of the tone curve
+
+    def _check_choices(self) -> None:
+        if self.matrix_is not in get_args(MatrixKind):
+            raise self._error("matrix_is", f"must be one of {', '.join(get_args(MatrixKind))}, got {self.matrix_is!r}")
+        if self.noise_in not in get_args(NoiseUnit):
+            raise self._error("noise_in", f"must be variance or DN, got {self.noise_in!r}")
+
+        patterns = [*CFA.__members__, *PATTERNS]
+        if self.cfa not in patterns:
+            raise self._error("cfa", f"is unknown: {self.cfa!r}; use one of {', '.join(dict.fromkeys(patterns))}")
+
+    def _check_grid(self) -> None:
+        if self.bits is not None and (not isinstance(self.bits, int) or not 1 <= self.bits <= 16):
+            raise self._error("bits", f"must be a whole number from 1 to 16, got {self.bits!r}")
+        for key in ("black_level", "white_level"):
+            value = getattr(self, key)
+            if value is not None and not (_is_number(value) and value >= 0):
+                raise self._error(key, f"must be a number of DN, at least 0, got {value!r:.100}")
+        if self.white_level is None and self.bits is None:
+            if self.black_level:
+                raise self._error("black_level", "needs bits or white_level as well")
+            return
+        if not self.full_scale > 0:
+            raise self._error("black_level", f"{self.black_level:g} DN is not below white, {self.white:g} DN")
+        if self.bits is not None and self.white > 2**self.bits - 1:
+            raise self._error("white_level", f"{self.white:g} DN is more than {self.bits} bits hold")
+
+    def _check_levels(self) -> None:
+        values = [level.iso for level in self.levels]
+        if len(set(values)) < len(values) or (None in values and len(values) > 1):
+            raise self._error("noise", f"must have a level for each ISO, or a single one without, got {values}")
+
+        rounding = self.quantum**2 / 12
+        for level in self.levels:
+            if level.shot_var < 0 or level.read_var < rounding:
+                at = "" if level.iso is None else f" at ISO {level.iso:g}"
+                reason = f"{level.read_var:.3g} of read_var{at} is less than rounding alone makes, {rounding:.3g}"
+                raise self._error("noise", f"{reason}; leave out bits to round nothing")
+
+    def _error(self, key: str, reason: str) -> ValueError:
+        return ValueError(f"camera {self.name!r}: {key} {reason}")
+
+    # -- digital numbers ----------------------------------------------------------------------------------------------
+
+    @property
+    def white(self) -> float:
+        """The DN at which the sensor saturates; 1 where neither ``white_level`` nor ``bits`` is given."""
+        if self.white_level is not None:
+            return float(self.white_level)
+        return 1.0 if self.bits is None else float(2**self.bits - 1)
+
+    @property
+    def full_scale(self) -> float:
+        """V, the DN from black to white."""
+        return self.white - self.black_level
+
+    @property
+    def quantum(self) -> float:
+        """The step of the rounding on the scale white = 1; 0 where nothing is rounded."""
+        return 0.0 if self.bits is None else 1.0 / self.full_scale
+
+    # -- noise --------------------------------------------------------------------------------------------------------
+
+    @property
+    def levels(self) -> list[Level]:
+        """The noise by ISO, ascending, as variances with white = 1; empty where it is not known."""
+        if self.noise is None:
+            return []
+        if not isinstance(self.noise, dict) or set(self.noise) <= {"shot_var", "read_var", "K", "sigma"}:
+            return [Level(None, *self._variances(self.noise, ""))]
+
+        levels = []
+        for iso, values in self.noise.items():
+            try:
+                number = float(iso)
+            except (TypeError, ValueError):
+                number = math.nan
+            if not 0 < number < math.inf:
+                raise self._error("noise", f"has levels by ISO, a positive number, got {iso!r:.100}")
+            levels.append(Level(number, *self._variances(values, f" at ISO {number:g}")))
+        return sorted(levels, key=lambda level: level.iso or 0.0)
+
+    def _variances(self, values: Any, where: str) -> tuple[float, float]:
+        in_dn = self.noise_in == "DN"
+        if isinstance(values, dict):
+            in_dn = "K" in values or "sigma" in values
+            keys = ("K", "sigma") if in_dn else ("shot_var", "read_var")
+            if set(values) != set(keys):
+                raise self._error("noise", f"{where} is {{{keys[0]}, {keys[1]}}}, got {', '.join(map(str, values))}")
+            values = [values[key] for key in keys]
+        if not isinstance(values, list) or len(values) != 2 or not all(_is_number(value) for value in values):
+            raise self._error("noise", f"{where} must be two numbers, got {values!r:.100}")
+
+        first, second = (float(value) for value in values)
+        if min(first, second) < 0:
+            raise self._error("noise", f"{where} must not be negative, got {first:g} and {second:g}")
+        if not in_dn:
+            if max(first, second) > _LARGEST_VAR:
+                advice = "(K, sigma) in DN needs noise_in='DN'"
+                raise self._error(
+                    "noise", f"{where} has variances {first:g} and {second:g}, as no sensor has; {advice}"
+                )
+            return first, second
+        if self.bits is None and self.white_level is None:
+            raise self._error("noise", f"{where} is in DN: give white_level or bits, and black_level")
+        return first / self.full_scale, (second / self.full_scale) ** 2
+
+    def noise_spec(self) -> dict[str, Any] | None:
+        """The noise as a name with settings, which :func:`rawaug.noise.noise_model` reads; None if unknown.
+
+        The grid of digital numbers is part of it where ``bits`` is given.
+        """
+        if not self.levels:
+            return None
+        rows = []
+        for level in self.levels:
+            row = {"iso": level.iso, "shot_var": level.shot_var, "read_var": level.read_var}
+            rows.append({key: value for key, value in row.items() if value is not None})
+        settings: dict[str, Any] = {"camera": self.name, "levels": rows}
+        if self.quantum:
+            settings["quantum"] = self.quantum
+        return {"name": "MeasuredNoise", "settings": settings}
+
+    # -- colour -------------------------------------------------------------------------------------------------------
+
+    def anchors(self) -> list[Anchor]:
+        """The camera in each light that its figures name, warmest first."""
+        matrices = self._by_light("matrix", self.matrix, (3, 3))
+        gains = self._by_light("white_balance", self.white_balance, (3,))
+        if len(matrices) == 1 and gains and not isinstance(self.white_balance, dict):
+            gains = dict.fromkeys(matrices, gains[_REFERENCE])  # both are of one light, that of the matrix
+
+        from_srgb = {light: self._from_srgb(light, matrix) for light, matrix in matrices.items()}
+        lights = {*matrices, *gains}
+        if gains and not isinstance(self.matrix, dict):
+            lights = {*gains}  # the one matrix serves in all of them
+
+        anchors = []
+        for light in sorted(lights, key=light_mired, reverse=True):
+            matrix = _mix_by_light(from_srgb, light)
+            stated = gains.get(light)
+            if stated is None:
+                stated = self._implied_gains(light, matrices)
+            stated = stated / stated[1]
+            to_d65 = adaptation(light_xyz(light), light_xyz(_REFERENCE))
+            from_xyz = torch.diag(1.0 / stated) @ matrix @ XYZ_TO_SRGB @ to_d65
+            anchors.append(Anchor(light, light_mired(light), matrix, stated, from_xyz))
+        return anchors
+
+    def _by_light(self, key: str, value: Any, shape: tuple[int, ...]) -> dict[str, Tensor]:
+        if value is None:
+            return {}
+        if not isinstance(value, dict):
+            value = {_REFERENCE: value}
+        by_light = {}
+        for light, numbers in value.items():
+            name = str(light)
+            try:
+                light_xyz(name)
+                by_light[name] = torch.tensor(numbers, dtype=torch.float64)
+            except (TypeError, ValueError) as error:
+                raise self._error(key, f"of light {name!r:.40} cannot be read: {error}") from None
+            if by_light[name].shape != shape or not by_light[name].isfinite().all():
+                size = " x ".join(map(str, shape))
+                raise self._error(key, f"of light {name} must be {size} finite numbers, got {numbers!r:.100}")
+            if key == "white_balance" and not (by_light[name] > 0).all():
+                raise self._error(key, f"of light {name} must be positive, got {numbers!r:.100}")
+        if not by_light:
+            raise self._error(key, "names no light")
+        return by_light
+
+    def _from_srgb(self, light: str, matrix: Tensor) -> Tensor:
+        """The matrix of a light from linear sRGB to white-balanced camera RGB, rows of sum 1."""
+        if self.matrix_is == "xyz_to_camera":
+            under_light = adaptation(light_xyz(_REFERENCE), light_xyz(light))
+            return camera_from_srgb(matrix @ under_light)
+        if self.matrix_is == "camera_to_srgb":
+            if float(torch.linalg.cond(matrix)) > 1e6:
+                raise self._error("matrix", f"of light {light} cannot be inverted")
+            matrix = torch.linalg.inv(matrix)
+        rows = matrix.sum(dim=1, keepdim=True)
+        if not ((rows - 1.0).abs() < 0.05).all():
+            sums = ", ".join(f"{value:.3f}" for value in rows.flatten().tolist())
+            raise self._error("matrix", f"of light {light} must keep white: its rows sum to {sums}, not to 1")
+        return matrix / rows
+
+    def _implied_gains(self, light: str, matrices: Mapping[str, Tensor]) -> Tensor:
+        """The gains of a light by the matrix from XYZ."""
+        if self.matrix_is != "xyz_to_camera":
+            raise self._error("white_balance", f"needs the gains of light {light} as well")
+        response = matrices[light] @ light_xyz(light)
+        if not (response > 0).all():
+            raise self._error("matrix", f"of light {light} makes white negative: {response.tolist()}")
+        return gains_in_light(matrices[light], light_xyz(light))
+
+    def matrix_for(self, white_balance: Sequence[float]) -> Tensor:
+        """The matrix ``(3, 3)`` from linear sRGB to white-balanced camera RGB in the light of as-shot gains.
+
+        It is that of the colour temperature on the Planckian or daylight locus whose gains are nearest, in logarithms.
+        """
+        anchors = self.anchors()
+        mireds = np.linspace(100.0, 500.0, 81)
+        lights = torch.stack([light_xyz(f"{1e6 / mired:.6f}") for mired in mireds])
+        weights = torch.from_numpy(weights_in_light([anchor.mired for anchor in anchors], mired_of(lights.numpy())))
+
+        from_xyz = torch.einsum("bn,nij->bij", weights, torch.stack([anchor.from_xyz for anchor in anchors]))
+        gains = gains_in_light(from_xyz, lights).clamp_min(1e-6)
+        stated = torch.tensor(white_balance, dtype=torch.float64)
+        distance = (gains.log() - (stated / stated[1]).log()).square().sum(dim=1)
+        nearest = weights[int(distance.argmin())]
+        return torch.einsum("n,nij->ij", nearest, torch.stack([anchor.matrix for anchor in anchors]))
+
+    # -- tone ---------------------------------------------------------------------------------------------------------
+
+    def inverse_curve(self, nodes: int) -> Tensor | None:
+        """Linear light ``(nodes,)`` over the values of the picture; None unless ``tone`` is points."""
+        if self.tone is None or isinstance(self.tone, str):
+            return None
+        try:
+            points = np.asarray(self.tone, dtype=np.float64)
+        except (TypeError, ValueError):
+            points = np.empty(0)
+        if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
+            points = np.zeros((2, 2))
+        ascending = bool((np.diff(points, axis=0) > 0).all())
+        if not ascending or tuple(points[0]) != (0.0, 0.0) or tuple(points[-1]) != (1.0, 1.0):
+            wanted = "must be a name, or ascending points (linear, value) from (0, 0) to (1, 1)"
+            raise self._error("tone", f"{wanted}, got {self.tone!r:.100}")
+        values = np.linspace(0.0, 1.0, nodes)
+        return torch.from_numpy(np.interp(values, points[:, 1], points[:, 0])).float()
+
+    # -- files --------------------------------------------------------------------------------------------------------
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures as plain values, without those that have their defaults; :meth:`from_json` reads them back."""
+        figures = asdict(self)
+        return {field.name: figures[field.name] for field in fields(self) if figures[field.name] != field.default}
+
+    @classmethod
+    def from_json(cls, content: Any, where: str = "camera") -> Camera:
+        """A camera of plain values.
+
+        Args:
+            content: a mapping with the names of the arguments.
+            where: opens the messages.
+
+        Raises:
+            ValueError: if a key is unknown or missing, or a figure is wrong.
+        """
+        keys = [field.name for field in fields(cls)]
+        if not isinstance(content, Mapping):
+            raise ValueError(f"{where}: must hold keys and values, {', '.join(keys)}")
+        for key in content:
+            if key not in keys:
+                raise ValueError(f"{where}: unknown key {key!r:.80}; use {', '.join(keys)}{suggest(key, keys)}")
+        for key in ("name", "matrix", "matrix_is"):
+            if key not in content:
+                raise ValueError(f"{where}: has no {key}")
+        try:
+            return cls(**content)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+
+    @classmethod
+    def load(cls, path: str | Path) -> Camera:
+        """A camera from a YAML file with the names of the arguments as keys.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is not YAML, or a figure is wrong.
+        """
+        return cls.from_json(read_yaml(path, "camera"), str(path))
+
+    @classmethod
+    def published(cls, name: str) -> Camera:
+        """The published camera of this name; ValueError if it is not listed."""
+        (matrix,) = load_cameras().select([name])
+        return cls(name, matrix=matrix.tolist(), matrix_is="xyz_to_camera")
+
+
+def is_camera_file(name: object) -> bool:
+    """Whether a name or path is that of a camera's YAML file."""
+    return isinstance(name, (str, Path)) and Path(name).suffix.lower() in YAML_EXTENSIONS
+
+
+def as_camera(camera: str | Path | Camera) -> Camera:
+    """A camera as it is, from its YAML file, or a published one by its name."""
+    if isinstance(camera, Camera):
+        return camera
+    return Camera.load(camera) if is_camera_file(camera) else Camera.published(str(camera))
+
+
+# -- lights ------------------------------------------------------------------------------------------------------------
+
+
+def light_chromaticity(light: str) -> tuple[float, float]:
+    """The chromaticity (x, y) of a light by its name or its colour temperature in kelvin; ValueError if unknown."""
+    if light in ILLUMINANTS:
+        return ILLUMINANTS[light]
+    if light in LAMPS:
+        return LAMPS[light]
+    try:
+        kelvin = float(light.removesuffix("K").strip())
+    except ValueError:
+        names = [*ILLUMINANTS, *LAMPS]
+        listed = f"{', '.join(names)}{suggest(light, names)}"
+        raise ValueError(f"light {light!r:.40} is unknown; use a number in kelvin, {listed}") from None
+    if not 1000 <= kelvin <= 15000:
+        raise ValueError(f"a light must be 1,000 to 15,000 kelvin, got {kelvin:g}")
+    locus = planckian if kelvin < 4000 else daylight
+    x, y = locus(np.array(kelvin)).tolist()
+    return x, y
+
+
+def light_xyz(light: str) -> Tensor:
+    """The white point of a light, XYZ ``(3,)`` with Y = 1; that of D65 is the white of sRGB."""
+    if light == _REFERENCE:
+        return SRGB_TO_XYZ.sum(dim=1)
+    return white_point(light_chromaticity(light))
+
+
+def light_mired(light: str) -> float:
+    """A million over the correlated colour temperature of a light."""
+    return float(mired_of(light_xyz(light)[None].numpy())[0])
+
+
+def mired_of(white: Array) -> Array:
+    """A million over the correlated colour temperatures ``(B,)`` of white points ``(B, 3)`` (McCamy, 1992)."""
+    total = white.sum(axis=1)
+    x, y = white[:, 0] / total, white[:, 1] / total
+    n = (x - 0.3320) / (0.1858 - y)
+    kelvin = ((449.0 * n + 3525.0) * n + 6823.3) * n + 5520.33
+    return np.asarray(1e6 / np.maximum(kelvin, 1000.0))
+
+
+def adaptation(white: Tensor, other: Tensor) -> Tensor:
+    """Bradford's adaptation ``(3, 3)`` of XYZ from one white point ``(3,)`` to another."""
+    cones = (_BRADFORD @ other) / (_BRADFORD @ white)
+    return torch.linalg.inv(_BRADFORD) @ torch.diag(cones) @ _BRADFORD
+
+
+def weights_in_light(anchors: Sequence[float], mired: Array) -> Array:
+    """Weights ``(B, N)`` of anchors at ascending or descending mireds, linear between two and constant beyond."""
+    mireds = np.asarray(anchors, dtype=np.float64)
+    if len(mireds) == 1:
+        return np.ones((len(mired), 1))
+    order = np.argsort(mireds)
+    rows = np.eye(len(mireds))[order]
+    columns = [np.interp(mired, mireds[order], rows[:, column]) for column in range(len(mireds))]
+    return np.stack(columns, axis=1)
+
+
+def _mix_by_light(matrices: Mapping[str, Tensor], light: str) -> Tensor:
+    """The matrix of a light, or the mixture of those of the lights beside it."""
+    if light in matrices:
+        return matrices[light]
+    mireds = [light_mired(name) for name in matrices]
+    weights = torch.from_numpy(weights_in_light(mireds, np.array([light_mired(light)])))[0]
+    return torch.einsum("n,nij->ij", weights, torch.stack(list(matrices.values())))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _plain(value: Any) -> Any:
+    """Arrays, tensors, tuples and mappings as lists and dicts of plain values."""
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (Tensor, np.ndarray)):
+        return value.tolist()
+    if isinstance(value, Iterable) and not isinstance(value, (str, bytes)):
+        return [_plain(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,0 +1,106 @@
+"""Settings of cameras of one's own: a camera in a light, mixtures of two where there are several."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from rawaug.isp.cameras import Array, LightRange, light_range, sample_lights
+from rawaug.isp.dictionary import (
+    CAMERAS_MIXED,
+    PLAUSIBLE_GAINS,
+    CameraDictionary,
+    CameraSampler,
+    sparse_shares,
+)
+from rawaug.isp.own_cameras import ILLUMINANTS, Camera, light_xyz, mired_of, weights_in_light
+
+_ROUNDS = 100
+
+
+class OwnCameraSampler(CameraSampler):
+    """Draws settings of cameras of one's own, on the CPU.
+
+    A light of their data sheets, by its name, is exactly that light; all others scatter as those of published cameras.
+
+    Args:
+        atoms: the dictionary of the ISP.
+        cameras: the cameras; an atom is one of them in one of its lights, in this order.
+        tone_atoms: number of tone curves.
+        light: as in :class:`rawaug.Draw`.
+        consistent: whether colour and gains are of one camera in one light; if not, the gains are drawn apart.
+
+    Raises:
+        ValueError: if the light is unknown.
+    """
+
+    def __init__(
+        self,
+        atoms: CameraDictionary,
+        cameras: Sequence[Camera],
+        tone_atoms: int,
+        light: float | str | None = None,
+        consistent: bool = True,
+    ) -> None:
+        anchors = [camera.anchors() for camera in cameras]
+        self._mireds = [[anchor.mired for anchor in in_lights] for in_lights in anchors]
+        self._from_xyz = np.stack([anchor.from_xyz.numpy() for in_lights in anchors for anchor in in_lights])
+        self._exact: Array | None = None
+
+        # Gains of the data sheets are plausible, whatever they are.
+        stated = np.stack([anchor.gains.numpy() for in_lights in anchors for anchor in in_lights])
+        self._lowest = min(PLAUSIBLE_GAINS[0], float(stated.min()))
+        self._highest = max(PLAUSIBLE_GAINS[1], float(stated.max()))
+
+        by_name = {anchor.light for in_lights in anchors for anchor in in_lights} | ILLUMINANTS.keys()
+        if isinstance(light, str) and light in by_name:
+            self._exact = light_xyz(light).numpy()
+            lights = LightRange()
+        else:
+            lights = light_range(light)
+        super().__init__(atoms, tone_atoms, lights, consistent)
+
+    def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Array, Array]:
+        weights, balance = np.empty((batch, len(self._from_xyz))), np.empty((batch, 3))
+        rest = np.arange(batch)
+        for _ in range(_ROUNDS):
+            cameras, shares = sparse_shares(len(rest), len(self._mireds), CAMERAS_MIXED, generator)
+            light = self._lights(len(rest), generator)
+            weights[rest] = self._weights(cameras.numpy(), shares.numpy(), light)
+            balance[rest] = self.balance(weights[rest], light)
+
+            plausible = (balance[rest] >= self._lowest) & (balance[rest] <= self._highest)
+            rest = rest[~plausible.all(axis=1)]
+            if not len(rest):
+                return weights, balance
+        limits = f"{self._lowest:g} to {self._highest:g}"
+        raise ValueError(f"no light of {self.lights.kelvin} K gives these cameras gains within {limits}")
+
+    def _lights(self, batch: int, generator: torch.Generator) -> Array:
+        if self._exact is not None:
+            return np.broadcast_to(self._exact, (batch, 3))
+        return sample_lights(batch, generator, self.lights)
+
+    def _weights(self, cameras: Array, shares: Array, light: Array) -> Array:
+        """Weights ``(B, N)`` of the atoms for ``(B, 2)`` cameras and their shares in lights ``(B, 3)``."""
+        mired = mired_of(light)
+        blocks = []
+        for number, mireds in enumerate(self._mireds):
+            share = (shares * (cameras == number)).sum(axis=1)
+            blocks.append(share[:, None] * weights_in_light(mireds, mired))
+        return np.concatenate(blocks, axis=1)
+
+    def balance(self, weights: Array, light: Array) -> Array:
+        """Compute the white balance ``(B, 3)``, green 1, of mixtures ``(B, N)`` in light of white points ``(B, 3)``."""
+        from_xyz = np.einsum("bn,nij->bij", weights, self._from_xyz)
+        response = np.einsum("bij,bj->bi", from_xyz, light)
+        return np.asarray(response[:, 1:2] / response)
+
+
+def own_cameras(info: Mapping[str, Any]) -> list[Camera]:
+    """The cameras of one's own that an ISP was made of, by its ``info``; none of other ISPs."""
+    stored: Sequence[Mapping[str, Any]] = info.get("own_cameras", [])
+    return [Camera.from_json(content, "the ISP's camera") for content in stored]
