@@ -5,15 +5,19 @@ Every one is called as ``model(noisy, variance=None) -> denoised``, all ``(B, 4,
 
 from denoisers.classical import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
 from denoisers.files import build, from_pretrained, load, save
+from denoisers.glide import GLIDE
 from denoisers.inference import SelfEnsemble, denoise_tiles
 from denoisers.joint import JointDRUNet
+from denoisers.ksvd import KSVD
 from denoisers.mosaic import MosaicDRUNet
 from denoisers.network import DENOISERS, Denoiser
 from denoisers.networks import DHDN, DnCNN, DRUNet, FFDNet, NAFNet, UNet
 from denoisers.published import PMRID, CycleISPDenoiser
+from denoisers.tnrd import TNRD
+from denoisers.wnnm import WNNM
 
 __all__ = [
-    "BM3D", "DENOISERS", "DHDN", "PMRID", "CycleISPDenoiser", "DRUNet", "Denoiser", "DnCNN", "FFDNet",
-    "JointDRUNet", "MosaicDRUNet", "NAFNet", "NonLocalMeans", "SelfEnsemble", "Stabilised", "TotalVariation",
-    "UNet", "Wavelet", "build", "denoise_tiles", "from_pretrained", "load", "save",
+    "BM3D", "DENOISERS", "DHDN", "GLIDE", "KSVD", "PMRID", "TNRD", "WNNM", "CycleISPDenoiser", "DRUNet", "Denoiser",
+    "DnCNN", "FFDNet", "JointDRUNet", "MosaicDRUNet", "NAFNet", "NonLocalMeans", "SelfEnsemble", "Stabilised",
+    "TotalVariation", "UNet", "Wavelet", "build", "denoise_tiles", "from_pretrained", "load", "save",
 ]  # fmt: skip

@@ -139,11 +139,21 @@ class TotalVariation(Classical):
         return denoise_tv_chambolle(planes, weight=0.4 * self.strength, channel_axis=-1)
 
 
-_OPPONENT = {
+OPPONENT = {
     4: 0.5 * np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]], np.float32),
     3: np.array([[2, 2, 2], [6**0.5, 0, -(6**0.5)], [2**0.5, -(8**0.5), 2**0.5]], np.float32) / 12**0.5,
 }
 """R, Gr, Gb, B, or R, G, B, to luminance and differences; orthonormal, so that white noise stays white."""
+
+
+def to_opponent(planes: Planes) -> Planes:
+    """Colours ``(h, w, 4)`` or ``(h, w, 3)`` to luminance, which comes first, and differences of the same shape."""
+    return planes @ OPPONENT[planes.shape[-1]].T
+
+
+def from_opponent(planes: Planes) -> Planes:
+    """Luminance and differences back to colours of the same shape."""
+    return planes @ OPPONENT[planes.shape[-1]]
 
 
 @FILTERS.register("BM3D")
@@ -157,9 +167,10 @@ class BM3D(Classical):
 
     def denoise(self, planes: Planes) -> Planes:
         """Filter ``(h, w, 4)``, or sRGB ``(h, w, 3)``, in luminance and differences of colour."""
-        bm3d, opponent = self.library("bm3d"), _OPPONENT[planes.shape[-1]]
+        bm3d = self.library("bm3d")
         # Blocks are matched on the first channel: let that be the luminance, whose noise is lowest.
-        return bm3d.bm3d(planes @ opponent.T, sigma_psd=[self.strength] * len(opponent)) @ opponent
+        deviations = [self.strength] * planes.shape[-1]
+        return from_opponent(bm3d.bm3d(to_opponent(planes), sigma_psd=deviations))
 
 
 class Transform(Protocol):

@@ -43,7 +43,8 @@ def run(
         out: output DNG or picture, or output folder.
         denoiser: .safetensors file written by rawaug run, .onnx file written by rawaug export (faster on a CPU), or
             the name of a shipped denoiser; by default rawaug-small, and rawaug-srgb for pictures.
-        classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, or {name, settings}.
+        classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, WNNM, KSVD, GLIDE,
+            or {name, settings}.
         noise: auto (the NoiseProfile tag where the frame bears it out, else an estimate, else the camera's published
             law, else the levels of the folder's files of the same camera and ISO), profile, estimate, camera (the law
             that the denoiser was trained for), an ISP file (uses its stored noise law), the name of a camera, or

@@ -61,7 +61,8 @@ def run(
             {name, settings}.
         seed: seed of that noise.
         bin: K bins the frames K x K by colour site first: clean references of real photographs (denoisers).
-        classical: classical filters to score on the same noise: NonLocalMeans, Wavelet, TotalVariation, BM3D.
+        classical: classical filters to score on the same noise: NonLocalMeans, Wavelet, TotalVariation, BM3D, WNNM,
+            KSVD, GLIDE.
         device: device for a denoiser: cpu, cuda, ...
         report: write an HTML page with a denoiser's scores and crops to this file.
         json: write the result as JSON to this file.

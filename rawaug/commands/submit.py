@@ -41,7 +41,8 @@ def run(
         benchmark: sidd:PATH with BenchmarkNoisyBlocksRaw.mat.
         out: the file to submit, SubmitRaw.csv.
         denoiser: .safetensors file written by rawaug run, or the name of a shipped denoiser; by default rawaug-small.
-        classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, or {name, settings}.
+        classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, WNNM, KSVD, GLIDE,
+            or {name, settings}.
         self_ensemble: average eight views of a network, at eight times the cost.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
     """

@@ -14,7 +14,7 @@ from rawaug.training.estimators import ESTIMATORS, LOSSES, R2R, Noisier
 
 
 def test_every_kind_finds_the_things_in_its_package() -> None:
-    assert {"NonLocalMeans", "Wavelet", "TotalVariation", "BM3D"} == set(FILTERS)
+    assert {"NonLocalMeans", "Wavelet", "TotalVariation", "BM3D", "KSVD", "WNNM", "GLIDE"} == set(FILTERS)
     assert {"demo", "fivek", "rawir", "sidd", "siddplus", "zurich"} <= set(DATASETS)
     assert {"supervised", "noisier", "noise2noise", "r2r", "neighbor2neighbor"} == set(ESTIMATORS)
     assert {"l1", "l2", "rms"} == set(LOSSES)

@@ -1,0 +1,143 @@
+r"""Trainable nonlinear reaction diffusion, TNRD (Chen and Pock, TPAMI 2017).
+
+A few stages of a diffusion, each with filters and functions of its own:
+
+.. math:: u_t = u_{t-1} - \sum_i \bar k_i * \phi_i(k_i * u_{t-1}) - \lambda (u_{t-1} - f)
+
+f is the noisy plane, and :math:`\bar k` is k turned by 180 degrees. A filter of unit length is a combination of the
+cosines of a square without the constant one, so that light does not matter; a function is a sum of 63 Gaussians, evenly
+spaced, as far apart as they are wide. With 48 filters of 7 x 7 a stage has 48 (48 + 63) + 1 = 5,329 parameters.
+
+Each plane is filtered by itself, with the same weights. Functions are looked up in tables, as in the published code.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, Unpack
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from denoisers.network import DENOISERS, Denoiser, Shared, require_bounded
+from rawaug.registry import require_between
+
+GAUSSIANS = 63
+"""Number of Gaussians of a function."""
+MARGIN = 5
+"""Widths of a Gaussian beyond the outermost ones after which a function is 0."""
+KNOTS_A_GAUSSIAN = 16
+"""Knots of the table of a function from one Gaussian to the next; between them it is linear, within 5e-4."""
+KNOTS = KNOTS_A_GAUSSIAN * (GAUSSIANS - 1 + 2 * MARGIN) + 1
+PUBLISHED_REACH = 310.0 / 255.0
+"""The largest response of a filter that a function covers, of pictures with white at 1, as published."""
+
+
+def cosine_filters(side: int) -> Tensor:
+    """The orthonormal cosines of a square without the constant one, ``(side^2 - 1, 1, side, side)``."""
+    place = torch.arange(side).double()
+    waves = torch.cos(math.pi * (2.0 * place + 1.0) * place[:, None] / (2 * side))
+    waves = waves / waves.norm(dim=1, keepdim=True)
+    squares = torch.einsum("ay,bx->abyx", waves, waves).flatten(0, 1)
+    return squares[1:, None].float()
+
+
+class Diffusion(nn.Module):
+    """One stage: filters, a function of each response, and the filters turned round.
+
+    Args:
+        side: of the filters, odd.
+        reach: largest response that the functions cover.
+    """
+
+    def __init__(self, side: int, reach: float) -> None:
+        super().__init__()
+        filters = side**2 - 1
+        self.side = side
+        self.reach = reach
+        self.combination = nn.Parameter(torch.eye(filters))
+        self.heights = nn.Parameter(torch.zeros(filters, GAUSSIANS))
+        self.fidelity = nn.Parameter(torch.zeros(()))
+        self.register_buffer("cosines", cosine_filters(side), persistent=False)
+
+    def filters(self) -> Tensor:
+        """The filters ``(F, 1, side, side)``, each of length 1 and sum 0."""
+        directions = self.combination / self.combination.norm(dim=1, keepdim=True).clamp_min(1e-12)
+        cosines = self.get_buffer("cosines").to(directions)
+        return torch.einsum("fb,bcyx->fcyx", directions, cosines)
+
+    def influence(self, response: Tensor) -> Tensor:
+        """Each filter's function of its responses ``(B, F, h, w)``."""
+        knots = torch.arange(0, KNOTS, device=response.device, dtype=response.dtype) / KNOTS_A_GAUSSIAN
+        centres = torch.arange(GAUSSIANS, device=response.device, dtype=response.dtype) + MARGIN
+        gaussians = torch.exp(-0.5 * (knots - centres[:, None]).square())
+        table = (self.heights @ gaussians).flatten()
+
+        spacing = 2.0 * self.reach / (GAUSSIANS - 1)
+        place = ((response + self.reach) / spacing + MARGIN) * KNOTS_A_GAUSSIAN
+        place = place.clamp(0.0, KNOTS - 1.001)
+        knot = place.detach().floor()
+        share = place - knot
+
+        row = torch.arange(response.shape[1], device=response.device)[:, None, None] * KNOTS
+        index = knot.long() + row
+        return torch.lerp(table[index], table[index + 1], share)
+
+    def forward(self, plane: Tensor, noisy: Tensor) -> Tensor:
+        """A plane ``(B, 1, h, w)`` and the noisy one to the next of the same shape; sides are ``side`` or more."""
+        margin = (self.side // 2,) * 4
+        filters = self.filters()
+
+        response = F.conv2d(F.pad(plane, margin, mode="reflect"), filters)
+        force = F.pad(self.influence(response), margin, mode="reflect")
+        turned = filters.flip((2, 3)).transpose(0, 1)
+        diffusion = F.conv2d(force, turned)
+        return plane - diffusion - self.fidelity * (plane - noisy)
+
+
+@DENOISERS.register("TNRD")
+class TNRD(Denoiser):
+    """Trainable nonlinear reaction diffusion (Chen and Pock, TPAMI 2017), made for noise of one level.
+
+    In the domain ``anscombe`` every noise has one level; set ``reach`` to what a filter responds there, such as 40
+    deviations.
+
+    Args:
+        stages: number of them, 1 to 1000; 5 is published.
+        side: of the filters, 3, 5 or 7; there are ``side**2 - 1``.
+        reach: largest response of a filter that the functions tell from larger ones.
+        channels, domain, seed: see :class:`denoisers.Denoiser`. There is no noise map.
+
+    Example:
+        >>> noisy = torch.rand(2, 4, 33, 50)
+        >>> TNRD(stages=2, side=3)(noisy).shape
+        torch.Size([2, 4, 33, 50])
+    """
+
+    defaults: ClassVar[Shared] = {**Denoiser.defaults, "variance_map": False}
+
+    def __init__(
+        self, stages: int = 5, side: int = 7, reach: float = PUBLISHED_REACH, **shared: Unpack[Shared]
+    ) -> None:
+        require_bounded(stages=stages)
+        require_between("reach", reach, 1e-6, 1e6)
+        if side not in (3, 5, 7):
+            raise ValueError(f"side must be 3, 5 or 7, got {side}")
+        if stages < 1:
+            raise ValueError(f"stages must be at least 1, got {stages}")
+        if shared.get("variance_map"):
+            raise ValueError("TNRD takes no noise map: leave out variance_map")
+
+        super().__init__({"stages": stages, "side": side, "reach": reach}, stride=8, **shared)
+        self.stages = nn.ModuleList()
+        for _ in range(stages):
+            self.stages.append(Diffusion(side, reach))
+
+    def residual(self, features: Tensor) -> Tensor:
+        """Run the stages on every plane: ``(B, channels, h, w)`` to the correction of the same shape."""
+        noisy = features.flatten(0, 1)[:, None]
+        plane = noisy
+        for stage in self.stages:
+            plane = stage(plane, noisy)
+        return (plane - noisy).reshape(features.shape)
