@@ -11,10 +11,10 @@ from rawaug.commands import YAML
 from rawaug.denoising.corrections import Correction, Corrections
 from rawaug.denoising.denoiser import RawDenoiser, require_classical
 from rawaug.denoising.frames import DenoisedFolder, denoise_file, denoise_folder
-from rawaug.denoising.pictures import PICTURES, PictureDenoiser, denoise_picture, denoise_pictures
+from rawaug.denoising.pictures import PICTURES, PictureDenoiser, denoise_picture, denoise_pictures, list_denoised
 from rawaug.errors import escape
 from rawaug.files import files_below, require_writable, write_json
-from rawaug.io.pictures import PICTURE_FORMATS
+from rawaug.io.content import ALL_PICTURE_EXTENSIONS, content_of, list_files
 from rawaug.io.raw import RAW_EXTENSIONS
 from rawaug.registry import Spec
 
@@ -84,32 +84,51 @@ def run(
         raise ValueError(f"{out}: {source} is a folder, and so is its output; give a name without .dng")
     result = denoise_folder(source, out, made, noise, corrections=corrections, overwrite=overwrite)
     print_denoised(result, json)
+    print_left_out(Path(source))
     if result.broken:
         raise ValueError(f"{source}: {len(result.broken)} of its files could not be denoised, listed above")
 
 
 def is_picture(source: str) -> bool:
-    """Whether a path is a developed picture, or a folder with such pictures and no RAW file."""
+    """Whether a path is a developed picture by its content, or a folder with pictures and no RAW file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is a file of neither kind.
+    """
     path = Path(source)
     if path.is_dir():
-        kinds = {file.suffix.lower() for file in files_below(path)}
-        return not kinds.intersection(RAW_EXTENSIONS) and bool(kinds.intersection(PICTURE_FORMATS))
-    return path.suffix.lower() in PICTURE_FORMATS
+        extensions = {file.suffix.lower() for file in files_below(path)}
+        return extensions.isdisjoint(RAW_EXTENSIONS) and not extensions.isdisjoint(ALL_PICTURE_EXTENSIONS)
+
+    content = content_of(path)
+    if content.kind == "other":
+        raise ValueError(f"{path}: is neither camera RAW nor a picture of a known format; check that it is complete")
+    return content.kind == "picture"
 
 
 def denoise_all(source: str, out: str, denoiser: PictureDenoiser, overwrite: bool) -> None:
     """Denoise a picture or a folder of them, and print what was done."""
     broken: dict[str, str] = {}
+    left_out: list[str] = []
     if Path(source).is_dir():
         done, broken = denoise_pictures(source, out, denoiser, overwrite)
+        left_out = list_denoised(Path(source)).lines()
     else:
         done = [denoise_picture(source, out, denoiser, overwrite)]
     for one in done:
         print(f"{escape(one.out)}: noise of {one.removed:.1f} in 255 removed, {one.seconds:.1f} s")
-    for reason in broken.values():
-        print(escape(reason))
+    for line in (*broken.values(), *left_out):
+        print(escape(line))
     if broken:
         raise ValueError(f"{source}: {len(broken)} of its files could not be denoised, listed above")
+
+
+def print_left_out(folder: Path) -> None:
+    """Print a line for each kind of file in a folder of RAW that is not denoised with it."""
+    listing = list_files(folder, RAW_EXTENSIONS, "neither RAW nor a picture that is known")
+    for line in listing.lines():
+        print(escape(line))
 
 
 def chosen(

@@ -6,10 +6,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from rawaug.data.demo import demo_files
-from rawaug.data.folders import PICTURE_EXTENSIONS
 from rawaug.errors import extra
 from rawaug.explore.page import build, make_server, open_socket, socket_url
-from rawaug.files import files_in
+from rawaug.io.content import list_pictures
 
 
 def run(pictures: str | None = None, /, *, isp: str = "universal", host: str = "127.0.0.1", port: int = 7860) -> None:
@@ -34,6 +33,6 @@ def choices(pictures: str | None) -> tuple[list[Path], list[str]]:
     if pictures is None:
         files = demo_files()
         return files, [f"{file.stem} (built in)" for file in files]
-    files = files_in(pictures, "picture", PICTURE_EXTENSIONS)
+    files = list_pictures(pictures).files
     above = pictures if Path(pictures).is_dir() else files[0].parent
     return files, [file.relative_to(above).as_posix() for file in files]

@@ -1,6 +1,8 @@
 """``rawaug hdr``: sRGB exposures of a scene to RAW, merged or scaled there, and back to one sRGB picture.
 
-The formulas are in :mod:`rawaug.isp.exposures`. Source: the HDR application of Conde et al., AAAI 2022.
+RAW files are developed by LibRaw first, each with its own white balance: what :func:`rawaug.fit` learns to reverse, so
+that ``--isp`` is best a camera that was fitted to such files. The formulas are in :mod:`rawaug.isp.exposures`. Source:
+the HDR application of Conde et al., AAAI 2022.
 """
 
 from __future__ import annotations
@@ -13,9 +15,10 @@ from torch import Tensor
 
 from rawaug.commands import YAML
 from rawaug.files import require_writable
-from rawaug.io import read_picture, write_picture
+from rawaug.io import write_picture
+from rawaug.io.content import content_of
 from rawaug.io.isolated import isolated
-from rawaug.io.pictures import read_exposure
+from rawaug.io.shots import read_shot, read_shot_exposure
 from rawaug.isp.exposures import merge_exposures, render_exposure
 from rawaug.isp.model import DictionaryISP
 from rawaug.registry import require_between
@@ -36,7 +39,8 @@ def run(
     """Merge exposures of a scene in RAW, or change the exposure of a single picture.
 
     Args:
-        pictures: sRGB pictures of one scene, aligned and of one size; or a single one.
+        pictures: sRGB pictures of one scene, aligned and of one size, or its RAW files, which LibRaw develops; or a
+            single one.
         out: the picture to write, 8-bit sRGB.
         ev: exposure of each picture in stops, as [-2,0,2]; by default from EXIF, relative to the median exposure.
         exposure: exposure of the result in stops, relative to the picture at 0 EV.
@@ -60,6 +64,9 @@ def hdr(
     isp: str | Path = "universal",
 ) -> Tensor:
     """The merged picture ``(3, H, W)`` in [0, 1]; arguments and errors as in :func:`run`."""
+    if not pictures:
+        raise ValueError("hdr: no picture is given")
+    _require_one_kind(pictures)
     stops = exposures(pictures, ev)
     for value in (*stops, exposure):
         require_between("an exposure", value, -MOST_STOPS, MOST_STOPS)
@@ -76,15 +83,27 @@ def exposures(pictures: Sequence[str | Path], ev: Sequence[float] | None) -> lis
         return list(ev)
     if len(pictures) == 1:
         return [0.0]
-    stated = [read_exposure(path) for path in pictures]
+    stated = [isolated(read_shot_exposure, path) for path in pictures]
     median = sorted(stated)[(len(stated) - 1) // 2]
     return [stops - median for stops in stated]
 
 
-def _read(pictures: Sequence[str | Path]) -> list[Tensor]:
-    read = [isolated(read_picture, path) for path in pictures]
-    for path, picture in zip(pictures, read, strict=True):
-        if picture.shape != read[0].shape:
-            size, first = (f"{one.shape[1]} x {one.shape[2]}" for one in (picture, read[0]))
-            raise ValueError(f"{path}: is {size}, but {pictures[0]} is {first}; align and crop them to one size")
-    return read
+def _read(paths: Sequence[str | Path]) -> list[Tensor]:
+    """The pictures, of one size."""
+    pictures = [isolated(read_shot, path) for path in paths]
+    height, width = pictures[0].shape[1:]
+    for path, picture in zip(paths, pictures, strict=True):
+        if picture.shape[1:] != (height, width):
+            size = f"{picture.shape[1]} x {picture.shape[2]}"
+            raise ValueError(f"{path}: is {size}, but {paths[0]} is {height} x {width}; align and crop them")
+    return pictures
+
+
+def _require_one_kind(paths: Sequence[str | Path]) -> None:
+    """Raise ValueError for RAW beside developed pictures, whose tone curves and white balance differ."""
+    first = content_of(paths[0])
+    for path in paths:
+        content = content_of(path)
+        if (content.kind == "raw") != (first.kind == "raw"):
+            kinds = f"{content.format}, but {paths[0]} is {first.format}"
+            raise ValueError(f"{path}: is {kinds}; give RAW files or developed pictures, not both")

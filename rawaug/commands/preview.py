@@ -18,8 +18,8 @@ from rawaug.bayer import pattern
 from rawaug.evaluation.figures import new_figure
 from rawaug.explore.views import stage_pictures
 from rawaug.files import require_writable
-from rawaug.io import read_picture
 from rawaug.io.pictures import MAX_PIXELS
+from rawaug.io.shots import read_shot
 from rawaug.isp.stages import frame_coordinates
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import trim_to_even
@@ -43,7 +43,7 @@ def run(
     """Draw a picture at every stage of an ISP, and as augmented RAW.
 
     Args:
-        picture: an sRGB picture.
+        picture: an sRGB picture, or a RAW file, which LibRaw develops.
         out: output PNG.
         isp: ISP file, or the name of a shipped ISP.
         count: number of augmented RAWs to plot.
@@ -56,7 +56,7 @@ def run(
     stages = Path(out) if Path(out).suffix else Path(f"{out}.png")
     require_writable(stages)
     augment = RawAugment.from_pretrained(isp, cfa=cfa)
-    whole = trim_to_even(read_picture(picture, max_pixels))
+    whole = trim_to_even(read_shot(picture, max_pixels))
     stages.parent.mkdir(parents=True, exist_ok=True)
     _draw_stages(augment, whole, count, seed).savefig(stages, dpi=130)
     print(stages)

@@ -61,3 +61,5 @@ def print_synthesis(result: Synthesis) -> None:
     print_rows(str(result.out), head, [[*map(str, numbers), f"{result.seconds:.1f}"]])
     for reason in result.broken.values():
         print(f"unreadable: {escape(reason)}")
+    for line in result.left_out:
+        print(line)

@@ -18,7 +18,8 @@ from typing import Any
 
 from torch import Tensor
 
-from rawaug.data.folders import PICTURE_EXTENSIONS, PictureFolder
+from rawaug.data.folders import PictureFolder
+from rawaug.data.formats import READABLE
 from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import DATASETS, PICTURES, Lazy, Pair
@@ -27,8 +28,8 @@ from rawaug.data.sidd import SiddBenchmark, SiddBlocks, SiddFrames, SiddPlusBloc
 from rawaug.errors import escape
 from rawaug.files import files_below, files_in
 from rawaug.io import RawFrame, read_raw
+from rawaug.io.content import RAW_EXTENSIONS, content_of, list_files, picture_extensions
 from rawaug.io.isolated import isolated
-from rawaug.io.raw import RAW_EXTENSIONS
 
 _SHOWN = 6
 _PAIRS = "pairs:"
@@ -63,17 +64,21 @@ class PartReport:
 
 @dataclass
 class DataReport:
-    """The report of :func:`check`; ``str()`` is the text that ``rawaug data check`` prints."""
+    """The report of :func:`check`; ``str()`` is the text that ``rawaug data check`` prints.
+
+    ``left_out`` has a line for each kind of file that nothing here reads.
+    """
 
     path: Path
     parts: list[PartReport]
+    left_out: list[str] = field(default_factory=list)
 
     @property
     def broken(self) -> list[str]:
         return [line for part in self.parts for line in part.broken]
 
     def __str__(self) -> str:
-        return "\n".join([escape(self.path), *map(str, self.parts)])
+        return "\n".join([escape(self.path), *map(str, self.parts), *self.left_out])
 
 
 def check(path: str | Path, first: int | None = None, **settings: Any) -> DataReport:
@@ -95,10 +100,21 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
-    known = list(_datasets(path)) or list(_files(path))
+    datasets = list(_datasets(path))
+    known = datasets or list(_files(path))
+    left_out = [] if datasets or path.is_file() else _left_out(path)
     if not known:
-        raise ValueError(f"{path}: contains no known dataset, RAW file or picture; see docs/datasets.md")
-    return DataReport(path, [_part(what, open_part, first) for what, open_part in known])
+        there = "; ".join(left_out) or "see docs/datasets.md"
+        raise ValueError(f"{path}: contains no known dataset, RAW file or picture; {there}")
+    return DataReport(path, [_part(what, open_part, first) for what, open_part in known], left_out)
+
+
+def _left_out(folder: Path) -> list[str]:
+    """A line for each kind of file in a folder that is neither RAW nor a picture that can be read here."""
+    read = (*RAW_EXTENSIONS, *picture_extensions())
+    if looks_like_pairs(list(files_below(folder))):
+        read = (*read, *READABLE)
+    return list_files(folder, read, "neither RAW nor a picture that is known").lines()
 
 
 def _of_kind(kind: str, spec: str) -> list[tuple[str, Callable[[], Any]]]:
@@ -127,7 +143,7 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     if any((path / split / "huawei_raw").is_dir() for split in ("train", "test")):
         for split in ("train", "test"):
             yield f"Zurich RAW to RGB, {split}", partial(Zurich, path, split)
-    elif any(name.endswith(".npy") for name in files):
+    elif any(name.endswith(".npy") for name in files) and not looks_like_pairs(found):
         splits = [split for split, name in RAWIR_FOLDERS.items() if (path / name).is_dir()]
         for split in splits or ["train"]:
             yield f"RAWIR or AIM 2022{', ' + split if splits else ''}", partial(Rawir, path, split)
@@ -135,14 +151,22 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
 
 def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     """RAW files and pictures of no known dataset; FiveK cannot be told from other DNGs."""
-    files = [path] if path.is_file() else list(files_below(path))
-    if path.is_dir() and looks_like_pairs(files):
+    if path.is_file():
+        content = content_of(path)
+        if content.kind == "raw":
+            yield "RAW files", partial(_RawFrames, path)
+        elif content.kind == "picture":
+            yield "pictures", partial(PictureFolder, path, allowed_share=1)
+        return
+
+    files = list(files_below(path))
+    if looks_like_pairs(files):
         yield "noisy/clean pairs", partial(PairFolder, path)
         return
-    raws = sorted(file for file in files if file.suffix.lower() in RAW_EXTENSIONS)
-    if raws:
+    extensions = {file.suffix.lower() for file in files}
+    if not extensions.isdisjoint(RAW_EXTENSIONS):
         yield "RAW files", partial(_RawFrames, path)
-    if any(file.suffix.lower() in PICTURE_EXTENSIONS for file in files) and path.is_dir():
+    if not extensions.isdisjoint(picture_extensions()):
         yield "pictures", partial(PictureFolder, path, allowed_share=1)
 
 

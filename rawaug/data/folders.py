@@ -27,10 +27,11 @@ from rawaug.data.pairs import LazyPairs, Pair, SomePairs, centre
 from rawaug.errors import escape
 from rawaug.files import files_in
 from rawaug.io import read_picture, read_raw, read_raw_and_develop
+from rawaug.io.content import PICTURE_EXTENSIONS as PICTURE_EXTENSIONS
+from rawaug.io.content import list_pictures
 from rawaug.io.pictures import MAX_PIXELS, recode_jpeg
 from rawaug.io.raw import RAW_EXTENSIONS
 
-PICTURE_EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
 _JPEG_SUFFIXES = (".jpg", ".JPG", ".jpeg", ".JPEG")
 _JPEG_MARGIN = 0.03
 """Cameras cut a few lines off their JPEGs that LibRaw keeps, or the other way round."""
@@ -43,10 +44,11 @@ class PictureFolder(Dataset[Tensor]):
     """The pictures of a folder and its subfolders, sorted by path: uint8 ``(3, H, W)`` of any size.
 
     A file that cannot be used is logged with the reason when it is met; :attr:`skipped` and :meth:`report` list those
-    met so far, by whichever worker. ``rawaug data check`` finds the files that crash a decoder, and a worker with it.
+    met so far, by whichever worker. Files of other kinds (RAW, HEIC where its decoder is not installed, text) are
+    counted in :attr:`left_out`. ``rawaug data check`` finds the files that crash a decoder, and a worker with it.
 
     Args:
-        path: a folder; files with one of :data:`PICTURE_EXTENSIONS` are taken, links to folders are not followed.
+        path: a folder, or one picture; files are taken by their extension, links to folders are not followed.
         min_side: smaller pictures are skipped; use the side of your crops. A mosaic has sides of at least 2.
         max_pixels: larger pictures are skipped.
         allowed_share: part of the files that may be skipped; above it, reading raises an error that names them.
@@ -61,9 +63,13 @@ class PictureFolder(Dataset[Tensor]):
     ) -> None:
         self.path = Path(path)
         self.min_side, self.max_pixels, self.allowed_share = min_side, max_pixels, allowed_share
-        found = sorted(str(file.relative_to(path)) for file in files_in(path, "picture", PICTURE_EXTENSIONS))
+        listing = list_pictures(self.path)
+        self.left_out = listing.lines()
+        if self.path.is_file():
+            self.path = self.path.parent
+        names = [str(file.relative_to(self.path)) for file in listing.files]
         # an array, since the reference counts of a list would be copied into every forked worker, page by page
-        self._names = np.array([os.fsencode(name) for name in found])
+        self._names = np.array([os.fsencode(name) for name in names])
         self._bad = torch.zeros(len(self), dtype=torch.uint8).share_memory_()
         self._reasons: dict[int, str] = {}
 
@@ -106,12 +112,12 @@ class PictureFolder(Dataset[Tensor]):
         return {self.file(index): self._reasons[index] for index in bad}
 
     def report(self) -> str:
-        """Name the files that were skipped so far, with the reasons, a line each."""
+        """Name the files that were skipped so far, with the reasons, and the kinds of files that are left out."""
         skipped = self.skipped
-        if not skipped:
-            return f"{escape(self.path)}: none of {len(self)} pictures skipped so far"
-        head = f"{escape(self.path)}: {len(skipped)} of {len(self)} pictures skipped"
-        return "\n".join([head, *map(escape, skipped.values())])
+        head = f"{escape(self.path)}: none of {len(self)} pictures skipped so far"
+        if skipped:
+            head = f"{escape(self.path)}: {len(skipped)} of {len(self)} pictures skipped"
+        return "\n".join([head, *map(escape, skipped.values()), *self.left_out])
 
     def _attempt(self, index: int) -> Tensor | None:
         """The picture, or None if it is damaged, which is then remembered."""
@@ -130,9 +136,9 @@ class PictureFolder(Dataset[Tensor]):
 
 
 def reports(pictures: Any) -> list[str]:
-    """The report of each folder in ``pictures`` that skipped files, including cached and concatenated ones."""
+    """The report of each folder in ``pictures`` that leaves files out, including cached and concatenated ones."""
     if isinstance(pictures, PictureFolder):
-        return [pictures.report()] if pictures.skipped else []
+        return [pictures.report()] if pictures.skipped or pictures.left_out else []
     inside = pictures.datasets if isinstance(pictures, ConcatDataset) else [getattr(pictures, "pictures", None)]
     return [report for each in inside if each is not None for report in reports(each)]
 

@@ -11,8 +11,9 @@ file    numbers                                         metadata                
 ======  ==============================================  =============================================  ===============
 RAW     as LibRaw reads them                            all, by their tags                             dng, 16 bits
 npz     the array ``noisy`` or ``clean``, or the only   arrays ``cfa``, ``black``, ``white``,          packed float32
-        one; packed ``(4, h, w)`` or ``(H, W)``         ``white_balance``, ``color_matrix``,
-                                                        ``shot_var``, ``read_var``
+        one; packed ``(4, h, w)`` or ``(h, w, 4)``,     ``white_balance``, ``color_matrix``,
+        or ``(H, W)``                                   ``shot_var``, ``read_var``
+npy     the same shapes                                 none                                           no
 mat     the same, of version 5 or 7.3                   variables of these names                       no
 tiff    the first page                                  its description, as JSON with these keys       mosaic, float32
 png     16 bits, one channel                            none                                           no
@@ -279,6 +280,22 @@ def read_npz(file: Path, wanted: Callable[[list[str]], Iterable[str]]) -> dict[s
         return {name: arrays[name] for name in names}
 
 
+def _read_npy(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
+    """The array of a file, whose header says how large it is; objects, which are pickles, are refused by NumPy."""
+    with damage_as_os_error(file, "cannot be read as NPY", _Unclear), file.open("rb") as opened:
+        version = np.lib.format.read_magic(opened)
+        read_header = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }.get(version)
+        if read_header is None:
+            raise ValueError(f"version {version[0]}.{version[1]} of the format")
+        shape, _, dtype = read_header(opened)
+        _require_size(math.prod(shape) * dtype.itemsize, "its array")
+        opened.seek(0)
+        return np.load(opened, allow_pickle=False), {}
+
+
 def write_npz(file: Path, clean: Tensor, noisy: Tensor, stated: Mapping[str, Any]) -> None:
     """Packed RAW ``(4, h, w)`` (or mosaics of other patterns) of a pair, and what is ``stated`` of both."""
     arrays: dict[str, Any] = {
@@ -329,6 +346,7 @@ def _read_png(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
 
 READERS: dict[str, Callable[[Path, str, bool, int], Found]] = {
     ".npz": _read_npz,
+    ".npy": _read_npy,
     ".tif": _read_tiff,
     ".tiff": _read_tiff,
     ".png": _read_png,
@@ -395,13 +413,18 @@ def _scale_to_raw(file: Path, numbers: np.ndarray, stated: Metadata) -> Tensor:
     return bayer.unpack((packed - sites) / (white - sites), cfa)
 
 
+_SHAPES = "a mosaic (H, W), or packed RAW (4, h, w) or (h, w, 4)"
+
+
 def _packed(file: Path, numbers: Tensor, cfa: CFA) -> Tensor:
-    """Pack a mosaic ``(H, W)`` or ``(1, H, W)``; packed RAW is returned unchanged."""
+    """Pack a mosaic ``(H, W)`` or ``(1, H, W)``; packed RAW has its planes first, or last where those alone are 4."""
     if numbers.ndim == 3 and numbers.shape[0] == 4:
         return numbers
+    if numbers.ndim == 3 and numbers.shape[-1] == 4:
+        return numbers.permute(2, 0, 1)
     if numbers.ndim == 3 and numbers.shape[0] == 1:
         numbers = numbers[0]
     if numbers.ndim != 2 or min(numbers.shape) < 2:
-        raise ValueError(f"{file}: has shape {tuple(numbers.shape)}; use a mosaic (H, W) or packed RAW (4, h, w)")
+        raise ValueError(f"{file}: has shape {tuple(numbers.shape)}; use {_SHAPES}")
     height, width = (side // 2 * 2 for side in numbers.shape)
     return bayer.pack(numbers[None, :height, :width], cfa)

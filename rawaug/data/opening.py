@@ -83,11 +83,12 @@ def _require_none(settings: Mapping[str, Any], spec: object) -> None:
         raise ValueError(f"{spec}: {', '.join(settings)} can only be given for pairs:PATH")
 
 
-def open_pictures(spec: str | Sequence[str], min_side: int = 2, max_pixels: int | None = None) -> Any:
+def open_pictures(spec: str | Path | Sequence[str | Path], min_side: int = 2, max_pixels: int | None = None) -> Any:
     """Open sRGB pictures, a map-style dataset of uint8 ``(3, H, W)``: a folder, ``"demo:"``, ``"shapes:100"``.
 
     Args:
-        spec: the path of a folder, ``"demo:"``, ``"shapes:COUNT"``, or several of these, one after the other.
+        spec: the path of a folder or of a picture, ``"demo:"``, ``"shapes:COUNT"``, or several of these, one after
+            the other.
         min_side: smaller pictures of a folder are skipped and reported; use the side of your crops.
         max_pixels: larger ones likewise; None for :data:`rawaug.io.pictures.MAX_PIXELS`.
 
@@ -98,8 +99,9 @@ def open_pictures(spec: str | Sequence[str], min_side: int = 2, max_pixels: int 
         >>> len(open_pictures(["demo:", "shapes:10"]))
         42
     """
-    if not isinstance(spec, str):
+    if not isinstance(spec, (str, Path)):
         return ConcatDataset([open_pictures(one, min_side, max_pixels) for one in spec])
+    spec = str(spec)
     kind, path = _kind_and_path(spec)
     if kind is None:
         return PictureFolder(path, min_side, max_pixels or MAX_PIXELS)

@@ -161,10 +161,23 @@ def _pairs_below(path: Path, noisy: str | None, clean: str | None) -> list[PairF
     if path.is_file():
         found = [pair for pair in found if path in pair[1:]]
     if not found:
-        raise ValueError(f"{path}: contains no noisy/clean pair named {noisy or f'{NOISY}, {CLEAN}'}")
+        wanted = noisy or f"{NOISY}, {CLEAN}"
+        raise ValueError(f"{path}: contains no noisy/clean pair named {wanted}{_unread_kinds(top)}")
     repeated = Counter(pair.name for pair in found)
     named = (p if repeated[p.name] == 1 else p._replace(name=p.noisy.relative_to(top).as_posix()) for p in found)
     return sorted(named, key=lambda pair: pair.noisy)
+
+
+def _unread_kinds(top: Path) -> str:
+    """Say which files are noisy or clean by their names, but of a kind that is not read."""
+    extensions = set()
+    for file in files_below(top):
+        named = re.search("noisy|clean", file.stem, re.IGNORECASE)
+        if named and file.suffix.lower() not in READABLE:
+            extensions.add(file.suffix.lower())
+    if not extensions:
+        return ""
+    return f"; {', '.join(sorted(extensions))} is not read, use .npz, .npy, .tiff, .png or .mat"
 
 
 def pairs_by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -> list[PairFiles]:

@@ -32,14 +32,10 @@ from torch import Tensor
 from rawaug.bayer import CFA, pattern_name, plane_indices
 from rawaug.errors import extra
 from rawaug.io.ciff import read_shot_info
+from rawaug.io.content import RAW_EXTENSIONS as RAW_EXTENSIONS
 from rawaug.io.gain_map import GainMap
 from rawaug.io.libraw import KNOWN_PATTERNS, is_stack, opened_raw
 from rawaug.io.tiff import MAKE, MODEL, TiffTags
-
-RAW_EXTENSIONS = (
-    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
-    *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
-)
 
 MONOCHROME = "MONOCHROME"
 """The pattern of a sensor without colour filters."""

@@ -22,8 +22,8 @@ from typing import Any, get_args
 
 import torch
 
-from rawaug.data.folders import PICTURE_EXTENSIONS
-from rawaug.files import LOCK, files_in, find_weights, locked, require_same_settings, sha256
+from rawaug.files import LOCK, find_weights, locked, require_same_settings, sha256
+from rawaug.io.content import list_pictures
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.config import AugmentConfig
 from rawaug.progress import progress
@@ -38,7 +38,10 @@ Outcome = tuple[int, dict[str, str]]
 
 @dataclass
 class Synthesis:
-    """The result of a run: the pairs that it made or found, and the reason for each picture that cannot be read."""
+    """The result of a run: the pairs that it made or found, and the reason for each picture that cannot be read.
+
+    ``left_out`` has a line for each kind of file in the folder that is no picture.
+    """
 
     out: Path
     pictures: int = 0
@@ -46,6 +49,7 @@ class Synthesis:
     existing: int = 0
     broken: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
+    left_out: list[str] = field(default_factory=list)
 
 
 def synth(
@@ -90,7 +94,8 @@ def synth(
     source, out = Path(source), Path(out)
     if source.is_dir() and out.resolve().is_relative_to(source := source.resolve()):
         raise ValueError(f"{out}: is inside the picture folder {source}; choose an output folder outside it")
-    pictures = files_in(source, "picture", PICTURE_EXTENSIONS)
+    listing = list_pictures(source)
+    pictures = listing.files
     source = source.parent if source.is_file() else source
     fixed = _settings(format, per_image, seed, AugmentConfig(**settings))
     if workers is not None and workers < 0:
@@ -109,6 +114,7 @@ def synth(
         result = _run(out, tasks[part - 1 :: parts], fixed, max_pixels, workers)
         if format == "webdataset":
             shards.write_index(out, len(tasks), fixed)
+    result.left_out = listing.lines()
     result.seconds = time.perf_counter() - start
     if result.pictures and len(result.broken) == result.pictures:
         count, reason = result.pictures, min(result.broken.values())

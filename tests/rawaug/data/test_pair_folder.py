@@ -231,3 +231,40 @@ def test_damage_by_others_is_a_line_and_the_rest_is_read(tmp_path: Path, monkeyp
         "loop_noisy.tif",
     ):
         assert sum(said in line for line in part.broken) == 1
+
+
+@pytest.mark.parametrize("kind", ["npy", "npz"])
+def test_packed_numbers_have_their_planes_first_or_last(tmp_path: Path, kind: str) -> None:
+    numbers = np.random.default_rng(0).integers(100, 900, (4, 8, 12)).astype(np.uint16)
+    for name, planes in (("first", numbers), ("last", np.ascontiguousarray(numbers.transpose(1, 2, 0)))):
+        for end in ("noisy", "clean"):
+            file = tmp_path / name / f"a_{end}.{kind}"
+            file.parent.mkdir(exist_ok=True)
+            np.save(file, planes) if kind == "npy" else np.savez(file, planes)
+    given: dict[str, Any] = {"cfa": "GRBG", "black": 64, "white": 1023}
+    first, last = (open_pairs(f"pairs:{tmp_path / name}", **given)[0] for name in ("first", "last"))
+    assert torch.equal(first.raw, last.raw)
+    packed = torch.from_numpy((numbers.astype(np.float32) - 64) / (1023 - 64))
+    assert torch.allclose(pack(first.raw, CFA.GRBG), packed)
+    if kind == "npy":
+        (part,) = check(tmp_path / "last").parts
+        assert part.what == "noisy/clean pairs", "not an unknown dataset of crops"
+
+
+def test_npy_never_unpickles_and_says_what_it_declares(tmp_path: Path) -> None:
+    for end in ("noisy", "clean"):
+        np.save(tmp_path / f"a_{end}.npy", np.array([{}], dtype=object), allow_pickle=True)
+        with (tmp_path / f"b_{end}.npy").open("wb") as file:
+            header = {"descr": "<f4", "fortran_order": False, "shape": (2**20, 2**20)}
+            np.lib.format.write_array_header_1_0(file, header)
+    pairs = open_pairs(f"pairs:{tmp_path}", cfa="RGGB", black=64, white=1023)
+    for index, message in ((0, "allow_pickle"), (1, "above the limit")):
+        with pytest.raises(OSError, match=message):
+            pairs[index]
+
+
+def test_a_kind_that_is_not_read_is_named(tmp_path: Path) -> None:
+    for end in ("noisy", "clean"):
+        (tmp_path / f"a_{end}.fits").write_bytes(b"SIMPLE")
+    with pytest.raises(ValueError, match=r"\.fits is not read, use \.npz"):
+        open_pairs(f"pairs:{tmp_path}")

@@ -7,13 +7,15 @@ import struct
 from pathlib import Path
 from typing import Any
 
+import imagecodecs
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+import tifffile
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image, ImageCms, ImageOps
+from PIL import Image, ImageCms, ImageOps, features
 
 from rawaug.io import decode_srgb, encode_srgb, read_picture, write_picture
 from rawaug.io.pictures import read_plane, recode_jpeg
@@ -231,3 +233,180 @@ def test_a_decoder_s_message_that_is_no_text_is_refused_like_any_other(tmp_path:
     (tmp_path / "b.exr").write_bytes(damaged)
     with pytest.raises(OSError, match=r"b\.exr: cannot be read as a picture \(OpenImageIO: .*\)"):
         read_picture(tmp_path / "b.exr")
+
+
+# -- what phones, cameras and other programs write ---------------------------------------------------------------------
+
+
+def ultra_hdr(stops: float) -> bytes:
+    """A JPEG with a gain map, as phones of Android 14 write it."""
+    ramp = np.linspace(0, 255, 64).astype(np.uint8)
+    gains = io.BytesIO()
+    Image.fromarray(np.tile(ramp[::4], (16, 1))).save(gains, "JPEG")
+    base = io.BytesIO()
+    Image.fromarray(np.tile(ramp[None, :, None], (64, 1, 3))).save(base, "JPEG", quality=95)
+    space = 'xmlns:hdrgm="http://ns.adobe.com/hdr-gain-map/1.0/" hdrgm:Version="1.0"'
+    law = f'hdrgm:GainMapMin="0" hdrgm:GainMapMax="{stops}" hdrgm:Gamma="1" hdrgm:OffsetSDR="0.015625" '
+    law += f'hdrgm:OffsetHDR="0.015625" hdrgm:HDRCapacityMin="0" hdrgm:HDRCapacityMax="{max(stops, 0.01)}"'
+    second = with_xmp(gains.getvalue(), f"<rdf:Description {space} {law}/>")
+    google = "http://ns.google.com/photos/1.0/container/"
+    items = '<rdf:li rdf:parseType="Resource"><Container:Item Item:Semantic="Primary" Item:Mime="image/jpeg"/></rdf:li>'
+    items += '<rdf:li rdf:parseType="Resource"><Container:Item Item:Semantic="GainMap" Item:Mime="image/jpeg" '
+    items += f'Item:Length="{len(second)}"/></rdf:li>'
+    names = f'xmlns:Container="{google}" xmlns:Item="{google}item/" {space}'
+    listing = f"<Container:Directory><rdf:Seq>{items}</rdf:Seq></Container:Directory>"
+    return with_xmp(base.getvalue(), f"<rdf:Description {names}>{listing}</rdf:Description>") + second
+
+
+def with_xmp(jpeg: bytes, description: str) -> bytes:
+    rdf = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
+    text = f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="{rdf}">{description}</rdf:RDF></x:xmpmeta>'
+    body = b"http://ns.adobe.com/xap/1.0/\0" + text.encode()
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]
+
+
+@pytest.mark.parametrize("stops", [0.0, 2.0])
+def test_of_a_jpeg_with_a_gain_map_the_picture_is_read_that_any_viewer_shows(tmp_path: Path, stops: float) -> None:
+    (tmp_path / "a.jpg").write_bytes(ultra_hdr(stops))
+    source = oiio.ImageInput.open(str(tmp_path / "a.jpg"))
+    assert source is not None
+    if str(source.spec().format) != "half":
+        pytest.skip("this OpenImageIO does not render gain maps")
+    with Image.open(tmp_path / "a.jpg") as image:
+        expected = np.asarray(image.convert("RGB"))
+    assert np.array_equal(read_picture(tmp_path / "a.jpg").permute(1, 2, 0).numpy(), expected)
+
+
+def test_a_linear_profile_is_applied_to_all_16_bits(tmp_path: Path) -> None:
+    """Cut to 8 bits before the profile, the shadows of a ramp would have 14 levels in place of 64."""
+    linear = np.linspace(0, 0.05, 512)
+    numbers = np.rint(65535 * linear).astype(np.uint16)[None, :, None].repeat(4, 0).repeat(3, -1)
+    primaries = {
+        b"rXYZ": (0.4361, 0.2225, 0.0139),
+        b"gXYZ": (0.3851, 0.7169, 0.0971),
+        b"bXYZ": (0.1431, 0.0606, 0.7141),
+    }
+    tags = {name: b"XYZ " + bytes(4) + s15_fixed16(*xyz) for name, xyz in primaries.items()}
+    tags[b"wtpt"] = b"XYZ " + bytes(4) + s15_fixed16(0.9642, 1, 0.8249)
+    profile = icc_profile(b"RGB ", tags | {name: curve(1.0) for name in (b"rTRC", b"gTRC", b"bTRC")})
+    tifffile.imwrite(tmp_path / "a.tif", numbers, photometric="rgb", iccprofile=profile)
+    expected = (255 * encode_srgb(torch.from_numpy(linear))).numpy()
+    row = read_picture(tmp_path / "a.tif")[1, 0].numpy()
+    assert np.abs(row - expected).max() <= 0.6 and len(np.unique(row)) == 64
+
+
+@pytest.mark.parametrize("extension", ["png", "webp", "tif", "gif", "jxl", "bmp"])
+def test_hidden_colours_are_black_in_every_format(tmp_path: Path, extension: str) -> None:
+    pixels = np.zeros((64, 64, 4), np.uint8)
+    pixels[..., :3] = 200, 120, 40
+    pixels[16:48, 8:24, :3] = np.random.default_rng(0).integers(0, 255, (32, 16, 3))
+    pixels[:, :32, 3] = 255
+    path = tmp_path / f"a.{extension}"
+    if extension == "jxl":
+        path.write_bytes(imagecodecs.jpegxl_encode(pixels, lossless=True))
+    elif extension == "gif":
+        indices = np.where(pixels[..., 3] > 0, 0, 1).astype(np.uint8)
+        image = Image.fromarray(indices, "P")
+        image.putpalette([200, 120, 40] * 2 + [0] * 762)
+        image.save(path, transparency=1)
+    elif extension == "bmp":
+        path.write_bytes(bitmap(pixels))
+    else:
+        settings: dict[str, Any] = {"lossless": True, "exact": True} if extension == "webp" else {}
+        Image.fromarray(pixels).save(path, **settings)
+    read = read_picture(path)
+    assert read[:, 5, 5].tolist() == [200, 120, 40] and read[:, 5, 60].tolist() == [0, 0, 0]
+
+
+def bitmap(pixels: np.ndarray) -> bytes:
+    """A BMP of 32 bits with bit fields, of which one is alpha."""
+    masks = struct.pack("<IIII", 0xFF0000, 0xFF00, 0xFF, 0xFF000000)
+    header = struct.pack("<IiiHHIIiiII", 124, pixels.shape[1], pixels.shape[0], 1, 32, 3, pixels.nbytes, 0, 0, 0, 0)
+    header = (header + masks).ljust(124, b"\0")
+    body = pixels[::-1, :, [2, 1, 0, 3]].tobytes()
+    return b"BM" + struct.pack("<IHHI", 14 + 124 + len(body), 0, 0, 14 + 124) + header + body
+
+
+def test_a_bmp_of_run_lengths_and_of_bit_fields_has_its_colours(tmp_path: Path) -> None:
+    palette = [(0, 0, 0), (200, 30, 10), (10, 200, 30), (30, 10, 200)]
+    runs = b"".join(bytes((8, (k % 4) << 4 | (k + 1) % 4)) + b"\0\0" for k in range(4)) + b"\0\1"
+    header = struct.pack("<IiiHHIIiiII", 40, 8, 4, 1, 4, 2, len(runs), 0, 0, 4, 4)
+    table = b"".join(bytes((blue, green, red, 0)) for red, green, blue in palette)
+    start = 14 + len(header) + len(table)
+    (tmp_path / "rle.bmp").write_bytes(
+        b"BM" + struct.pack("<IHHI", start + len(runs), 0, 0, start) + header + table + runs
+    )
+    rows = [[palette[(k + side % 2) % 4] for side in range(8)] for k in (3, 2, 1, 0)]
+    assert read_picture(tmp_path / "rle.bmp").permute(1, 2, 0).tolist() == [[list(c) for c in row] for row in rows]
+
+    numbers = (np.arange(64).reshape(8, 8) * 1023 % 65536).astype(np.uint16)  # 5, 6 and 5 bits
+    header = struct.pack("<IiiHHIIiiII", 40, 8, -8, 1, 16, 3, numbers.nbytes, 0, 0, 0, 0)
+    masks = struct.pack("<III", 0xF800, 0x07E0, 0x001F)
+    start = 14 + len(header) + len(masks)
+    data = b"BM" + struct.pack("<IHHI", start + numbers.nbytes, 0, 0, start) + header + masks + numbers.tobytes()
+    (tmp_path / "fields.bmp").write_bytes(data)
+    parts = np.stack([numbers >> 11, numbers >> 5 & 63, numbers & 31]) * (255 / np.array([31, 63, 31]).reshape(3, 1, 1))
+    assert np.abs(read_picture(tmp_path / "fields.bmp").numpy() - parts).max() <= 1
+
+
+def test_an_animated_jpeg_xl_or_png_is_refused(tmp_path: Path) -> None:
+    frames = np.random.default_rng(0).integers(0, 255, (3, 32, 32, 3)).astype(np.uint8)
+    (tmp_path / "moves.jxl").write_bytes(imagecodecs.jpegxl_encode(frames, lossless=True, photometric="rgb"))
+    (tmp_path / "still.jxl").write_bytes(imagecodecs.jpegxl_encode(frames[0], lossless=True))
+    first, *others = (Image.fromarray(frame) for frame in frames)
+    first.save(tmp_path / "moves.png", save_all=True, append_images=others)
+    for name in ("moves.jxl", "moves.png"):
+        with pytest.raises(ValueError, match="is an animation"):
+            read_picture(tmp_path / name)
+    assert np.array_equal(read_picture(tmp_path / "still.jxl").permute(1, 2, 0).numpy(), frames[0])
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_tiff_in_lossless_jpeg_of_16_bits_is_not_black(tmp_path: Path, channels: int) -> None:
+    numbers = np.random.default_rng(0).integers(0, 65535, (32, 48, channels)).astype(np.uint16)
+    kind = {"photometric": "rgb" if channels == 3 else "minisblack"}
+    how = {"compression": "jpeg", "compressionargs": {"lossless": True, "bitspersample": 16}}
+    tifffile.imwrite(tmp_path / "a.tif", numbers if channels == 3 else numbers[..., 0], **kind, **how)
+    read = read_picture(tmp_path / "a.tif").permute(1, 2, 0).numpy()
+    assert np.array_equal(read, np.broadcast_to(np.rint(numbers / 257), read.shape))
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_heic_is_read_upright_and_close(tmp_path: Path, turned: bool) -> None:
+    heif = pytest.importorskip("pillow_heif")
+    smooth = np.linspace(40, 200, 64 * 96 * 3).reshape(64, 96, 3).astype(np.uint8)
+    exif = Image.Exif()
+    exif[274] = 6 if turned else 1
+    image = heif.from_pillow(Image.fromarray(smooth))
+    image.save(tmp_path / "a.jpg.heic", quality=95, exif=exif.tobytes())
+    expected = np.rot90(smooth, -1) if turned else smooth
+    read = read_picture(tmp_path / "a.jpg.heic").permute(1, 2, 0).numpy()
+    assert read.shape == expected.shape and np.abs(read.astype(int) - expected).max() <= 6
+
+
+def test_avif_is_read_upright_and_heic_without_its_decoder_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rawaug.io.decoding.reads_heic", lambda: False)
+    (tmp_path / "a.jpg").write_bytes(b"\0\0\0\x24ftypheic\0\0\0\0mif1MiHEMiPr")
+    with pytest.raises(ValueError, match=r"a\.jpg: is HEIC, .*pip install .*heif"):
+        read_picture(tmp_path / "a.jpg")
+
+    if not features.check("avif"):
+        pytest.skip("this Pillow does not read AVIF")
+    smooth = np.linspace(40, 200, 64 * 96 * 3).reshape(64, 96, 3).astype(np.uint8)
+    exif = Image.Exif()
+    exif[274] = 6
+    Image.fromarray(smooth).save(tmp_path / "a.avif", quality=95, exif=exif)
+    read = read_picture(tmp_path / "a.avif").permute(1, 2, 0).numpy()
+    assert read.shape == (96, 64, 3) and np.abs(read.astype(int) - np.rot90(smooth, -1)).max() <= 6
+
+
+def test_exif_has_the_last_word_on_the_orientation(tmp_path: Path) -> None:
+    stored = io.BytesIO()
+    exif = Image.Exif()
+    exif[274] = 6
+    Image.fromarray(PIXELS).save(stored, "JPEG", exif=exif)
+    description = '<rdf:Description xmlns:tiff="http://ns.adobe.com/tiff/1.0/" tiff:Orientation="1"/>'
+    (tmp_path / "a.jpg").write_bytes(with_xmp(stored.getvalue(), description))
+    assert read_picture(tmp_path / "a.jpg").shape == (3, 37, 24)

@@ -1,0 +1,292 @@
+"""What a file is, asked of its first bytes: camera RAW, a picture, or neither.
+
+Names lie: iPhones write HEIC that is renamed to .jpg, DNG, NEF and CR2 are TIFF files whose first picture is a
+thumbnail, and downloads have no extension at all. Every command asks :func:`content_of`. Where the bytes tell nothing
+(RAW without a header, an empty file), the extension decides, so that the reader can say what is wrong.
+
+A TIFF is RAW if it has a DNG's version, or a directory whose pixels are a mosaic (photometric interpretation 32803) or
+linear RAW (34892). Source: TIFF 6.0; DNG 1.7.1; ISO/IEC 14496-12 (brands of HEIF); the signatures of each format.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import BinaryIO, Literal, NamedTuple
+
+from rawaug.errors import escape, how_to_install
+from rawaug.files import files_below, require_file
+from rawaug.io.directories import PHOTOMETRIC, SUB_DIRECTORIES, DamagedTags, Directory, TiffFile
+
+RAW_EXTENSIONS = (
+    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
+    *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
+)
+PICTURE_EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
+"""Extensions of the pictures that are read without an extra."""
+HEIF_EXTENSIONS, AVIF_EXTENSIONS = (".heic", ".heif", ".hif"), (".avif",)
+ALL_PICTURE_EXTENSIONS = (*PICTURE_EXTENSIONS, *HEIF_EXTENSIONS, *AVIF_EXTENSIONS)
+_UNKNOWN_RAW = (".x3f", ".cap", ".eip", ".braw", ".r3d", ".ari", ".gpr")
+"""RAW that nothing here reads, which is counted as RAW all the same."""
+
+Kind = Literal["raw", "picture", "other"]
+
+
+class Content(NamedTuple):
+    """What a file is, and the name of its format, such as ``"JPEG"`` or ``"DNG"``."""
+
+    kind: Kind
+    format: str
+
+
+_OTHER = Content("other", "unknown")
+_SIGNATURES: tuple[tuple[int, bytes, Content], ...] = (
+    (0, b"\xff\xd8\xff", Content("picture", "JPEG")),
+    (0, b"\x89PNG\r\n\x1a\n", Content("picture", "PNG")),
+    (0, b"GIF8", Content("picture", "GIF")),
+    (8, b"WEBP", Content("picture", "WebP")),
+    (0, b"\xff\x0a", Content("picture", "JPEG XL")),
+    (0, b"\0\0\0\x0cJXL ", Content("picture", "JPEG XL")),
+    (0, b"\0\0\0\x0cjP  ", Content("picture", "JPEG 2000")),
+    (0, b"\xff\x4f\xff\x51", Content("picture", "JPEG 2000")),
+    (0, b"BM", Content("picture", "BMP")),
+    (0, b"\x76\x2f\x31\x01", Content("picture", "OpenEXR")),
+    (0, b"#?RADIANCE", Content("picture", "Radiance")),
+    (0, b"#?RGBE", Content("picture", "Radiance")),
+    (0, b"8BPS", Content("picture", "PSD")),
+    (0, b"FUJIFILMCCD-RAW", Content("raw", "RAF")),
+    (6, b"HEAPCCDR", Content("raw", "CRW")),
+    (0, b"\0MRM", Content("raw", "MRW")),
+    (0, b"FOVb", Content("raw", "X3F")),
+    (0, b"IIU\0", Content("raw", "RW2")),
+    (0, b"IIRO", Content("raw", "ORF")),
+    (0, b"IIRS", Content("raw", "ORF")),
+    (0, b"MMOR", Content("raw", "ORF")),
+    (8, b"CR\x02", Content("raw", "CR2")),
+    (8, b"IIII", Content("raw", "IIQ")),
+    (8, b"MMMM", Content("raw", "IIQ")),
+)
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_HEIC = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+_AVIF = (b"avif", b"avis")
+_PORTABLE = tuple(b"P%d" % number for number in range(1, 8))
+_DNG_VERSION, _LEAF = 50706, 34310
+_RAW_PHOTOMETRICS = (32803, 34892)
+_MOST_DIRECTORIES = 32
+
+
+def content_of(path: str | Path) -> Content:
+    """What a file is, by its first bytes, or by its extension where they tell nothing.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        OSError: if it is no regular file, or cannot be read.
+
+    Example:
+        >>> content_of("IMG_0001.jpg").format  # doctest: +SKIP
+        'HEIC'
+    """
+    path = Path(path)
+    require_file(path)
+    with path.open("rb") as file:
+        content = _by_bytes(file)
+
+    if content.kind == "other" or content.format == "TIFF":
+        return _by_extension(path.suffix.lower(), content)
+    return content
+
+
+def is_raw(path: str | Path) -> bool:
+    """Whether a file is camera RAW: see :func:`content_of`."""
+    return content_of(path).kind == "raw"
+
+
+def _by_bytes(file: BinaryIO) -> Content:
+    head = file.read(64)
+    for place, signature, content in _SIGNATURES:
+        if head.startswith(signature, place):
+            return content
+    if head.startswith(_TIFF):
+        return _of_tiff(file)
+    if head[4:8] == b"ftyp":
+        return _of_boxes(head)
+    if head.startswith(_PORTABLE) and head[2:3].isspace():
+        return Content("picture", "PNM")
+    return _OTHER
+
+
+def _by_extension(extension: str, content: Content) -> Content:
+    """What the extension says of a file whose bytes do not: those of a TIFF can be either."""
+    if extension in (*RAW_EXTENSIONS, *_UNKNOWN_RAW):
+        return Content("raw", extension[1:].upper())
+    if extension in ALL_PICTURE_EXTENSIONS and content.kind == "other":
+        return Content("picture", "unknown")
+    return content
+
+
+def _of_boxes(head: bytes) -> Content:
+    """The brands of a file of boxes: its own comes first, then those that it is compatible with."""
+    size = int.from_bytes(head[:4], "big")
+    brands = [head[8:12]] + [head[place : place + 4] for place in range(16, min(size, len(head)), 4)]
+    if b"crx " in brands:
+        return Content("raw", "CR3")
+    for brand in brands:
+        if brand in _AVIF:
+            return Content("picture", "AVIF")
+    for brand in brands:
+        if brand in _HEIC:
+            return Content("picture", "HEIC")
+    return _OTHER
+
+
+def _of_tiff(file: BinaryIO) -> Content:
+    """RAW or a picture; a picture where the directories are damaged, which its reader will say."""
+    try:
+        tiff = TiffFile(file)
+        for directory in _directories(tiff):
+            if _DNG_VERSION in directory.entries:
+                return Content("raw", "DNG")
+            photometric = tiff.number(directory, PHOTOMETRIC, -1)
+            if photometric in _RAW_PHOTOMETRICS or _LEAF in directory.entries:
+                return Content("raw", "RAW based on TIFF")
+    except DamagedTags:
+        pass
+    return Content("picture", "TIFF")
+
+
+def _directories(tiff: TiffFile) -> Iterator[Directory]:
+    """The first directories of a file and those that they point at, each once."""
+    waiting = [tiff.first]
+    places: set[int] = set()
+    while waiting and len(places) < _MOST_DIRECTORIES:
+        place = waiting.pop(0)
+        if not place or place in places:
+            continue
+        places.add(place)
+
+        directory = tiff.directory(place)
+        yield directory
+        waiting.extend(tiff.numbers(directory.entries.get(SUB_DIRECTORIES)))
+        waiting.append(directory.following)
+
+
+# -- folders of files of many kinds ------------------------------------------------------------------------------------
+
+
+@dataclass
+class LeftOut:
+    """Files of one kind that a command does not read: how many of each extension, and what to do with them."""
+
+    what: str
+    advice: str
+    extensions: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def count(self) -> int:
+        """The number of these files."""
+        return self.extensions.total()
+
+    def __str__(self) -> str:
+        shown = self.extensions.most_common(_SHOWN)
+        names = ", ".join(f"{escape(extension) or 'no extension'} {count}" for extension, count in shown)
+        if len(self.extensions) > _SHOWN:
+            names += f", {len(self.extensions) - _SHOWN} other extensions"
+        plural = "s" if self.count > 1 else ""
+        return f"{self.count} {self.what}{plural} left out ({names}): {self.advice}"
+
+
+_SHOWN = 6
+
+
+@dataclass
+class Listing:
+    """The files of a folder and its subfolders that are read, sorted by path, and those that are not, by kind."""
+
+    files: list[Path] = field(default_factory=list)
+    left_out: dict[str, LeftOut] = field(default_factory=dict)
+
+    def lines(self) -> list[str]:
+        """A line for each kind that is left out."""
+        return [str(kind) for kind in self.left_out.values()]
+
+    def leave_out(self, what: str, advice: str, extension: str) -> None:
+        """Count a file that is not read."""
+        kind = self.left_out.setdefault(what, LeftOut(what, advice))
+        kind.extensions[extension] += 1
+
+
+def picture_extensions() -> tuple[str, ...]:
+    """Extensions of the pictures that can be read here: HEIC and AVIF where their decoders are installed."""
+    extensions: tuple[str, ...] = PICTURE_EXTENSIONS
+    if reads_heic():
+        extensions += HEIF_EXTENSIONS
+    if reads_avif():
+        extensions += AVIF_EXTENSIONS
+    return extensions
+
+
+def reads_heic() -> bool:
+    """Whether the decoder of HEIC is installed."""
+    return find_spec("pillow_heif") is not None
+
+
+def reads_avif() -> bool:
+    """Whether Pillow is there, and of a version that reads AVIF."""
+    return find_spec("PIL") is not None and find_spec("PIL.AvifImagePlugin") is not None
+
+
+def list_pictures(path: str | Path) -> Listing:
+    """The pictures of a folder and its subfolders by their extensions, and by kinds how many other files there are.
+
+    No file is opened, so that a folder of a million files is listed in seconds. A path of a file is that file.
+
+    Raises:
+        FileNotFoundError: if there is no such file or folder.
+        ValueError: if there is no picture that can be read; the message says what there is.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        require_file(path, "picture file or folder")
+        return Listing([path])
+
+    listing = list_files(path, picture_extensions(), "not a picture that is known")
+    if not listing.files:
+        there = "; ".join(listing.lines())
+        known = f"supported extensions are {', '.join(picture_extensions())}"
+        raise ValueError(f"{path}: contains no picture file; {there or known}")
+    return listing
+
+
+def list_files(folder: Path, taken: Sequence[str], other: str) -> Listing:
+    """The files of a folder whose extensions are ``taken``, and the number of others by kind, ``other`` last."""
+    advice = _advice_by_extension(other)
+    listing = Listing()
+    for file in files_below(folder):
+        extension = file.suffix.lower()
+        if extension in taken:
+            listing.files.append(file)
+        else:
+            what, why = advice.get(extension, ("other file", other))
+            listing.leave_out(what, why, extension)
+
+    listing.files.sort()
+    order = ("picture", "HEIC picture", "AVIF picture", "RAW file", "other file")
+    listing.left_out = {what: listing.left_out[what] for what in order if what in listing.left_out}
+    return listing
+
+
+def _advice_by_extension(other: str) -> dict[str, tuple[str, str]]:
+    """What files of an extension are called, and what to do with them."""
+    advice: dict[str, tuple[str, str]] = {}
+    for extension in PICTURE_EXTENSIONS:
+        advice[extension] = ("picture", "call the command on a folder of them alone")
+    for extension in (*RAW_EXTENSIONS, *_UNKNOWN_RAW):
+        advice[extension] = ("RAW file", "not developed pictures; develop them first, or use commands for RAW")
+    for extension in HEIF_EXTENSIONS:
+        advice[extension] = ("HEIC picture", f"pillow_heif is not installed; {how_to_install('heif')}")
+    for extension in AVIF_EXTENSIONS:
+        advice[extension] = ("AVIF picture", f"this Pillow does not read them; {how_to_install('heif')}")
+    return advice

@@ -1,0 +1,354 @@
+"""Pictures of any format as the numbers that their files hold, by the decoder that reads that format right.
+
+OpenImageIO reads most. Four kinds go to other libraries. BMP, of which it mixes up run lengths and bit fields, goes to
+Pillow; so does a JPEG with a gain map ("Ultra HDR", as Android phones write it), which it renders in linear light, for
+the picture that every viewer shows. HEIC and AVIF, which it does not know, go to libheif and Pillow. TIFF in lossless
+JPEG of 16 bits, which it decodes to black, goes to tifffile.
+
+What a header says besides is read here too, byte for byte: OpenImageIO takes the orientation from XMP where EXIF says
+otherwise, and does not see an EXIF chunk behind the pixels of a PNG.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rawaug.errors import extra, how_to_install
+from rawaug.files import require_file
+from rawaug.io.content import content_of, reads_avif, reads_heic
+from rawaug.io.directories import COMPRESSION, DamagedTags, TiffFile
+from rawaug.io.headers import Headers, read_headers
+from rawaug.io.isolated import damage_as_os_error
+from rawaug.io.profiles import profile_of_code_points
+
+MAX_PIXELS = 2**26
+"""Larger pictures (8192 x 8192) are refused by default, since a few header bytes can claim any size."""
+
+MAX_CHANNELS = 4
+
+_LINEAR_FORMATS = ("openexr", "hdr")
+_WITH_ASSOCIATED_ALPHA = ("tiff", "openexr")
+"""Formats whose colours may be multiplied by alpha already."""
+_UPRIGHT = ("JPEG XL", "HEIC", "JPEG 2000")
+"""Formats that their decoders turn upright, whatever EXIF says."""
+_BITS = 258
+_JPEG_IN_TIFF = 7
+
+
+class Decoded(NamedTuple):
+    """The first picture of a file.
+
+    Args:
+        colours: ``(H, W, 1)`` or ``(H, W, 3)`` of uint8, uint16 or float32, as stored: neither turned nor converted.
+        alpha: ``(H, W, 1)`` of the same type, where there is transparency.
+        associated: whether ``colours`` are multiplied by alpha already.
+        format: of the content, such as ``"JPEG"``.
+        linear: whether the numbers are linear light, as those of OpenEXR are.
+        profile: the ICC profile.
+        orientation: of EXIF, 1 to 8.
+        headers: EXIF and other metadata as bytes.
+    """
+
+    colours: np.ndarray
+    alpha: np.ndarray | None
+    associated: bool
+    format: str
+    linear: bool
+    profile: bytes | None
+    orientation: int
+    headers: Headers
+
+
+def decode(path: Path, max_pixels: int = MAX_PIXELS, coarse: bool = False) -> Decoded:
+    """The numbers of a picture file.
+
+    Args:
+        path: the file.
+        max_pixels: larger pictures are refused before anything is decoded.
+        coarse: 16 bits may be given back as 8, by rounding, where no profile and no alpha have to be applied first.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        OSError: if the file is not a picture, or is truncated.
+        ValueError: if its header declares more than ``max_pixels``, it is camera RAW or animated, or its colours are
+            neither grey nor RGB.
+    """
+    require_file(path, "picture file")
+    require_utf8(path)
+    content = content_of(path)
+    if content.kind == "raw":
+        raise ValueError(f"{path}: is camera RAW ({content.format}), not a developed picture; develop it first")
+
+    headers = read_headers(path, content.format)
+    if headers.animated:
+        raise ValueError(f"{path}: is an animation; save a single frame")
+
+    if content.format in ("HEIC", "AVIF"):
+        return _decode_heif(path, content.format, max_pixels, headers)
+    if content.format == "BMP":
+        return _decode_with_pillow(path, "BMP", max_pixels, headers)
+    if content.format == "TIFF" and _is_jpeg_of_many_bits(path):
+        return _decode_with_tifffile(path, max_pixels, headers)
+    return _decode_with_oiio(path, content.format, max_pixels, coarse, headers)
+
+
+def require_utf8(path: Path) -> None:
+    """Raise OSError if the name is not UTF-8, which the libraries need."""
+    if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # how Python represents bytes that are not UTF-8
+        raise OSError(f"{os.fsencode(path)!r}: cannot be opened because its name is not UTF-8; rename it")
+
+
+def require_size(path: Path, height: int, width: int, channels: int, max_pixels: int) -> None:
+    """Raise ValueError if the declared size is above the limit, before anything is decoded."""
+    pixels = height * width
+    if pixels <= max_pixels and pixels * channels <= MAX_CHANNELS * max_pixels:
+        return
+    size = f"{height} x {width} pixels"
+    if pixels <= max_pixels:
+        size += f" of {channels} channels"
+    raise ValueError(f"{path}: declares {size}, above the limit of {max_pixels}; split it, or raise max_pixels")
+
+
+# -- OpenImageIO -------------------------------------------------------------------------------------------------------
+
+
+def open_image(path: Path) -> Any:
+    """OpenImageIO's reader of a file, which leaves colours as they are under their alpha."""
+    oiio = load_oiio()
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(str(path), config)
+    if source is None:
+        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {reason(oiio) or 'no reason given'})")
+    return source
+
+
+def load_oiio() -> Any:
+    """OpenImageIO, which is not imported before a picture is read or written."""
+    with extra("raw"):
+        import OpenImageIO
+
+    return OpenImageIO
+
+
+def reason(source: Any) -> str:
+    """The first line of OpenImageIO's message, if there is one."""
+    try:
+        lines = source.geterror().strip().splitlines()
+    except UnicodeDecodeError:  # it quotes the damaged file
+        return "its header is damaged"
+    return lines[0] if lines else ""
+
+
+def _decode_with_oiio(path: Path, name: str, max_pixels: int, coarse: bool, headers: Headers) -> Decoded:
+    source = open_image(path)
+    spec = source.spec()
+    require_size(path, spec.height * spec.depth, spec.width, spec.nchannels, max_pixels)
+    if name == "JPEG" and _is_float(spec):
+        source.close()
+        return _decode_with_pillow(path, "JPEG", max_pixels, headers)
+
+    has_alpha = _require_grey_or_rgb(spec, path)
+    profile = spec.getattribute("ICCProfile")
+    kind = _number_type(spec, path)
+    if coarse and kind == "uint16" and profile is None and not has_alpha:
+        kind = "uint8"
+
+    try:
+        pixels = source.read_image(kind)
+    except UnicodeDecodeError as error:  # OpenImageIO's binding, of texts in the header
+        raise OSError(f"{path}: cannot be read as a picture (its header is damaged: {error}); copy it again") from error
+    fault = reason(source)  # also set where a decoder padded a truncated file
+    format_name = source.format_name()
+    # a GIF is marked as animated only if its frames have a duration
+    moves = spec.get_int_attribute("oiio:Movie") or (format_name == "gif" and source.seek_subimage(1, 0))
+    source.close()
+    if moves:
+        raise ValueError(f"{path}: is an animation; save a single frame")
+    if pixels is None or fault:
+        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {fault or 'no reason given'})")
+
+    associated = format_name in _WITH_ASSOCIATED_ALPHA and not spec.get_int_attribute("oiio:UnassociatedAlpha")
+    orientation = headers.orientation
+    if orientation is None:
+        orientation = spec.get_int_attribute("Orientation", 1)
+    if name in _UPRIGHT:
+        orientation = 1
+    return Decoded(
+        colours=pixels[..., :-1] if has_alpha else pixels,
+        alpha=pixels[..., -1:] if has_alpha else None,
+        associated=associated,
+        format=name,
+        linear=format_name in _LINEAR_FORMATS,
+        profile=None if profile is None else bytes(profile),
+        orientation=orientation,
+        headers=headers,
+    )
+
+
+def _is_float(spec: Any) -> bool:
+    oiio = load_oiio()
+    return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+
+
+def _number_type(spec: Any, path: Path) -> str:
+    """The type that the numbers are read in: their own, or the next that holds them."""
+    if _is_float(spec):
+        return "float"
+    name = str(spec.format)
+    if name not in ("uint8", "uint16"):
+        raise ValueError(f"{path}: holds {name} numbers; a picture has 8 or 16 bits, or floating point")
+    return name
+
+
+def _require_grey_or_rgb(spec: Any, path: Path) -> bool:
+    """Whether there is alpha; ValueError if a conversion to RGB would need a profile or a choice of channels."""
+    stored = spec.get_string_attribute("tiff:ColorSpace") or spec.get_string_attribute("jpeg:ColorSpace")
+    if any(name in stored for name in ("CMYK", "YCCK", "LAB", "separated")):
+        raise ValueError(f"{path}: is {stored}; convert it to sRGB first")
+
+    names = tuple(spec.channelnames)
+    if names == ("R", "G"):  # grey with alpha in JPEG XL
+        return True
+    more = names[1:] if len(names) < 3 else names[3:]
+    if more not in ((), ("A",)):
+        raise ValueError(f"{path}: has channels {', '.join(names)}; expected grey or R, G, B, with optional alpha")
+    return bool(more)
+
+
+# -- other decoders ----------------------------------------------------------------------------------------------------
+
+
+def _decode_with_pillow(path: Path, name: str, max_pixels: int, headers: Headers) -> Decoded:
+    """The first picture of a BMP or JPEG, 8 bits."""
+    with extra("raw"):
+        from PIL import Image
+
+    with _pillow_damage(path), Image.open(path, formats=(name,)) as image:
+        require_size(path, image.height, image.width, len(image.getbands()), max_pixels)
+        return _of_pillow(image, path, name, headers)
+
+
+def _pillow_damage(path: Path) -> Any:
+    """Turn Pillow's errors into an OSError that names the file, except ours."""
+    return damage_as_os_error(path, "cannot be read as a picture", _Refused)
+
+
+class _Refused(ValueError):
+    """A file that is whole, but not taken."""
+
+
+def _of_pillow(image: Any, path: Path, name: str, headers: Headers, orientation: int | None = None) -> Decoded:
+    if image.mode in ("CMYK", "YCCK", "LAB"):
+        raise _Refused(f"{path}: is {image.mode}; convert it to sRGB first")
+    if image.mode in ("P", "PA") or "transparency" in image.info:
+        image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
+    if image.mode not in ("L", "LA", "RGB", "RGBA"):
+        image = image.convert("L" if image.mode == "1" else "RGB")
+
+    profile = image.info.get("icc_profile")
+    pixels = np.array(image)
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    return Decoded(
+        colours=pixels[..., :-1] if image.mode in ("LA", "RGBA") else pixels,
+        alpha=pixels[..., -1:] if image.mode in ("LA", "RGBA") else None,
+        associated=False,
+        format=name,
+        linear=False,
+        profile=profile or None,
+        orientation=orientation or headers.orientation or 1,
+        headers=headers,
+    )
+
+
+def _decode_heif(path: Path, name: str, max_pixels: int, headers: Headers) -> Decoded:
+    """HEIC by libheif, AVIF by Pillow; colours that are named by numbers alone get a profile."""
+    readable = reads_heic() if name == "HEIC" else reads_avif()
+    if not readable:
+        library = "pillow_heif is not installed" if name == "HEIC" else "this Pillow does not read AVIF"
+        raise ValueError(f"{path}: is {name}, and {library}; {how_to_install('heif')}")
+
+    decoded = _decode_heic(path, max_pixels) if name == "HEIC" else _decode_avif(path, max_pixels, headers)
+    if decoded.profile is None and headers.code_points is not None:
+        primaries, transfer = headers.code_points
+        decoded = decoded._replace(profile=profile_of_code_points(primaries, transfer, path))
+    return decoded
+
+
+def _decode_avif(path: Path, max_pixels: int, headers: Headers) -> Decoded:
+    with extra("heif"):
+        from PIL import Image
+
+    with _pillow_damage(path), Image.open(path, formats=("AVIF",)) as image:
+        require_size(path, image.height, image.width, len(image.getbands()), max_pixels)
+        if getattr(image, "n_frames", 1) > 1:
+            raise _Refused(f"{path}: is an animation; save a single frame")
+        # Pillow leaves the pixels as they are, and says how they are turned
+        orientation = image.getexif().get(274, 1)
+        return _of_pillow(image, path, "AVIF", headers._replace(exif=image.info.get("exif")), orientation)
+
+
+def _decode_heic(path: Path, max_pixels: int) -> Decoded:
+    """HEIC of 8, 10 or 12 bits. libheif turns it upright; 10 and 12 bits come as 16."""
+    with extra("heif"):
+        import pillow_heif
+
+    with _pillow_damage(path):
+        image = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
+        width, height = image.size
+        if max_pixels < height * width:
+            raise _Refused(f"{path}: declares {height} x {width} pixels, above the limit of {max_pixels}; split it")
+        pixels = np.array(image)
+        info, mode = image.info, image.mode
+
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    has_alpha = pixels.shape[-1] in (2, 4)
+    return Decoded(
+        colours=pixels[..., :-1] if has_alpha else pixels,
+        alpha=pixels[..., -1:] if has_alpha else None,
+        associated="a" in mode,  # "RGBa" is multiplied by alpha, "RGBA" is not
+        format="HEIC",
+        linear=False,
+        profile=info.get("icc_profile") or None,
+        orientation=1,
+        headers=Headers(exif=_without_prefix(info.get("exif")), xmp=info.get("xmp") or None),
+    )
+
+
+def _without_prefix(exif: bytes | None) -> bytes | None:
+    return exif.removeprefix(b"Exif\0\0") if exif else None
+
+
+def _is_jpeg_of_many_bits(path: Path) -> bool:
+    """Whether a TIFF holds lossless JPEG of more than 8 bits."""
+    with path.open("rb") as file:
+        try:
+            tiff = TiffFile(file)
+            first = tiff.directory(tiff.first)
+            return tiff.number(first, COMPRESSION) == _JPEG_IN_TIFF and tiff.number(first, _BITS) > 8
+        except DamagedTags:
+            return False
+
+
+def _decode_with_tifffile(path: Path, max_pixels: int, headers: Headers) -> Decoded:
+    with extra("raw"):
+        import tifffile
+
+    with _pillow_damage(path), warnings.catch_warnings(), tifffile.TiffFile(path) as tiff:
+        page = tiff.pages[0]
+        require_size(path, page.imagelength, page.imagewidth, page.samplesperpixel, max_pixels)
+        if page.bitspersample != 16 or page.samplesperpixel not in (1, 3) or page.photometric not in (1, 2, 6):
+            kind = f"{page.bitspersample} bits, {page.samplesperpixel} channels"
+            raise _Refused(f"{path}: is a TIFF in JPEG of {kind}, which is not read; save it as PNG or plain TIFF")
+        pixels = page.asarray()
+        profile = page.tags.valueof(34675)
+
+    pixels = pixels.reshape(*pixels.shape[:2], -1)
+    return Decoded(pixels, None, False, "TIFF", False, profile, headers.orientation or 1, headers)

@@ -1,0 +1,168 @@
+"""TIFF directories, as they stand in TIFF files, in RAW files and in EXIF: tags read and written byte for byte.
+
+A directory is a list of entries: a code, a type, the number of values, and the values or where they stand. An EXIF
+block is a small TIFF without pixels: its first directory points at those of the exposure, of GPS, and at a thumbnail's.
+Nothing is converted here, so that what is copied stays what it was, makers' notes included. Source: TIFF 6.0;
+Exif 2.32.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from typing import BinaryIO, NamedTuple
+
+ORIENTATION, COMPRESSION, PHOTOMETRIC, SUB_DIRECTORIES = 274, 259, 262, 330
+EXIF, GPS, INTEROPERABILITY = 34665, 34853, 40965
+THUMBNAIL, THUMBNAIL_BYTES = 513, 514
+POINTERS = (EXIF, GPS, INTEROPERABILITY)
+"""Tags whose value is the place of another directory."""
+
+MOST_ENTRIES, MOST_BYTES = 4096, 2**26
+"""Larger directories, and larger values of one, are taken for damage."""
+
+_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
+"""Bytes of a value, by type."""
+
+
+class DamagedTags(ValueError):
+    """A directory that cannot be right."""
+
+
+class Entry(NamedTuple):
+    """One tag of a file: its type, the number of its values, and the place and size of their bytes."""
+
+    code: int
+    dtype: int
+    values: int
+    place: int
+    size: int
+
+
+class Tag(NamedTuple):
+    """One tag to be written: its values are bytes in the file's order."""
+
+    code: int
+    dtype: int
+    values: int
+    data: bytes
+
+
+class Directory(NamedTuple):
+    """The tags of a directory by their codes, and where the next one begins, 0 for none."""
+
+    entries: dict[int, Entry]
+    following: int
+
+
+class TiffFile:
+    """The directories of a TIFF or of an EXIF block.
+
+    Args:
+        file: the bytes, which begin with those of a TIFF's header.
+
+    Raises:
+        DamagedTags: if this is no TIFF.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.end = file.seek(0, 2)
+
+        head = self.read(0, 16) if self.end >= 16 else self.read(0, 8).ljust(16, b"\0")
+        if head[:2] not in (b"II", b"MM"):
+            raise DamagedTags("no TIFF header")
+        self.order = "<" if head[:2] == b"II" else ">"
+
+        self.big = struct.unpack(self.order + "H", head[2:4])[0] == 43
+        self.first: int = struct.unpack(self.order + ("Q" if self.big else "I"), head[8:16] if self.big else head[4:8])[
+            0
+        ]
+
+    def directory(self, place: int) -> Directory:
+        """The directory that begins at ``place``."""
+        counter, pointer = ("Q", "Q") if self.big else ("H", "I")
+        head = struct.calcsize(self.order + counter)
+        (count,) = struct.unpack(self.order + counter, self.read(place, head))
+        if count > MOST_ENTRIES:
+            raise DamagedTags(f"a directory of {count} tags")
+
+        inside = struct.calcsize(self.order + pointer)
+        step = 4 + 2 * inside
+        table = self.read(place + head, count * step)
+
+        entries: dict[int, Entry] = {}
+        for start in range(0, count * step, step):
+            code, dtype = struct.unpack_from(self.order + "HH", table, start)
+            (values,) = struct.unpack_from(self.order + pointer, table, start + 4)
+            size = _SIZES.get(dtype, 0) * values
+            if not size:
+                continue
+
+            at = place + head + start + 4 + inside
+            if size > inside:
+                (at,) = struct.unpack_from(self.order + pointer, table, start + 4 + inside)
+            entries[code] = Entry(code, dtype, values, at, size)
+
+        return Directory(entries, self._following(place + head + count * step, pointer))
+
+    def tag(self, entry: Entry) -> Tag:
+        """A tag with its values."""
+        if entry.size > MOST_BYTES:
+            raise DamagedTags(f"tag {entry.code} of {entry.size} bytes")
+        return Tag(entry.code, entry.dtype, entry.values, self.read(entry.place, entry.size))
+
+    def numbers(self, entry: Entry | None) -> tuple[int, ...]:
+        """The whole numbers of a tag; none where it is missing or holds others."""
+        letters = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}
+        if entry is None or entry.dtype not in letters:
+            return ()
+        return struct.unpack(f"{self.order}{entry.values}{letters[entry.dtype]}", self.tag(entry).data)
+
+    def number(self, directory: Directory, code: int, default: int = 0) -> int:
+        """The first whole number of a tag."""
+        numbers = self.numbers(directory.entries.get(code))
+        return numbers[0] if numbers else default
+
+    def rational(self, entry: Entry | None) -> float:
+        """The first number of a tag of fractions; 0 where it is missing, holds others, or divides by zero."""
+        if entry is None or entry.dtype not in (5, 10):
+            return 0.0
+        letter = "I" if entry.dtype == 5 else "i"
+        over, under = struct.unpack_from(f"{self.order}2{letter}", self.tag(entry).data)
+        return over / under if under else 0.0
+
+    def _following(self, place: int, pointer: str) -> int:
+        """Where the next directory begins. Some programs leave this out behind the last one."""
+        size = struct.calcsize(self.order + pointer)
+        if place + size > self.end:
+            return 0
+        return int(struct.unpack(self.order + pointer, self.read(place, size))[0])
+
+    def read(self, place: int, size: int) -> bytes:
+        """Bytes of the file; DamagedTags if it has fewer."""
+        if place + size > self.end:
+            raise DamagedTags(f"{size} bytes at {place} of {self.end}")
+        self._file.seek(place)
+        return self._file.read(size)
+
+
+def pack_directory(order: str, tags: Iterable[Tag], place: int, following: int = 0) -> bytes:
+    """A directory that stands at ``place``, with the values that do not fit into it behind it."""
+    ordered = sorted(tags, key=lambda tag: tag.code)
+    beyond = place + 2 + 12 * len(ordered) + 4
+
+    table, values = struct.pack(order + "H", len(ordered)), b""
+    for tag in ordered:
+        table += struct.pack(order + "HHI", tag.code, tag.dtype, tag.values)
+        if len(tag.data) <= 4:
+            table += tag.data.ljust(4, b"\0")
+        else:
+            table += struct.pack(order + "I", beyond + len(values))
+            values += tag.data + bytes(len(tag.data) % 2)
+    return table + struct.pack(order + "I", following) + values
+
+
+def pointer_tag(order: str, code: int, place: int) -> Tag:
+    """The tag that says where a directory stands."""
+    return Tag(code, 4, 1, struct.pack(order + "I", place))

@@ -1,0 +1,378 @@
+"""What the header of a picture file says beside its pixels: EXIF and XMP as bytes, and whether it is an animation.
+
+Each container is walked by its own lengths, without decoding: the segments of JPEG, the chunks of PNG (some programs
+write EXIF behind the pixels) and of WebP, the directories of TIFF, the boxes of HEIF and JPEG XL. Damage ends the walk,
+and the decoder says what is wrong. Source: ITU-T T.81; PNG 3; RIFF container of WebP; TIFF 6.0; ISO/IEC 14496-12 and
+18181-1.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from rawaug.io.directories import ORIENTATION, DamagedTags, TiffFile
+
+EXIF_PREFIX = b"Exif\0\0"
+XMP_PREFIX = b"http://ns.adobe.com/xap/1.0/\0"
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+XMP_KEYWORD = b"XML:com.adobe.xmp"
+XMP_TAG = 700
+
+_MOST_CHUNKS = 2**20
+_MOST_BYTES = 2**26
+_START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
+_XMP_ORIENTATION = re.compile(rb"""tiff:Orientation(?:>|=["'])([1-8])\b""")
+
+
+class Headers(NamedTuple):
+    """Metadata of a picture file.
+
+    Args:
+        exif: a block that begins with a TIFF's header.
+        xmp: a packet of XMP.
+        stated: the orientation of a TIFF, whose tags are no block.
+        animated: whether the file says that it has several frames.
+        code_points: primaries and transfer function by the numbers of ITU-T H.273, of HEIF.
+    """
+
+    exif: bytes | None = None
+    xmp: bytes | None = None
+    stated: int | None = None
+    animated: bool = False
+    code_points: tuple[int, int] | None = None
+
+    @property
+    def orientation(self) -> int | None:
+        """The orientation that EXIF states, else the one of XMP; None where neither does, or it is none of 1 to 8."""
+        stated = self.stated or orientation_of_exif(self.exif)
+        if stated is None and self.xmp is not None:
+            match = _XMP_ORIENTATION.search(self.xmp)
+            stated = int(match[1]) if match else None
+        return stated
+
+
+def read_headers(path: Path, name: str) -> Headers:
+    """The metadata of a file of the format ``name``; what is damaged or unknown is left out."""
+    reader = _READERS.get(name)
+    if reader is None:
+        return Headers()
+    with path.open("rb") as file:
+        try:
+            return reader(file)
+        except (DamagedTags, struct.error, zlib.error, ValueError, IndexError):
+            return Headers()
+
+
+def orientation_of_exif(exif: bytes | None) -> int | None:
+    """The orientation of an EXIF block, 1 to 8; None if it states none."""
+    if not exif:
+        return None
+    try:
+        tiff = TiffFile(BytesIO(exif))
+        stated = tiff.number(tiff.directory(tiff.first), ORIENTATION)
+    except DamagedTags:
+        return None
+    return stated if 1 <= stated <= 8 else None
+
+
+# -- JPEG --------------------------------------------------------------------------------------------------------------
+
+
+class Segment(NamedTuple):
+    """A part of a JPEG's header: its marker, and what stands behind marker and length."""
+
+    marker: int
+    data: bytes
+
+
+def jpeg_segments(file: BinaryIO) -> Iterator[Segment]:
+    """The segments of a JPEG before its first scan."""
+    file.seek(2)
+    while True:
+        head = file.read(2)
+        while len(head) == 2 and head[1] == 0xFF:  # bytes of 255 may fill the space before a marker
+            head = head[1:] + file.read(1)
+        if len(head) < 2 or head[0] != 0xFF or head[1] in (_START_OF_SCAN, _END_OF_IMAGE):
+            return
+        (length,) = struct.unpack(">H", file.read(2))
+        data = file.read(length - 2)
+        if len(data) < length - 2:
+            return
+        yield Segment(head[1], data)
+
+
+def _of_jpeg(file: BinaryIO) -> Headers:
+    exif, xmp = None, None
+    for segment in jpeg_segments(file):
+        if segment.marker != 0xE1:
+            continue
+        if segment.data.startswith(EXIF_PREFIX) and exif is None:
+            exif = segment.data[len(EXIF_PREFIX) :]
+        elif segment.data.startswith(XMP_PREFIX) and xmp is None:
+            xmp = segment.data[len(XMP_PREFIX) :]
+    return Headers(exif, xmp)
+
+
+# -- PNG ---------------------------------------------------------------------------------------------------------------
+
+
+class Chunk(NamedTuple):
+    """A part of a PNG or WebP: its name, where its data begin, and their length."""
+
+    name: bytes
+    place: int
+    length: int
+
+
+def png_chunks(file: BinaryIO) -> Iterator[Chunk]:
+    """The chunks of a PNG in their order."""
+    place = len(PNG_SIGNATURE)
+    end = file.seek(0, 2)
+    for _ in range(_MOST_CHUNKS):
+        file.seek(place)
+        head = file.read(8)
+        if len(head) < 8:
+            return
+        length, name = struct.unpack(">I4s", head)
+        if place + 12 + length > end:
+            return
+        yield Chunk(name, place + 8, length)
+        place += 12 + length
+
+
+def chunk_data(file: BinaryIO, chunk: Chunk) -> bytes:
+    """What a chunk holds."""
+    if chunk.length > _MOST_BYTES:
+        raise ValueError(f"chunk {chunk.name!r} of {chunk.length} bytes")
+    file.seek(chunk.place)
+    return file.read(chunk.length)
+
+
+def _of_png(file: BinaryIO) -> Headers:
+    exif, xmp, raw_profile = None, None, None
+    animated = False
+    for chunk in png_chunks(file):
+        if chunk.name == b"acTL":
+            animated = True
+        elif chunk.name == b"eXIf":
+            exif = chunk_data(file, chunk).removeprefix(EXIF_PREFIX)
+        elif chunk.name == b"iTXt":
+            xmp = xmp_of_text(chunk_data(file, chunk)) or xmp
+        elif chunk.name in (b"zTXt", b"tEXt"):
+            raw_profile = _raw_profile(chunk.name, chunk_data(file, chunk)) or raw_profile
+    return Headers(exif or raw_profile, xmp, animated=animated)
+
+
+def xmp_of_text(data: bytes) -> bytes | None:
+    """The packet of an iTXt chunk; None if it holds another text."""
+    keyword, _, rest = data.partition(b"\0")
+    if keyword != XMP_KEYWORD or len(rest) < 2:
+        return None
+    packet = rest[2:].split(b"\0", 2)[-1]
+    return inflate(packet) if rest[0] else packet
+
+
+def inflate(data: bytes) -> bytes:
+    """Data of zlib, up to a limit."""
+    inflater = zlib.decompressobj()
+    plain = inflater.decompress(data, _MOST_BYTES)
+    if inflater.unconsumed_tail:
+        raise ValueError(f"more than {_MOST_BYTES} bytes")
+    return plain
+
+
+def _raw_profile(name: bytes, data: bytes) -> bytes | None:
+    """EXIF as ImageMagick wrote it before PNG had a chunk for it: a text of hexadecimal numbers."""
+    keyword, _, text = data.partition(b"\0")
+    if keyword not in (b"Raw profile type exif", b"Raw profile type APP1"):
+        return None
+    if name == b"zTXt":
+        text = inflate(text[1:])
+    words = text.split(None, 2)
+    profile = bytes.fromhex(words[2].decode("ascii"))
+    return profile.removeprefix(EXIF_PREFIX) if profile.startswith((EXIF_PREFIX, b"II", b"MM")) else None
+
+
+# -- WebP and TIFF -----------------------------------------------------------------------------------------------------
+
+
+def webp_chunks(file: BinaryIO) -> Iterator[Chunk]:
+    """The chunks of a WebP in their order."""
+    place = 12
+    end = file.seek(0, 2)
+    for _ in range(_MOST_CHUNKS):
+        file.seek(place)
+        head = file.read(8)
+        if len(head) < 8:
+            return
+        name, length = struct.unpack("<4sI", head)
+        if place + 8 + length > end:
+            return
+        yield Chunk(name, place + 8, length)
+        place += 8 + length + length % 2
+
+
+def _of_webp(file: BinaryIO) -> Headers:
+    exif, xmp = None, None
+    animated = False
+    for chunk in webp_chunks(file):
+        if chunk.name == b"EXIF":
+            exif = chunk_data(file, chunk).removeprefix(EXIF_PREFIX)
+        elif chunk.name == b"XMP ":
+            xmp = chunk_data(file, chunk)
+        elif chunk.name == b"ANIM":
+            animated = True
+    return Headers(exif, xmp, animated=animated)
+
+
+def _of_tiff(file: BinaryIO) -> Headers:
+    tiff = TiffFile(file)
+    first = tiff.directory(tiff.first)
+    stated = tiff.number(first, ORIENTATION)
+    xmp = first.entries.get(XMP_TAG)
+    return Headers(None, tiff.tag(xmp).data if xmp else None, stated if 1 <= stated <= 8 else None)
+
+
+# -- boxes of HEIF and JPEG XL -----------------------------------------------------------------------------------------
+
+
+class Box(NamedTuple):
+    """A box: its name, and where its contents begin and end."""
+
+    name: bytes
+    start: int
+    end: int
+
+
+def boxes(file: BinaryIO, start: int, end: int) -> Iterator[Box]:
+    """The boxes between two places of a file."""
+    place = start
+    for _ in range(_MOST_CHUNKS):
+        file.seek(place)
+        head = file.read(16)
+        if place + 8 > end or len(head) < 8:
+            return
+        size, name = struct.unpack(">I4s", head[:8])
+        inside = place + 8
+        if size == 1 and len(head) == 16:
+            (size,) = struct.unpack(">Q", head[8:])
+            inside = place + 16
+        beyond = place + size if size else end
+        if beyond < inside or beyond > end:
+            return
+        yield Box(name, inside, beyond)
+        place = beyond
+
+
+def _of_heif(file: BinaryIO) -> Headers:
+    """The code points of the first colour box; its decoder gives EXIF."""
+    start, end = 0, file.seek(0, 2)
+    for name, skipped in ((b"meta", 4), (b"iprp", 0), (b"ipco", 0)):
+        inside = [box for box in boxes(file, start, end) if box.name == name]
+        if not inside:
+            return Headers()
+        start, end = inside[0].start + skipped, inside[0].end
+
+    for box in boxes(file, start, end):
+        file.seek(box.start)
+        data = file.read(8)
+        if box.name == b"colr" and data.startswith(b"nclx"):
+            primaries, transfer = struct.unpack(">HH", data[4:])
+            return Headers(code_points=(primaries, transfer))
+    return Headers()
+
+
+def _of_jpeg_xl(file: BinaryIO) -> Headers:
+    """EXIF and XMP of a file of boxes, and whether the codestream is an animation."""
+    file.seek(0)
+    if file.read(2) == b"\xff\x0a":
+        file.seek(0)
+        return Headers(animated=_is_animated_codestream(file.read(64)))
+
+    exif, xmp, codestream = None, None, b""
+    for box in boxes(file, 0, file.seek(0, 2)):
+        file.seek(box.start)
+        size = min(box.end - box.start, _MOST_BYTES)
+        if box.name == b"Exif":
+            exif = file.read(size)[4:]
+        elif box.name == b"xml ":
+            xmp = file.read(size)
+        elif box.name in (b"jxlc", b"jxlp") and not codestream:
+            codestream = file.read(64)[4 if box.name == b"jxlp" else 0 :]
+    return Headers(exif, xmp, animated=_is_animated_codestream(codestream))
+
+
+class _Bits:
+    """Bits of a codestream, the lowest of each byte first."""
+
+    def __init__(self, data: bytes) -> None:
+        self._value, self._left = int.from_bytes(data, "little"), 8 * len(data)
+
+    def take(self, count: int) -> int:
+        if count > self._left:
+            raise ValueError("the codestream ends in its header")
+        bits = self._value & ((1 << count) - 1)
+        self._value >>= count
+        self._left -= count
+        return bits
+
+    def choose(self, *widths: int) -> None:
+        """Pass over a number that is written in one of four widths."""
+        self.take(widths[self.take(2)])
+
+
+def _is_animated_codestream(data: bytes) -> bool:
+    if not data.startswith(b"\xff\x0a"):
+        return False
+    bits = _Bits(data[2:])
+    _pass_size(bits)
+    all_default = bits.take(1)
+    if all_default or not bits.take(1):
+        return False
+
+    bits.take(3)  # orientation
+    if bits.take(1):
+        _pass_size(bits)
+    if bits.take(1):
+        _pass_preview_size(bits)
+    return bool(bits.take(1))
+
+
+def _pass_size(bits: _Bits) -> None:
+    """Pass over height and width; the latter is left out where a ratio gives it."""
+    small = bits.take(1)
+    for what in ("height", "width"):
+        if small:
+            bits.take(5)
+        else:
+            bits.choose(9, 13, 18, 30)
+        if what == "height" and bits.take(3):
+            return
+
+
+def _pass_preview_size(bits: _Bits) -> None:
+    small = bits.take(1)
+    for what in ("height", "width"):
+        if small:
+            bits.choose(0, 0, 5, 9)
+        else:
+            bits.choose(6, 8, 10, 12)
+        if what == "height" and bits.take(3):
+            return
+
+
+_READERS = {
+    "JPEG": _of_jpeg,
+    "PNG": _of_png,
+    "WebP": _of_webp,
+    "TIFF": _of_tiff,
+    "HEIC": _of_heif,
+    "AVIF": _of_heif,
+    "JPEG XL": _of_jpeg_xl,
+}

@@ -1,0 +1,444 @@
+"""EXIF, XMP and ICC profiles, carried from one picture file to another byte for byte.
+
+Between two files of one format everything is copied as it stands: the segments of a JPEG, with what follows its picture
+(gain maps, short films), the chunks of a PNG before and behind its pixels, the tags of a TIFF. To another format go
+EXIF, XMP and the ICC profile. What describes the coding of the pixels is the new file's own. Three things are mended
+because new pixels make them untrue: a thumbnail in EXIF is rendered again in the bytes that it has; an orientation
+becomes 1 where the decoder has turned the picture (HEIC, JPEG XL); and the list of pictures in a JPEG of several (MPF)
+gets their new places. Source: Exif 2.32; CIPA DC-007 (MPF); PNG 3; TIFF 6.0.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import warnings
+import zlib
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rawaug.io.directories import (
+    EXIF,
+    GPS,
+    INTEROPERABILITY,
+    ORIENTATION,
+    POINTERS,
+    THUMBNAIL,
+    THUMBNAIL_BYTES,
+    DamagedTags,
+    Directory,
+    Tag,
+    TiffFile,
+    pack_directory,
+    pointer_tag,
+)
+from rawaug.io.headers import (
+    EXIF_PREFIX,
+    PNG_SIGNATURE,
+    XMP_KEYWORD,
+    XMP_PREFIX,
+    XMP_TAG,
+    Segment,
+    chunk_data,
+    jpeg_segments,
+    png_chunks,
+    read_headers,
+)
+
+ICC_TAG, IPTC_TAG, PHOTOSHOP_TAG = 34675, 33723, 34377
+_ICC_PREFIX = b"ICC_PROFILE\0"
+_MPF_PREFIX = b"MPF\0"
+_JFXX_PREFIX = b"JFXX\0"
+_APP0, _APP1, _APP2, _APP14, _APP15, _COMMENT = 0xE0, 0xE1, 0xE2, 0xEE, 0xEF, 0xFE
+_MOST_IN_SEGMENT = 65533
+_MP_ENTRIES = 45058
+
+_LAYOUT = frozenset(
+    (
+        *(*range(254, 260), *range(262, 267), 273, *range(277, 282), 284, 285, *range(288, 294), 301, 317),
+        *(*range(320, 331), *range(332, 348), *range(512, 522), *range(529, 533), 559, 37724),
+    )
+)
+"""Tags of a TIFF that describe how its pixels are stored; 37724 holds Photoshop's layers, which are other pixels."""
+_NOT_IN_EXIF = (XMP_TAG, IPTC_TAG, PHOTOSHOP_TAG, ICC_TAG)
+"""Tags of a TIFF that other files have in parts of their own."""
+
+_OF_PNG_CODING = (
+    *(b"IHDR", b"PLTE", b"IDAT", b"IEND", b"tRNS", b"hIST", b"sPLT", b"bKGD", b"sBIT"),
+    *(b"acTL", b"fcTL", b"fdAT"),
+)
+_KEPT_OF_PNG = (b"iCCP", b"sRGB", b"gAMA", b"cHRM", b"cICP", b"mDCV", b"cLLI", b"mDCv", b"cLLi", b"tIME")
+"""Chunks that may not be copied to other pixels unless they are known, which these are."""
+
+
+class Metadata(NamedTuple):
+    """What a file says beside its pixels.
+
+    Args:
+        source: the file.
+        format: of its content, such as ``"JPEG"``.
+        exif: a block that begins with a TIFF's header; of a TIFF, one that is made of its tags.
+        xmp: a packet of XMP.
+        profile: the ICC profile.
+    """
+
+    source: Path
+    format: str
+    exif: bytes | None
+    xmp: bytes | None
+    profile: bytes | None
+
+
+Thumbnail = Callable[[int, int], np.ndarray]
+"""Renders the new picture, as it is stored, in a height and width, uint8 ``(h, w, 3)``."""
+
+
+def read_exif(path: Path, name: str) -> bytes | None:
+    """The EXIF block of a file of the format ``name``; of a TIFF, one that is made of its tags."""
+    if name != "TIFF":
+        return read_headers(path, name).exif
+    try:
+        return _exif_of_tiff(path)
+    except (DamagedTags, struct.error):
+        return None
+
+
+# -- EXIF blocks -------------------------------------------------------------------------------------------------------
+
+
+def _exif_of_tiff(path: Path) -> bytes:
+    """The tags of a TIFF's first directory that are no part of its coding, and those of EXIF and GPS, as a block."""
+    with path.open("rb") as file:
+        tiff = TiffFile(file)
+        first = tiff.directory(tiff.first)
+        tags = [tiff.tag(entry) for code, entry in first.entries.items() if code not in _NOT_IN_EXIF]
+        return _pack_block(tiff, _without_layout(tags), first)
+
+
+def _without_layout(tags: list[Tag]) -> list[Tag]:
+    return [tag for tag in tags if tag.code not in _LAYOUT and tag.code not in POINTERS]
+
+
+def _pack_block(tiff: TiffFile, tags: list[Tag], first: Directory) -> bytes:
+    """A block of ``tags`` and of the directories that ``first`` points at."""
+    head = (b"II*\0" if tiff.order == "<" else b"MM\0*") + struct.pack(tiff.order + "I", 8)
+    pointed = [code for code in (EXIF, GPS) if code in first.entries]
+    size = len(pack_directory(tiff.order, tags + [pointer_tag(tiff.order, code, 0) for code in pointed], 8))
+
+    behind, pointers = b"", []
+    for code in pointed:
+        place = 8 + size + len(behind)
+        pointers.append(pointer_tag(tiff.order, code, place))
+        behind += _pack_pointed(tiff, tiff.number(first, code), place)
+    return head + pack_directory(tiff.order, tags + pointers, 8) + behind
+
+
+def _pack_pointed(tiff: TiffFile, source: int, place: int) -> bytes:
+    """The directory at ``source`` of a file for ``place`` of a block, with that of interoperability behind it."""
+    directory = tiff.directory(source)
+    tags = [tiff.tag(entry) for code, entry in directory.entries.items() if code not in POINTERS]
+    if INTEROPERABILITY not in directory.entries:
+        return pack_directory(tiff.order, tags, place)
+
+    size = len(pack_directory(tiff.order, [*tags, pointer_tag(tiff.order, INTEROPERABILITY, 0)], place))
+    inner = tiff.directory(tiff.number(directory, INTEROPERABILITY))
+    inner_tags = [tiff.tag(entry) for entry in inner.entries.values()]
+    own = [*tags, pointer_tag(tiff.order, INTEROPERABILITY, place + size)]
+    return pack_directory(tiff.order, own, place) + pack_directory(tiff.order, inner_tags, place + size)
+
+
+def mend_exif(exif: bytes, thumbnail: Thumbnail | None, upright: bool) -> bytes:
+    """A block with its thumbnail rendered again, and the orientation 1 if the picture has been turned ``upright``.
+
+    Every other byte stays where it is. A block that is damaged is left as it is.
+    """
+    block = bytearray(exif)
+    try:
+        tiff = TiffFile(BytesIO(exif))
+        first = tiff.directory(tiff.first)
+        entry = first.entries.get(ORIENTATION)
+        if upright and entry is not None and entry.dtype == 3:
+            block[entry.place : entry.place + 2] = struct.pack(tiff.order + "H", 1)
+        if thumbnail is not None and first.following:
+            _mend_thumbnail(block, tiff, tiff.directory(first.following), thumbnail)
+    except DamagedTags:
+        return exif
+    return bytes(block)
+
+
+def _mend_thumbnail(block: bytearray, tiff: TiffFile, second: Directory, render: Thumbnail) -> None:
+    """Put a new JPEG of the same sides where the old one stands, at the best quality that fits."""
+    from PIL import Image
+
+    start, size = tiff.number(second, THUMBNAIL), tiff.number(second, THUMBNAIL_BYTES)
+    if not size or start + size > len(block):
+        return
+    try:
+        with Image.open(BytesIO(block[start : start + size]), formats=("JPEG",)) as old:
+            width, height = old.size
+    except (OSError, SyntaxError, ValueError):
+        return
+
+    picture = Image.fromarray(render(height, width))
+    for quality in (95, 90, 85, 80, 70, 60, 50, 40, 30, 20, 10):
+        new = BytesIO()
+        picture.save(new, "JPEG", quality=quality)
+        if new.tell() <= size:
+            block[start : start + size] = new.getvalue().ljust(size, b"\0")
+            entry = second.entries[THUMBNAIL_BYTES]
+            letter = "H" if entry.dtype == 3 else "I"
+            struct.pack_into(tiff.order + letter, block, entry.place, new.tell())
+            return
+
+
+# -- JPEG --------------------------------------------------------------------------------------------------------------
+
+
+def dress_jpeg(plain: bytes, metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -> bytes:
+    """A JPEG as an encoder writes it, with the metadata of the source in place of the encoder's."""
+    coding = _without_application_segments(plain)
+    if metadata.format != "JPEG":
+        return b"\xff\xd8" + b"".join(_new_segments(metadata, thumbnail, upright)) + coding
+
+    with metadata.source.open("rb") as file:
+        segments = [segment for segment in jpeg_segments(file) if _is_kept(segment)]
+        file.seek(0)
+        source = file.read()
+    packed = [_pack_segment(_mended(segment, thumbnail, upright)) for segment in segments]
+    head = b"\xff\xd8" + b"".join(packed)
+
+    end = _end_of_picture(source)
+    trailer = source[end:]
+    if not trailer.strip(b"\0"):
+        return head + coding + trailer
+    return _with_places(head + coding, segments, source, end) + trailer
+
+
+def _is_kept(segment: Segment) -> bool:
+    """Whether a segment is metadata: not a table, nor what the encoder says of its colours."""
+    if segment.marker == _COMMENT:
+        return True
+    if segment.marker == _APP14 and segment.data.startswith(b"Adobe"):
+        return False
+    if segment.marker == _APP0 and segment.data.startswith(_JFXX_PREFIX):
+        return False
+    return _APP0 <= segment.marker <= _APP15
+
+
+def _mended(segment: Segment, thumbnail: Thumbnail | None, upright: bool) -> Segment:
+    if segment.marker != _APP1 or not segment.data.startswith(EXIF_PREFIX):
+        return segment
+    exif = mend_exif(segment.data[len(EXIF_PREFIX) :], thumbnail, upright)
+    return segment._replace(data=EXIF_PREFIX + exif)
+
+
+def _pack_segment(segment: Segment) -> bytes:
+    return struct.pack(">BBH", 0xFF, segment.marker, len(segment.data) + 2) + segment.data
+
+
+def _new_segments(metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -> list[bytes]:
+    """EXIF, XMP and the profile of another kind of file; a warning of what is too long for a segment."""
+    parts = []
+    if metadata.exif is not None:
+        parts.append((_APP1, EXIF_PREFIX + mend_exif(metadata.exif, thumbnail, upright)))
+    if metadata.xmp is not None:
+        parts.append((_APP1, XMP_PREFIX + metadata.xmp))
+    for _, data in parts:
+        if len(data) > _MOST_IN_SEGMENT:
+            what = "EXIF" if data.startswith(EXIF_PREFIX) else "XMP"
+            warnings.warn(f"{metadata.source}: its {what} of {len(data)} bytes is left out of a JPEG", stacklevel=2)
+    if metadata.profile is not None:
+        step = _MOST_IN_SEGMENT - len(_ICC_PREFIX) - 2
+        pieces = [metadata.profile[start : start + step] for start in range(0, len(metadata.profile), step)]
+        for number, piece in enumerate(pieces, 1):
+            parts.append((_APP2, _ICC_PREFIX + bytes((number, len(pieces))) + piece))
+    return [_pack_segment(Segment(*part)) for part in parts if len(part[1]) <= _MOST_IN_SEGMENT]
+
+
+def _without_application_segments(plain: bytes) -> bytes:
+    """The tables and the scans of a JPEG: what stands behind its start and its application segments."""
+    place = 2
+    while plain[place] == 0xFF and _APP0 <= plain[place + 1] <= _APP15:
+        (length,) = struct.unpack_from(">H", plain, place + 2)
+        place += 2 + length
+    return plain[place:]
+
+
+_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]", re.DOTALL)
+"""A marker within or behind a scan, which is neither a stuffed byte nor a restart."""
+
+
+def _end_of_picture(source: bytes) -> int:
+    """Where the first picture of a JPEG ends, behind its end-of-image marker; the file's end if it has none."""
+    place = 2
+    while (match := _MARKER.search(source, place)) is not None:
+        marker = source[match.start() + 1]
+        if marker == 0xD9:
+            return match.end()
+        if match.end() + 2 > len(source):
+            break
+        (length,) = struct.unpack_from(">H", source, match.end())
+        place = match.end() + length
+    return len(source)
+
+
+def _with_places(new: bytes, segments: list[Segment], source: bytes, end: int) -> bytes:
+    """The new first picture, whose list of pictures (MPF), if it has one, says where the others now stand."""
+    listing = next((segment for segment in segments if _is_listing(segment)), None)
+    if listing is None:
+        return new
+    old_place = source.index(listing.data) + len(_MPF_PREFIX)
+    new_place = new.index(listing.data) + len(_MPF_PREFIX)
+
+    block = bytearray(listing.data[len(_MPF_PREFIX) :])
+    try:
+        tiff = TiffFile(BytesIO(block))
+        entry = tiff.directory(tiff.first).entries.get(_MP_ENTRIES)
+    except DamagedTags:
+        return new
+    if entry is None:
+        return new
+
+    for at in range(entry.place, entry.place + entry.size - 15, 16):
+        size, offset = struct.unpack_from(tiff.order + "II", block, at + 4)
+        if offset == 0:
+            struct.pack_into(tiff.order + "I", block, at + 4, len(new))
+        elif old_place + offset >= end:
+            moved = old_place + offset - end + len(new) - new_place
+            struct.pack_into(tiff.order + "II", block, at + 4, size, moved)
+    return new[:new_place] + bytes(block) + new[new_place + len(block) :]
+
+
+def _is_listing(segment: Segment) -> bool:
+    return segment.marker == _APP2 and segment.data.startswith(_MPF_PREFIX)
+
+
+# -- PNG ---------------------------------------------------------------------------------------------------------------
+
+
+def dress_png(plain: bytes, metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -> bytes:
+    """A PNG as an encoder writes it, with the metadata of the source in their places."""
+    before, behind = _png_parts(metadata, thumbnail, upright)
+    header: list[bytes] = []
+    pixels: list[bytes] = []
+    file = BytesIO(plain)
+    for chunk in png_chunks(file):
+        if chunk.name == b"IHDR":
+            header.append(pack_chunk(chunk.name, chunk_data(file, chunk)))
+        elif chunk.name == b"IDAT":
+            pixels.append(pack_chunk(chunk.name, chunk_data(file, chunk)))
+    return b"".join((PNG_SIGNATURE, *header, *before, *pixels, *behind, pack_chunk(b"IEND", b"")))
+
+
+def pack_chunk(name: bytes, data: bytes) -> bytes:
+    """A chunk of a PNG."""
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+
+def _png_parts(metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -> tuple[list[bytes], list[bytes]]:
+    """The chunks of metadata before and behind the pixels."""
+    before: list[bytes] = []
+    behind: list[bytes] = []
+    if metadata.format != "PNG":
+        if metadata.profile is not None:
+            before.append(pack_chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(metadata.profile)))
+        if metadata.exif is not None:
+            before.append(pack_chunk(b"eXIf", mend_exif(metadata.exif, thumbnail, upright)))
+        if metadata.xmp is not None:
+            before.append(pack_chunk(b"iTXt", XMP_KEYWORD + b"\0\0\0\0\0" + metadata.xmp))
+        return before, behind
+
+    side = before
+    with metadata.source.open("rb") as file:
+        for chunk in png_chunks(file):
+            if chunk.name == b"IDAT":
+                side = behind
+            if not _is_copied(chunk.name):
+                continue
+            data = chunk_data(file, chunk)
+            if chunk.name == b"eXIf":
+                data = mend_exif(data, thumbnail, upright)
+            side.append(pack_chunk(chunk.name, data))
+    return before, behind
+
+
+def _is_copied(name: bytes) -> bool:
+    """Whether a chunk may stand beside other pixels: it is known to, or its name says so."""
+    if name in _OF_PNG_CODING:
+        return False
+    return name in _KEPT_OF_PNG or bool(name[3:4].islower())
+
+
+# -- TIFF --------------------------------------------------------------------------------------------------------------
+
+
+def dress_tiff(plain: bytes, metadata: Metadata, upright: bool) -> bytes:
+    """A TIFF as an encoder writes it, in the byte order of the block, with the tags of the source.
+
+    The block of EXIF comes first, at the offsets that it has: makers' notes may hold such. Its thumbnail is not
+    linked, since readers would take it for a second page.
+    """
+    written = TiffFile(BytesIO(plain))
+    layout = [written.tag(entry) for entry in written.directory(written.first).entries.values()]
+    order = written.order
+
+    block = _block_of(metadata, order, upright)
+    source = TiffFile(BytesIO(block))
+    kept = source.directory(source.first)
+    pointers = [source.tag(entry) for code, entry in kept.entries.items() if code in (EXIF, GPS)]
+    tags = _without_layout([source.tag(entry) for entry in kept.entries.values()]) + pointers
+    tags += _tags_of_parts(metadata, order)
+
+    start = len(block) + len(block) % 2
+    place = start
+    strips, places = [], []
+    for strip in _strips(written):
+        places.append(place)
+        strips.append(strip + bytes(len(strip) % 2))
+        place += len(strips[-1])
+
+    own = [tag for tag in layout if tag.code in _LAYOUT and tag.code != 273]
+    own.append(Tag(273, 4, len(places), struct.pack(f"{order}{len(places)}I", *places)))
+    codes = {tag.code for tag in own}
+    tags = own + [tag for tag in tags if tag.code not in codes]
+
+    directory = pack_directory(order, {tag.code: tag for tag in tags}.values(), place)
+    head = block[:4] + struct.pack(order + "I", place)
+    return b"".join((head, block[8:].ljust(start - 8, b"\0"), *strips, directory))
+
+
+def byte_order(metadata: Metadata) -> str:
+    """The byte order of the metadata, ``<`` or ``>``, which a TIFF that holds them must have."""
+    return ">" if metadata.exif is not None and metadata.exif.startswith(b"MM") else "<"
+
+
+def _block_of(metadata: Metadata, order: str, upright: bool) -> bytes:
+    if metadata.exif is not None:
+        return mend_exif(metadata.exif, None, upright)
+    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8)
+    return head + pack_directory(order, [], 8)
+
+
+def _tags_of_parts(metadata: Metadata, order: str) -> list[Tag]:
+    """XMP, the profile, and of a TIFF its IPTC and Photoshop's resources."""
+    tags = []
+    if metadata.format == "TIFF":
+        with metadata.source.open("rb") as file:
+            tiff = TiffFile(file)
+            entries = tiff.directory(tiff.first).entries
+            return [tiff.tag(entries[code]) for code in _NOT_IN_EXIF if code in entries]
+    if metadata.xmp is not None:
+        tags.append(Tag(XMP_TAG, 1, len(metadata.xmp), metadata.xmp))
+    if metadata.profile is not None:
+        tags.append(Tag(ICC_TAG, 7, len(metadata.profile), metadata.profile))
+    return tags
+
+
+def _strips(tiff: TiffFile) -> list[bytes]:
+    first = tiff.directory(tiff.first)
+    places, sizes = tiff.numbers(first.entries.get(273)), tiff.numbers(first.entries.get(279))
+    return [tiff.read(place, size) for place, size in zip(places, sizes, strict=True)]

@@ -1,0 +1,57 @@
+"""A shot as sRGB and its exposure, whether its file is camera RAW or a developed picture.
+
+RAW is developed by LibRaw with the camera's white balance (:func:`rawaug.io.develop`), the rendering that
+:func:`rawaug.fit` learns from. The thumbnails in RAW files are never shown.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from torch import Tensor
+
+from rawaug.bayer import turn
+from rawaug.io.content import is_raw
+from rawaug.io.decoding import MAX_PIXELS
+from rawaug.io.pictures import read_exposure, read_picture
+from rawaug.io.raw import read_raw, read_raw_and_develop
+
+
+def read_shot(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
+    """A picture, or RAW that is developed, as sRGB, uint8 ``(3, H, W)``, upright.
+
+    Args:
+        path: a file of either kind, which its content tells.
+        max_pixels: a larger picture is refused before it is decoded.
+
+    Raises:
+        FileNotFoundError, OSError, ValueError: as :func:`rawaug.io.read_picture` and :func:`rawaug.io.read_raw` do.
+
+    Example:
+        >>> read_shot("IMG_0001.dng").dtype  # doctest: +SKIP
+        torch.uint8
+    """
+    if not is_raw(path):
+        return read_picture(path, max_pixels)
+    frame, srgb = read_raw_and_develop(path)
+    return turn(srgb, frame.upright_view).contiguous()
+
+
+def read_shot_exposure(path: str | Path) -> float:
+    """The exposure in stops as :func:`rawaug.io.pictures.read_exposure` defines it.
+
+    Raises:
+        FileNotFoundError, OSError: if the file is missing or damaged.
+        ValueError: if it does not state its exposure.
+    """
+    if not is_raw(path):
+        return read_exposure(path)
+
+    frame = read_raw(path)
+    stated = {"exposure time": frame.exposure.seconds, "f-number": frame.exposure.f_number, "ISO": frame.iso}
+    missing = [name for name, value in stated.items() if not value]
+    if missing:
+        raise ValueError(f"{path}: does not state its {' or '.join(missing)}; give the exposures with --ev")
+    seconds, f_number, speed = (float(value or 0.0) for value in stated.values())
+    return math.log2(seconds * speed / (100.0 * f_number**2))

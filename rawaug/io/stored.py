@@ -1,0 +1,259 @@
+"""Pictures to denoise: their numbers as the file has them, and back to a file with all that the first one said.
+
+A picture is neither turned nor converted: its EXIF, its ICC profile and its orientation go to the new file as they are
+(:mod:`rawaug.io.metadata`), and so does transparency. 8 and 16 bits, and floating point in TIFF, are kept where the new
+format has them.
+"""
+
+from __future__ import annotations
+
+from io import BytesIO
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from rawaug.errors import extra
+from rawaug.files import replacing
+from rawaug.io.decoding import MAX_PIXELS, decode
+from rawaug.io.directories import DamagedTags, TiffFile
+from rawaug.io.headers import webp_chunks
+from rawaug.io.metadata import (
+    Metadata,
+    Thumbnail,
+    byte_order,
+    dress_jpeg,
+    dress_png,
+    dress_tiff,
+    mend_exif,
+    read_exif,
+)
+from rawaug.io.pictures import require_unit_range
+
+QUALITY = 97
+"""Of a JPEG or WebP that is written, of a JPEG with chroma at full size."""
+PICTURE_FORMATS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+"""Extensions of the files that are written here."""
+
+_TURNED_BY_DECODER = ("HEIC", "JPEG XL", "JPEG 2000")
+_LARGEST_WEBP = 16383
+_TIFF_COMPRESSIONS = {1: None, 5: "lzw"}
+"""How a TIFF is packed again, by the number of its tag; anything else becomes Deflate."""
+
+
+class StoredPicture(NamedTuple):
+    """A picture as its file has it.
+
+    Args:
+        colours: ``(H, W, 1)`` or ``(H, W, 3)``, uint8, uint16 or float32, display values, not turned upright.
+        alpha: ``(H, W, 1)`` of the same type, where there is transparency; ``colours`` are not multiplied by it.
+        metadata: what the file says beside its pixels.
+    """
+
+    colours: np.ndarray
+    alpha: np.ndarray | None
+    metadata: Metadata
+
+    @property
+    def srgb(self) -> Tensor:
+        """float32 ``(3, H, W)`` in [0, 1]; grey has three equal channels."""
+        planes = torch.from_numpy(np.ascontiguousarray(self.colours.transpose(2, 0, 1)).astype(np.float32))
+        if self.colours.dtype.kind == "u":
+            planes *= 1.0 / np.iinfo(self.colours.dtype).max
+        return planes.expand(3, -1, -1).contiguous()
+
+
+def read_stored(path: str | Path, max_pixels: int = MAX_PIXELS) -> StoredPicture:
+    """A picture of 8 or 16 bits, or of floating-point numbers in [0, 1].
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        OSError: if it is not a picture, or is truncated.
+        ValueError: if it is camera RAW, larger than ``max_pixels``, animated, CMYK or CIELAB, a TIFF of several pages,
+            or holds linear light or numbers outside [0, 1].
+    """
+    path = Path(path)
+    picture = decode(path, max_pixels)
+    if picture.linear:
+        raise ValueError(f"{path}: is {picture.format}, which holds linear light; save it as a developed picture")
+    if picture.format == "TIFF":
+        _require_one_page(path)
+
+    colours, alpha = picture.colours, picture.alpha
+    if colours.dtype.kind == "f":
+        colours = require_unit_range(colours, path)
+    if alpha is not None and picture.associated:
+        colours = _divided(colours, alpha)
+
+    exif = picture.headers.exif
+    if picture.format == "TIFF":
+        exif = read_exif(path, "TIFF")
+    metadata = Metadata(path, picture.format, exif, picture.headers.xmp, picture.profile)
+    return StoredPicture(np.ascontiguousarray(colours), alpha, metadata)
+
+
+def write_stored(path: str | Path, srgb: Tensor, like: StoredPicture) -> None:
+    """Write sRGB ``(3, H, W)`` in [0, 1] with the channels, bits and metadata of ``like``, whole or not at all.
+
+    Raises:
+        ValueError: if the extension is none of :data:`PICTURE_FORMATS`, or the format cannot hold the picture.
+        OSError: if the file cannot be written.
+    """
+    path = Path(path)
+    extension = path.suffix.lower()
+    if extension not in PICTURE_FORMATS:
+        raise ValueError(f"{path}: cannot be written; use one of {', '.join(PICTURE_FORMATS)}")
+
+    planes = srgb if like.colours.shape[-1] == 3 else srgb.mean(0, keepdim=True)
+    planes = planes.detach().cpu().clamp(0.0, 1.0)
+    upright = like.metadata.format in _TURNED_BY_DECODER
+    if extension in (".jpg", ".jpeg"):
+        data = _jpeg(planes, like, upright)
+    elif extension == ".png":
+        data = _png(planes, like, upright)
+    elif extension == ".webp":
+        data = _webp(path, planes, like, upright)
+    else:
+        data = _tiff(planes, like, upright)
+    with replacing(path) as partial:
+        partial.write_bytes(data)
+
+
+def _numbers(planes: Tensor, dtype: np.dtype) -> np.ndarray:
+    """Planes in [0, 1] as ``(H, W, C)`` of a type."""
+    pixels = planes.permute(1, 2, 0).numpy()
+    if dtype.kind == "f":
+        return np.ascontiguousarray(pixels.astype(dtype))
+    return np.ascontiguousarray(np.rint(pixels * np.iinfo(dtype).max).astype(dtype))
+
+
+def _with_alpha(pixels: np.ndarray, alpha: np.ndarray | None) -> np.ndarray:
+    """Colours with alpha behind them, in the type of the colours."""
+    if alpha is None:
+        return pixels
+    if alpha.dtype != pixels.dtype:
+        least, most = np.iinfo(pixels.dtype).max, 1.0 if alpha.dtype.kind == "f" else np.iinfo(alpha.dtype).max
+        alpha = np.rint(alpha.astype(np.float64) * (least / most)).astype(pixels.dtype)
+    return np.ascontiguousarray(np.concatenate([pixels, alpha], axis=-1))
+
+
+def _divided(colours: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Colours that were multiplied by alpha, without it; black where alpha is 0."""
+    most = 1.0 if colours.dtype.kind == "f" else float(np.iinfo(colours.dtype).max)
+    quotient = colours * (most / np.maximum(alpha.astype(np.float64), most * 1e-6))
+    quotient = np.clip(quotient, 0.0, most)
+    return quotient.astype(colours.dtype) if colours.dtype.kind == "f" else np.rint(quotient).astype(colours.dtype)
+
+
+def _renderer(planes: Tensor) -> Thumbnail:
+    """What renders thumbnails of a picture."""
+
+    def render(height: int, width: int) -> np.ndarray:
+        small = F.interpolate(planes[None], (height, width), mode="area")[0]
+        return _numbers(small.expand(3, -1, -1), np.dtype(np.uint8))
+
+    return render
+
+
+def _jpeg(planes: Tensor, like: StoredPicture, upright: bool) -> bytes:
+    with extra("raw"):
+        from PIL import Image
+
+    pixels = _numbers(planes, np.dtype(np.uint8))
+    file = BytesIO()
+    Image.fromarray(pixels if pixels.shape[-1] == 3 else pixels[..., 0]).save(
+        file, "JPEG", quality=QUALITY, subsampling="4:4:4"
+    )
+    return dress_jpeg(file.getvalue(), like.metadata, _renderer(planes), upright)
+
+
+def _png(planes: Tensor, like: StoredPicture, upright: bool) -> bytes:
+    with extra("raw"):
+        import imagecodecs
+
+    dtype = np.dtype(np.uint8) if like.colours.dtype == np.uint8 else np.dtype(np.uint16)
+    pixels = _with_alpha(_numbers(planes, dtype), like.alpha)
+    if pixels.shape[-1] == 1:
+        pixels = pixels[..., 0]
+    return dress_png(bytes(imagecodecs.png_encode(pixels)), like.metadata, _renderer(planes), upright)
+
+
+def _webp(path: Path, planes: Tensor, like: StoredPicture, upright: bool) -> bytes:
+    with extra("raw"):
+        from PIL import Image
+
+    height, width = planes.shape[-2:]
+    if max(height, width) > _LARGEST_WEBP:
+        raise ValueError(f"{path}: WebP holds at most {_LARGEST_WEBP} pixels a side; use .png or .jpg")
+
+    pixels = _with_alpha(_numbers(planes.expand(3, -1, -1), np.dtype(np.uint8)), like.alpha)
+    known = {"icc_profile": like.metadata.profile, "xmp": like.metadata.xmp}
+    if like.metadata.exif is not None:
+        known["exif"] = mend_exif(like.metadata.exif, _renderer(planes), upright)
+    file = BytesIO()
+    settings = {"quality": QUALITY, "lossless": _is_lossless(like.metadata), "exact": True}
+    Image.fromarray(pixels).save(file, "WEBP", **settings, **{key: value for key, value in known.items() if value})
+    return file.getvalue()
+
+
+def _is_lossless(metadata: Metadata) -> bool:
+    """Whether a picture comes from a format without losses, and so keeps every bit."""
+    if metadata.format in ("JPEG", "HEIC", "AVIF"):
+        return False
+    if metadata.format != "WebP":
+        return True
+    with metadata.source.open("rb") as file:
+        return any(chunk.name == b"VP8L" for chunk in webp_chunks(file))
+
+
+def _tiff(planes: Tensor, like: StoredPicture, upright: bool) -> bytes:
+    with extra("raw"):
+        import tifffile
+
+    order = byte_order(like.metadata)
+    pixels = _with_alpha(_numbers(planes, like.colours.dtype), like.alpha)
+    photometric = "rgb" if planes.shape[0] == 3 else "minisblack"
+    file = BytesIO()
+    tifffile.imwrite(
+        file,
+        pixels if pixels.shape[-1] > 1 else pixels[..., 0],
+        photometric=photometric,
+        planarconfig="contig" if pixels.shape[-1] > 1 else None,
+        extrasamples=["unassalpha"] if like.alpha is not None else None,
+        compression=_compression(like.metadata),
+        byteorder=order,
+        metadata=None,
+    )
+    return dress_tiff(file.getvalue(), like.metadata, upright)
+
+
+def _compression(metadata: Metadata) -> str | None:
+    """That of the source where it is a TIFF; none of other pictures."""
+    if metadata.format != "TIFF":
+        return None
+    with metadata.source.open("rb") as file:
+        tiff = TiffFile(file)
+        return _TIFF_COMPRESSIONS.get(tiff.number(tiff.directory(tiff.first), 259, 1), "deflate")
+
+
+def _require_one_page(path: Path) -> None:
+    """Raise ValueError if a TIFF has several pictures, of which only the first would be denoised."""
+    with path.open("rb") as file:
+        try:
+            tiff = TiffFile(file)
+            places: list[int] = []
+            place = tiff.first
+            pages = 0
+            while place and place not in places and len(places) < 64:
+                places.append(place)
+                directory = tiff.directory(place)
+                kind = tiff.number(directory, 254)
+                pages += not kind & 5  # neither a thumbnail nor a mask
+                place = directory.following
+        except DamagedTags:
+            return
+    if pages > 1:
+        raise ValueError(f"{path}: is a TIFF of {pages} pages; save each as a file of its own")
