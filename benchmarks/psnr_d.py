@@ -35,7 +35,7 @@ from rawaug.files import write_json
 from rawaug.isp.model import DictionaryISP, restrict_to_cameras
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.paper.baselines import UPI
-from rawaug.paper.methods import DownstreamConfig, MadeCrops, score_on, train_on
+from rawaug.paper.downstream import DownstreamConfig, MadeCrops, score_on, train_on
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.draw import Draw

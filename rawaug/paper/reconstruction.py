@@ -1,15 +1,14 @@
-"""The reconstruction table: every method fitted on the same pairs, measured on frames left out.
+"""RAW reconstruction on equal terms: every method is fitted to the same pairs and scored on frames it has not seen.
 
-PSNR_r is leave-one-frame-out: a method is fitted on all frames but one, and scored on that one. With ``test`` it is
-that of a published split: a method is fitted once to all frames, and scored on every frame of another set. PSNR_d is
-measured on frames of cameras that no method has seen. The figures of each fit go into a file of their own, so that a
-stopped run can resume.
+Without ``test`` the protocol is leave-one-out: a method is fitted on all frames but one, and scored on that one. With
+``test`` it is that of a published split: a method is fitted once to all frames, and scored on every frame of another
+set. PSNR_d is measured on frames of cameras that no method has seen. The figures of each fit go into a file of their
+own, so that a stopped run can resume.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -31,30 +30,31 @@ from rawaug.files import fingerprint, write_json
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
 from rawaug.noise import noise_model
-from rawaug.paper.baselines import Training
+from rawaug.paper.baselines import BASELINES, Training
+from rawaug.paper.downstream import DownstreamConfig, psnr_d
 from rawaug.paper.methods import (
     FAMILIES,
     ROWS,
-    DownstreamConfig,
     Fitted,
     cycle_psnr,
     fit_family,
     is_method,
     learns_by_descent,
     mosaic_only_psnr,
-    psnr_d,
     resume,
     score_rows,
 )
 from rawaug.plugin.pictures import trim_to_even
 from rawaug.progress import progress
+from rawaug.registry import check_settings
 from rawaug.training.config import weights_key
 from rawaug.training.loop import require_trainable
 
 COLUMNS = {
-    "psnr_r": "PSNR_r", "worst25": "worst 25%", "best25": "best 25%", "forward": "RAW to sRGB", "cycle": "cycle",
-    "cycle_without_mosaic": "no mosaic", "psnr_d": "PSNR_d",
+    "psnr_r": "PSNR_r", "worst25": "worst 25%", "best25": "best 25%", "balanced": "balanced", "forward": "RAW to sRGB",
+    "cycle": "cycle", "cycle_same_setting": "same setting", "cycle_without_mosaic": "no mosaic", "psnr_d": "PSNR_d",
 }  # fmt: skip
+"""Keys of a row and the headings of their columns."""
 
 
 def print_methods(title: str, rows: Mapping[str, Mapping[str, Any]], ceiling: float) -> None:
@@ -65,18 +65,33 @@ def print_methods(title: str, rows: Mapping[str, Mapping[str, Any]], ceiling: fl
         rows: by name, as in ``table.json``.
         ceiling: PSNR in dB that the mosaic alone leaves of a cycle.
     """
+    columns = {}
+    for key, heading in COLUMNS.items():
+        if any(row.get(key) is not None for row in rows.values()):
+            columns[key] = heading
 
-    def cells(row: Mapping[str, Any]) -> Iterator[str]:
-        for value in map(row.get, COLUMNS):
-            yield "" if value is None else mean_and_spread(value if isinstance(value, list) else [value], 2)
-        yield f"{row['parameters'] / 1e6:.3f}"
-        yield f"{row['seconds']:.1f}"
-        yield "" if row["mpix_s"] is None else f"{row['mpix_s']:.3g}"
+    table = [[name, *cells_of(row, list(columns))] for name, row in rows.items()]
+    print_rows(title, ["method", *columns.values(), "M par.", "s to fit", "Mpix/s"], table)
 
-    heads = ["method", *COLUMNS.values(), "M par.", "s to fit", "Mpix/s"]
-    print_rows(title, heads, [[name, *cells(row)] for name, row in rows.items()])
     threads = torch.get_num_threads()
     print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); threads: {threads}")
+    for name, row in rows.items():
+        if row.get("known"):
+            print(f"note: {name} was fitted before to {row['known']} of the frames that it is scored on")
+
+
+def cells_of(row: Mapping[str, Any], columns: Sequence[str]) -> list[str]:
+    """A row of the table as text: the figures of ``columns``, parameters, seconds and speed."""
+    cells = []
+    for key in columns:
+        value = row.get(key)
+        if value is None:
+            cells.append("")
+        else:
+            cells.append(mean_and_spread(value if isinstance(value, list) else [value], 2))
+
+    speed = "" if row["mpix_s"] is None else f"{row['mpix_s']:.3g}"
+    return [*cells, f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}", speed]
 
 
 @dataclass
@@ -95,11 +110,16 @@ class Comparison:
             frames and never sees a clean one, and the scores are against the clean frames. Null adds no noise.
         methods: families to fit: dictionary, dictionary-encoders and the baselines; or ISPs to take as they are, by
             a shipped one's name or a file.
-        seconds: training budget of methods trained by gradient descent, without file reading.
+        sizes: by baseline, settings in place of its published size, such as ``{unet: {width: 16}}``.
+        seconds: training budget of methods trained by gradient descent, without file reading; null for none.
+        steps: their number of steps at most; null for no limit. With steps alone the same seed gives the same weights.
         crop: side of the crops that these methods train on: small ones give more steps to a short budget.
         batch: crops in a step of them.
         patches: random patches of each left-out frame that are scored; null scores all.
+        balanced: whether there is a column with InvISP's figure, on whole frames: PSNR of demosaiced, white-balanced
+            and gamma-compressed RAW.
         pictures: sRGB pictures for the cycle and for PSNR_d.
+        picture_count: number of pictures to use; null for all, which are kept in memory.
         fit: of the dictionary ISP.
         downstream: how PSNR_d is measured; null skips it.
         seed: of the first run.
@@ -115,11 +135,15 @@ class Comparison:
     test_count: int | None = None
     noise: str | None = None
     methods: list[str] = field(default_factory=lambda: ["dictionary", "upi", "upi-tuned"])
-    seconds: float = 20.0
+    sizes: dict[str, dict[str, Any]] = field(default_factory=dict)
+    seconds: float | None = 20.0
+    steps: int | None = None
     crop: int = 64
     batch: int = 2
     patches: int | None = 8
+    balanced: bool = False
     pictures: str = "demo:"
+    picture_count: int | None = None
     fit: FitConfig = field(default_factory=FitConfig)
     downstream: DownstreamConfig | None = None
     seed: int = 0
@@ -137,10 +161,18 @@ class Comparison:
             raise ValueError(f"patches must be at least 1, or null for all, got {self.patches}")
         if self.noise and any(not method.startswith("dictionary") for method in self.methods):
             raise ValueError("noise: only the dictionary ISP can be fitted to noisy frames; remove the other methods")
+        if any(learns_by_descent(method) for method in self.methods):
+            Training(self.seconds, self.steps).require_budget()
+
+        for family, size in self.sizes.items():
+            if family not in BASELINES:
+                raise ValueError(f"sizes: {family} is no baseline; use {', '.join(BASELINES)}")
+            check_settings(f"sizes: {family}", BASELINES[family], size)
 
     def shortest(self) -> Comparison:
         """The comparison with one step of every method, on the first frames."""
-        few: dict[str, Any] = {"count": 2, "test_count": 1, "patches": 1, "seeds": 1, "seconds": 0.1}
+        few: dict[str, Any] = {"count": 2, "test_count": 1, "patches": 1, "seeds": 1, "seconds": 0.1, "steps": 1}
+        few["picture_count"] = 2
         downstream = self.downstream and self.downstream.shortest()
         return replace(self, **few, select="first", fit=self.fit.shortest(), downstream=downstream)
 
@@ -160,144 +192,203 @@ class ComparisonRun:
     def __init__(self, settings: Comparison) -> None:
         if settings.downstream is not None:
             require_trainable("cpu", 1, settings.downstream.train.precision)
-        self.settings, self.folder = settings, run_folder(settings)
+        self.settings = settings
+        self.folder = run_folder(settings)
         self.seeds = range(settings.seed, settings.seed + settings.seeds)
-        found = open_pairs(settings.data, split="train")
-        self.pairs = _fitted_frames(settings, found)
-        self.scored = _test_frames(settings, found) if settings.test else self.pairs
         self.fit = replace(settings.fit, noisy=settings.fit.noisy or bool(settings.noise))
-        self._fitted: dict[str, Fitted] = {}
+        self._whole_fits: dict[str, Fitted] = {}
+
+        every = open_pairs(settings.data, split="train")
+        self.pairs = _fitted_frames(settings, every)
+        self.scored = _test_frames(settings, every) if settings.test else self.pairs
+
         side = settings.downstream.train.crop if settings.downstream else 2
         pictures = open_pictures(settings.pictures, min_side=side)
-        self.pictures = [trim_to_even(pictures[k]) for k in range(len(pictures))]
+        used = range(len(pictures))[: settings.picture_count]
+        self.pictures = [trim_to_even(pictures[k]) for k in used]
 
     def all_rows(self) -> dict[str, dict[str, Any]]:
         """All rows by name, which are printed, and written with every single figure."""
-        settings, rows = self.settings, dict[str, dict[str, Any]]()
+        settings = self.settings
+        rows: dict[str, dict[str, Any]] = {}
         for family in settings.methods:
             rows |= self._rows(family)
+
         ceiling = mosaic_only_psnr(self.pictures, CFA(self.pairs[0].cfa))
         write_json({"settings": asdict(settings), "rows": rows, "mosaic_only_psnr": ceiling}, self._path("table"))
+
         frames = len(self.scored)
         on = f"one of {frames} frames left out" if settings.test is None else f"{frames} frames of {settings.test}"
-        title = f"{settings.name}: {on}, seeds: {settings.seeds}, {settings.data}"
-        print_methods(title, rows, ceiling)
+        print_methods(f"{settings.name}: {on}, seeds: {settings.seeds}, {settings.data}", rows, ceiling)
         return rows
 
     def _rows(self, family: str) -> dict[str, dict[str, Any]]:
-        names = names_of(self.scored)
-        fits = list(product(self.seeds, range(len(names))))
+        self._whole_fits = {}
+        fits = list(product(self.seeds, range(len(self.scored))))
         folds = [self._fold(family, seed, frame) for seed, frame in progress(fits, label=family, unit="fit")]
-        speeds = [fold["mpix_s"] for fold in folds if fold["mpix_s"] is not None]
         whole = self._all_frames(family)
 
-        def by_seed(values: list[float]) -> list[list[float]]:
-            return [values[k : k + len(names)] for k in range(0, len(values), len(names))]
-
-        back = [fold["forward"] for fold in folds if fold.get("forward") is not None]
-        if len(back) == len(folds):
-            whole["forward"] = [fmean(of_seed) for of_seed in by_seed(back)]
+        forward = [fold.get("forward") for fold in folds]
+        if None not in forward:
+            whole["forward"] = [fmean(of_seed) for of_seed in self._by_seed(forward)]
 
         rows = {}
         for row in folds[0]["rows"]:
-            values = by_seed([fold["rows"][row] for fold in folds])
-            worst, best = zip(*map(worst_and_best_quarter, values), strict=True)
             name = family if row == "blind" else f"{family}, {ROWS[row]}"
-            rows[name] = {
-                "psnr_r": [fmean(of_seed) for of_seed in values],
-                "frames": {
-                    name: list(of_frame) for name, of_frame in zip(names, zip(*values, strict=True), strict=True)
-                },
-                "worst25": list(worst),
-                "best25": list(best),
-                "seconds": fmean(fold["seconds"] for fold in folds),
-                "mpix_s": median(speeds) if speeds else None,
-                "parameters": folds[0]["parameters"],
-                **(whole if row == "blind" else {}),
-            }
+            rows[name] = self._row(folds, row)
+            if row == "blind":
+                rows[name] |= whole
         return rows
+
+    def _row(self, folds: Sequence[dict[str, Any]], row: str) -> dict[str, Any]:
+        """The figures of one row of a family."""
+        names = names_of(self.scored)
+        values = self._by_seed([fold["rows"][row] for fold in folds])
+        quarters = [worst_and_best_quarter(of_seed) for of_seed in values]
+        speeds = [fold["mpix_s"] for fold in folds if fold["mpix_s"] is not None]
+
+        figures: dict[str, Any] = {
+            "psnr_r": [fmean(of_seed) for of_seed in values],
+            "frames": {name: [of_seed[k] for of_seed in values] for k, name in enumerate(names)},
+            "worst25": [worst for worst, _ in quarters],
+            "best25": [best for _, best in quarters],
+            "seconds": fmean(fold["seconds"] for fold in folds),
+            "mpix_s": median(speeds) if speeds else None,
+            "parameters": folds[0]["parameters"],
+        }
+        if row in folds[0].get("balanced", {}):
+            balanced = self._by_seed([fold["balanced"][row] for fold in folds])
+            figures["balanced"] = [fmean(of_seed) for of_seed in balanced]
+
+        known = sum(bool(fold.get("known")) for fold in folds[: len(names)])
+        if known:
+            figures["known"] = known
+        for key in ("steps", "curve"):
+            if key in folds[0]:
+                figures[key] = folds[0][key]
+        return figures
+
+    def _by_seed(self, values: Sequence[Any]) -> list[list[Any]]:
+        """The figures of all fits, a list of frames a seed."""
+        frames = len(self.scored)
+        return [list(values[k : k + frames]) for k in range(0, len(values), frames)]
 
     def _fold(self, family: str, seed: int, frame: int) -> dict[str, Any]:
         """The figures of a fit without one frame, scored on it; or of a fit to all, scored on a test frame."""
-        settings, training = self.settings, self._training(seed)
-        key = fingerprint(family, asdict(training), settings.patches, *self._frames())
+        settings = self.settings
+        samples = (*self._fit_key(family, seed), settings.patches)
+        key = fingerprint(*samples, "balanced") if settings.balanced else fingerprint(*samples)
         name = names_of(self.scored)[frame]
         path = self._path(f"{family}-{'on' if settings.test else 'without'}-{name}-seed{seed}")
 
         def measure() -> dict[str, Any]:
             pair = self.scored[frame]
-            if settings.test and key not in self._fitted:
-                self._fitted = {key: fit_family(family, self.pairs, self.fit, training)}
-            others = [other for other in self.pairs if other is not pair]
-            fitted = self._fitted[key] if settings.test else fit_family(family, others, self.fit, training)
-            pair = pair.in_pattern(self.pairs[0].cfa) if settings.test else pair
-            result = score_rows(fitted, pair, settings.patches)
-            return result | {**fitted.model.info, "seconds": fitted.seconds, "parameters": fitted.parameters}
+            if settings.test:
+                fitted = self._fit_to_all(family, seed)
+                pair = pair.in_pattern(self.pairs[0].cfa)
+            else:
+                others = [other for other in self.pairs if other is not pair]
+                fitted = self._fit(family, others, seed)
+
+            figures = score_rows(fitted, pair, settings.patches, settings.balanced)
+            return {**fitted.model.info, **figures, "seconds": fitted.seconds, "parameters": fitted.parameters}
 
         return resume(path, key, measure)
 
     def _all_frames(self, family: str) -> dict[str, Any]:
         """Measure a fit to all pairs on other data: its cycle and its PSNR_d."""
         settings = self.settings
-        downstream = settings.downstream if settings.downstream and family in settings.downstream.methods else None
-        training = self._training(settings.seed)
-        samples = (family, asdict(training), settings.pictures, *self._frames())
+        downstream = None
+        if settings.downstream and family in settings.downstream.methods:
+            downstream = settings.downstream
+        samples = (*self._fit_key(family, settings.seed), settings.pictures, settings.picture_count)
 
         def measure() -> dict[str, Any]:
-            fitted = fit_family(family, self.pairs, self.fit, training)
+            fitted = self._fit_to_all(family, settings.seed)
             result: dict[str, Any] = cycle_psnr(fitted, self.pictures)
-            if downstream:
-                drawn = (*samples, downstream.noise, downstream.exposure)
-                trained = weights_key(downstream.denoiser, downstream.train, drawn, validation="watched")
-                folder = self.folder / f"{family.replace('/', '_')}-denoisers-{trained}"
-                seeds = self.seeds
-                result["psnr_d"] = [psnr_d(fitted.model, self.pictures, downstream, folder, seed) for seed in seeds]
+            if downstream is None:
+                return result
+
+            drawn = (*samples, downstream.noise, downstream.exposure)
+            trained = weights_key(downstream.denoiser, downstream.train, drawn, validation="watched")
+            folder = self.folder / f"{family.replace('/', '_')}-denoisers-{trained}"
+            result["psnr_d"] = []
+            for seed in self.seeds:
+                result["psnr_d"].append(psnr_d(fitted.model, self.pictures, downstream, folder, seed))
             return result
 
         key = fingerprint(*samples, list(self.seeds), downstream and asdict(downstream))
-        return resume(self._path(f"{family}-all-frames"), key, measure)
+        figures = resume(self._path(f"{family}-all-frames"), key, measure)
+        return {name: value for name, value in figures.items() if name != "key"}
+
+    def _fit_to_all(self, family: str, seed: int) -> Fitted:
+        """The fit to all pairs, which serves the test frames, the cycle and PSNR_d."""
+        key = fingerprint(*self._fit_key(family, seed))
+        if key not in self._whole_fits:
+            self._whole_fits[key] = self._fit(family, self.pairs, seed)
+        return self._whole_fits[key]
+
+    def _fit(self, family: str, pairs: Sequence[Pair], seed: int) -> Fitted:
+        return fit_family(family, pairs, self.fit, self._training(seed), self.settings.sizes.get(family))
 
     def _training(self, seed: int) -> Training:
-        return Training(self.settings.seconds, crop=self.settings.crop, batch=self.settings.batch, seed=seed)
-
-    def _frames(self) -> tuple[Any, ...]:
-        """The settings and frames that a fit depends on besides its family, budget and seed."""
         settings = self.settings
-        return asdict(self.fit), settings.noise, settings.data, names_of(self.pairs), settings.test
+        return Training(settings.seconds, settings.steps, settings.crop, settings.batch, seed)
+
+    def _fit_key(self, family: str, seed: int) -> tuple[Any, ...]:
+        """The settings and frames that a fit depends on."""
+        settings = self.settings
+        size = settings.sizes.get(family)
+        frames = (settings.noise, settings.data, names_of(self.pairs), settings.test)
+        return (family, size, asdict(self._training(seed)), asdict(self.fit), *frames)
 
     def _path(self, stem: str) -> Path:
         return self.folder / f"{stem.replace('/', '_')}.json"
 
 
-def _fitted_frames(settings: Comparison, found: Sequence[Pair]) -> list[Pair]:
+def _fitted_frames(settings: Comparison, every: Sequence[Pair]) -> list[Pair]:
     """The chosen frames, all of one pattern, and registered where a method needs that."""
-    chosen = SomePairs(found, select_pairs(found, len(found), settings.count, settings.select))
+    chosen = SomePairs(every, select_pairs(every, len(every), settings.count, settings.select))
     names = names_of(chosen)
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"data: several frames are named {twice[0]}; rename the files")
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"data: several frames are named {name}; rename the files")
+
     pairs = list(skip_broken(chosen, "data"))
-    if len(pairs) < 2 and not settings.test:
-        raise ValueError(f"data: {settings.data} has {len(pairs)} frame; leave-one-out needs two or more")
     if settings.test:
         pairs = [pair.in_pattern(pairs[0].cfa) for pair in pairs]
+    elif len(pairs) < 2:
+        raise ValueError(f"data: {settings.data} has {len(pairs)} frame; leave-one-out needs two or more")
+
     exact = any(learns_by_descent(method) for method in settings.methods)
     for pair in pairs:
-        if pair.cfa != pairs[0].cfa or (exact and not pair.registered):
-            what = "is not registered pixel by pixel" if pair.cfa == pairs[0].cfa else "has a different CFA"
-            raise ValueError(f"data: {pair.name} {what}; {', '.join(settings.methods)} cannot share a table on it")
+        reason = ""
+        if pair.cfa != pairs[0].cfa:
+            reason = "has a different CFA"
+        elif exact and not pair.registered:
+            reason = "is not registered pixel by pixel"
+        if reason:
+            raise ValueError(f"data: {pair.name} {reason}; {', '.join(settings.methods)} cannot share a table on it")
+
     if settings.noise is None:
         return pairs
     noise = noise_model(settings.noise)  # frozen: keyed by the frame's name, as a noisy capture
-    drawn = [trial_of(pair, noise).noisy for pair in pairs]
-    return [replace(pair, noisy=bayer.unpack(noisy, pair.cfa)[0]) for pair, noisy in zip(pairs, drawn, strict=True)]
+    captured = []
+    for pair in pairs:
+        noisy = trial_of(pair, noise).noisy
+        captured.append(replace(pair, noisy=bayer.unpack(noisy, pair.cfa)[0]))
+    return captured
 
 
-def _test_frames(settings: Comparison, found: Sequence[Pair]) -> Sequence[Pair]:
+def _test_frames(settings: Comparison, every: Sequence[Pair]) -> Sequence[Pair]:
     """The frames of ``test`` that can be read, none of which is in the data."""
     test = open_pairs(str(settings.test), split="test")
-    tested = Readable(SomePairs(test, range(len(test))[: settings.test_count]))
-    deque(skip_broken(tested, "test"), maxlen=0)
-    scored = tested.kept()
-    if (seen := shared_frame(scored, found)) is not None:
-        raise ValueError(f"test: {seen} is also in data; score on unseen frames")
+    readable = Readable(SomePairs(test, range(len(test))[: settings.test_count]))
+    for _ in skip_broken(readable, "test"):
+        pass  # each frame is read once, so that a damaged one is found before anything is fitted
+
+    scored = readable.kept()
+    shared = shared_frame(scored, every)
+    if shared is not None:
+        raise ValueError(f"test: {shared} is also in data; score on unseen frames")
     return scored

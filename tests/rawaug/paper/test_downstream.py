@@ -18,10 +18,10 @@ from rawaug.evaluation.trials import trial_of
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
-from rawaug.paper import methods
+from rawaug.paper import downstream
 from rawaug.paper.baselines import UPI
 from rawaug.paper.baselines.unet import UNetISP
-from rawaug.paper.methods import DownstreamConfig, MadeCrops, psnr_d
+from rawaug.paper.downstream import DownstreamConfig, MadeCrops, psnr_d
 from rawaug.training.config import DenoiserConfig
 
 SILENT = noise_model((0.0, 0.0))
@@ -59,7 +59,7 @@ def scored(monkeypatch: pytest.MonkeyPatch, given: list[Pair], frame_of: Callabl
         return trial_of(pair, *rest)
 
     given.extend([frame_of("small", size=(64, 64)), frame_of("large", size=(96, 130))])
-    monkeypatch.setattr(methods, "trial_of", trial)
+    monkeypatch.setattr(downstream, "trial_of", trial)
     return seen
 
 

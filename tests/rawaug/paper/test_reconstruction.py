@@ -17,7 +17,7 @@ from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig
 from rawaug.paper import reconstruction
 from rawaug.paper.baselines import Training
-from rawaug.paper.methods import DownstreamConfig
+from rawaug.paper.downstream import DownstreamConfig
 from rawaug.paper.reconstruction import Comparison, compare
 
 FrameOf = Callable[..., Pair]
@@ -49,7 +49,9 @@ class Laboratory:
         self.min_side = min_side
         return [torch.arange(192, dtype=torch.uint8).reshape(3, 8, 8)]
 
-    def fit_family(self, family: str, pairs: Sequence[Pair], fit: FitConfig, training: Training) -> Any:
+    def fit_family(
+        self, family: str, pairs: Sequence[Pair], fit: FitConfig, training: Training, sizes: Any = None
+    ) -> Any:
         seconds, seed = training.seconds or 0.0, training.seed
         names = [pair.name for pair in pairs]
         left_out = [f"f{k}" for k in range(self.frames) if f"f{k}" not in names]
@@ -63,7 +65,7 @@ class Laboratory:
         model = SimpleNamespace(info={"frames": names}, cfa=CFA.RGGB, number=self.cameras)
         return SimpleNamespace(model=model, seconds=seconds + len(self.folds) % 2, parameters=1234, seed=seed)
 
-    def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
+    def score_rows(self, fitted: Any, pair: Pair, patches: int | None, balanced: bool = False) -> dict[str, Any]:
         value = 10.0 * (int(pair.name[1:]) + 1) + fitted.seed
         rows = {"blind": value, "as-shot": value + 1}
         return {"rows": rows, "mpix_s": 2.0 ** int(pair.name[1:]), "forward": value - 5}
@@ -113,13 +115,13 @@ def test_a_published_split_is_fitted_once_and_scored_on_every_test_frame(
         def open_pairs(self, spec: str, split: str) -> list[Pair]:
             return test if spec == "blocks" else super().open_pairs(spec, split)
 
-        def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
+        def score_rows(self, fitted: Any, pair: Pair, patches: int | None, balanced: bool = False) -> dict[str, Any]:
             scored.append(pair)
             return {"rows": {"blind": 40.0 + int(pair.name[1:])}, "mpix_s": 1.0, "forward": None}
 
     laboratory = Split(monkeypatch)
     rows = compare(settings(tmp_path, test="blocks", methods=["dictionary"], seeds=1))
-    assert laboratory.folds == [] and laboratory.wholes == [("dictionary", 0)] * 2, "one fit for all test frames"
+    assert laboratory.folds == [] and laboratory.wholes == [("dictionary", 0)], "one fit for all that is measured"
     assert rows["dictionary"]["frames"] == {"t0": [40.0], "t1": [41.0], "t2": [42.0]}
     assert {pair.cfa for pair in scored} == {CFA.RGGB} and scored[1].raw.shape == (1, 4, 4)
     assert "3 frames of blocks" in capsys.readouterr().out
@@ -148,6 +150,10 @@ def test_a_stopped_run_goes_on_from_its_files(laboratory: Laboratory, tmp_path: 
     ("changes", "folds", "wholes"),
     [
         ({"seconds": 9.0}, 16, 1),
+        ({"steps": 9}, 16, 1),
+        ({"sizes": {"upi": {}}}, 0, 0),
+        ({"balanced": True}, 16, 0),
+        ({"picture_count": 1}, 0, 1),
         ({"crop": 32}, 16, 1),
         ({"batch": 1}, 16, 1),
         ({"patches": None}, 16, 0),

@@ -1,0 +1,165 @@
+"""PSNR_d: the PSNR, on real RAW, of a denoiser that is trained on the RAW that a method makes of sRGB pictures.
+
+Pictures, network, steps and noise are the same for every method. The dictionary ISP draws camera settings from its
+hull, UPI from its published distributions; a network has one answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from denoisers import Denoiser
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data import open_pairs
+from rawaug.data.folders import skip_broken
+from rawaug.data.pairs import Sample, SomePairs
+from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.evaluation.scores import Row, score
+from rawaug.evaluation.trials import Trial, trial_of
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.stages import as_float
+from rawaug.noise import NoiseModel, noise_model
+from rawaug.paper.baselines.base import BaselineISP
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.draw import Draw
+from rawaug.seeding import derive_seed
+from rawaug.training.config import DenoiserConfig, TrainConfig
+from rawaug.training.loop import train
+from rawaug.training.stream import PictureCrops, Source, TrainingStream, add_noise, freeze_samples
+
+SHORTEST_CROP = 256
+"""Side in pixels of what a dry run scores of a test frame."""
+
+
+@dataclass
+class DownstreamConfig:
+    """How PSNR_d is measured.
+
+    Args:
+        methods: the families of which it is measured.
+        test: RAW frames of unseen cameras; folders, or ``kind:path``.
+        test_crop: side of the central crop scored of each test frame; null for the whole frame.
+        test_count: number of frames of each of ``test``; null for all.
+        bin: K bins these frames K x K by colour site: clean references of real photographs.
+        exposure: lowest and highest exposure in stops at which the RAW of a fitted ISP is drawn, for the test cameras'
+            headroom is not known; ISPs of published cameras and UPI's published distributions have their own.
+        noise: preset, in training and on the test frames.
+        denoiser: the network.
+        train: the loop.
+    """
+
+    methods: list[str] = field(default_factory=lambda: ["dictionary", "upi"])
+    test: list[str] = field(default_factory=lambda: ["demo:test"])
+    test_crop: int | None = 1024
+    test_count: int | None = None
+    bin: int = 1
+    exposure: tuple[float, float] | None = (-1.5, 0.0)
+    noise: str = "cycleisp_sidd"
+    denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+    def shortest(self) -> DownstreamConfig:
+        """One step, one small test frame."""
+        one = replace(self.train, steps=1, batch=2, warmup=1, validate_every=1, checkpoint_every=1)
+        return replace(self, test_crop=SHORTEST_CROP, test_count=1, train=one)
+
+
+def psnr_d(
+    model: BaselineISP | DictionaryISP,
+    pictures: Sequence[Tensor],
+    config: DownstreamConfig,
+    folder: Path,
+    seed: int,
+) -> float:
+    """Mean PSNR in dB, on the test frames, of a denoiser that is trained on a method's RAW.
+
+    Args:
+        model: makes the RAW.
+        pictures: uint8 sRGB ``(3, H, W)``.
+        config: network, loop, noise and test frames.
+        folder: of the training's files, one folder a seed in it, from which a stopped training goes on.
+        seed: of the training.
+    """
+    crops = crops_of(model, pictures, noise_model(config.noise), config)
+    net = train_on(crops, config, folder, seed)
+    rows = score_on(net, config, CFA(model.cfa))
+    return fmean(row.psnr for row in rows)
+
+
+def train_on(crops: Source, config: DownstreamConfig, folder: Path, seed: int) -> Denoiser:
+    """A denoiser trained on ``crops``; ``config``, ``folder`` and ``seed`` as in :func:`psnr_d`."""
+    stream = TrainingStream(None, crops, config.train.batch, 1.0, derive_seed(seed, "downstream"))
+    samples = freeze_samples(crops, "watched")
+    label = f"{folder.name} {seed}"
+    return train(stream, samples, config.denoiser, config.train, folder / f"seed{seed}", seed, label=label)
+
+
+def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> list[Row]:
+    """The scores of a network on the test frames, whose noise is frozen with seed 0; ``cfa`` is the network's."""
+    noise = noise_model(config.noise)
+    denoiser = RawDenoiser.of(net, cfa=cfa)
+
+    trials: list[Trial] = []
+    for spec in config.test:
+        every = open_pairs(spec, split="test", bin=config.bin)
+        frames = SomePairs(every, range(len(every))[: config.test_count])
+        for pair in skip_broken(frames, spec):
+            part = pair.middle(config.test_crop) if config.test_crop else pair
+            trials.append(trial_of(part, noise, cfa))
+    return list(score([denoiser], trials, "PSNR_d"))
+
+
+def crops_of(
+    model: BaselineISP | DictionaryISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig
+) -> Source:
+    """The training samples that a method makes of pictures."""
+    if isinstance(model, BaselineISP):
+        return MadeCrops(pictures, model.draw, model.cfa, noise, config.train.crop)
+
+    # The plugin keeps each crop's place in its frame.
+    draw = Draw(exposure=None if model.config.cameras else config.exposure)
+    return PictureCrops(RawPairs(pictures, RawAugment(model, noise, draw=draw), config.train.crop))
+
+
+class MadeCrops:
+    """Crops of pictures, turned at random, made RAW by any function.
+
+    Args:
+        pictures: uint8 sRGB ``(3, H, W)``.
+        make: maps float sRGB ``(1, 3, h, w)`` and a generator to a mosaic ``(1, 1, h, w)``.
+        cfa: the pattern of these mosaics.
+        noise: drawn for each crop.
+        crop: side of the crops in pixels.
+    """
+
+    def __init__(
+        self,
+        pictures: Sequence[Tensor],
+        make: Callable[[Tensor, torch.Generator], Tensor],
+        cfa: CFA,
+        noise: NoiseModel,
+        crop: int,
+    ) -> None:
+        self.pictures = pictures
+        self.make = make
+        self.cfa = cfa
+        self.noise = noise
+        self.crop = bayer.RandomCrop(crop)
+        self.turn = bayer.RandomTurn(cfa, keep_cfa=False)
+
+    @torch.no_grad()
+    def draw(self, generator: torch.Generator) -> Sample:
+        """A sample of packed RAW ``(4, crop / 2, crop / 2)``."""
+        index = int(torch.randint(len(self.pictures), (), generator=generator))
+        patch = self.turn(self.crop(self.pictures[index], generator), generator)
+        raw = self.make(as_float(patch[None]), generator).clamp(0.0, 1.0)
+        clean = bayer.pack(raw, self.cfa)
+        return add_noise(clean, self.noise, generator)
