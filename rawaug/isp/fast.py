@@ -30,13 +30,15 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import BatchParams, Stage, Tables, highlight_rise, node_colours
 from rawaug.isp.tone import STEPS, to_code
 from rawaug.kernels import fastest
-from rawaug.kernels.reference import Camera, Display, fall_off, look_up, render, unprocess
+from rawaug.kernels.reference import Camera, Display, fall_off, look_up, mask_frame, render, unprocess
 from rawaug.kernels.runtime import one_thread
 
 NODES = 65
 """Nodes of the table along each axis of the sRGB cube."""
 CURVE_NODES = 1025
 """Nodes of an inverted tone curve, over the root of linear light."""
+PLACE_NODES = 33
+"""Nodes along each side of a picture at which gains by place are computed, to be interpolated between them."""
 
 
 class BakedISP(nn.Module):
@@ -72,7 +74,12 @@ class BakedISP(nn.Module):
             float32 ``(B, 4, H/2, W/2)``, planes R, Gr, Gb, B.
         """
         _require_batch(srgb, params, place)
-        return _pass(srgb, self._camera(srgb, params, place), white)
+        camera, size = self._camera(srgb, params, place), (srgb.shape[-2], srgb.shape[-1])
+        gain = _place_gain(self.isp.ordered_stages, place, size, self.table, forward=False)
+        if gain is None:
+            return _pass(srgb, camera, white)
+        sites = torch.cat([gain[..., i::2, j::2] for i, j in CFA(self.config.cfa).sites], dim=1)
+        return (_pass(srgb, camera, math.inf) * sites).clamp_max(white)
 
     @torch.no_grad()
     def colours(
@@ -92,12 +99,18 @@ class BakedISP(nn.Module):
         """
         _require_batch(srgb, params, place)
         camera, rgb = self._camera(srgb, params, place), []
-        if not shaded:
+        gain = None
+        if shaded:
+            size = srgb.shape[-2], srgb.shape[-1]
+            gain = _place_gain(self.isp.ordered_stages, place, size, self.table, forward=False)
+        else:
             camera = camera._replace(attention=camera.attention[:0], shading=camera.shading[:0])
+        ceiling = white if gain is None else math.inf
         for colour in range(3):
             sites = torch.tensor([(i, j, colour) for i, j in CFA.RGGB.sites])
-            rgb.append(unpack(_pass(srgb, camera._replace(sites=sites), white), CFA.RGGB))
-        return torch.cat(rgb, dim=1)
+            rgb.append(unpack(_pass(srgb, camera._replace(sites=sites), ceiling), CFA.RGGB))
+        colours = torch.cat(rgb, dim=1)
+        return colours if gain is None else (colours * gain).clamp_max(white)
 
     @torch.no_grad()
     def shade(self, x4: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor:
@@ -105,7 +118,10 @@ class BakedISP(nn.Module):
         camera = self._camera(x4, params, place)
         mask = fall_off(camera, 0, *x4.shape[-2:])
         x5 = x4 if mask is None else x4 * mask
-        return x5 * look_up(camera.attention, x5)[:, :1] if camera.attention.numel() else x5
+        if camera.attention.numel():
+            x5 = x5 * look_up(camera.attention, x5)[:, :1]
+        gain = _place_gain(self.isp.ordered_stages, place, (x4.shape[-2], x4.shape[-1]), self.table, forward=False)
+        return x5 if gain is None else x5 * gain
 
     def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> Camera:
         table = self.table
@@ -140,6 +156,8 @@ class FastForward(nn.Module):
         """
         _require_batch(linear, params, place)
         display, linear = self._display(linear, params, place), linear.float()
+        gain = self._gain(linear, place)
+        linear = linear if gain is None else linear * gain
         learning = linear.requires_grad or display.matrix.requires_grad or display.gains.requires_grad
         if learning and torch.is_grad_enabled():
             return render(linear, display)
@@ -167,7 +185,9 @@ class FastForward(nn.Module):
                 own, at = ISPParams(*(value[i, None] for value in params)), None if place is None else place[i, None]
                 alone.append(self.develop([raw[i, None] for raw in raws], [method], own, at))
             return [torch.cat(pictures) for pictures in zip(*alone, strict=True)]
-        display = self._display(raws[0], params, place)
+        display, gain = self._display(raws[0], params, place), self._gain(raws[0], place)
+        if gain is not None:  # the gains change slowly: it is alike before demosaicing and after
+            raws = [raw * gain for raw in raws]
 
         def in_steps(raw: Tensor) -> Tensor:
             found = [self._demosaic_balanced(*one) for one in zip(raw.split(1), methods, display.gains, strict=True)]
@@ -177,6 +197,10 @@ class FastForward(nn.Module):
         if directional:
             return [in_steps(raw) for raw in raws]
         return [fastest("develop", raw, display, self.cfa, methods, otherwise=partial(in_steps, raw)) for raw in raws]
+
+    def _gain(self, image: Tensor, place: Tensor | None) -> Tensor | None:
+        size = image.shape[-2], image.shape[-1]
+        return _place_gain(self.isp.ordered_stages, place, size, self.table, forward=True, batch=len(image))
 
     def _demosaic_balanced(self, raw: Tensor, method: str, gains: Tensor) -> Tensor:
         """Demosaic ``(1, 1, H, W)``; a choice of direction needs balanced RAW clipped at black, as developers do it."""
@@ -236,6 +260,34 @@ def _batch_params(
     for stage in stages:
         made = stage.adjust(made, params, place, (height, width))
     return made
+
+
+@torch.no_grad()
+def _place_gain(
+    stages: Sequence[Stage],
+    place: Tensor | None,
+    size: tuple[int, int],
+    like: Tensor,
+    forward: bool,
+    batch: int = 1,
+) -> Tensor | None:
+    """Compute the gains by place ``(B, 1, H, W)`` of pictures of a size, between :data:`PLACE_NODES` a side."""
+    gaining = [stage for stage in stages if stage.has_place_gain]
+    if not gaining:
+        return None
+    height, width = size
+    places = [[0, 0, height, width]] * batch if place is None else place.tolist()
+    frame = like.new_tensor([mask_frame(one, height, width, (0.0, 0.0)) for one in places])
+    down = torch.linspace(0.0, height - 1.0, min(PLACE_NODES, height)).to(like)[:, None]
+    right = torch.linspace(0.0, width - 1.0, min(PLACE_NODES, width)).to(like)
+    start_y, start_x, down_y, down_x, right_y, right_x = frame[:, :, None, None].unbind(1)
+    coordinates = torch.stack(
+        [start_y + down * down_y + right * right_y, start_x + down * down_x + right * right_x], dim=1
+    )
+    gain = torch.ones_like(coordinates[:, :1])
+    for stage in gaining:
+        gain = gain * stage.place_gain(coordinates, forward)
+    return F.interpolate(gain, size, mode="bilinear", align_corners=True)
 
 
 def _pass(srgb: Tensor, camera: Camera, white: float) -> Tensor:

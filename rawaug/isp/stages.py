@@ -7,7 +7,7 @@ f1      tone mapping     x1 = x + phi(x; theta_r)                        x = x1 
 f2      gamma            x2 = max(x1, eps) ** gamma                      x1 = max(x2, eps) ** (1 / gamma)
 f3      colour           x3 = C x2                                       x2 = pinv(C) x3
 f4      white balance    x4 = h(x3; g), Brooks' highlight-safe 1/g       x3 = g x4
-f5      lens shading     x5 = x4 G(p) A(x4)                              x4 = x5 / G(p) A'(x5)
+f5      lens shading     x5 = x4 G(p) A(x4, p)                           x4 = x5 / G(p) A'(x5, p)
 f6      mosaic           y = one channel a site                          x5 = bilinear demosaic of y
 ======  ===============  ==============================================  ==============================================
 
@@ -20,7 +20,8 @@ Everything but f6 is pointwise, given the parameters: a set of pixels ``(B, 3, 1
 
 The baked pass (:mod:`rawaug.isp.fast`) is ``y_c = sum_k C[c, k] T_k(x) max(m + (1 - m) / g_c, 1 / g_c) G(p) A(x4)``.
 What a stage does to every picture alike goes into the tables ``T`` and ``A`` once (:meth:`Stage.bake`); what depends
-on a picture's setting or place goes into ``C``, ``1 / g`` and ``G`` for each batch (:meth:`Stage.adjust`).
+on a picture's setting or place goes into ``C``, ``1 / g`` and ``G`` for each batch (:meth:`Stage.adjust`), and what no
+table holds of the place multiplies the RAW (:meth:`Stage.place_gain`).
 
 A new kind of stage is a class with ``@STAGES.register(name)`` above it.
 """
@@ -46,6 +47,8 @@ EPS = 1e-6
 
 WIDTH = 32
 """Features of the networks."""
+LEAST_FACTOR = 0.02
+"""Entries of L of a Gaussian mask that is not fitted yet."""
 _HALF_LEVEL = 0.5 / 255
 
 
@@ -77,13 +80,14 @@ def require_display_range(image: Tensor) -> None:
         raise ValueError(f"a float picture must be in [0, 1], got {low:.4g} to {high:.4g}; {advice}")
 
 
-def _colourwise(hidden: int, outputs: int) -> nn.Sequential:
+def _pixelwise(hidden: int, outputs: int, inputs: int = 3) -> nn.Sequential:
     """Stack ``hidden`` 1 x 1 convolutions to 32 features with ReLU, and one that is zero until it is trained."""
     last = nn.Conv2d(WIDTH, outputs, 1)
     nn.init.zeros_(last.weight)
     last.bias = nn.Parameter(torch.zeros(outputs))
-    inputs = [3, *[WIDTH] * (hidden - 1)]
-    layers = [layer for channels in inputs for layer in (nn.Conv2d(channels, WIDTH, 1), nn.ReLU())]
+    layers: list[nn.Module] = []
+    for channels in [inputs, *[WIDTH] * (hidden - 1)]:
+        layers += [nn.Conv2d(channels, WIDTH, 1), nn.ReLU()]
     return nn.Sequential(*layers, last)
 
 
@@ -92,7 +96,7 @@ class ToneNetwork(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.layers = _colourwise(hidden=3, outputs=3)
+        self.layers = _pixelwise(hidden=3, outputs=3)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map colours ``(B, 3, H, W)`` to colours of the same shape, each pixel by itself."""
@@ -178,15 +182,16 @@ def coordinates_or_full(x: Tensor, coordinates: Tensor | None) -> Tensor:
 
 
 class GaussianMask(nn.Module):
-    """The sensor's fall-off ``G(p) = exp(-||L^T (p - mu)||^2 / 2)``, precision ``Sigma^-1 = L L^T``; flat at first.
+    """The sensor's fall-off ``G(p) = exp(-||L^T (p - mu)||^2 / 2)``, precision ``Sigma^-1 = L L^T``.
 
-    ``p`` are the coordinates of :func:`frame_coordinates`.
+    ``p`` are the coordinates of :func:`frame_coordinates`. A flat mask, L = 0, is a saddle, which gradient descent
+    never leaves; the mask starts with :data:`LEAST_FACTOR` instead, which takes 0.02 % of the light from the corners.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.mean = nn.Parameter(torch.zeros(2))
-        self.factor = nn.Parameter(torch.zeros(3))  # L11, L21, L22
+        self.factor = nn.Parameter(torch.tensor([LEAST_FACTOR, 0.0, LEAST_FACTOR]))  # L11, L21, L22
 
     @property
     def precision(self) -> Tensor:
@@ -203,24 +208,37 @@ class GaussianMask(nn.Module):
 
     @torch.no_grad()
     def set(self, mean: Tensor, precision: Tensor) -> None:
-        """Set the mean ``(2,)`` and the precision ``(2, 2)``; negative curvature is taken as none."""
+        """Set the mean ``(2,)`` and the precision ``(2, 2)``; less curvature than at the start is taken as that."""
         values, vectors = torch.linalg.eigh(precision)
-        root = vectors @ torch.diag(values.clamp_min(0.0).sqrt())
+        root = vectors @ torch.diag(values.clamp_min(LEAST_FACTOR**2).sqrt())
         lower = torch.linalg.qr(root.T).R.T
         self.mean.copy_(mean)
         self.factor.copy_(torch.stack([lower[0, 0], lower[1, 0], lower[1, 1]]))
 
 
 class AttentionMask(nn.Module):
-    """A per-pixel gain ``A = 2 sigmoid(...)`` in (0, 2); the paper has no 2, with which it is the identity at first."""
+    """A gain for each pixel by its colour and by its place, ``A = 2 sigmoid(a(x)) 2 sigmoid(b(p))``, in (0, 4).
+
+    Both networks are zero at first, so that the mask is the identity, for which the paper's sigmoid has no factor of 2.
+    Colour and place are factors of their own, so that the baked pass can look the first one up in a table.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self.layers = _colourwise(hidden=2, outputs=1)
+        self.layers = _pixelwise(hidden=2, outputs=1)
+        self.place_layers = _pixelwise(hidden=2, outputs=1, inputs=2)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Compute the mask ``(B, 1, H, W)`` of an image ``(B, 3, H, W)``."""
+    def of_colour(self, x: Tensor) -> Tensor:
+        """Compute the gains ``(B, 1, H, W)`` by the colours of an image ``(B, 3, H, W)``."""
         return 2.0 * torch.sigmoid(self.layers(x))
+
+    def of_place(self, coordinates: Tensor) -> Tensor:
+        """Compute the gains ``(B, 1, H, W)`` by the coordinates ``(B, 2, H, W)`` of the pixels in the full frame."""
+        return 2.0 * torch.sigmoid(self.place_layers(coordinates))
+
+    def forward(self, x: Tensor, coordinates: Tensor) -> Tensor:
+        """Compute the mask ``(B, 1, H, W)`` of an image ``(B, 3, H, W)`` at coordinates ``(1 or B, 2, H, W)``."""
+        return self.of_colour(x) * self.of_place(coordinates)
 
 
 class Tables(NamedTuple):
@@ -305,6 +323,24 @@ class Stage(nn.Module, ABC):
     def describe(self) -> str:
         """Describe the stage's parameters in one line; the line is empty if the settings hold them all."""
         return ""
+
+    @property
+    def has_place_gain(self) -> bool:
+        """Whether this stage multiplies RAW by what :meth:`place_gain` computes."""
+        return False
+
+    def place_gain(self, coordinates: Tensor, forward: bool) -> Tensor:
+        """Compute what this stage multiplies RAW by besides, by place alone, which no table holds.
+
+        Args:
+            coordinates: ``(B, 2, H, W)`` of pixels in the full frame.
+            forward: whether it is the forward pass, which multiplies RAW before all else, or the reverse pass, which
+                does so after all else.
+
+        Returns:
+            ``(B, 1, H, W)``, ones by default.
+        """
+        return torch.ones_like(coordinates[:, :1])
 
     # -- fitting ----------------------------------------------------------------------------------------------------
 
@@ -471,21 +507,28 @@ class LensShading(Stage):
         self.forward_attention = AttentionMask() if config.attention else None
 
     def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
-        """Compute x5 = x4 G(p) A(x4 G(p)), both ``(B, 3, H, W)``."""
-        x = x * self.mask(coordinates_or_full(x, coordinates))
-        return x if self.reverse_attention is None else x * self.reverse_attention(x)
+        """Compute x5 = x4 G(p) A(x4 G(p), p), both ``(B, 3, H, W)``."""
+        where = coordinates_or_full(x, coordinates)
+        x = x * self.mask(where)
+        return x if self.reverse_attention is None else x * self.reverse_attention(x, where)
 
     def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
-        """Compute x4 from x5, both ``(B, 3, H, W)``: divide by the mask, then apply the forward attention."""
-        x = x / self.mask(coordinates_or_full(x, coordinates))
-        return x if self.forward_attention is None else x * self.forward_attention(x)
+        """Compute x4 from x5, both ``(B, 3, H, W)``: divide by the mask, then apply the forward attention.
+
+        The attention's gains by place come first, those by colour last.
+        """
+        where = coordinates_or_full(x, coordinates)
+        if self.forward_attention is None:
+            return x / self.mask(where)
+        x = x * self.forward_attention.of_place(where) / self.mask(where)
+        return x * self.forward_attention.of_colour(x)
 
     def bake(self, tables: Tables) -> Tables:
-        """Put the reverse attention mask into the tables."""
+        """Put the reverse attention mask by colour into the tables."""
         return _bake_attention(tables, self.reverse_attention)
 
     def bake_forward(self, tables: Tables) -> Tables:
-        """Put the forward attention mask into the tables."""
+        """Put the forward attention mask by colour into the tables."""
         return _bake_attention(tables, self.forward_attention)
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
@@ -499,6 +542,18 @@ class LensShading(Stage):
         precision = self.mask.precision * (0.5 / math.log(2.0))
         shading = torch.stack([precision[0, 0], 2.0 * precision[0, 1], precision[1, 1]])
         return batch._replace(frame=frame, shading=shading)
+
+    @property
+    def has_place_gain(self) -> bool:
+        """Whether there is an attention mask."""
+        return self.reverse_attention is not None
+
+    def place_gain(self, coordinates: Tensor, forward: bool) -> Tensor:
+        """Compute the attention's gains by place ``(B, 1, H, W)``, in the direction asked for."""
+        attention = self.forward_attention if forward else self.reverse_attention
+        if attention is None:
+            return super().place_gain(coordinates, forward)
+        return attention.of_place(coordinates)
 
     def describe(self) -> str:
         """Describe the mask by its mean and precision."""
@@ -515,7 +570,7 @@ class LensShading(Stage):
 
 
 def _bake_attention(tables: Tables, mask: AttentionMask | None) -> Tables:
-    return tables if mask is None else tables._replace(attention=mask(tables.cube))
+    return tables if mask is None else tables._replace(attention=mask.of_colour(tables.cube))
 
 
 def require_params(params: ISPParams | None) -> ISPParams:

@@ -31,6 +31,7 @@ from rawaug.files import read_tensors, write_tensors
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.samples import FitFrames, FrameSummary, PixelSamples
+from rawaug.isp.fit.start import measure_lights
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.staged import with_white_balance
 from rawaug.progress import progress
@@ -341,6 +342,8 @@ def joint_steps(config: FitConfig, frames: int) -> int:
 def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent) -> None:
     """Refine everything at once, if ``config.joint_steps`` says so; the gain goes to ``isp.info``.
 
+    What as-shot gains need to know of the atoms is measured anew afterwards.
+
     Args:
         isp: the fitted ISP.
         frames: all frames of the fit, of which a tenth is held out.
@@ -363,6 +366,8 @@ def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, desc
     tensors = dict(isp.named_parameters())
     descent.run("end to end", loss, tensors, steps, LEARNING_RATE, watch=lambda: mean_psnr(isp, watched))
     seen = descent.watched["end to end"]
+    if seen.step > 0:
+        measure_lights(isp, trained)
     isp.info["joint"] = {"steps": steps, "kept_step": seen.step, "gain_db": round(seen.best - seen.start, 2)}
 
 

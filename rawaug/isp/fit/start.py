@@ -23,7 +23,7 @@ from rawaug.isp import stages
 from rawaug.isp.config import ISPParams
 from rawaug.isp.dictionary import l1_normalise, log_light
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.samples import FrameSummary, PixelSamples
+from rawaug.isp.fit.samples import FitFrames, FrameSummary, PixelSamples
 from rawaug.isp.model import DictionaryISP
 from rawaug.seeding import derive_seed
 
@@ -242,6 +242,68 @@ def set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) -> 
         square = (predicted - samples.target) ** 2 * samples.site
         errors[knee] = float((square.sum((1, 2, 3)) / samples.site.sum((1, 2, 3)) + 1e-6).log().sum())
     isp.configure(knee=min(errors, key=lambda knee: errors[knee]))
+
+
+LIGHT_PIXELS, LIGHT_FRAMES = 1024, 16
+"""Pixels of a frame, and frames at a time, by which the lights of trained atoms are measured."""
+LIGHT_RIDGE = 1e-2
+"""How strongly the neutrals of atoms that few frames use are drawn to the mean."""
+
+
+@torch.no_grad()
+def measure_lights(isp: DictionaryISP, frames: FitFrames) -> None:
+    """Measure the light, the neutral and the spread of colour atoms anew, which training has moved.
+
+    An atom's light is the mean of those frames that choose it, where encoders choose. The neutrals are those under
+    which as-shot gains come nearest to each frame's best gains, and the spread is the one under which they do so best.
+    """
+    balance = torch.tensor([shot.white_balance for shot in frames.shots])
+    if isp.config.encoders:
+        chosen = torch.cat([isp.choose(shot.srgb).colour_weights for shot in frames.shots])
+        share = chosen / chosen.sum(dim=0).clamp_min(1e-6)
+        isp.colour.light.copy_(share.T @ log_light(balance))
+    pixels = frames.pixels.pick(torch.arange(min(LIGHT_PIXELS, frames.pixels.srgb.shape[-1])))
+    errors: dict[float, float] = {}
+    neutrals: dict[float, Tensor] = {}
+    for spread in SPREADS:
+        isp.colour.spread.fill_(spread)
+        weights = isp.colour.weights_for(balance)
+        matrix = isp.colour.combine(weights)
+        a, b, known = _second_moments(isp, pixels, weights, matrix)
+        best = b.clamp_min(1e-9) / a.clamp_min(1e-9)
+        wanted = -best.log() - balance.log() - matrix.sum(2).clamp_min(1e-3).log()
+        neutrals[spread] = _solve_mixture(weights, wanted)
+        isp.colour.neutral.copy_(neutrals[spread])
+        inverse = 1.0 / isp.colour.gains_for(balance, weights)
+        excess = (known * (inverse * a - b) ** 2 / a.clamp_min(1e-9)).sum(dim=1)
+        errors[spread] = float((excess + SPREAD_EPS).log().sum())
+    spread = min(errors, key=lambda width: errors[width])
+    isp.colour.spread.fill_(spread)
+    isp.colour.neutral.copy_(neutrals[spread])
+
+
+def _second_moments(
+    isp: DictionaryISP, pixels: PixelSamples, weights: Tensor, matrix: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute ``<x x>`` and ``<x y>`` of each frame's channels under gains of 1, and which channels have any pixel."""
+    moments: list[Tensor] = []
+    for index in torch.arange(len(matrix)).split(LIGHT_FRAMES):
+        part = PixelSamples(*(value[index] for value in pixels))
+        none = weights.new_empty(len(index), 0)
+        tones = isp.typical_tones().expand(len(index), -1)
+        params = ISPParams(weights[index], none, matrix[index], torch.ones(len(index), 3), tones)
+        x = isp.reverse_pixels(part.srgb, params, part.coordinates)
+        square, cross = (x * x * part.known).mean((2, 3)), (x * part.target * part.known).mean((2, 3))
+        moments.append(torch.stack([square, cross]))
+    a, b = torch.cat(moments, dim=1)
+    return a, b, (a > 0).float()
+
+
+def _solve_mixture(weights: Tensor, wanted: Tensor) -> Tensor:
+    """Find values of the atoms ``(N, 3)`` whose mixtures by ``weights`` ``(F, N)`` are near ``wanted`` ``(F, 3)``."""
+    mean = wanted.median(dim=0).values
+    normal = weights.T @ weights + LIGHT_RIDGE * torch.eye(weights.shape[1])
+    return mean + torch.linalg.solve(normal, weights.T @ (wanted - mean))
 
 
 def set_priors(isp: DictionaryISP, samples: PixelSamples, config: FitConfig) -> None:

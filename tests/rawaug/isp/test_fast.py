@@ -118,7 +118,8 @@ def forward_curved(**settings: object) -> DictionaryISP:
         if tone := isp.find(ToneMap):
             list(tone.forward_network.parameters())[-2].normal_(std=0.05, generator=generator)
         if (lens := isp.find(LensShading)) and lens.forward_attention:
-            list(lens.forward_attention.parameters())[-2].normal_(std=0.05, generator=generator)
+            for layers in (lens.forward_attention.layers, lens.forward_attention.place_layers):
+                list(layers.parameters())[-2].normal_(std=0.05, generator=generator)
     return isp
 
 

@@ -26,8 +26,9 @@ def x() -> torch.Tensor:
 
 def test_untrained_networks_are_the_identity(x: torch.Tensor) -> None:
     assert torch.equal(stages.ToneNetwork()(x), x)
-    assert torch.equal(stages.AttentionMask()(x), torch.ones(2, 1, 6, 8))
-    assert torch.equal(stages.GaussianMask()(stages.frame_coordinates(6, 8)), torch.ones(1, 1, 6, 8))
+    where = stages.frame_coordinates(6, 8)
+    assert torch.equal(stages.AttentionMask()(x, where), torch.ones(2, 1, 6, 8))
+    torch.testing.assert_close(stages.GaussianMask()(where), torch.ones(1, 1, 6, 8), atol=3e-4, rtol=0)
 
 
 def test_a_tone_network_starts_from_exactly_the_curve(x: torch.Tensor) -> None:
@@ -71,6 +72,43 @@ def test_gaussian_mask_takes_mean_and_precision() -> None:
     p = coordinates[0] - mean[:, None, None]
     expected = torch.exp(-0.5 * (0.8 * p[0] ** 2 + 0.2 * p[0] * p[1] + 0.5 * p[1] ** 2))
     torch.testing.assert_close(mask(coordinates)[0, 0], expected)
+
+
+def vignetted_wall(height: int = 24, width: int = 36) -> tuple[torch.Tensor, torch.Tensor]:
+    """Coordinates, and what is left of the light there: 60 % in the corners, around a point off centre."""
+    where = stages.frame_coordinates(height, width)
+    centre = torch.tensor([0.1, -0.05])[None, :, None, None]
+    return where, torch.exp(-0.5 * ((where - centre) ** 2).sum(1, keepdim=True))
+
+
+def descend(module: nn.Module, wanted: torch.Tensor, *inputs: torch.Tensor) -> float:
+    """The largest error after descending on the squared one."""
+    optimiser = torch.optim.Adam(module.parameters(), lr=0.02)
+    for _ in range(800):
+        loss = ((module(*inputs) - wanted) ** 2).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    return float((module(*inputs) - wanted).detach().abs().max())
+
+
+def test_a_gaussian_mask_is_learned_from_scratch() -> None:
+    where, light = vignetted_wall()
+    assert descend(stages.GaussianMask(), light, where) < 0.01
+
+
+def test_a_mask_that_was_set_flat_can_still_be_learned() -> None:
+    mask = stages.GaussianMask()
+    mask.set(torch.zeros(2), torch.zeros(2, 2))
+    where, light = vignetted_wall()
+    assert descend(mask, light, where) < 0.01
+
+
+def test_the_attention_mask_sees_where_a_pixel_is() -> None:
+    torch.manual_seed(0)
+    where, light = vignetted_wall()
+    wall = torch.full((1, 3, 24, 36), 0.5)
+    assert descend(stages.AttentionMask(), light, wall, where) < 0.05
 
 
 class Squeeze(Stage):

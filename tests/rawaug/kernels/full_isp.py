@@ -31,5 +31,6 @@ def full_isp(**settings: Any) -> DictionaryISP:
     if lens := isp.find(LensShading):
         lens.mask.set(torch.tensor([0.1, 0.0]), 0.5 * torch.eye(2))
         if lens.reverse_attention:
-            list(lens.reverse_attention.parameters())[-2].normal_(std=0.05, generator=generator)
+            for layers in (lens.reverse_attention.layers, lens.reverse_attention.place_layers):
+                list(layers.parameters())[-2].normal_(std=0.05, generator=generator)
     return isp

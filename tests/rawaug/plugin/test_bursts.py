@@ -59,7 +59,8 @@ def test_the_shading_of_the_lens_does_not_move_with_the_scene(attention: bool) -
     assert lens is not None
     lens.mask.set(torch.tensor([0.1, 0.0]), torch.tensor([[9.0, 2.0], [2.0, 5.0]]))
     if lens.reverse_attention is not None:
-        list(lens.reverse_attention.parameters())[-2].data.normal_(std=0.1, generator=seeded())
+        for layers in (lens.reverse_attention.layers, lens.reverse_attention.place_layers):
+            list(layers.parameters())[-2].data.normal_(std=0.1, generator=seeded())
     wall = torch.full((1, 3, 64, 96), 0.5)
     pair = RawAugment(isp, noise=(0.0, 0.0), burst=Burst(3, motion=(8.0, 4.0)))(wall, seeded())
     still = RawAugment(isp, noise=(0.0, 0.0))(wall, seeded())

@@ -13,6 +13,7 @@ from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig, descent, fit_isp, pipeline
 from rawaug.isp.fit.descent import Descent, joint_steps, mean_psnr, train_jointly
 from rawaug.isp.fit.samples import FitFrames, sample_pixels
+from rawaug.isp.fit.start import measure_lights
 from rawaug.isp.model import DictionaryISP
 
 LIGHTS = [(1.6, 1.0, 1.9), (1.9, 1.0, 1.6)]
@@ -145,6 +146,31 @@ def test_where_every_step_is_worse_the_start_remains(
     trained(isp, sample_pixels(frames, CONFIG.pixels, CONFIG.seed), steps=10, learning_rate=1.0)
     assert isp.info["joint"] == {"steps": 10, "kept_step": 0, "gain_db": 0.0}
     assert all(torch.equal(value, before[key]) for key, value in isp.state_dict().items())
+
+
+def test_as_shot_gains_know_the_atoms_that_training_has_moved(
+    isp: DictionaryISP, frames: list[Pair], trained: Callable[..., None]
+) -> None:
+    drawn = sample_pixels(frames, CONFIG.pixels, CONFIG.seed)
+    before = mean_psnr(isp, drawn, as_shot=True)
+    with torch.no_grad():
+        isp.gain.log_gains.add_(0.2)  # makes the descent move everything
+    trained(isp, drawn, steps=60, learning_rate=1e-2)
+    assert isp.info["joint"]["kept_step"] > 0
+    assert mean_psnr(isp, drawn, as_shot=True) > before - 5.0
+
+
+def test_lights_of_atoms_are_measured(isp: DictionaryISP, frames: list[Pair]) -> None:
+    drawn = sample_pixels(frames, CONFIG.pixels, CONFIG.seed)
+    before = mean_psnr(isp, drawn, as_shot=True)
+    with torch.no_grad():
+        isp.stages["gamma"].reverse_gamma.add_(0.1)
+        isp.colour.matrices.mul_(torch.tensor([1.0, 1.2, 0.9])[:, None])
+        isp.colour.neutral.add_(0.3)
+    spoilt = mean_psnr(isp, drawn, as_shot=True)
+    measure_lights(isp, drawn)
+    assert spoilt < before - 10.0
+    assert mean_psnr(isp, drawn, as_shot=True) > spoilt + 8.0
 
 
 def test_it_ends_a_fit_that_asks_for_it_and_one_of_many_frames(frames: list[Pair]) -> None:
