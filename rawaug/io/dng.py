@@ -4,12 +4,12 @@ r"""Mosaics and linear RGB out, as DNG: ``d = round(y (white - black) + black)``
 under D65, ``X = diag(1 / daylight) M^-1 S^-1``, from the frame's ``color_matrix`` M (white-balanced camera to linear
 sRGB) and S, which takes linear sRGB to XYZ: the inverse of what :func:`rawaug.io.read_raw` does.
 
-A rewritten DNG keeps camera, colour, lens corrections, EXIF, GPS and XMP of its source. Left out is what describes the
-old pixels (their layout, levels, digests, previews, noise profile) and what points into the old file (maker notes). The
-EXIF and GPS directories are copied value by value in their binary form.
+A rewritten DNG keeps camera, colour, lens corrections, EXIF, GPS, XMP and previews of its source
+(:mod:`rawaug.io.carried`). The mosaic stands in the first directory, the previews in its sub-directories.
 
 Pixels are compressed as lossless JPEG, the difference to the left neighbour of the same colour in Huffman's code, to
-about half (14 bits) or a third (10 bits) of their size. (LibRaw reads no integers compressed by deflate.)
+about half (14 bits) or a third (10 bits) of their size. (LibRaw reads no integers compressed by deflate.) Their MD5 is
+written as well, so that a damaged file can be told.
 Source: DNG specification 1.4, chapters 3 to 6; TIFF 6.0, section 2; ITU-T T.81, annex H.
 """
 
@@ -22,7 +22,7 @@ from contextlib import nullcontext
 from itertools import product
 from os import SEEK_END
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -31,32 +31,57 @@ from torch import Tensor
 from rawaug.bayer import pattern, plane_indices
 from rawaug.errors import extra
 from rawaug.files import replacing
+from rawaug.io.carried import (
+    ASCII,
+    BYTE,
+    DOUBLE,
+    INTEROPERABILITY,
+    LONG,
+    RATIONAL,
+    SHORT,
+    SRATIONAL,
+    SUB_DIRECTORIES,
+    UNDEFINED,
+    Carried,
+    Entry,
+    Preview,
+    Tags,
+    read_carried,
+)
+from rawaug.io.damage import tiled_digest
 from rawaug.io.gain_map import GainMap, of_planes, opcode_list
-from rawaug.io.raw import XYZ_FROM_SRGB, RawFrame
+from rawaug.io.raw import MONOCHROME, XYZ_FROM_SRGB, RawFrame
 from rawaug.io.tiff import (
-    ACTIVE_AREA,
     CFA_PHOTOMETRIC,
     DNG_VERSION,
     LINEAR_PHOTOMETRIC,
     OPCODE_LIST_2,
     OPCODE_LIST_3,
-    all_pages,
-    main_mosaic,
-    opened_tiff,
     tag_damage,
 )
 from rawaug.version import __version__
 
-BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 7, 10, 12
-_BEYOND_16_BITS = 65535.5
 LINEAR_WHITE = 65535
 """Digital number of white in a linear DNG, whose black is 0."""
+
+_BEYOND_16_BITS = 65535.5
 _LARGEST = 2.0**31 - 2
 _LARGEST_ISO = 65535
-_UNIQUE_CAMERA_MODEL = 50708
 _D65 = 21
+_GREY = 1
 _EXIF_ORIENTATIONS = {0: 1, 1: 2, 3: 3, 2: 4, 4: 5, 6: 6, 7: 7, 5: 8}
 """By LibRaw's flip."""
+
+_SUBFILE_TYPE, _ORIENTATION, _PHOTOMETRIC, _SUB_IFDS = 254, 274, 262, 330
+_UNIQUE_CAMERA_MODEL = 50708
+_CROP_ORIGIN, _CROP_SIZE = 50719, 50720
+_COLOR_MATRIX, _AS_SHOT_NEUTRAL, _ILLUMINANT = 50721, 50728, 50778
+_NOISE_PROFILE, _NEW_RAW_DIGEST = 51041, 51111
+_OF_MOSAICS = (50710, 50733, 50734, 50737, 50738, 51008, OPCODE_LIST_2)
+"""Green split, Bayer's sharpness, antialias strength, and opcodes of what is before demosaicing."""
+
+_PADDING = 2
+"""Sites around the default crop, which Adobe's programs want for demosaicing."""
 
 
 def write_dng(
@@ -73,7 +98,7 @@ def write_dng(
         frame: its mosaic is rounded to digital numbers by its own levels; orientation, colour, noise profile, exposure
             and gain maps are written as tags; ``iso`` and ``exposure`` too, unless the source has EXIF.
         source: the RAW file that the frame was read from: its other metadata (a DNG's profiles, opcodes and crop;
-            EXIF, GPS and XMP of any TIFF) is kept.
+            EXIF, GPS and XMP of any TIFF) and its previews are kept.
         baseline_exposure: stops by which a RAW developer should brighten; a DNG source's own value takes precedence.
         rgb: linear camera RGB ``(3, H, W)`` to write in place of the mosaic, as a linear DNG.
 
@@ -86,49 +111,82 @@ def write_dng(
     path = Path(path)
     _require_colour(frame, path)
     numbers = digital_numbers(frame, path) if rgb is None else linear_numbers(frame, rgb, path)
-    size = numbers.shape[0], numbers.shape[1]
-    carried = read_carried_tags(Path(source), size) if source is not None else CarriedTags("<", {}, {})
-    # write an Exif directory if the source has none
-    directories = {"ExifTag": _exif(frame, carried.byte_order), **carried.directories}
+
+    carried = Carried()
+    if source is not None:
+        carried = read_carried(Path(source), (numbers.shape[0], numbers.shape[1]))
+
+    directories = dict(carried.directories)
+    if "ExifTag" not in directories:
+        directories["ExifTag"] = _exif(frame, carried.byte_order)
     directories = {name: entries for name, entries in directories.items() if entries}
-    own = _camera(frame) if DNG_VERSION in carried.tags else _camera(frame) | _color(frame, baseline_exposure)
-    tags = own | carried.tags | {254: (LONG, 1, 0), 274: (SHORT, 1, _EXIF_ORIENTATIONS[frame.orientation])}
-    if rgb is None:
-        tags |= _tags_of_the_mosaic(frame)
-    else:
-        tags = {code: tag for code, tag in tags.items() if code not in _OF_MOSAICS} | _tags_of_full_colour(frame)
+
+    tags = _tags(frame, numbers, carried, baseline_exposure)
     extra_tags: list[tuple[Any, ...]] = [(code, *tag, True) for code, tag in sorted(tags.items())]
     extra_tags += [(name, LONG, 1, 0, True) for name in directories]
+
     with replacing(path) as partial:
         with tag_damage(Path(source)) if source is not None else nullcontext():
-            _write(partial, numbers, carried.byte_order, extra_tags)
-        for name, entries in directories.items():
-            append_directory(partial, name, entries)
+            _write_pixels(partial, numbers, frame.cfa, carried, extra_tags)
+        _append_directories(partial, directories, carried)
 
 
-def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[tuple[Any, ...]]) -> None:
+def _tags(frame: RawFrame, numbers: np.ndarray, carried: Carried, baseline_exposure: float) -> Tags:
+    tags = _camera(frame)
+    if DNG_VERSION not in carried.tags:
+        tags |= _color(frame, baseline_exposure)
+    tags |= carried.tags
+    tags[_SUBFILE_TYPE] = (LONG, 1, 0)
+    tags[_ORIENTATION] = (SHORT, 1, _EXIF_ORIENTATIONS[frame.orientation])
+
+    height, width, *colours = numbers.shape
+    if _CROP_SIZE not in tags and min(height, width) > 4 * _PADDING:
+        tags[_CROP_ORIGIN] = (LONG, 2, (_PADDING, _PADDING))
+        tags[_CROP_SIZE] = (LONG, 2, (width - 2 * _PADDING, height - 2 * _PADDING))
+
+    if not colours:
+        tags[_NEW_RAW_DIGEST] = (BYTE, 16, tiled_digest(numbers))
+        if frame.cfa != MONOCHROME:
+            return tags | _of_mosaic(frame)
+
+    for code in _OF_MOSAICS:
+        tags.pop(code, None)
+    if colours:
+        return tags | _of_full_colour(frame)
+    return tags | _of_one_plane(frame)
+
+
+def _write_pixels(path: Path, numbers: np.ndarray, cfa: str, carried: Carried, tags: Sequence[tuple[Any, ...]]) -> None:
     with extra("raw"):
         import imagecodecs
         import tifffile
 
     height, width, *colours = numbers.shape
-    # even and odd columns of a mosaic are components: their colours differ
-    columns = np.ascontiguousarray(numbers) if colours else numbers.reshape(height, width // 2, 2)
-    tifffile.imwrite(
-        path,
-        iter([imagecodecs.jpeg8_encode(columns, lossless=True, predictor=1, bitspersample=16)]),
-        shape=numbers.shape,
-        dtype=numbers.dtype,
-        bitspersample=16,
-        compression="jpeg",
-        rowsperstrip=height,
-        byteorder="<" if byte_order == "<" else ">",
-        planarconfig="contig" if colours else None,
-        photometric=LINEAR_PHOTOMETRIC if colours else CFA_PHOTOMETRIC,
-        extratags=tags,
-        software=f"rawaug {__version__}",
-        metadata=None,
-    )
+    if colours:
+        columns = np.ascontiguousarray(numbers)
+        photometric, planes = LINEAR_PHOTOMETRIC, "contig"
+    else:
+        # even and odd columns of a mosaic are components: their colours differ
+        columns = numbers.reshape(height, width // 2, 2)
+        photometric = _GREY if cfa == MONOCHROME else CFA_PHOTOMETRIC
+        planes = None
+
+    stream = imagecodecs.jpeg8_encode(columns, lossless=True, predictor=1, bitspersample=16)
+    with tifffile.TiffWriter(path, byteorder="<" if carried.byte_order == "<" else ">") as tiff:
+        tiff.write(
+            iter([stream]),
+            shape=numbers.shape,
+            dtype=numbers.dtype,
+            bitspersample=16,
+            compression="jpeg",
+            rowsperstrip=height,
+            planarconfig=planes,
+            photometric=photometric,
+            extratags=tags,
+            subifds=len(carried.previews) or None,
+            software=f"rawaug {__version__}",
+            metadata=None,
+        )
 
 
 def _require_colour(frame: RawFrame, path: Path) -> None:
@@ -141,6 +199,9 @@ def _require_colour(frame: RawFrame, path: Path) -> None:
         raise ValueError(f"{path}: orientation must be a LibRaw flip from 0 to 7, got {frame.orientation}")
 
 
+# -- digital numbers ---------------------------------------------------------------------------------------------------
+
+
 def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
     """The mosaic as uint16 ``(H, W)``."""
     height, width = frame.mosaic.shape[-2:]
@@ -148,17 +209,28 @@ def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
         raise ValueError(f"{path}: the mosaic must be (1, H, W) with even sides, got {tuple(frame.mosaic.shape)}")
     if not 0 <= min(frame.black) <= max(frame.black) < frame.white < _BEYOND_16_BITS:
         raise ValueError(f"{path}: levels must be 0 <= black < white <= 65535, got {frame.black} and {frame.white}")
+
     numbers = np.empty((height, width), np.uint16)
-    cell = plane_indices(frame.cfa)
-    for i, j in product(range(len(cell)), repeat=2):
-        black, site = frame.black[cell[i, j]], (slice(i, None, len(cell)), slice(j, None, len(cell)))
+    cell = cell_of_planes(frame.cfa)
+    size = len(cell)
+    for i, j in product(range(size), repeat=2):
+        black = frame.black[cell[i, j]]
+        site = (slice(i, None, size), slice(j, None, size))
         plane = frame.mosaic[0][site].double().mul_(frame.white - black).add_(black).round_()
+
         low, high = (extreme.item() for extreme in torch.aminmax(plane))
         if not (low >= 0 and high < _BEYOND_16_BITS):
             need = f"digital numbers from {low:g} to {high:g} at black {black:g}, white {frame.white:g}"
             raise ValueError(f"{path}: 16 bits cannot hold {need}; raise the black level, or clip the mosaic")
         numbers[site] = plane.numpy().astype(np.uint16)
     return numbers
+
+
+def cell_of_planes(cfa: str) -> Tensor:
+    """Indices into a frame's ``black`` of the sites of a pattern's cell, ``(n, n)``."""
+    if cfa == MONOCHROME:
+        return torch.zeros(1, 1, dtype=torch.long)
+    return plane_indices(cfa)
 
 
 def linear_numbers(frame: RawFrame, rgb: Tensor, path: Path) -> np.ndarray:
@@ -169,57 +241,83 @@ def linear_numbers(frame: RawFrame, rgb: Tensor, path: Path) -> np.ndarray:
     return (rgb.permute(1, 2, 0).clamp(0, 1) * LINEAR_WHITE).round().numpy().astype(np.uint16)
 
 
+# -- tags --------------------------------------------------------------------------------------------------------------
+
+
 def _camera(frame: RawFrame) -> Tags:
     make, _, model = frame.camera.partition(" ")
     names = {271: make, 272: model or make, _UNIQUE_CAMERA_MODEL: frame.camera}
-    # tifffile takes text of 7 bits; DNG has UTF-8 in its place
-    return {code: (ASCII, 0, name if name.isascii() else name.encode()) for code, name in names.items()}
+    tags: Tags = {}
+    for code, name in names.items():
+        # tifffile takes text of 7 bits; DNG has UTF-8 in its place
+        tags[code] = (ASCII, 0, name if name.isascii() else name.encode())
+    return tags
 
 
 def _color(frame: RawFrame, baseline_exposure: float) -> Tags:
     """Tags that are only written if the source is not a DNG."""
+    needed = 3 if frame.gain_maps else 1
     tags: Tags = {
         DNG_VERSION: (BYTE, 4, bytes((1, 4, 0, 0))),
-        50707: (BYTE, 4, bytes((1, 3 if frame.gain_maps else 1, 0, 0))),
-        50721: (SRATIONAL, 9, _rationals(xyz_to_camera(frame).ravel())),
-        50728: (RATIONAL, 3, _rationals([1 / gain for gain in frame.white_balance])),
+        50707: (BYTE, 4, bytes((1, needed, 0, 0))),
         50730: (SRATIONAL, 1, _rationals([baseline_exposure])),
-        50778: (SHORT, 1, _D65),
         **_opcodes(OPCODE_LIST_2, [m for m in frame.gain_maps if m.on_mosaic]),
         **_opcodes(OPCODE_LIST_3, [m for m in frame.gain_maps if not m.on_mosaic]),
     }
-    return tags | {306: (ASCII, 0, frame.exposure.date)} if frame.exposure.date else tags
+    if frame.cfa != MONOCHROME:
+        tags[_COLOR_MATRIX] = (SRATIONAL, 9, _rationals(xyz_to_camera(frame).ravel()))
+        tags[_AS_SHOT_NEUTRAL] = (RATIONAL, 3, _rationals([1 / gain for gain in frame.white_balance]))
+        tags[_ILLUMINANT] = (SHORT, 1, _D65)
+    if frame.exposure.date:
+        tags[306] = (ASCII, 0, frame.exposure.date)
+    return tags
 
 
 def _opcodes(code: int, maps: Sequence[GainMap]) -> Tags:
+    if not maps:
+        return {}
     opcodes = opcode_list(maps)
-    return {code: (UNDEFINED, len(opcodes), opcodes)} if maps else {}
+    return {code: (UNDEFINED, len(opcodes), opcodes)}
 
 
-def _tags_of_the_mosaic(frame: RawFrame) -> Tags:
-    known, kinds = pattern(frame.cfa), plane_indices(frame.cfa).flatten().tolist()
+def _of_mosaic(frame: RawFrame) -> Tags:
+    known = pattern(frame.cfa)
     size = known.period
-    repeats = size if size == 2 or len(set(frame.black)) > 1 else 1  # LibRaw states one level of X-Trans, if it is one
+    kinds = plane_indices(frame.cfa).flatten().tolist()
+    # LibRaw states one level of X-Trans, if it is one
+    repeats = size if size == 2 or len(set(frame.black)) > 1 else 1
     levels = [frame.black[kind] for kind in kinds[: repeats**2]]
-    tags: Tags = {
+    return {
         33421: (SHORT, 2, (size, size)),
         33422: (BYTE, size**2, bytes("RGB".index(colour) for colour in "".join(known.rows))),
         50710: (BYTE, 3, bytes((0, 1, 2))),
         50711: (SHORT, 1, 1),
+        **_levels(frame, repeats, levels),
+    }
+
+
+def _of_one_plane(frame: RawFrame) -> Tags:
+    """The levels of a monochrome picture."""
+    return _levels(frame, 1, [frame.black[0]])
+
+
+def _levels(frame: RawFrame, repeats: int, black: Sequence[float]) -> Tags:
+    tags: Tags = {
         50713: (SHORT, 2, (repeats, repeats)),
-        50714: (RATIONAL, repeats**2, _rationals(levels, 2**14)),
+        50714: (RATIONAL, len(black), _rationals(black, 2**14)),
         50717: (LONG, 1, round(frame.white)),
     }
-    return tags | {51041: (DOUBLE, 2, frame.noise_profile)} if frame.noise_profile is not None else tags
+    if frame.noise_profile is not None:
+        tags[_NOISE_PROFILE] = (DOUBLE, 2, frame.noise_profile)
+    return tags
 
 
-_OF_MOSAICS = (50710, 50733, 50734, 50737, 50738, 51008, OPCODE_LIST_2)
-"""Green split, Bayer's sharpness, antialias strength, and opcodes of what is before demosaicing."""
-
-
-def _tags_of_full_colour(frame: RawFrame) -> Tags:
+def _of_full_colour(frame: RawFrame) -> Tags:
     """Levels by colour; shading maps of the mosaic's sites become maps of the planes."""
-    maps = [m for found in frame.gain_maps if found.on_mosaic for m in of_planes(found, frame.cfa)]
+    maps = []
+    for gain_map in frame.gain_maps:
+        if gain_map.on_mosaic:
+            maps += of_planes(gain_map, frame.cfa)
     # LibRaw takes a black level of three colours for that of four, the last one 0, and develops 3 % too dark
     return {
         50713: (SHORT, 2, (1, 1)),
@@ -238,20 +336,22 @@ def xyz_to_camera(frame: RawFrame) -> np.ndarray:
 def _exif(frame: RawFrame, byte_order: str) -> list[Entry]:
     """ISO and exposure as an EXIF directory, with the version of EXIF that it follows; empty where nothing is known."""
     shot = frame.exposure
-    numbers = {33434: shot.seconds, 33437: shot.f_number, 37386: shot.focal_length}
-    entries = [
-        Entry(code, RATIONAL, 1, struct.pack(byte_order + "2I", *_rationals([value])))
-        for code, value in numbers.items()
-        if value is not None
-    ]
+    entries = []
+    for code, value in ((33434, shot.seconds), (33437, shot.f_number), (37386, shot.focal_length)):
+        if value is not None:
+            entries.append(Entry(code, RATIONAL, 1, struct.pack(byte_order + "2I", *_rationals([value]))))
+
     if frame.iso is not None:
         entries.append(Entry(34855, SHORT, 1, struct.pack(byte_order + "H", min(round(frame.iso), _LARGEST_ISO))))
         if frame.iso > _LARGEST_ISO:  # EXIF 2.3: the sensitivity is then the recommended exposure index
             entries.append(Entry(34864, SHORT, 1, struct.pack(byte_order + "H", 2)))
             entries.append(Entry(34866, LONG, 1, struct.pack(byte_order + "I", round(frame.iso))))
+
     if shot.date is not None:
         entries.append(Entry(36867, ASCII, len(shot.date) + 1, shot.date.encode() + b"\0"))
-    return [*entries, Entry(36864, UNDEFINED, 4, b"0230")] if entries else []
+    if entries:
+        entries.append(Entry(36864, UNDEFINED, 4, b"0230"))
+    return entries
 
 
 def _rationals(values: Iterable[float], denominator: int = 10**6) -> tuple[int, ...]:
@@ -265,129 +365,92 @@ def _rationals(values: Iterable[float], denominator: int = 10**6) -> tuple[int, 
     return tuple(numbers)
 
 
-_SUB_DIRECTORIES = {"ExifTag": 34665, "GPSTag": 34853}
-_POINTERS = (37500, 40965)  # maker note, interoperability directory
-_SIZES = (0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8)
-"""Bytes of a value of the TIFF types 0 to 12."""
+# -- directories -------------------------------------------------------------------------------------------------------
+
+
+def _append_directories(path: Path, directories: dict[str, list[Entry]], carried: Carried) -> None:
+    """Write sub-directories and previews behind the pixels, and have the first directory point at them."""
+    with path.open("r+b") as file:
+        order = "<" if file.read(2) == b"II" else ">"
+        for name, entries in directories.items():
+            if name == "ExifTag" and carried.interoperability:
+                place = _append(file, order, carried.interoperability)
+                entries = [*entries, Entry(INTEROPERABILITY, LONG, 1, struct.pack(order + "I", place))]
+            place = _append(file, order, entries)
+            _point(file, order, SUB_DIRECTORIES[name], [place])
+
+        if carried.previews:
+            places = [_append_preview(file, order, preview) for preview in carried.previews]
+            _point(file, order, _SUB_IFDS, places)
+
+        first = _entry(file, order, _PHOTOMETRIC)
+        if _unpack(file, order + "H", first + _VALUE) == (_GREY,):  # tifffile writes linear RAW of three planes alone
+            file.seek(first + _VALUE)
+            file.write(struct.pack(order + "H", LINEAR_PHOTOMETRIC))
+
+
+def _append(file: BinaryIO, order: str, entries: Sequence[Entry]) -> int:
+    """Write a directory at the end of a file, with the values that do not fit into it behind it; its place."""
+    start = _even_end(file)
+    beyond = start + 2 + 12 * len(entries) + 4
+    table, values = struct.pack(order + "H", len(entries)), b""
+    for entry in sorted(entries, key=lambda entry: entry.code):
+        table += struct.pack(order + "HHI", entry.code, entry.dtype, entry.values)
+        if len(entry.data) <= 4:
+            table += entry.data.ljust(4, b"\0")
+        else:
+            table += struct.pack(order + "I", beyond + len(values))
+            values += entry.data + bytes(len(entry.data) % 2)
+    file.seek(start)
+    file.write(table + bytes(4) + values)
+    return start
+
+
+def _append_preview(file: BinaryIO, order: str, preview: Preview) -> int:
+    places = []
+    for segment in preview.segments:
+        places.append(_even_end(file))
+        file.seek(places[-1])
+        file.write(segment)
+
+    entries = [entry for entry in preview.entries if entry.code != _SUBFILE_TYPE]
+    entries.append(Entry(_SUBFILE_TYPE, LONG, 1, struct.pack(order + "I", 1)))
+    lengths = [len(segment) for segment in preview.segments]
+    for code, numbers in zip(preview.codes, (places, lengths), strict=True):
+        entries.append(Entry(code, LONG, len(numbers), struct.pack(f"{order}{len(numbers)}I", *numbers)))
+    return _append(file, order, entries)
+
+
+def _even_end(file: BinaryIO) -> int:
+    end = file.seek(0, SEEK_END)
+    if end % 2:
+        file.write(b"\0")
+    return end + end % 2
+
+
+def _point(file: BinaryIO, order: str, code: int, places: Sequence[int]) -> None:
+    """Write the places of directories into a tag of the first directory, which has room for them."""
+    at = _entry(file, order, code) + _VALUE
+    if len(places) > 1:
+        (at,) = _unpack(file, order + "I", at)
+    file.seek(at)
+    file.write(struct.pack(f"{order}{len(places)}I", *places))
+
+
 _VALUE = 8
 """Offset within an entry of its value, or of the pointer to it."""
 
-_OF_ANY_TIFF = (270, 271, 272, 306, 315, 700, 33432)
-_LAYOUT = (
-    *(*range(254, 260), 262, 266, 273, 277, 278, 279, 282, 283, 284, 296, 297, 317),
-    *(*range(320, 326), 330, 338, 339),
-)
-_PREVIEW = (*range(512, 522), *range(529, 533), *range(50966, 50972))
-_LEVELS = (33421, 33422, 50711, 50712, *range(50713, 50718), 50829, 50830, 51041)
-_DIGESTS = (50781, 50828, 50972, 50973, 51111, 51114)
-_REPLACED = (274, 305, 347, 37500, *_SUB_DIRECTORIES.values())
-_DROPPED = frozenset((*_LAYOUT, *_PREVIEW, *_LEVELS, *_DIGESTS, *_REPLACED))
-_CROP = (50718, 50719, 50720, 51125)
 
-Tags = dict[int, tuple[int, int, Any]]
-"""Type, count and value by code; tifffile counts text itself."""
-
-
-class Entry(NamedTuple):
-    """One value of a directory, its bytes in the file's order."""
-
-    code: int
-    dtype: int
-    values: int
-    data: bytes
-
-
-class CarriedTags(NamedTuple):
-    """Of a source: its byte order (``<`` or ``>``), the tags of the picture, and its sub-directories by name."""
-
-    byte_order: str
-    tags: Tags
-    directories: dict[str, list[Entry]]
-
-
-def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
-    """What is kept of ``path`` for a mosaic of ``size`` (height, width); nothing if it is not a TIFF."""
-    # a DNG gives all tags of its first directory and of the mosaic's; the private tags of other TIFFs (NEF, CR2, ARW)
-    # mean something else, so that they give their description, author, XMP, EXIF and GPS
-    with extra("raw"):
-        import tifffile
-
-    try:
-        with opened_tiff(path) as tiff, path.open("rb") as file:
-            pages = all_pages(tiff)
-            first = pages[0].tags
-            dng = any(DNG_VERSION in page.tags for page in pages)
-            mosaics = [mosaic] if dng and (mosaic := main_mosaic(pages)) is not None else []
-            tags: Tags = {}
-            for page in (pages[0], *mosaics):
-                kept = [tag for tag in page.tags if (tag.code not in _DROPPED if dng else tag.code in _OF_ANY_TIFF)]
-                tags |= {tag.code: (int(tag.dtype), tag.count, _value(tag)) for tag in kept}
-            if mosaics and not _fills_active_area(mosaics[0], size):
-                tags = {code: tag for code, tag in tags.items() if code not in _CROP}
-            order = tiff.byteorder
-            pointers = {name: first[code].offset + _VALUE for name, code in _SUB_DIRECTORIES.items() if code in first}
-            return CarriedTags(order, tags, {name: _read(file, order, at) for name, at in pointers.items()})
-    except tifffile.TiffFileError:
-        return CarriedTags("<", {}, {})
-
-
-def _value(tag: Any) -> Any:
-    """Text as tifffile writes it: 7 bits; other texts as the bytes that they are in UTF-8."""
-    if tag.dtype == ASCII and isinstance(tag.value, str) and not tag.value.isascii():
-        return tag.value.encode() + b"\0"
-    return tag.value
-
-
-def _fills_active_area(mosaic: Any, size: tuple[int, int]) -> bool:
-    area = mosaic.tags.valueof(ACTIVE_AREA) or (0, 0, mosaic.imagelength, mosaic.imagewidth)
-    return bool((area[2] - area[0], area[3] - area[1]) == size)
-
-
-def _read(file: BinaryIO, order: str, pointer: int) -> list[Entry]:
-    """The directory whose offset is stored at ``pointer``."""
-    (start,) = _unpack(file, order + "I", pointer)
-    (count,) = _unpack(file, order + "H", start)
-    entries, left = [], file.seek(0, SEEK_END)
-    for place in range(start + 2, start + 2 + 12 * count, 12):
-        code, dtype, values = _unpack(file, order + "HHI", place)
-        if code in _POINTERS or not 0 < dtype < len(_SIZES):
-            continue
-        size = _SIZES[dtype] * values
-        left -= size
-        if left < 0:
-            raise ValueError(f"values of tag {code} and others are larger than the file")
-        file.seek(place + 8 if size <= 4 else _unpack(file, order + "I", place + 8)[0])
-        entries.append(Entry(code, dtype, values, file.read(size)))
-    return entries
+def _entry(file: BinaryIO, order: str, code: int) -> int:
+    """Where the entry of tag ``code`` stands in the first directory."""
+    (first,) = _unpack(file, order + "I", 4)
+    (count,) = _unpack(file, order + "H", first)
+    for place in range(first + 2, first + 2 + 12 * count, 12):
+        if _unpack(file, order + "H", place) == (code,):
+            return place
+    raise ValueError(f"tag {code} is not in the first directory")
 
 
 def _unpack(file: BinaryIO, form: str, place: int) -> tuple[Any, ...]:
     file.seek(place)
     return struct.unpack(form, file.read(struct.calcsize(form)))
-
-
-def append_directory(path: Path, name: str, entries: list[Entry]) -> None:
-    """Write a sub-directory behind a TIFF, in whose first directory the tag ``name`` comes to point at it."""
-    with path.open("r+b") as file:
-        order = "<" if file.read(2) == b"II" else ">"
-        end = file.seek(0, SEEK_END)
-        start = end + end % 2
-        beyond = start + 2 + 12 * len(entries) + 4
-        table, values = struct.pack(order + "H", len(entries)), b""
-        for entry in sorted(entries, key=lambda entry: entry.code):
-            inside = len(entry.data) <= 4
-            place = entry.data.ljust(4, b"\0") if inside else struct.pack(order + "I", beyond + len(values))
-            table += struct.pack(order + "HHI", entry.code, entry.dtype, entry.values) + place
-            values += b"" if inside else entry.data + bytes(len(entry.data) % 2)
-        file.seek(start)
-        file.write(table + bytes(4) + values)
-        file.seek(_pointer(file, order, _SUB_DIRECTORIES[name]))
-        file.write(struct.pack(order + "I", start))
-
-
-def _pointer(file: BinaryIO, order: str, code: int) -> int:
-    """Offset of the value of tag ``code`` in the first directory."""
-    (first,) = _unpack(file, order + "I", 4)
-    (count,) = _unpack(file, order + "H", first)
-    places = range(first + 2, first + 2 + 12 * count, 12)
-    return next(place + _VALUE for place in places if _unpack(file, order + "H", place) == (code,))

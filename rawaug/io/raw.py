@@ -34,7 +34,7 @@ from rawaug.errors import extra
 from rawaug.io.ciff import read_shot_info
 from rawaug.io.content import RAW_EXTENSIONS as RAW_EXTENSIONS
 from rawaug.io.gain_map import GainMap
-from rawaug.io.libraw import KNOWN_PATTERNS, is_stack, opened_raw
+from rawaug.io.libraw import KNOWN_PATTERNS, caught_stderr, is_stack, opened_raw
 from rawaug.io.tiff import MAKE, MODEL, TiffTags
 
 MONOCHROME = "MONOCHROME"
@@ -192,7 +192,8 @@ def read_preview(path: str | Path) -> bytes | np.ndarray | None:
 
     with opened_raw(Path(path), unpack=False) as (raw, _):
         try:
-            preview = raw.extract_thumb()
+            with caught_stderr():
+                preview = raw.extract_thumb()
         except rawpy.LibRawError:
             return None
         data = preview.data

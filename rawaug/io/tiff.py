@@ -205,8 +205,13 @@ def _pages(pages: Any) -> Iterator[Any]:
 
 
 def main_mosaic(pages: list[Any]) -> Any:
-    """The page that LibRaw reads: of several mosaics, as phones write them, the largest; None without any."""
+    """The page that LibRaw reads: of several mosaics, as phones write them, the largest; None without any.
+
+    The one plane of a monochrome sensor counts as a mosaic.
+    """
     mosaics = [page for page in pages if page.photometric == CFA_PHOTOMETRIC]
+    if not mosaics:
+        mosaics = [page for page in pages if page.photometric == LINEAR_PHOTOMETRIC and page.samplesperpixel == 1]
     return max(mosaics, key=lambda page: page.imagelength * page.imagewidth, default=None)
 
 

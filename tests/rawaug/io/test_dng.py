@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import imagecodecs
 import numpy as np
 import pytest
 import rawpy
@@ -16,9 +17,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from rawaug.bayer import CFA, mosaic, pattern, plane_indices
-from rawaug.io import GainMap, RawFrame, read_raw, read_raw_and_develop, write_dng
+from rawaug.io import GainMap, RawFrame, develop, dng, read_raw, read_raw_and_develop, write_dng
+from rawaug.io.carried import read_carried
 from rawaug.io.gain_map import parse_gain_maps
-from rawaug.io.raw import Exposure
+from rawaug.io.raw import MONOCHROME, Exposure
 
 MATRIX = torch.tensor([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.6, 1.6]])
 WHITE_BALANCE = (2.1, 1.0, 1.4)
@@ -172,7 +174,7 @@ def test_metadata_of_a_source_are_kept(tmp_path: Path, bayer_dng: Callable[..., 
     with tifffile.TiffFile(tmp_path / "a.dng") as tiff:
         tags = tiff.pages.first.tags
         assert tags["ProfileName"].value == "Vivid" and tags.valueof(50940) == (0.0, 0.0, 1.0, 1.0)
-        assert 51111 not in tags and tags["Orientation"].value == 6
+        assert tags[51111].value != bytes(16) and tags["Orientation"].value == 6
         assert np.array_equal(tags["ColorMatrix1"].value[::2], 10000 * np.eye(3).ravel())
     back = read_raw(tmp_path / "a.dng")
     assert back.mosaic.max() < 0.51 and back.orientation == frame.orientation
@@ -280,3 +282,131 @@ def test_libraw_demosaics_xtrans_in_its_colours(tmp_path: Path) -> None:
     with rawpy.imread(str(tmp_path / "a.dng")) as file:
         rgb = file.postprocess(user_wb=[1, 1, 1, 1], adjust_maximum_thr=0, **settings) / 65535
     assert np.abs(rgb[6:-6, 6:-6] - [0.5, 0.3, 0.2]).max() < 2e-3
+
+
+def thumbnail(shade: int) -> np.ndarray:
+    return np.full((12, 16, 3), shade, np.uint8)
+
+
+def with_previews(path: Path, numbers: np.ndarray, bayer_dng: Callable[..., Path]) -> Path:
+    """A DNG as Adobe's converter writes it: a thumbnail first, then the mosaic, then a JPEG."""
+    whole = bayer_dng(path.with_name("mosaic.dng"), numbers)
+    with tifffile.TiffFile(whole) as file:
+        kept = {tag.code: (tag.code, int(tag.dtype), tag.count, tag.value, True) for tag in file.pages.first.tags}
+    of_camera = [kept[code] for code in (271, 272, 50706, 50708, 50721, 50728, 50778)]
+    of_mosaic = [kept[code] for code in (33421, 33422, 50714, 50717)]
+    jpeg = imagecodecs.jpeg8_encode(thumbnail(200).repeat(2, 0).repeat(2, 1), level=90)
+    with tifffile.TiffWriter(path) as file:
+        file.write(thumbnail(100), photometric="rgb", subifds=2, extratags=of_camera, metadata=None, subfiletype=1)
+        file.write(numbers, photometric=32803, extratags=of_mosaic, metadata=None)
+        shape = {"shape": (24, 32, 3), "dtype": np.uint8, "photometric": "ycbcr", "compression": "jpeg"}
+        file.write(iter([jpeg]), **shape, metadata=None, subfiletype=1, rowsperstrip=24)
+    return path
+
+
+@pytest.mark.parametrize("full_colour", [False, True])
+def test_the_previews_of_a_dng_are_kept(full_colour: bool, tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+    numbers = np.random.default_rng(0).integers(0, 4096, (64, 96)).astype(np.uint16)
+    source = with_previews(tmp_path / "source.dng", numbers, bayer_dng)
+    frame = read_raw(source)
+    rgb = torch.full((3, 64, 96), 0.5) if full_colour else None
+    write_dng(tmp_path / "a.dng", frame, source, rgb=rgb)
+    with tifffile.TiffFile(tmp_path / "a.dng") as file, tifffile.TiffFile(source) as before:
+        main, (small, large) = file.pages.first, file.pages.first.pages
+        assert main.shape[:2] == (64, 96) and main.tags[254].value == 0
+        assert (small.asarray() == thumbnail(100)).all() and small.tags[254].value == 1
+        jpegs = [tuple(page.dataoffsets + page.databytecounts) for page in (large, before.pages.first.pages[1])]
+    contents = [path.read_bytes() for path in (tmp_path / "a.dng", source)]
+    first, second = (content[at : at + size] for content, (at, size) in zip(contents, jpegs, strict=True))
+    assert first == second, "byte for byte"
+    with rawpy.imread(str(tmp_path / "a.dng")) as raw:
+        assert raw.extract_thumb().data[:2] == b"\xff\xd8"
+    if not full_colour:
+        assert torch.equal(read_raw(tmp_path / "a.dng").mosaic, frame.mosaic)
+
+
+def test_previews_that_are_not_in_the_file_are_left_out(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+    numbers = np.random.default_rng(0).integers(0, 4096, (64, 96)).astype(np.uint16)
+    source = with_previews(tmp_path / "source.dng", numbers, bayer_dng)
+    with tifffile.TiffFile(source, mode="r+") as file:
+        file.pages.first.pages[1].tags["StripByteCounts"].overwrite(10**8)
+    write_dng(tmp_path / "a.dng", read_raw(source), source)
+    with tifffile.TiffFile(tmp_path / "a.dng") as file:
+        assert len(file.pages.first.pages) == 1
+
+
+def test_the_preview_of_a_crw_is_kept_with_what_the_camera_did(tmp_path: Path, camera_files: Path) -> None:
+    source = camera_files / "raw/canon/s40_0101.crw"
+    write_dng(tmp_path / "a.dng", read_raw(source), source)
+    with tifffile.TiffFile(tmp_path / "a.dng") as file:
+        (preview,) = file.pages.first.pages
+        exif = file.pages.first.tags["ExifTag"].value
+        assert preview.shape == (480, 640, 3) and preview.asarray().std() > 20
+        assert exif["ExposureTime"] == (9702, 10**6) and exif["FNumber"][0] == pytest.approx(2.92e6, rel=1e-2)
+
+
+@pytest.mark.parametrize("safe", [False, True])
+def test_makers_notes_and_interoperability(safe: bool, tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+    numbers = np.full((32, 48), 700, np.uint16)
+    extra = [(50741, 3, 1, int(safe), True), ("ExifTag", 4, 1, 0, True)]
+    plain = bayer_dng(tmp_path / "plain.dng", numbers)
+    source = tmp_path / "source.dng"
+    with tifffile.TiffFile(plain) as file:
+        kept = [(tag.code, int(tag.dtype), tag.count, tag.value, True) for tag in file.pages.first.tags
+                if tag.code in (33421, 33422) or tag.code > 50000]  # fmt: skip
+    tifffile.imwrite(source, numbers, photometric=32803, metadata=None, extratags=[*kept, *extra])
+    with source.open("r+b") as file:
+        inner = dng._append(file, "<", [dng.Entry(1, 2, 4, b"R98\0"), dng.Entry(2, 7, 4, b"0100")])
+        entries = [
+            dng.Entry(37500, 7, 12, b"maker's note"),
+            dng.Entry(40965, 4, 1, struct.pack("<I", inner)),
+            dng.Entry(42036, 2, 8, b"EF 50mm\0"),
+        ]
+        dng._point(file, "<", 34665, [dng._append(file, "<", entries)])
+    write_dng(tmp_path / "a.dng", read_raw(source), source)
+    with tifffile.TiffFile(tmp_path / "a.dng") as tiff:
+        exif = tiff.pages.first.tags["ExifTag"].value
+    assert exif["LensModel"] == "EF 50mm"
+    interoperability = read_carried(tmp_path / "a.dng", (32, 48)).interoperability
+    assert [entry.data for entry in interoperability] == [b"R98\0", b"0100"]
+    assert ("MakerNote" in exif) == safe
+
+
+def test_a_default_crop_leaves_room_for_demosaicing(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+    numbers = np.full((32, 48), 700, np.uint16)
+    write_dng(tmp_path / "a.dng", read_raw(bayer_dng(tmp_path / "plain.dng", numbers)))
+    cropped = bayer_dng(
+        tmp_path / "cropped.dng", numbers, extra=[(50719, 3, 2, (4, 6), True), (50720, 3, 2, (40, 20), True)]
+    )
+    write_dng(tmp_path / "b.dng", read_raw(cropped), cropped)
+    for name, crop in (("a", ((2, 2), (44, 28))), ("b", ((4, 6), (40, 20)))):
+        with tifffile.TiffFile(tmp_path / f"{name}.dng") as file:
+            tags = file.pages.first.tags
+            assert (tags["DefaultCropOrigin"].value, tags["DefaultCropSize"].value) == crop
+
+
+def monochrome(path: Path, numbers: np.ndarray, filters: bool, bayer_dng: Callable[..., Path]) -> Path:
+    """A DNG of a sensor without colours: linear RAW of one plane, or a mosaic all of whose filters are alike."""
+    if filters:
+        return bayer_dng(path, numbers, "GGGG", black=(500,), white=16383)
+    bayer_dng(path, numbers, None, black=(500,), white=16383)
+    with tifffile.TiffFile(path, mode="r+") as file:
+        file.pages.first.tags["PhotometricInterpretation"].overwrite(34892)
+    return path
+
+
+@pytest.mark.parametrize("filters", [False, True])
+def test_monochrome_frames_go_there_and_back(filters: bool, tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+    numbers = np.random.default_rng(0).integers(0, 16384, (36, 46)).astype(np.uint16)
+    source = monochrome(tmp_path / "source.dng", numbers, filters, bayer_dng)
+    with pytest.raises(ValueError, match="monochrome"):
+        read_raw(source)
+    frame = read_raw(source, monochrome=True)
+    assert frame.cfa == MONOCHROME and frame.black == (500.0,) * 4
+    assert np.abs(frame.mosaic[0].numpy() - (numbers - 500.0) / (16383 - 500)).max() < 1e-6
+    write_dng(tmp_path / "a.dng", frame, source)
+    with tifffile.TiffFile(tmp_path / "a.dng") as file:
+        assert file.pages.first.photometric == 34892 and 33421 not in file.pages.first.tags
+    assert np.array_equal(numbers_in(tmp_path / "a.dng"), numbers)
+    assert torch.equal(read_raw(tmp_path / "a.dng", monochrome=True).mosaic, frame.mosaic)
+    assert develop(tmp_path / "a.dng").shape == (3, 36, 46)
