@@ -14,13 +14,14 @@ Source: https://github.com/hellopipu/PBRID, the winner of the RAW denoising chal
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.network import conv, pad_to_multiple
+from denoisers.network import pad_to_multiple
 
 STATES = 7
 """Channels of the state, the first of which is the estimate."""
@@ -77,7 +78,7 @@ class _Residual(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.res = nn.Sequential(conv(width, width, bias=False), nn.ReLU(), conv(width, width, bias=False))
+        self.res = nn.Sequential(_conv(width, width), nn.ReLU(), _conv(width, width))
 
     def forward(self, x: Tensor) -> Tensor:
         correction: Tensor = self.res(x)
@@ -89,16 +90,16 @@ class _UNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.m_head = conv(STATES + 1, WIDTHS[0], bias=False)
+        self.m_head = _conv(STATES + 1, WIDTHS[0])
 
-        for k, (wide, narrow) in enumerate(zip(WIDTHS, WIDTHS[1:], strict=False), start=1):
+        for k, (wide, narrow) in enumerate(pairwise(WIDTHS), start=1):
             down = nn.Conv2d(wide, narrow, 2, stride=2, bias=False)
             up = nn.ConvTranspose2d(narrow, wide, 2, stride=2, bias=False)
             self.add_module(f"m_down{k}", nn.Sequential(*_residuals(wide), down))
             self.add_module(f"m_up{k}", nn.Sequential(up, *_residuals(wide)))
 
         self.m_body = nn.Sequential(*_residuals(WIDTHS[-1]))
-        self.m_tail = conv(WIDTHS[0], STATES, bias=False)
+        self.m_tail = _conv(WIDTHS[0], STATES)
 
     def forward(self, x: Tensor) -> Tensor:
         scales = [self.m_head(x)]
@@ -117,3 +118,7 @@ class _UNet(nn.Module):
 
 def _residuals(width: int) -> list[nn.Module]:
     return [_Residual(width) for _ in range(BLOCKS)]
+
+
+def _conv(inputs: int, outputs: int) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)

@@ -53,8 +53,8 @@ def run(
     The noisy input, NonLocalMeans and the shipped denoisers of mosaics are always in the table.
 
     Args:
-        denoisers: names of shipped denoisers or filters, .safetensors files (also the published weights of PMRID and
-            BF-DnCNN), .onnx files, or package.module:function, called with noisy packed RAW and its variance.
+        denoisers: names of shipped denoisers or filters, .safetensors files (also the published weights of PMRID,
+            BF-DnCNN and PBRID), .onnx files, or package.module:function, called with noisy packed RAW and its variance.
         data: clean RAW frames: a folder, a file, or kind:path; of developed pictures cc15:DIR, polyu:DIR, sidd-srgb:DIR
             or pictures:DIR, for which the denoisers are rawaug-srgb, a .safetensors of pictures (FFDNet's weights too)
             or a filter, with @15 behind it if told a level of 15/255.

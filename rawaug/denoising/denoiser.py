@@ -25,6 +25,7 @@ from denoisers.classical import FILTERS, Stabilised
 from denoisers.files import find_denoiser, list_shipped
 from denoisers.mosaic import BayerAdapter, MosaicDRUNet, denoise_mosaic
 from denoisers.network import DENOISERS, PACKED
+from denoisers.pbrid import PBRID
 from rawaug import bayer
 from rawaug.bayer import CFA, crop_to_cfa, noise_variance
 from rawaug.denoising.foreign import AGAIN, STRIDE, BiasFreeDnCNN, OnnxNetwork, load_published
@@ -124,10 +125,10 @@ class RawDenoiser:
         """The denoiser that a name, a file or an object stands for. Nothing is imported by name.
 
         Args:
-            spec: the name of a shipped denoiser; a ``.safetensors`` of rawaug, of PMRID's authors or of BF-DnCNN; an
-                ``.onnx``; a classical filter by its name, or ``{"name": ..., "settings": {...}}``; a network
-                ``model(noisy, variance)`` or ``model(noisy)`` of packed RAW ``(B, 4, h, w)``; or a function of the
-                same arguments, which gets whole frames.
+            spec: the name of a shipped denoiser; a ``.safetensors`` of rawaug, or of PMRID, BF-DnCNN or PBRID as
+                published; an ``.onnx``; a classical filter by its name, or ``{"name": ..., "settings": {...}}``; a
+                network ``model(noisy, variance)`` or ``model(noisy)`` of packed RAW ``(B, 4, h, w)``; or a function of
+                the same arguments, which gets whole frames.
             device: auto, cpu, cuda, ...; where a network runs. Filters, functions and ONNX run on the CPU.
             precision: ``"auto"`` computes in bfloat16 where that is fast and costs the network less than 0.05 dB.
             changes: attributes in place of those found, such as ``name``, ``views``, ``strength``.
@@ -292,12 +293,14 @@ def _hashed(path: Path) -> dict[str, Any]:
 
 
 def _of_weights(path: Path) -> RawDenoiser:
-    """A denoiser of a file of rawaug's, PMRID's or BF-DnCNN's weights: the tensors say which."""
+    """A denoiser of a file of rawaug's, PMRID's, BF-DnCNN's or PBRID's weights: the tensors say which."""
     metadata, tensors = read_tensors(path, AGAIN)
     if "conv00" in tensors:
         return replace(_of_network("BF-DnCNN", BiasFreeDnCNN(tensors), {}), cfa=None)
     if "conv0.conv.weight" in tensors and metadata.get("format") != "rawaug":
-        return _of_network("PMRID, published weights", load_published("PMRID", path), {})
+        return _of_network("PMRID, published weights", load_published(denoisers.PMRID(), path), {})
+    if "rec_blocks.m_head.weight" in tensors:
+        return _of_network("PBRID, published weights", load_published(PBRID(), path), {})
     if "conv00.weight" in tensors or str(parse_object(metadata.get("config", "{}")).get("channels", PACKED)) == "3":
         raise ValueError(f"{path}: denoises developed pictures, not RAW; give it a .jpg, .png or .tif")
     if metadata.get("format") != "rawaug":
@@ -312,7 +315,7 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> RawDe
     network = network if of_any is None else BayerAdapter(of_any)
     reads = getattr(network, "reads_variance", None)
     reads = _takes_two(network.forward) if reads is None else reads
-    if not isinstance(network, (denoisers.Denoiser, BayerAdapter, OnnxNetwork, BiasFreeDnCNN)):
+    if not isinstance(network, (denoisers.Denoiser, BayerAdapter, OnnxNetwork, BiasFreeDnCNN, PBRID)):
         network = _Foreign(network, bool(reads))
     made = network.eval()
     upscale, own = getattr(made, "upscale", 1), CFA(info.get("cfa", "RGGB"))

@@ -1,4 +1,4 @@
-"""Networks of others: ONNX files, and PMRID and bias-free DnCNN with the weights that their authors published.
+"""Networks of others: ONNX files, and published networks with their authors' weights.
 
 ``rawaug export`` writes ONNX that states the CFA and the stride; any will do that takes noisy packed RAW
 ``(1, 4, h, w)``, and its variance or not. What anybody's file does wrong is one line that names it.
@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-import denoisers
 from denoisers.domains import fit_levels
 from rawaug.errors import extra
 from rawaug.files import parse_object, read_tensors
@@ -90,22 +89,25 @@ def feeds(names: Sequence[str], images: Sequence[Tensor]) -> dict[str, Any]:
 AGAIN = "download or convert it again"
 
 
-def load_published(name: str, path: str | Path) -> denoisers.Denoiser:
-    """A network with the weights of its authors, from a ``.safetensors`` file, in eval mode.
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def load_published(model: Network, path: str | Path) -> Network:
+    """Give a network the weights of its authors, from a ``.safetensors`` file, and put it in eval mode.
 
     Args:
-        name: of the network: PMRID, or FFDNet for colour, whose normalisations are folded into its convolutions.
+        model: PMRID, PBRID, or FFDNet for colour, whose normalisations are folded into its convolutions.
         path: of the file.
 
     Raises:
         ValueError: if the file is damaged or holds other weights.
     """
-    model = denoisers.build(name)
+    _, weights = read_tensors(path, AGAIN)
     try:
-        model.load_state_dict(read_tensors(path, AGAIN)[1])
+        model.load_state_dict(weights)
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
-        raise ValueError(f"{path} does not fit {name}'s network: {reason}") from None
+        raise ValueError(f"{path} does not fit {type(model).__name__}'s network: {reason}") from None
     return model.eval()
 
 

@@ -162,7 +162,7 @@ def _network(spec: str) -> tuple[str, nn.Module]:
     path = find_denoiser(spec)
     metadata, tensors = read_tensors(path, AGAIN)
     if "conv00.weight" in tensors and metadata.get("format") != "rawaug":
-        return "FFDNet, published weights", load_published("FFDNet", path)
+        return "FFDNet, published weights", load_published(denoisers.FFDNet(), path)
     network = denoisers.load(path)[0]
     if network.channels != 3:
         raise ValueError(f"{spec}: denoises RAW, not pictures; use {PICTURES}")

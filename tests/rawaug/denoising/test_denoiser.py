@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import denoisers
+from denoisers.pbrid import PBRID
 from rawaug.bayer import CFA, pack, unpack
 from rawaug.commands.benchmark import named
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
@@ -116,6 +117,10 @@ def test_weights_of_others_are_known_by_their_tensors(tmp_path: Path, noisy: Noi
     assert RawDenoiser.of(tmp_path / "bf.safetensors").name == "BF-DnCNN"
     pmrid = RawDenoiser.of(tmp_path / "pmrid.safetensors")
     assert pmrid.name.startswith("PMRID") and pmrid(noisy).shape == noisy.image.shape
+    save_file(PBRID().state_dict(), tmp_path / "pbrid.safetensors")
+    pbrid = RawDenoiser.of(tmp_path / "pbrid.safetensors")
+    assert pbrid.name.startswith("PBRID") and not pbrid.reads_levels and pbrid.cfa == CFA.RGGB
+    assert pbrid(noisy).shape == noisy.image.shape
     (tmp_path / "finetuned").mkdir()
     denoisers.save(denoisers.build("DnCNN", width=4, depth=3), tmp_path / "finetuned" / "denoiser.safetensors", {})
     assert RawDenoiser.of(tmp_path / "finetuned" / "denoiser.safetensors").name == "finetuned"  # an arm of a run
