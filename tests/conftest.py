@@ -34,13 +34,14 @@ from rawaug.isp.stages import STAGES
 from rawaug.noise.models import NOISE
 from rawaug.paper.baselines.base import BASELINES
 from rawaug.registry import Registry
+from rawaug.tasks.base import TASKS
 from rawaug.training.estimators import ESTIMATORS, LOSSES
 
 torch.set_num_threads(1)
 settings.register_profile("rawaug", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("rawaug")
 multiprocessing.set_forkserver_preload(
-    ["rawaug.experiment.plan", "rawaug.camera.fit", "rawaug.plugin.dataset", "lightning_fabric"]
+    ["rawaug.experiment.run", "rawaug.camera.fit", "rawaug.plugin.dataset", "lightning_fabric"]
 )
 
 
@@ -118,7 +119,7 @@ def camera_files() -> Path:
 @pytest.fixture
 def registries(monkeypatch: pytest.MonkeyPatch) -> list[Registry]:
     """All registries, with the built-in things in them; what a test registers is forgotten after it."""
-    kinds = [BASELINES, DATASETS, DENOISERS, ESTIMATORS, EXPERIMENTS, FILTERS, LOSSES, NOISE, PICTURES, STAGES]
+    kinds = [BASELINES, DATASETS, DENOISERS, ESTIMATORS, EXPERIMENTS, FILTERS, LOSSES, NOISE, PICTURES, STAGES, TASKS]
     for kind in kinds:
         monkeypatch.setattr(kind, "_things", {name: kind[name] for name in kind})
     return kinds

@@ -13,13 +13,14 @@ import yaml
 from torch import Tensor
 
 from rawaug.cli import main
-from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe, find_recipe, kind_of, read_recipe
+from rawaug.experiment.recipe import find_recipe, kind_of, read_recipe
+from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.estimators import Supervised
 
 FOLDER = Path(__file__).parents[1] / "recipes"
 FILES = {file.relative_to(FOLDER).with_suffix("").as_posix(): file for file in sorted(FOLDER.rglob("*.yaml"))}
 ALL = {name: kind_of(read_recipe(file)) for name, file in FILES.items()}
-NAMES = [name for name, kind in ALL.items() if kind in ("training", "srgb")]
+NAMES = [name for name, kind in ALL.items() if kind in ("raw", "srgb")]
 """The recipes that train denoisers."""
 
 

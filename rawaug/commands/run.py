@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
@@ -18,13 +18,17 @@ from rich.table import Table
 from rich.text import Text
 
 from rawaug.commands import value_of
-from rawaug.experiment import plan
-from rawaug.experiment.plan import settings_of, use_all_pairs
-from rawaug.experiment.recipe import EXPERIMENTS, Recipe, find_recipe, kind_of, read_recipe, recipe_list
+from rawaug.experiment import run as experiment
+from rawaug.experiment.inputs import use_all_pairs
+from rawaug.experiment.recipe import find_recipe, kind_of, read_recipe, recipe_list, settings_of
 from rawaug.registry import suggest
+from rawaug.tasks.settings import Recipe
 
 SHARED = ("channels", "variance_map", "deviation", "domain")
 """Settings that all networks have: they say what a recipe's network is for."""
+
+Options = list[tuple[str, Any]]
+"""The dotted keys of the command line with their values, in their order."""
 
 
 def run(
@@ -48,26 +52,89 @@ def run(
         print(f"rawaug run RECIPE [--key value ...], where RECIPE is a YAML file or one of\n\n{recipe_list()}\n")
         print("rawaug run RECIPE --help lists its keys; --dry-run rehearses it on your data.")
         return
+
     file = find_recipe(recipe)
     content = read_recipe(file)
     kind = kind_of(content, file)
     if keys:
         print_keys(settings_of(kind), content)
         return
-    given = [_in_full(key, value) for key, value in _given(changes)]
-    whole = _without_old_settings(content, given)
-    for key, value in given:
-        if key == "arms" and isinstance(value, (str, list)):
-            whole["arms"] = keep_arms(whole.get("arms") or {}, value)
-            continue
-        whole = _with(whole, settings_of(kind), key.split("."), value)
-    settings = with_values(settings_of(kind), whole, file)
+
+    options = parse_options(changes, settings_of(kind))
+    settings = with_values(settings_of(kind), merge_options(content, options), file)
     if isinstance(settings, Recipe):
-        settings = use_all_pairs(settings, content, {key.replace("-", "_") for key, _ in given})
+        settings = use_all_pairs(settings, content, {key for key, _ in options})
+
     if dry_run:
-        plan.dry_run(kind, settings, overwrite)
+        experiment.dry_run(kind, settings, overwrite)
     else:
-        EXPERIMENTS[kind](settings, overwrite)
+        experiment.run_kind(kind, settings, overwrite)
+
+
+# -- the command line --------------------------------------------------------------------------------------------------
+
+
+def parse_options(words: Sequence[str], settings: type[Any]) -> Options:
+    """The words of a command line, ``--key value`` or ``--key=value``, as dotted keys and values.
+
+    ``--denoiser DnCNN`` is short for ``--denoiser.name DnCNN``; a field of the settings may be spelt with hyphens.
+
+    Raises:
+        ValueError: if a word is no key, or a key has no value.
+    """
+    field_names = set()
+    for key in keys_of(settings):
+        field_names.update(key.name.split("."))
+
+    options = []
+    rest = iter(words)
+    for word in rest:
+        name, equals, text = word.partition("=")
+        if not name.startswith("--"):
+            raise ValueError(f"{word}: too many arguments; keys of the recipe are set by --key value")
+        if not equals:
+            following = next(rest, None)
+            if following is None:
+                raise ValueError(f"{name} needs a value")
+            text = following
+
+        parts = []
+        for part in name.removeprefix("--").split("."):
+            underscored = part.replace("-", "_")
+            parts.append(underscored if underscored in field_names else part)
+
+        value = value_of(text)
+        if parts[-1] == "denoiser" and isinstance(value, str):
+            parts.append("name")
+        options.append((".".join(parts), value))
+
+    return options
+
+
+def merge_options(content: Mapping[str, Any], options: Options) -> dict[str, Any]:
+    """The content of a recipe's file with the values of the command line in it."""
+    merged = deepcopy(dict(content))
+    for key, value in options:
+        if key.endswith("denoiser.name"):
+            drop_old_settings(merged, key, value)
+
+    for key, value in options:
+        if key == "arms" and isinstance(value, (str, list)):
+            merged["arms"] = keep_arms(merged.get("arms") or {}, value)
+        else:
+            set_value(merged, key.split("."), value)
+
+    return merged
+
+
+def set_value(content: dict[str, Any], path: Sequence[str], value: Any) -> None:
+    """Set a value at a path of keys; what is no mapping on the way there becomes one."""
+    for part in path[:-1]:
+        if not isinstance(content.get(part), dict):
+            content[part] = {}
+        content = content[part]
+
+    content[path[-1]] = value
 
 
 def keep_arms(arms: Mapping[str, Any], names: str | Sequence[str]) -> dict[str, Any]:
@@ -84,15 +151,62 @@ def keep_arms(arms: Mapping[str, Any], names: str | Sequence[str]) -> dict[str, 
     return {name: arm for name, arm in arms.items() if name in wanted}
 
 
+def drop_old_settings(content: dict[str, Any], key: str, name: Any) -> None:
+    """Drop the settings of a network in whose place another is named; what all networks have stays.
+
+    Args:
+        content: of the recipe, which is changed.
+        key: the dotted key that names the network.
+        name: the other network.
+    """
+    place: Any = content
+    above = key.removesuffix(".name")
+    for part in above.split("."):
+        place = place.get(part) if isinstance(place, Mapping) else None
+
+    if not isinstance(place, dict) or not place.get("settings") or place.get("name", "UNet") == name:
+        return
+
+    shared = {}
+    dropped = {}
+    for setting, value in place["settings"].items():
+        if setting in SHARED:
+            shared[setting] = value
+        else:
+            dropped[setting] = value
+
+    place["settings"] = shared
+    if dropped:
+        of = place.get("name", "UNet")
+        print(
+            f"{above}: the settings of {of} are dropped for {name}'s own: {json.dumps(dropped)}; "
+            f"others: --{above}.settings.KEY VALUE"
+        )
+
+
+# -- settings ----------------------------------------------------------------------------------------------------------
+
+
 def with_values(settings: type[Any], content: Mapping[str, Any], source: object) -> Any:
-    """An instance of the dataclass ``settings`` with the values of ``content``, which its types decide on."""
-    content = {key: value for key, value in content.items() if key != "experiment" or key in get_type_hints(settings)}
+    """An instance of the dataclass ``settings`` with the values of ``content``, which its types decide on.
+
+    Args:
+        settings: a dataclass.
+        content: the values by key; ``experiment`` is no key unless the dataclass has it.
+        source: where they come from, which heads an error.
+
+    Raises:
+        ValueError: if a key is unknown, or a value is of another type or out of bounds.
+    """
+    values = dict(content)
+    if "experiment" not in get_type_hints(settings):
+        values.pop("experiment", None)
+
     try:
-        _require_known(settings, content, [key.name for key in keys_of(settings)])
-        return TypeAdapter(settings).validate_python(content)
+        _require_known(settings, values, [key.name for key in keys_of(settings)])
+        return TypeAdapter(settings).validate_python(values)
     except ValidationError as error:
-        first = error.errors()[0]
-        raise ValueError(f"{source}: {_reason(first, content)}") from None
+        raise ValueError(f"{source}: {_reason(error.errors()[0], values)}") from None
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
 
@@ -108,18 +222,25 @@ class Key(NamedTuple):
 def keys_of(settings: type[Any], above: str = "") -> Iterator[Key]:
     """The keys of a dataclass and of those in it, as their docstrings explain them."""
     hints = get_type_hints(settings)
-    documented = (parse(base.__doc__ or "").params for base in reversed(settings.__mro__))
-    meanings = {part.arg_name: part.description or "" for params in documented for part in params}
+    meanings: dict[str, str] = {}
+    for base in reversed(settings.__mro__):
+        for parameter in parse(base.__doc__ or "").params:
+            meanings[parameter.arg_name] = parameter.description or ""
+
     for field in fields(settings):
-        part, named = _part(hints[field.name])
+        part, by_name = _part(hints[field.name])
         name = f"{above}{field.name}"
-        if part is None or named:
-            default = field.default if field.default_factory is MISSING else field.default_factory()
-            among = field.metadata.get("registry", ())
-            listed = f" One of {', '.join(among)}." if among else ""
+
+        if part is None or by_name:
+            default = field.default
+            if field.default_factory is not MISSING:
+                default = field.default_factory()
+            names = field.metadata.get("registry", ())
+            listed = f" One of {', '.join(names)}." if names else ""
             yield Key(name, default, meanings.get(field.name, "") + listed)
+
         if part is not None:
-            yield from keys_of(part, f"{name}.NAME." if named else f"{name}.")
+            yield from keys_of(part, f"{name}.NAME." if by_name else f"{name}.")
 
 
 def print_keys(settings: type[Any], content: Mapping[str, Any]) -> None:
@@ -128,72 +249,27 @@ def print_keys(settings: type[Any], content: Mapping[str, Any]) -> None:
     sections: dict[str, list[Key]] = {}
     for key in keys_of(settings):
         sections.setdefault(key.name.rpartition(".")[0], []).append(key)
+
     for section, keys in sections.items():
         console.print(Text(f"{section or 'recipe'}:", style="bold"))
         table = Table.grid(padding=(0, 2))
         for key in keys:
-            value: Any = content
-            for name in key.name.split("."):
-                value = value.get(name, key.default) if isinstance(value, Mapping) else key.default
-            shown = "" if value is MISSING else json.dumps(value)
-            shown = "by NAME, below" if key.name == "arms" else shown
             option = f"--{key.name.replace('_', '-')}"
             meaning = re.sub(r"(:\w+:)?`+([^`]*)`+", r"\2", " ".join(key.meaning.split()))  # without markup
-            table.add_row(Text(option, style="cyan"), Text(meaning), Text(shown))
+            table.add_row(Text(option, style="cyan"), Text(meaning), Text(_shown_value(key, content)))
         console.print(Padding(table, (0, 0, 1, 2)))
 
 
-def _given(words: Sequence[str]) -> Iterator[tuple[str, Any]]:
-    rest = iter(words)
-    for word in rest:
-        key, equals, value = word.partition("=")
-        if not key.startswith("--"):
-            raise ValueError(f"{word}: too many arguments; keys of the recipe are set by --key value")
-        found = value if equals else next(rest, None)
-        if found is None:
-            raise ValueError(f"{key} needs a value")
-        yield key.removeprefix("--"), value_of(found)
+def _shown_value(key: Key, content: Mapping[str, Any]) -> str:
+    """The value of a key in a recipe's content, or its default, as JSON."""
+    if key.name == "arms":
+        return "by NAME, below"
 
+    value: Any = content
+    for name in key.name.split("."):
+        value = value.get(name, key.default) if isinstance(value, Mapping) else key.default
 
-def _in_full(key: str, value: Any) -> tuple[str, Any]:
-    """``--denoiser DnCNN`` is short for ``--denoiser.name DnCNN``."""
-    return (f"{key}.name", value) if key.split(".")[-1] == "denoiser" and isinstance(value, str) else (key, value)
-
-
-def _without_old_settings(content: Mapping[str, Any], given: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """The recipe without the settings of a network in whose place another is named; what all networks have stays."""
-    result = deepcopy(dict(content))
-    for key, name in given:
-        path = key.split(".")
-        if path[-2:] != ["denoiser", "name"]:
-            continue
-        place: Any = result
-        for part in path[:-1]:
-            place = place.get(part) if isinstance(place, Mapping) else None
-        if not isinstance(place, dict) or not place.get("settings") or place.get("name", "UNet") == name:
-            continue
-        kept = {setting: value for setting, value in place["settings"].items() if setting in SHARED}
-        dropped = {setting: value for setting, value in place["settings"].items() if setting not in SHARED}
-        place["settings"] = kept
-        if dropped:
-            of = place.get("name", "UNet")
-            said = f"{'.'.join(path[:-1])}: the settings of {of} are dropped for {name}'s own: {json.dumps(dropped)}"
-            print(f"{said}; others: --{'.'.join(path[:-1])}.settings.KEY VALUE")
-    return result
-
-
-def _with(content: Any, settings: type[Any] | None, path: Sequence[str], value: Any) -> Any:
-    """``content`` with a value at a dotted path; fields of a dataclass may be spelt with hyphens."""
-    if not path:
-        return value
-    hints = get_type_hints(settings) if settings else {}
-    key = path[0].replace("-", "_") if path[0].replace("-", "_") in hints else path[0]
-    part, named = _part(hints.get(key))
-    before = dict(content) if isinstance(content, Mapping) else {}
-    if named and len(path) > 1:
-        below = before.get(key) or {}
-        return before | {key: below | {path[1]: _with(below.get(path[1]), part, path[2:], value)}}
-    return before | {key: _with(before.get(key), part, path[1:], value)}
+    return "" if value is MISSING else json.dumps(value)
 
 
 def _part(hint: Any) -> tuple[type[Any] | None, bool]:
@@ -201,19 +277,28 @@ def _part(hint: Any) -> tuple[type[Any] | None, bool]:
     for inside in (hint, *get_args(hint)):
         if is_dataclass(inside):
             return inside, getattr(hint, "__origin__", None) is dict  # type: ignore[return-value]
+
     return None, False
 
 
-def _require_known(settings: type[Any], content: Any, known: Sequence[str], above: str = "") -> None:
+def _require_known(settings: Any, content: Any, known: Iterable[str], above: str = "") -> None:
+    """Raise ValueError, with the nearest name, if a key is none of a dataclass or of those in it."""
+    if not isinstance(content, Mapping):
+        return  # pydantic says what it should be
+
     hints = get_type_hints(settings)
     for key, value in content.items():
         if key not in hints:
             raise ValueError(f"{above}{key}: no such key{suggest(f'{above}{key}', known)}")
-        part, named = _part(hints[key])
-        parts = value.items() if named and isinstance(value, Mapping) else [("", value)]
-        for name, one in parts if part else ():
-            if isinstance(one, Mapping):
-                _require_known(part, one, known, f"{above}{key}.{name}{'.' if name else ''}")  # type: ignore[arg-type]
+
+        part, by_name = _part(hints[key])
+        if part is None:
+            continue
+        if not by_name:
+            _require_known(part, value, known, f"{above}{key}.")
+        elif isinstance(value, Mapping):
+            for name, one in value.items():
+                _require_known(part, one, known, f"{above}{key}.{name}.")
 
 
 def _reason(error: Any, content: Any) -> str:
@@ -222,10 +307,12 @@ def _reason(error: Any, content: Any) -> str:
     for key in error["loc"]:
         if not isinstance(content, Mapping) or key not in content:
             break
-        keys.append(key)
+        keys.append(str(key))
         content = content[key]
-    name = ".".join(map(str, keys))
-    if error["type"] == "value_error":
-        text = str(error["ctx"]["error"])
-        return text if not keys or text.startswith(str(keys[0])) else f"{name}: {text}"
-    return f"{name}: {error['msg'][0].lower()}{error['msg'][1:]}, got {content!r:.80}"
+
+    name = ".".join(keys)
+    if error["type"] != "value_error":
+        return f"{name}: {error['msg'][0].lower()}{error['msg'][1:]}, got {content!r:.80}"
+
+    text = str(error["ctx"]["error"])
+    return text if not keys or text.startswith(keys[0]) else f"{name}: {text}"

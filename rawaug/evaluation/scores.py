@@ -148,14 +148,14 @@ def _score_one(denoiser: Denoiser, trial: Trial) -> Iterator[Row]:
 def to_domain(name: str, denoised: Tensor, trial: Trial) -> Iterator[tuple[str, Tensor]]:
     """A denoiser's result in the trial's domain, by name.
 
-    RAW ``(1, 4, h, w)`` goes all of the trial's ways there, whose names follow that of the denoiser.
+    RAW ``(1, 4, h, w)`` goes all of the trial's ways there, whose names, if any, follow that of the denoiser.
     """
     if denoised.shape[1] == trial.clean.shape[1]:
         yield name, denoised
         return
 
     for way, follow in trial.ways.items():
-        yield f"{name}, {way}", follow(denoised)
+        yield f"{name}, {way}" if way else name, follow(denoised)
 
 
 def compare(image: Tensor, trial: Trial) -> tuple[float, float, float | None, float | None]:

@@ -1,292 +1,25 @@
-"""Recipes: a dataclass for each part, which explains every key; the types of its fields say what a value may be."""
+"""Recipe files: where they are, how they are read, and which kind of experiment one is for."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, get_type_hints
 
-from pydantic import BeforeValidator
-
-from rawaug.data.pair_folder import PairSettings
-from rawaug.data.pairs import OWN_PICTURES, Pair
 from rawaug.files import read_yaml
-from rawaug.isp.fit import FitConfig
-from rawaug.kernels.runtime import find_device
-from rawaug.noise import noise_model
-from rawaug.plugin.draw import Draw
-from rawaug.plugin.targets import Srgb, Target
-from rawaug.registry import Registry, require_between, split_spec, suggest
-from rawaug.training.config import MOST, DenoiserConfig, TrainConfig, Weighing
-from rawaug.training.estimators import ESTIMATORS
-from rawaug.training.srgb_noise import Told, noise_on_srgb
+from rawaug.registry import Registry, suggest
+from rawaug.tasks.base import TASKS
 
-EXPERIMENTS = Registry("experiment", "rawaug.experiments", "rawaug.experiment", "rawaug.paper")
-"""The experiments by the name in a recipe's key ``experiment``: functions ``run(settings, overwrite)``.
+EXPERIMENTS = Registry("experiment", "rawaug.experiments", "rawaug.paper")
+"""The experiments that are no tasks, by the name in a recipe's key ``experiment``.
 
-``settings`` is a dataclass of the recipe's keys, whose method ``shortest()`` gives the settings of a dry run.
+They are functions ``run(settings, overwrite)``. ``settings`` is a dataclass of the recipe's keys, whose method
+``shortest()`` gives the settings of a dry run.
 """
 
-SHORT_CROP = 256
-"""Side in pixels of the middles of frames that a dry run uses."""
-HELD_OUT = "auto"
-"""The value of ``data.validation`` for a part of ``data.pairs``."""
-USUAL = "usual"
-"""The value of ``data.validation`` that :class:`DataConfig` replaces by the one that suits ``data.pairs``."""
-DEMO = "demo:"
-"""What the names of the built-in, simulated frames begin with."""
-_PAIRS = "pairs:"
-_BOUNDS: dict[str, tuple[float, float]] = {
-    **dict.fromkeys(("count", "validation_count", "test_count"), (1, MOST)),
-    **dict.fromkeys(("validation_crop", "test_crop"), (32, MOST)),
-    "bin": (1, 16),
-    "max_pixels": (4, 2**40),
-}
-
-
-def _require_noise_form(value: Any) -> Any:
-    """Refuse what is neither a name, a list nor a mapping, in the words of :func:`rawaug.noise.noise_model`."""
-    if not isinstance(value, (str, list, tuple, Mapping)):
-        noise_model(value)
-    return value
-
-
-NoiseSetting = Annotated[tuple[float, float] | str | list[str] | dict[str, Any], BeforeValidator(_require_noise_form)]
-"""The noise of a recipe, as :func:`rawaug.noise.noise_model` takes it."""
-
-
-@dataclass
-class DataConfig(PairSettings):
-    """Where pictures come from.
-
-    Args:
-        pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``, such as ``pairs:PATH`` for
-            noisy/clean pairs; null for none.
-        count: number of pairs to use; null for all.
-        select: which: first; scenes, whole ones; phones, as many of each; or a list of names of frames or their
-            folders.
-        pictures: the sRGB pictures to augment with: a folder, ``demo:``, ``shapes:COUNT``, a list of these, or
-            ``pairs``, those of the chosen pairs.
-        memory_mb: size in megabytes of the cache of decoded pictures.
-        max_pixels: larger pictures, those of pairs and PNG mosaics too, are refused; null for 2^26.
-        validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
-            fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
-            and keeps the final weights; usual is demo:validation where ``pairs`` is the demo's or null, else auto.
-        validation_count: number of pairs to use; null for all.
-        validation_crop: side of the central crop used of each validation frame; null for the whole frame.
-        test: test pairs; no earlier stage sees them.
-        test_count: number of pairs to use; null for all.
-        test_crop: side of the central crop used of each test frame; null for the whole frame.
-        bin: K bins validation and test frames K x K by colour site before noise is added: clean references of real
-            photographs, which then have about 1 / K^2 of their own noise.
-    """
-
-    pairs: str | None = "demo:train"
-    count: int | None = None
-    select: str | list[str] = "first"
-    pictures: str | list[str] = "demo:"
-    memory_mb: int = 0
-    max_pixels: int | None = None
-    validation: str | None = USUAL
-    validation_count: int | None = None
-    validation_crop: int | None = 512
-    test: str = "demo:test"
-    test_count: int | None = None
-    test_crop: int | None = 1024
-    bin: int = 1
-
-    def __post_init__(self) -> None:
-        for key, (least, most) in _BOUNDS.items():
-            if getattr(self, key) is not None:
-                require_between(f"data.{key}", getattr(self, key), least, most)
-
-        if self.validation == USUAL:
-            own_frames = self.pairs is not None and not self.pairs.startswith(DEMO)
-            self.validation = HELD_OUT if own_frames else "demo:validation"
-
-        if self.validation == HELD_OUT and self.pairs is None:
-            raise ValueError("data.validation: auto holds out a part of data.pairs, which is null; set one of them")
-        if not self.pictures:
-            raise ValueError("data.pictures must name a folder, demo:, or a list of these, got an empty list")
-        if self.pictures == OWN_PICTURES and self.pairs is None:
-            raise ValueError("data.pictures: pairs takes those of data.pairs, which is null; set one of them")
-        given = [key for key, value in self._pair_settings().items() if value is not None]
-        specs = (self.pairs, self.validation, self.test)
-        if given and not any(isinstance(spec, str) and spec.startswith(_PAIRS) for spec in specs):
-            raise ValueError(f"data.{given[0]}: applies to {_PAIRS}PATH, which neither pairs, validation nor test is")
-
-    def settings_of(self, spec: str | Sequence[Pair]) -> dict[str, Any]:
-        """The settings of ``pairs:PATH`` that are for this spec; none if it is another kind of data."""
-        return self._pair_settings() if isinstance(spec, str) and spec.startswith(_PAIRS) else {}
-
-    def _pair_settings(self) -> dict[str, Any]:
-        return {setting.name: getattr(self, setting.name) for setting in fields(PairSettings)}
-
-
-@dataclass
-class ArmConfig:
-    """One way of training; everything else is the same for all arms.
-
-    Args:
-        augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
-        draw: how the camera settings of pictures are drawn.
-        srgb: of sRGB targets: how pictures are developed; null draws every demosaicing, without JPEG.
-        zoom: of supervised arms: half of the crops of pictures are enlarged by up to this factor, see
-            :class:`rawaug.RawPairs`; 1 for none.
-        srgb_noise: of sRGB targets: noise drawn on the pictures themselves, in place of the camera's: Gaussian, BSRGAN,
-            Coloured, or {name, settings}, see :mod:`rawaug.training.srgb_noise`.
-        srgb_share: share of the samples that have ``srgb_noise``; the rest have the camera's.
-        told: of sRGB targets: what a network that reads a level of noise is told of it; null for nothing.
-        estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
-            and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
-        denoiser: this arm's network, in place of the recipe's; ``{start: rawaug-small}`` fine-tunes a shipped one.
-        learning_rate: in place of ``train.learning_rate``; null takes that one.
-        weigh: in place of ``train.weigh``; null takes that one.
-        steps: at most, where fewer than ``train.steps`` are enough, as for fine-tuning; null takes them all.
-    """
-
-    augmented: float = 0.0
-    draw: Draw = Draw()
-    srgb: Srgb | None = None
-    zoom: float = 1.0
-    srgb_noise: str | dict[str, Any] | None = None
-    srgb_share: float = 1.0
-    told: Told | None = None
-    estimator: str | dict[str, Any] = "supervised"
-    denoiser: DenoiserConfig | None = None
-    learning_rate: float | None = None
-    weigh: Weighing | None = None
-    steps: int | None = None
-
-    def __post_init__(self) -> None:
-        for key in ("augmented", "srgb_share"):
-            require_between(key, getattr(self, key), 0.0, 1.0)
-        if self.steps is not None:
-            require_between("steps", self.steps, 1, MOST)
-        try:
-            ESTIMATORS.make(self.estimator)
-        except ValueError as error:
-            raise ValueError(f"estimator: {error}") from None
-
-    @property
-    def sees_clean(self) -> bool:
-        """Whether the estimator needs clean frames."""
-        name, _ = split_spec(self.estimator)
-        return bool(ESTIMATORS[name].sees_clean)
-
-
-@dataclass
-class Recipe:
-    """A whole experiment. Other kinds of it override ``target``, the images that its arms are trained on.
-
-    Args:
-        name: of the output folder within ``out``.
-        data: where pictures come from.
-        isp: how the dictionary ISP is fitted.
-        camera: an ISP to use unchanged, by a shipped one's name or a file; null fits one to ``data.pairs``.
-        noise: added to clean RAW in training, and to test frames without a noisy capture: the name of a preset
-            or of a camera, a list of names of which each picture draws one, [shot_var, read_var], {name, settings} of a
-            camera or a model, or "camera", the levels measured on the frames that the ISP is fitted to.
-        denoiser: the network.
-        train: the training loop.
-        arms: the variants to compare, by name; all supervised, or all self-supervised (no stage sees a clean frame).
-        classical: classical denoisers to compare with, such as Wavelet, or {name: Wavelet, settings: {strength: 0.8}}.
-            BM3D is left out if its wheel is not installed, and a line says so.
-        views: number of views of the self-ensemble: 4, the flips, as in the paper, or 8, with quarter turns.
-        untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
-        self_ensemble: whether every arm is also scored averaged over ``views``, at that many times the cost.
-        seed: of the first run.
-        steps: optimiser steps, in place of ``train.steps``.
-        seeds: number of runs, with seeds ``seed``, ``seed + 1``, ...; several give mean and spread.
-        device: auto, cpu, cuda, ...: Fabric's accelerator.
-        devices: number of devices.
-        out: folder of all runs.
-    """
-
-    target: ClassVar[Target] = "raw"
-    together: ClassVar[bool] = False
-    """Whether frames are binned so that the four sites of a cell make a pixel of full colour."""
-    name: str = "experiment"
-    data: DataConfig = field(default_factory=DataConfig)
-    isp: FitConfig = field(default_factory=FitConfig)
-    camera: str | None = None
-    noise: NoiseSetting = "cycleisp_sidd"
-    denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
-    train: TrainConfig = field(default_factory=TrainConfig)
-    arms: dict[str, ArmConfig] = field(default_factory=dict)
-    classical: list[str | dict[str, Any]] = field(default_factory=list)
-    views: Literal[4, 8] = 8
-    untouched: list[str] = field(default_factory=list)
-    self_ensemble: bool = True
-    steps: int | None = None
-    seed: int = 0
-    seeds: int = 1
-    device: str = "auto"
-    devices: int = 1
-    out: str = "runs"
-
-    def __post_init__(self) -> None:
-        if not self.arms:
-            raise ValueError("arms: a recipe needs at least one arm")
-        require_between("seed", self.seed, -(2**63), 2**62)
-        require_between("seeds", self.seeds, 1, 1000)
-        if self.steps is not None:
-            self.train = replace(self.train, steps=self.steps)
-        if self.data.pairs is None and self.camera is None:
-            raise ValueError("data.pairs: fitting an ISP needs pairs; set it, or camera: universal")
-        if self.data.pairs is None and any(arm.augmented < 1.0 for arm in self.arms.values()):
-            raise ValueError("data.pairs: without real pairs every arm must have augmented: 1")
-        if len({arm.sees_clean for arm in self.arms.values()}) > 1:
-            raise ValueError(
-                "arms: supervised and self-supervised arms cannot be mixed; the latter must not see clean frames"
-            )
-        if self.target != "raw" and any(arm.augmented < 1.0 or not arm.sees_clean for arm in self.arms.values()):
-            raise ValueError(f"arms: {self.target} targets are made from pictures; set augmented: 1 and no estimator")
-        for label, arm in self.arms.items():
-            try:
-                if arm.srgb_noise is not None:
-                    noise_on_srgb(arm.srgb_noise)
-                for key in ("srgb", "srgb_noise", "told"):
-                    if getattr(arm, key) is not None and self.target != "srgb":
-                        raise ValueError(f"{key} is for target 'srgb', not {self.target!r}; omit it")
-                name, _ = split_spec(arm.estimator)
-                weigh, known = self.loop_of(label).weigh, ESTIMATORS[name].weighings
-                if weigh not in known:
-                    raise ValueError(f"weigh: {weigh} is not for noisy targets of {name}; use {' or '.join(known)}")
-            except ValueError as error:
-                raise ValueError(f"arms.{label}: {error}") from None
-
-    def network_of(self, arm: str) -> DenoiserConfig:
-        """The network of an arm: its own, or else the recipe's."""
-        return self.arms[arm].denoiser or self.denoiser
-
-    def loop_of(self, arm: str) -> TrainConfig:
-        """The training loop of an arm: the recipe's, with the arm's own learning rate, weighting and steps."""
-        own = self.arms[arm]
-        steps = None if own.steps is None else min(own.steps, self.train.steps)
-        given: dict[str, Any] = {"learning_rate": own.learning_rate, "weigh": own.weigh, "steps": steps}
-        return replace(self.train, **{key: value for key, value in given.items() if value is not None})
-
-    def shortest(self) -> Recipe:
-        """The recipe with one step an arm, on the middles of a few of its frames; networks and precision stay."""
-        data = replace(self.data, count=2, select="first", validation_count=1, test_count=1)
-        data = replace(data, validation_crop=SHORT_CROP, test_crop=SHORT_CROP)
-        train = replace(self.train, steps=1, validate_every=1, checkpoint_every=1, workers=min(self.train.workers, 1))
-        if find_device(self.device).type == "cpu":
-            train = replace(train, batch=min(train.batch, 4 * self.devices))
-        return replace(self, data=data, isp=self.isp.shortest(), train=train, steps=None, seeds=1, views=4)
-
-    @property
-    def validation_noise(self) -> object:
-        """The noise of validation frames, if it is another than that of the training."""
-        return None
-
-    @property
-    def self_supervised(self) -> bool:
-        """Whether the arms may see noisy frames alone."""
-        return not any(arm.sees_clean for arm in self.arms.values())
+DEFAULT_KIND = "raw"
+"""The kind of a recipe without the key ``experiment``."""
 
 
 def read_recipe(file: str | Path) -> dict[str, Any]:
@@ -299,10 +32,26 @@ def read_recipe(file: str | Path) -> dict[str, Any]:
 
 def kind_of(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
     """The kind of experiment that a recipe is for; ValueError, which names the file, if there is no such kind."""
-    kind = content.get("experiment", "training")
-    if not isinstance(kind, str) or kind not in EXPERIMENTS:
-        raise ValueError(f"{file}: unknown experiment {kind!r:.80}; use one of {', '.join(EXPERIMENTS)}")
-    return kind
+    kind = content.get("experiment", DEFAULT_KIND)
+    known = kinds()
+    if kind not in known:
+        raise ValueError(f"{file}: unknown experiment {kind!r:.80}; use one of {', '.join(known)}")
+
+    return str(kind)
+
+
+def kinds() -> list[str]:
+    """The kinds of experiment: the tasks and the comparisons of methods, each named after its file."""
+    return [*TASKS, *EXPERIMENTS]
+
+
+def settings_of(kind: str) -> type[Any]:
+    """The dataclass with the keys of a kind of experiment: a task's, or the type of a function's first argument."""
+    if kind in TASKS:
+        settings: type[Any] = TASKS[kind].settings
+        return settings
+
+    return next(iter(get_type_hints(EXPERIMENTS[kind]).values()))
 
 
 def shipped_recipes() -> dict[str, Path]:

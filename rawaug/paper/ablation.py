@@ -23,7 +23,7 @@ from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.figures import new_figure
 from rawaug.evaluation.tables import print_rows
-from rawaug.experiment.plan import claim, require_free
+from rawaug.experiment.folder import claim, require_free
 from rawaug.experiment.recipe import EXPERIMENTS
 from rawaug.files import write_json
 from rawaug.isp import staged

@@ -24,7 +24,7 @@ from rawaug.data.folders import Readable, skip_broken
 from rawaug.data.pairs import Pair, SomePairs, names_of, select_pairs, shared_frame
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.evaluation.trials import trial_of
-from rawaug.experiment.plan import claim, require_free, run_folder
+from rawaug.experiment.folder import claim, require_free, run_folder
 from rawaug.experiment.recipe import EXPERIMENTS
 from rawaug.files import fingerprint, write_json
 from rawaug.isp.fit import FitConfig

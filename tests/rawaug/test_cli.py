@@ -18,8 +18,7 @@ from denoisers.classical import FILTERS
 from rawaug.cli import COMMANDS, app, main
 from rawaug.commands.run import keys_of
 from rawaug.data import demo_pictures
-from rawaug.experiment.plan import settings_of
-from rawaug.experiment.recipe import EXPERIMENTS
+from rawaug.experiment.recipe import kinds, settings_of
 from rawaug.io import write_picture
 
 QUICK_FIT = ["--steps", "4", "--curve-steps", "10", "--prior-steps", "10", "--pixels", "512", "--batch", "128"]
@@ -118,7 +117,7 @@ def test_every_option_says_what_it_does(command: str) -> None:
     assert all(said.values()), said
     shared = [text for text in said.values() if list(said.values()).count(text) > 1]
     assert set(shared) <= {"pixels of each frame in a step."}, "the text of a whole group of options"
-    for kind in EXPERIMENTS if command == "run" else ():
+    for kind in kinds() if command == "run" else ():
         assert not [key.name for key in keys_of(settings_of(kind)) if not key.meaning], kind
 
 

@@ -24,8 +24,8 @@ from rawaug.data.pairs import (
     stamps,
     whole_scenes,
 )
-from rawaug.experiment.plan import plan_data
-from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
+from rawaug.experiment.inputs import open_inputs
+from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 
 
 def pair(**changes: Any) -> Pair:
@@ -66,7 +66,7 @@ def test_a_recipe_augments_the_pictures_of_the_pairs_that_it_trains_on() -> None
     pairs, test = demo_pairs("train", count=3), demo_pairs("test", count=1)
     data = DataConfig(count=2, pictures="pairs", validation=None)
     recipe = Recipe(data=data, arms={"ours": ArmConfig(augmented=0.5)})
-    plan = plan_data(recipe, {"pairs": pairs, "test": test})
+    plan = open_inputs(recipe, {"pairs": pairs, "test": test})
     assert isinstance(plan.pictures, PairPictures) and len(plan.pictures) == 2 == len(plan.pictures[:])
     assert torch.equal(plan.pictures[1], pairs[1].srgb)
     with pytest.raises(ValueError, match=r"data\.pictures: pairs takes those of data\.pairs, which is null"):

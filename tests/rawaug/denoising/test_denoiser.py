@@ -19,8 +19,9 @@ from rawaug.bayer import CFA, pack, unpack
 from rawaug.commands.benchmark import named
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.denoising.foreign import BiasFreeDnCNN
-from rawaug.experiment.demosaicing import JointRecipe
-from rawaug.experiment.recipe import EXPERIMENTS, ArmConfig, DataConfig
+from rawaug.experiment.run import run
+from rawaug.tasks.rgb import RgbRecipe
+from rawaug.tasks.settings import ArmConfig, DataConfig
 from rawaug.training.config import DenoiserConfig
 
 LEVELS = (1.8e-3, 1.2e-5)
@@ -55,9 +56,9 @@ def test_a_function_is_imported_from_the_command_line_alone(tmp_path: Path, monk
     (tmp_path / "evil.py").write_text("raise SystemExit('imported')\n")
     given: dict[str, Any] = {"camera": "universal", "arms": {"joint": ArmConfig(1.0)}, "out": str(tmp_path)}
     network = DenoiserConfig("JointDRUNet", {"width": 4, "scales": 2})
-    recipe = JointRecipe(data=DataConfig(pairs=None), denoiser=network, untouched=["evil:f"], **given)
+    recipe = RgbRecipe(data=DataConfig(pairs=None), denoiser=network, untouched=["evil:f"], **given)
     with pytest.raises(FileNotFoundError, match="evil:f: no such denoiser"):
-        EXPERIMENTS["demosaic"](recipe)
+        run(recipe)
     with pytest.raises(ValueError, match="evil:f: no such denoiser"):
         RawDenoiser.of("evil:f")
     assert "evil" not in sys.modules

@@ -22,7 +22,7 @@ from rawaug.denoising.denoiser import Noisy, RawDenoiser, require_classical
 from rawaug.evaluation.scores import NOISY, Row, compare, score, summary
 from rawaug.evaluation.tables import print_scores
 from rawaug.evaluation.trials import trial_of
-from rawaug.experiment.denoising import find_classical
+from rawaug.experiment.run import find_classical
 from rawaug.io import write_picture
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP

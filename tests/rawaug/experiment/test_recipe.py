@@ -12,18 +12,19 @@ import pytest
 
 from rawaug.cli import main
 from rawaug.commands.run import with_values
-from rawaug.experiment import plan
-from rawaug.experiment.plan import settings_of
-from rawaug.experiment.recipe import EXPERIMENTS, ArmConfig, Recipe, find_recipe, kind_of, read_recipe
+from rawaug.experiment import run as experiment
+from rawaug.experiment.recipe import EXPERIMENTS, find_recipe, kind_of, kinds, read_recipe, settings_of
 from rawaug.isp.fit.samples import BLOCK
 from rawaug.paper.baselines import BASELINES
 from rawaug.paper.methods import FAMILIES, ROWS
 from rawaug.paper.reconstruction import Comparison
+from rawaug.tasks.base import TASKS
+from rawaug.tasks.settings import ArmConfig, Recipe
 from rawaug.training.config import TrainConfig, Weighing
 
 FOLDER = find_recipe("fewshot").parent
 NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(FOLDER.rglob("*.yaml"))]
-OTHERS = {"rgb2raw": "reconstruction", "any": "mosaics"}
+OTHERS = {"rgb2raw": "reconstruction", "any": "mosaic", "demosaic": "rgb"}
 """Recipes that neither train nor are named after their kind."""
 HEAD = "camera: universal\ndata: {pairs: null, pictures: 'demo:'}\narms: {augmented: {augmented: 1.0}}\n"
 LAUGHS = "a0: &a0 [ha, ha]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}, *a{k - 1}]\n" for k in range(1, 40))
@@ -37,7 +38,9 @@ def header(name: str) -> str:
 
 
 def test_every_kind_has_settings_that_name_it() -> None:
-    assert set(EXPERIMENTS) - {"training", "srgb", "demosaic", "mosaics"} == {"reconstruction", "ablation"}
+    assert set(TASKS) == {"raw", "rgb", "mosaic", "srgb"} and set(EXPERIMENTS) == {"reconstruction", "ablation"}
+    for name in TASKS:
+        assert settings_of(name).kind == name and TASKS[name].__module__ == f"rawaug.tasks.{name}"
     for name in ("reconstruction", "ablation"):
         assert settings_of(name)().name == name
 
@@ -46,19 +49,15 @@ def test_every_kind_has_settings_that_name_it() -> None:
 def test_the_commands_of_a_header_can_be_given(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     last = name.rpartition("/")[2]
     kind = kind_of(read_recipe(find_recipe(name)))
-    assert kind == (last if last in EXPERIMENTS else OTHERS.get(name, "training"))
+    assert kind == (last if last in kinds() else OTHERS.get(name, "raw"))
     given: list[Any] = []
 
-    def run(settings: Any, overwrite: bool) -> None:
-        given.append(settings)
-
-    run.__annotations__ = {"settings": settings_of(kind)}
-    monkeypatch.setitem(EXPERIMENTS._things, kind, run)
-    monkeypatch.setattr(plan, "dry_run", lambda kind, settings, overwrite: given.append(settings))
+    for name_of_function in ("run_kind", "dry_run"):
+        monkeypatch.setattr(experiment, name_of_function, lambda kind, settings, overwrite: given.append(settings))
     head = header(name)
     commands = re.findall(r"^#   rawaug (run [^\n]+?)(?:  +\S.*)?$", head, re.MULTILINE)
     assert len(commands) >= 3 and any("--dry-run" in command for command in commands)
-    assert kind != "training" or ("--seeds 3" in head and re.search(r"about \d+ (minutes|hours)", head)), "the cost"
+    assert kind != "raw" or ("--seeds 3" in head and re.search(r"about \d+ (minutes|hours)", head)), "the cost"
     for command in commands:
         assert shlex.split(command)[1] == name
         assert main(shlex.split(command)) == 0
@@ -81,7 +80,7 @@ def test_the_reconstruction_header_lists_methods_rows_and_budgets() -> None:
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        ("experiment: reconstruktion", "unknown experiment 'reconstruktion'; use one of ablation, .*training"),
+        ("experiment: reconstruktion", "unknown experiment 'reconstruktion'; use one of .*ablation"),
         ("experiment: [ablation]", r"unknown experiment \['ablation'\]; use one of"),
         ("experiment: [ablation", "not a recipe"),
         ("just words", "it must hold keys and values"),
@@ -89,7 +88,7 @@ def test_the_reconstruction_header_lists_methods_rows_and_budgets() -> None:
         ("denoiser: {settings: {width: " + "[" * 48 + "1" + "]" * 48 + "}}", "is nested more than 50 levels deep"),
         ("x: " + "[" * 20_000, "is nested more than 50 levels deep"),
         ("train: {steps: " + "9" * 5000 + "}", "Exceeds the limit"),
-        ("x: " + "y" * 2**20, "has 1048579 bytes, a recipe at most 65536"),
+        ("x: " + "y" * 2**20, "has 1048579 bytes, a recipe has at most 65536"),
     ],
 )
 def test_what_is_no_recipe_ends_in_one_line_with_its_name(content: str, reason: str, tmp_path: Path) -> None:
@@ -104,7 +103,7 @@ def test_a_recipe_that_names_no_kind_trains_and_bytes_are_none(tmp_path: Path) -
     mine = tmp_path / "mine.yaml"
     for content in ("name: x\n", ""):
         mine.write_text(content)
-        assert kind_of(read_recipe(mine)) == "training"
+        assert kind_of(read_recipe(mine)) == "raw"
     mine.write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(ValueError, match=r"mine\.yaml: not a recipe"):
         read_recipe(mine)
@@ -158,17 +157,17 @@ def test_a_weighing_that_moves_the_mean_of_noisy_targets_is_refused(name: str) -
 def test_on_and_off_are_words_and_truth_values_stay(tmp_path: Path) -> None:
     content = "isp: {encoders: on, shading: off, attention: true}\nself_ensemble: off\narms: {real: {}}\n"
     (tmp_path / "mine.yaml").write_text(content)
-    recipe = with_values(settings_of("training"), read_recipe(tmp_path / "mine.yaml"), "mine")
+    recipe = with_values(settings_of("raw"), read_recipe(tmp_path / "mine.yaml"), "mine")
     assert (recipe.isp.encoders, recipe.isp.shading) == ("on", "off")
     assert recipe.isp.attention is True and recipe.self_ensemble is False
 
 
 def test_null_is_taken_where_the_types_have_it() -> None:
     content = {"camera": "universal", "steps": None, "arms": {"real": {"denoiser": None}}}
-    recipe = with_values(settings_of("training"), content, "mine")
+    recipe = with_values(settings_of("raw"), content, "mine")
     assert recipe.steps is None and recipe.network_of("real") == recipe.denoiser
     for key in ("data", "isp", "train", "arms", "device", "seed", "out", "views", "noise"):
         with pytest.raises(ValueError, match=f"^mine: {key}.* got None"):
-            with_values(settings_of("training"), {key: None}, "mine")
+            with_values(settings_of("raw"), {key: None}, "mine")
     with pytest.raises(ValueError, match=r"^mine: arms\.real\.denoiser\.name: .* got None"):
-        with_values(settings_of("training"), {"arms": {"real": {"denoiser": {"name": None}}}}, "mine")
+        with_values(settings_of("raw"), {"arms": {"real": {"denoiser": {"name": None}}}}, "mine")

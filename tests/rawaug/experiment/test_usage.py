@@ -15,8 +15,10 @@ from rawaug.bayer import CFA
 from rawaug.commands.run import run
 from rawaug.data import demo_pairs
 from rawaug.evaluation.verdict import verdict
-from rawaug.experiment import plan
-from rawaug.experiment.denoising import TrainingRun
+from rawaug.experiment import report
+from rawaug.experiment import run as experiment
+from rawaug.tasks.raw import RawTask
+from rawaug.tasks.settings import ArmConfig
 from rawaug.training.noisy_frames import NoisyFrame, faintness_note, noise_of
 
 
@@ -35,7 +37,7 @@ def test_the_last_line_is_the_command_of_the_verdict(arm: tuple[float, ...], las
     results = {"mine": [{"plain": scores(psnr)} for psnr in arm]}
     others = {"rawaug-small": scores(40.0), "Wavelet strength=0.5": scores(35.0)}
     said = usage(results, others)
-    assert said[-1] == last and verdict(results, others)[1].startswith(f"Use {last.split(': ')[0][7:]}: ")
+    assert said[-1] == last and verdict(results, others).sentence.startswith(f"Use {last.split(': ')[0][7:]}: ")
 
 
 def test_a_filter_or_nothing_is_used_as_the_verdict_says() -> None:
@@ -47,20 +49,24 @@ def test_a_filter_or_nothing_is_used_as_the_verdict_says() -> None:
 
 
 def usage(results: Any, others: Any) -> list[str]:
-    made: Any = SimpleNamespace(
-        results=results,
-        arm_folder=lambda arm, seed: Path("runs") / f"seed{seed}" / arm,
-        seeds=range(len(results["mine"])),
-        recipe=SimpleNamespace(untouched=["rawaug-small"]),
+    recipe: Any = SimpleNamespace(
+        arms={"mine": ArmConfig()},
+        untouched=["rawaug-small"],
         classical=[{"name": "Wavelet", "settings": {"strength": 0.5}}],
     )
-    return TrainingRun.usage(made, others)
+    experiment: Any = SimpleNamespace(
+        arm_folder=lambda arm, seed: Path("runs") / f"seed{seed}" / arm,
+        seeds=range(len(results["mine"])),
+        recipe=recipe,
+        task=RawTask(recipe),
+    )
+    return report.usage(experiment, {"": results}, {"": verdict(results, others)})
 
 
 @pytest.fixture
 def given(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     found: list[Any] = []
-    monkeypatch.setattr(plan, "dry_run", lambda kind, settings, overwrite: found.append(settings))
+    monkeypatch.setattr(experiment, "dry_run", lambda kind, settings, overwrite: found.append(settings))
     return found
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rawaug.data.pairs import Pair
-from rawaug.experiment.plan import dry_run
+from rawaug.experiment.run import dry_run
 from rawaug.isp.fit import FitConfig
 from rawaug.paper import ablation, reconstruction
 from rawaug.paper.ablation import Ablation

@@ -12,7 +12,7 @@ from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.trials import trial_of
-from rawaug.experiment.denoising import change_cfa
+from rawaug.experiment.stages import change_cfa
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model

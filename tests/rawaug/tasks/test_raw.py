@@ -7,11 +7,11 @@ import torch
 
 from rawaug.commands.run import with_values
 from rawaug.data import demo_pictures
-from rawaug.experiment.denoising import training_stream, validation_samples
-from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.plugin.targets import Srgb, Target
+from rawaug.tasks.raw import RawTask
+from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.config import TrainConfig
 
 
@@ -26,16 +26,18 @@ def test_other_targets_are_trained_and_watched_on(aim: Target, noisy: tuple[int,
     recipe = Aimed(data=DataConfig(pairs=None), camera="universal", arms=arms, train=TrainConfig(crop=32))
     isp, noise = DictionaryISP(), noise_model((1e-4, 1e-6))
     pictures = [picture[:, :96, :128] for picture in demo_pictures(2)]
-    one, other = (training_stream(recipe, arm, [], pictures, isp, noise, 0)[0] for arm in recipe.arms.values())
+    task = RawTask(recipe)
+    one, other = (task.stream(arm, [], pictures, isp, noise, 0)[0] for arm in recipe.arms)
     assert one.noisy.shape == one.variance.shape == noisy and one.clean.shape == clean
     assert torch.equal(one.noisy, other.noisy) == (aim == "rgb"), "through JPEG, if any"
-    watched = validation_samples(recipe, [], pictures, isp, noise)[0]
+    watched = task.validation_trials([], pictures, isp, noise)[0]
     assert watched.noisy.shape == (1, *noisy) and watched.clean.shape == (1, *clean)
 
 
 def test_a_target_that_an_arm_cannot_have_is_refused() -> None:
     class Developed(Recipe):
         target: Target = "srgb"  # type: ignore[misc]
+        from_pictures = True
 
     with pytest.raises(ValueError, match=r"arms\.one: srgb is for target 'srgb', not 'raw'"):
         Recipe(arms={"one": ArmConfig(1.0, srgb=Srgb(jpeg=(40, 95)))})

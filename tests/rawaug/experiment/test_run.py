@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from rawaug.errors import MissingExtra
-from rawaug.experiment import denoising
-from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
+from rawaug.experiment.run import run
+from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.config import TrainConfig
 from rawaug.training.loop import require_trainable
 
@@ -40,7 +40,7 @@ def test_it_is_found_before_any_work(
     monkeypatch.setitem(sys.modules, "pywt", None)
     recipe = replace(recipe, data=DataConfig(pairs=unread, validation=unread, test=unread))
     with pytest.raises((ValueError, OSError), match=message):
-        denoising.run(replace(recipe, **change))
+        run(replace(recipe, **change))
     assert not list(Path(recipe.out).iterdir())
 
 

@@ -14,17 +14,10 @@ from rawaug.bayer import bin_mosaic
 from rawaug.cli import main
 from rawaug.data import Pair, demo_pairs
 from rawaug.data.pairs import names_of, stamps
-from rawaug.experiment.plan import name_given_pairs, plan_data, require_usable, use_all_pairs
-from rawaug.experiment.recipe import (
-    ArmConfig,
-    DataConfig,
-    Recipe,
-    find_recipe,
-    read_recipe,
-    recipe_list,
-    shipped_recipes,
-)
+from rawaug.experiment.inputs import name_given_pairs, open_inputs, require_usable, use_all_pairs
+from rawaug.experiment.recipe import find_recipe, read_recipe, recipe_list, shipped_recipes
 from rawaug.io import write_picture
+from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.config import TrainConfig
 
 ARMS = {"real": ArmConfig()}
@@ -58,7 +51,7 @@ def data(tmp_path: Path) -> DataConfig:
 
 
 def plan_of(recipe: Recipe, **given: Any) -> Any:
-    return plan_data(name_given_pairs(recipe, given), given)
+    return open_inputs(name_given_pairs(recipe, given), given)
 
 
 def test_own_pairs_are_all_used_and_a_part_of_them_is_held_out(own: Path, data: DataConfig) -> None:

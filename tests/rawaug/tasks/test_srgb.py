@@ -18,10 +18,11 @@ from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.evaluation.figures import read_log
 from rawaug.evaluation.scores import score, to_domain
 from rawaug.evaluation.trials import Trial
-from rawaug.experiment.recipe import ArmConfig, DataConfig
-from rawaug.experiment.srgb import REAL, SrgbRecipe, SrgbRun, best_filter, developed, srgb_trials
+from rawaug.experiment.run import run
 from rawaug.io.pictures import write_picture
 from rawaug.metrics import psnr
+from rawaug.tasks.settings import ArmConfig, DataConfig
+from rawaug.tasks.srgb import REAL, SrgbRecipe, best_filter, developed, srgb_trials
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.srgb_noise import Told
 
@@ -110,15 +111,16 @@ def test_the_recipe_scores_every_arm_and_method_at_every_level(
     assert not list(tmp_path.iterdir())
     assert main(["run", "srgb", *SMALL, "--out", str(tmp_path), "--seeds", "2"]) == 0
     results = json.loads((tmp_path / "srgb" / "results.json").read_text())
-    assert set(results["results"]) == {"gaussian", "bsrgan", "camera", "camera without finishing"}
-    assert set(results["others"]) == {"noisy", "NonLocalMeans"}
-    for runs in (*results["results"].values(), [results["others"]["noisy"]] * 2):
+    weak, strong = (results[level] for level in ("0.002, 1e-05", "0.008, 0.0001"))
+    assert set(weak["results"]) == {"gaussian", "bsrgan", "camera", "camera without finishing"}
+    assert set(weak["others"]) == {"NonLocalMeans"}
+    for arm, runs in weak["results"].items():
+        for one, other in zip(runs, strong["results"][arm], strict=True):
+            assert 10 < other["plain"]["psnr"] < one["plain"]["psnr"] < 50
+            assert 0 < other["plain"]["ssim_noisy"] < one["plain"]["ssim_noisy"] <= 1
         assert len(runs) == 2
-        for run in runs:
-            weak, strong = run.values()
-            assert 10 < strong["psnr"] < weak["psnr"] < 50 and 0 < strong["ssim"] < weak["ssim"] <= 1
-    noisy, filtered_too = (results["others"][name]["0.008, 0.0001"]["psnr"] for name in ("noisy", "NonLocalMeans"))
-    assert filtered_too > noisy + 1
+    noisy = strong["results"]["gaussian"][0]["plain"]["psnr_noisy"]
+    assert strong["others"]["NonLocalMeans"]["psnr"] > noisy + 1
     said = capsys.readouterr().out
     assert "0.002, 1e-05" in said and (tmp_path / "srgb" / "picture.png").is_file()
     assert main(["run", "srgb", *SMALL, "--out", str(tmp_path), "--seeds", "2"]) == 0
@@ -138,16 +140,13 @@ def test_real_pairs_choose_the_weights_and_are_scored(tmp_path: Path) -> None:
     recipe = replace(
         RECIPE, data=DataConfig(pairs=None, pictures="tiny:", validation=seen, test=unseen), out=str(tmp_path)
     )
-    found = SrgbRun(recipe, True, {}).run_stages()
-    scored = [
-        found["gaussian"][0][REAL],
-        json.loads((tmp_path / "a" / "results.json").read_text())["others"]["noisy"][REAL],
-    ]
-    assert all(20 < one["psnr"] < 40 for one in scored)
+    found = run(recipe, True)
+    plain = found["gaussian"][0]["plain"] if REAL not in found else found[REAL]["gaussian"][0]["plain"]
+    assert all(20 < plain[key] < 40 for key in ("psnr", "psnr_noisy"))
     (row,) = read_log(tmp_path / "a" / "seed0" / "gaussian" / "log.csv")
     assert 20 < float(row["psnr"]) < 40
     with pytest.raises(ValueError, match=r"is also in data\.validation"):
-        SrgbRun(replace(recipe, data=replace(recipe.data, test=seen)), True, {})
+        run(replace(recipe, data=replace(recipe.data, test=seen)), True)
 
 
 @pytest.mark.usefixtures("tiny")
@@ -161,13 +160,13 @@ def test_the_strength_of_a_filter_is_chosen_on_validation_whatever_the_test_fram
     recipe = replace(RECIPE, classical=["NonLocalMeans"], out=str(tmp_path))
     found = {}
     for frame in (flat, detailed):
-        SrgbRun(recipe, True, {"validation": [frame], "test": [test]}).run_stages()
-        others = json.loads((tmp_path / "a" / "results.json").read_text())["others"]
-        found[frame.name] = others["NonLocalMeans"]["0.008, 0.0001"]["psnr"]
+        run(recipe, True, validation=[frame], test=[test])
+        others = json.loads((tmp_path / "a" / "results.json").read_text())["0.008, 0.0001"]["others"]
+        found[frame.name] = others["NonLocalMeans"]["psnr"]
     assert found["flat"] < found["detailed"] - 0.2
     capsys.readouterr()
     other = replace(recipe, classical=[], levels=[(2e-3, 1e-5)])
-    SrgbRun(other, True, {"validation": [detailed], "test": [test]}).run_stages()
+    run(other, True, validation=[detailed], test=[test])
     assert "already trained" not in capsys.readouterr().out, "the levels of validation choose the weights"
 
 

@@ -1,0 +1,245 @@
+"""The data of a run: opened and divided, but not yet read, so that everything that is missing is found at once."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from rawaug.data import open_pictures
+from rawaug.data.folders import Cached, Readable, left_out
+from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, SomePairs, names_of, select_pairs, shared_frame
+from rawaug.files import find_weights
+from rawaug.isp.model import DictionaryISP
+from rawaug.tasks.base import TASKS, Task
+from rawaug.tasks.settings import HELD_OUT, DataConfig, Recipe
+from rawaug.training.estimators import ESTIMATORS
+from rawaug.training.noisy_frames import noise_of
+
+MOST_HELD_OUT = 16
+"""Largest number of frames that are held out for validation: a fifth of them, but at least one."""
+
+GIVEN = "given pairs"
+"""The value of ``data.pairs``, ``data.validation`` or ``data.test`` in the results of pairs given from Python."""
+
+MARGIN = 6
+"""Pixels by which a frame is larger than the crops of it, which are turned and shifted to a pattern."""
+
+_NAMED = 6
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The data of a run.
+
+    Attributes:
+        pairs: what the ISP is fitted to, and real training frames.
+        validation: what chooses the weights.
+        test: what the result is scored on.
+        pictures: sRGB pictures to make RAW of.
+        available: the number of frames that ``pairs``, ``validation`` and ``test`` were taken from.
+        held_out: whether ``validation`` is a part of ``pairs``.
+    """
+
+    pairs: Sequence[Pair]
+    validation: Sequence[Any]
+    test: Sequence[Any]
+    pictures: Any
+    available: tuple[int, int, int]
+    held_out: bool
+
+    def lines(self, recipe: Recipe) -> list[str]:
+        """The number and the names of the frames of each part of the run, a line each, for the user to check."""
+        data = recipe.data
+        of_pairs, of_validation, of_test = self.available
+
+        train = "no RAW frames"
+        if self.pairs:
+            train = listing(self.pairs, of_pairs, data.pairs)
+
+        validate = "no frames: monitored on RAW made from the pictures; the final weights are kept"
+        if self.validation:
+            source = f"{data.pairs}, held out" if self.held_out else data.validation
+            validate = listing(self.validation, of_validation, source, MOST_HELD_OUT)
+
+        isp = f"{recipe.camera}, unchanged"
+        if recipe.camera is None:
+            isp = f"fitted to {len(self.pairs)} frame{'s' * (len(self.pairs) != 1)}"
+
+        texts = {
+            "train": train,
+            "validate": validate,
+            "test": listing(self.test, of_test, data.test),
+            "pictures": f"{len(self.pictures)} of {data.pictures}",
+            "ISP": isp,
+        }
+        return [f"{part:<10}{text}" for part, text in texts.items()]
+
+    def read(self) -> tuple[Inputs, list[str]]:
+        """The data without the frames that cannot be read, and lines that name these.
+
+        All frames are read once: a damaged one is better found now than after the training.
+        """
+        pairs, validation, test = Readable(self.pairs), Readable(self.validation), Readable(self.test)
+        readable_pairs = list(pairs)
+        for frames in (validation, test):
+            for _ in frames:
+                pass
+
+        lines = left_out(pairs, "data.pairs") + left_out(validation, "data.validation") + left_out(test, "data.test")
+        inputs = replace(self, pairs=readable_pairs, validation=validation.kept(), test=test.kept())
+        return inputs, lines
+
+
+def listing(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
+    """Tell which frames of a dataset are used, as in ``"2 of 8 of demo:train: a, b"``.
+
+    Args:
+        frames: what is used.
+        available: the number of frames that they are taken from.
+        source: its name.
+        most: the number of frames that are named.
+    """
+    names = names_of(frames)
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{len(names)} of {available} of {source}: {', '.join(names[:most])}{more}"
+
+
+# -- opening -----------------------------------------------------------------------------------------------------------
+
+
+def open_inputs(recipe: Recipe, frames: Mapping[str, Sequence[Pair]], task: Task | None = None) -> Inputs:
+    """Open and divide the data that a recipe names, or that ``frames`` has in their place; no frame is read.
+
+    Raises:
+        FileNotFoundError: if there are no such data.
+        ValueError: if they are not what the recipe needs, or a test frame is also among the others.
+    """
+    data = recipe.data
+    task = task or TASKS[recipe.kind](recipe)
+    clean = not recipe.self_supervised
+
+    test = task.open(frames.get("test", data.test), "test", True)
+    pairs = task.open(frames.get("pairs", data.pairs), "train", clean)
+
+    _require_unseen(test, pairs, "pairs")
+
+    validation_source = frames.get("validation", data.validation)
+    held_out = isinstance(validation_source, str) and validation_source == HELD_OUT
+    count = len(pairs)
+    if held_out:
+        count -= _number_held_out(len(pairs))
+        validation: Sequence[Any] = SomePairs(pairs, range(count, len(pairs)))
+    else:
+        validation = task.open(validation_source, "validation", clean)
+        _require_unseen(test, validation, "validation")
+
+    chosen = SomePairs(pairs, select_pairs(pairs, count, data.count, data.select))
+    return Inputs(
+        pairs=chosen,
+        validation=task.prepare(validation, "validation"),
+        test=task.prepare(test, "test"),
+        pictures=_open_pictures(data, chosen, recipe.train.crop),
+        available=(len(pairs), len(pairs) if held_out else len(validation), len(test)),
+        held_out=held_out,
+    )
+
+
+def _number_held_out(available: int) -> int:
+    """The number of frames that are held out of those available; none of a single one."""
+    if available < 2:
+        return 0
+
+    return min(max(1, available // 5), MOST_HELD_OUT)
+
+
+def _require_unseen(test: Sequence[Any], frames: Sequence[Any], part: str) -> None:
+    """Raise ValueError if a test frame is also in another part."""
+    shared = shared_frame(test, frames)
+    if shared is not None:
+        raise ValueError(f"data.test: {shared} is also in data.{part}; test on unseen frames")
+
+
+def _open_pictures(data: DataConfig, pairs: Sequence[Pair], crop: int) -> Any:
+    """The pictures to make RAW of, those of the pairs or others, cached as far as the recipe says."""
+    pictures: Any = PairPictures(pairs)
+    if data.pictures != OWN_PICTURES:
+        pictures = open_pictures(data.pictures, crop + MARGIN, data.max_pixels)
+
+    return Cached(pictures, data.memory_mb) if data.memory_mb else pictures
+
+
+# -- data in place of the recipe's -------------------------------------------------------------------------------------
+
+
+def use_all_pairs(recipe: Recipe, content: Mapping[str, Any], keys: Collection[str]) -> Recipe:
+    """The recipe with all of the pairs that replace its own, a part of which is held out to validate on.
+
+    What its file says of ``data.count`` and ``data.validation`` is about its own pairs; a validation of null stays.
+
+    Args:
+        recipe: with the user's values.
+        content: what its file says.
+        keys: the dotted keys that the user has set.
+    """
+    data = recipe.data
+    usual = (content.get("data") or {}).get("pairs", DataConfig.pairs)
+    if "data.pairs" not in keys or data.pairs is None or _dataset(data.pairs) == _dataset(usual):
+        return recipe
+
+    if "data.count" not in keys:
+        data = replace(data, count=None)
+    if "data.validation" not in keys and data.validation is not None:
+        data = replace(data, validation=HELD_OUT)
+
+    return replace(recipe, data=data)
+
+
+def _dataset(spec: str | None) -> str | None:
+    """The dataset that a spec names; each folder counts as a dataset."""
+    kind, colon, _ = (spec or "").partition(":")
+    return kind if colon and len(kind) > 1 and kind != "pairs" else spec
+
+
+def name_given_pairs(recipe: Recipe, frames: Mapping[str, Sequence[Pair]]) -> Recipe:
+    """The recipe with :data:`GIVEN` as the name of data that are given; if pairs alone are, some are held out."""
+    names: dict[str, Any] = dict.fromkeys(frames, GIVEN)
+    if "pairs" in frames and "validation" not in frames and recipe.data.validation is not None:
+        names["validation"] = HELD_OUT
+
+    return replace(recipe, data=replace(recipe.data, **names))
+
+
+# -- what the frames must have -----------------------------------------------------------------------------------------
+
+
+def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[Pair]) -> None:
+    """Raise ValueError unless the frames, as they were read, have what the fit and the arms need of them."""
+    real = {name: arm for name, arm in recipe.arms.items() if arm.augmented < 1.0}
+
+    for pair in pairs:
+        if recipe.camera is None and not pair.color_known:
+            raise ValueError(
+                f"{pair.name}: its white balance and colour matrix are unknown, so no ISP can be fitted to it; "
+                "use a shipped one: camera: universal"
+            )
+        if real and min(pair.raw.shape[-2:]) < recipe.train.crop + MARGIN:
+            size = f"{pair.raw.shape[-2]} x {pair.raw.shape[-1]}"
+            raise ValueError(f"{pair.name}: a frame of {size} is too small for train.crop={recipe.train.crop}")
+
+    if not recipe.self_supervised:
+        return
+
+    for name, arm in real.items():
+        shots = ESTIMATORS.make(arm.estimator).shots
+        if shots > 1:
+            raise ValueError(f"arms.{name}: needs {shots} shots of a scene, frames have 1; set its augmented to 1")
+
+    if recipe.noise == "camera":
+        return
+
+    levels = None
+    if recipe.camera is not None:
+        levels = DictionaryISP.from_pretrained(find_weights(recipe.camera)).info.get("noise")
+    for pair in [*(pairs if real else []), *validation]:
+        noise_of(pair, levels)

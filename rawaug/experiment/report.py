@@ -1,0 +1,291 @@
+"""The report of a run: ``results.json``, tables, a picture, the page with all of it, and the command to use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from denoisers.network import Denoiser
+from rawaug.data.folders import reports
+from rawaug.evaluation.figures import plot_curves
+from rawaug.evaluation.page import Page
+from rawaug.evaluation.scores import require_numbers
+from rawaug.evaluation.tables import first_runs, print_table
+from rawaug.evaluation.trials import own_noise_note
+from rawaug.evaluation.verdict import Verdict, verdict
+from rawaug.experiment.stages import (
+    Camera,
+    Experiment,
+    Results,
+    Summaries,
+    is_leader,
+    score_methods,
+    without_tables,
+)
+from rawaug.files import write_json
+from rawaug.registry import spec_label
+from rawaug.tasks.settings import Recipe
+
+
+class Report:
+    """The scores of a run as they come.
+
+    Args:
+        experiment: the run.
+
+    Attributes:
+        camera: the ISP, noise and trials of the last seed.
+        networks: by arm, of the last seed.
+        tables: by table and arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``.
+        noise_note: a line on training frames with much noise of their own; empty if there are none.
+    """
+
+    def __init__(self, experiment: Experiment) -> None:
+        self.experiment = experiment
+        self.camera: Camera | None = None
+        self.networks: dict[str, Denoiser] = {}
+        self.tables: dict[str, dict[str, list[Summaries]]] = {}
+        self.noise_note = ""
+
+    def add(self, arm: str, network: Denoiser, scores: Mapping[str, Summaries]) -> None:
+        """Add the scores of an arm with one more seed."""
+        self.networks[arm] = network
+        for group, summaries in scores.items():
+            self.tables.setdefault(group, {}).setdefault(arm, []).append(summaries)
+
+    @property
+    def results(self) -> Results:
+        """The scores as ``results.json`` has them; of a process that writes nothing, arms without entries."""
+        if not self.tables:
+            return {arm: [] for arm in self.experiment.recipe.arms}
+
+        results: Results = without_tables(self.tables)
+        return results
+
+
+def write_report(report: Report) -> None:
+    """Write ``results.json``, the picture and the page, and print the tables.
+
+    Raises:
+        ValueError: if a score is no number; everything else is written before.
+    """
+    experiment, camera = report.experiment, report.camera
+    assert camera is not None
+    recipe, task, folder = experiment.recipe, experiment.task, experiment.folder
+
+    others: dict[str, dict[str, Any]] = {group: {} for group in report.tables}
+    file = write_results(report, others)
+    methods = choose_methods(report, camera)
+    others |= score_methods(camera, methods)
+    write_results(report, others)
+
+    verdicts = {group: verdict(results, others[group]) for group, results in report.tables.items()}
+    commands = usage(experiment, report.tables, verdicts)
+
+    title = title_of(experiment)
+    page = Page(title, lead_of(verdicts))
+    page.add_facts(facts_of(report, others, commands[-1]), next(iter(report.tables.values())))
+    names = {one.name for of_group in methods.values() for one in of_group} | set(recipe.arms)
+    page.add("Methods", terms={name: text for name, text in methods_of(recipe).items() if name in names})
+    for group, results in report.tables.items():
+        page.add_scores(results, others[group], group)
+
+    page.add_curves(curves(experiment))
+    panels = task.panels(shown_methods(report, camera, methods), camera.trials)
+    for row in panels:
+        page.add_frame(row, recipe.data.test_crop)
+    page.write(folder / "report.html", asdict(recipe))
+    picture = task.save_picture(panels, folder / "picture.png")
+
+    for group, results in report.tables.items():
+        print_table(results, f"{title}: {group}" if group else title, others[group])
+    say(page.lead, own_noise_note(all_first_runs(report, others)), report.noise_note)
+    print(f"table: {file}\npicture: {picture}\npage: {folder / 'report.html'}")
+    say(*reports(experiment.inputs.pictures), *experiment.unreadable, *commands)
+    require_all_numbers(report, others)
+
+
+def say(*lines: str) -> None:
+    """Print what is not empty, in the process that writes."""
+    texts = [line for line in lines if line]
+    if texts and is_leader():
+        print("\n".join(texts))
+
+
+# -- scores ------------------------------------------------------------------------------------------------------------
+
+
+def write_results(report: Report, others: Mapping[str, Mapping[str, Any]]) -> Path:
+    """Write ``results.json``; the path."""
+    experiment = report.experiment
+    tables = {}
+    for group, results in report.tables.items():
+        tables[group] = {"results": results, "others": others[group]}
+
+    content = {"recipe": asdict(experiment.recipe), **without_tables(tables)}
+    content |= experiment.task.notes(experiment.inputs.test)
+    if experiment.unreadable:
+        content["unreadable"] = experiment.unreadable
+
+    path = experiment.folder / "results.json"
+    write_json(content, path)
+    return path
+
+
+def choose_methods(report: Report, camera: Camera) -> dict[str, list[Any]]:
+    """The denoisers that arms are compared with, by table."""
+    experiment = report.experiment
+    arm = next(iter(experiment.recipe.arms))
+    methods = {}
+    for group in report.tables:
+        validation = camera.validation_trials(arm)
+        methods[group] = experiment.task.methods_for(group, experiment.methods, validation)
+
+    return methods
+
+
+def all_first_runs(report: Report, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    """The summary of every method by name and table, of an arm that of its first seed."""
+    runs = {}
+    for group, results in report.tables.items():
+        for name, scores in first_runs(results, others[group]).items():
+            runs[f"{name}, {group}" if group else name] = scores
+
+    return runs
+
+
+def require_all_numbers(report: Report, others: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raise ValueError if a score of any table is no number."""
+    summaries: list[Mapping[str, Any]] = []
+    for group, results in report.tables.items():
+        for runs in results.values():
+            for run in runs:
+                summaries += run.values()
+        summaries += others[group].values()
+
+    require_numbers(summaries)
+
+
+# -- what the page says ------------------------------------------------------------------------------------------------
+
+
+def title_of(experiment: Experiment) -> str:
+    """The title of tables and page: what was tested on what."""
+    recipe, task = experiment.recipe, experiment.task
+    settings = f"real pairs: {len(experiment.inputs.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
+    title = f"{recipe.name} tested on {recipe.data.test} ({settings})"
+    return f"{title}: {task.compared_in}" if task.compared_in else title
+
+
+def lead_of(verdicts: Mapping[str, Verdict]) -> str:
+    """The verdict of every table in a sentence each."""
+    sentences = []
+    for group, one in verdicts.items():
+        sentences.append(f"{group}: {one.sentence}" if group else one.sentence)
+
+    return " ".join(sentences)
+
+
+def facts_of(report: Report, others: Mapping[str, Mapping[str, Any]], command: str) -> dict[str, Any]:
+    """What the page states besides the scores, by term; ``command`` is the line that ends a run."""
+    task = report.experiment.task
+    return {
+        "Noise": task.test_noise(),
+        "To use it": command.partition(": ")[2],
+        "Training frames": report.noise_note,
+        "Own noise": own_noise_note(all_first_runs(report, others)),
+    }
+
+
+def methods_of(recipe: Recipe) -> dict[str, str]:
+    """Explain each row of the table in a line, by its name."""
+    texts = {spec_label(spec): "a filter, nothing is trained" for spec in recipe.classical}
+    for name in recipe.untouched:
+        texts[Path(name).stem] = "trained weights as they are"
+    for label in recipe.arms:
+        texts[label] = _explain(recipe, label)
+
+    return texts
+
+
+def _explain(recipe: Recipe, label: str) -> str:
+    """What an arm is trained on, in a line."""
+    arm, network = recipe.arms[label], recipe.network_of(label)
+    start = f"{network.name} from random weights"
+    if network.start is not None:
+        start = f"{network.start}, trained further"
+
+    real, synthetic = "real noisy frames", "RAW made from pictures"
+    how = f", by {spec_label(arm.estimator)}"
+    if arm.sees_clean:
+        real, how = "real pairs", ""
+
+    frames = f"{real}, with {synthetic} as {arm.augmented:.0%} of a batch"
+    if arm.augmented == 0.0:
+        frames = real
+    elif arm.augmented == 1.0:
+        frames = synthetic
+
+    return f"{start}, on {frames}{how}"
+
+
+def curves(experiment: Experiment) -> dict[str, bytes]:
+    """PNG files of the arms' loss and validation PSNR, by title."""
+    logs = {}
+    for arm in experiment.recipe.arms:
+        logs[arm] = [experiment.arm_folder(arm, seed) / "log.csv" for seed in experiment.seeds]
+
+    return plot_curves(logs)
+
+
+def shown_methods(report: Report, camera: Camera, methods: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
+    """The denoisers whose pictures are shown, by table: the first filter, trained denoisers, and the arms."""
+    experiment = report.experiment
+    hidden = {spec_label(spec) for spec in experiment.classical[1:]}
+
+    arms = []
+    for arm, network in report.networks.items():
+        arms.append(experiment.task.denoiser(arm, network, camera.pattern(arm)))
+
+    shown = {}
+    for group, of_group in methods.items():
+        shown[group] = [one for one in of_group if one.name not in hidden] + arms
+
+    return shown
+
+
+def usage(
+    experiment: Experiment, tables: Mapping[str, Mapping[str, Sequence[Summaries]]], verdicts: Mapping[str, Verdict]
+) -> list[str]:
+    """The files of weights, and the commands that use what the verdicts name; of an arm the best seed's."""
+    lines = []
+    for arm in experiment.recipe.arms:
+        for seed in experiment.seeds:
+            lines.append(f"denoiser, {arm}: {experiment.arm_folder(arm, seed) / 'denoiser.safetensors'}")
+
+    for group, one in verdicts.items():
+        line = _command(experiment, tables[group], one)
+        if line not in lines:
+            lines.append(line)
+
+    return lines
+
+
+def _command(experiment: Experiment, results: Mapping[str, Sequence[Summaries]], one: Verdict) -> str:
+    """The command that uses what a verdict recommends."""
+    if not one.use:
+        return "to use: nothing is recommended, as the verdict says"
+
+    command = experiment.task.command_of_method(one.use)
+    if one.use in results:
+        scores = [run["plain"].get("psnr", 0.0) for run in results[one.use]]
+        seed = experiment.seeds[scores.index(max(scores))]
+        path = experiment.arm_folder(one.use, seed) / "denoiser.safetensors"
+        command = experiment.task.command_of_weights(path)
+
+    if not command:
+        return "to use: nothing, the frames are best as they are"
+
+    return f"to use {one.use}: {command}"

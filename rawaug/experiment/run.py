@@ -1,0 +1,200 @@
+"""A recipe, stage by stage: fit the ISP, train every arm, score it, report.
+
+Each stage leaves a file in ``OUT/NAME``; a stage whose file was made with the same settings is skipped, so that
+a stopped run resumes.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from contextlib import nullcontext, redirect_stdout
+from dataclasses import replace
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from denoisers.classical import FILTERS
+from denoisers.files import find_denoiser
+from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures
+from rawaug.denoising.denoiser import require_classical
+from rawaug.evaluation.trials import added_noise_note, training_noise_note
+from rawaug.experiment.folder import claim, require_free
+from rawaug.experiment.inputs import Inputs, name_given_pairs, open_inputs, require_usable
+from rawaug.experiment.recipe import EXPERIMENTS
+from rawaug.experiment.report import Report, say, write_report
+from rawaug.experiment.stages import Camera, Experiment, Results, fit_isp, is_leader, score_arm, train_arm
+from rawaug.files import LOCK, locked
+from rawaug.noise import noise_model
+from rawaug.plugin.augment import noise_for
+from rawaug.registry import Spec, split_spec
+from rawaug.tasks.base import TASKS
+from rawaug.tasks.settings import Recipe
+from rawaug.training.estimators import ESTIMATORS
+from rawaug.training.loop import require_trainable
+from rawaug.training.noisy_frames import drop_clean, faintness_note
+from rawaug.training.state import first_network, start_of
+
+
+def run(
+    recipe: Recipe,
+    overwrite: bool = False,
+    *,
+    pairs: Sequence[Pair] | None = None,
+    validation: Sequence[Pair] | None = None,
+    test: Sequence[Pair] | None = None,
+) -> Results:
+    """Run a recipe; the results as in ``results.json``.
+
+    Of several processes (``devices``) the first one writes; the others return no scores.
+
+    Args:
+        recipe: what is run.
+        overwrite: whether a run of this name with other settings is replaced; what does not depend on them is kept.
+        pairs: frames in place of those that ``data.pairs`` names. Without ``validation`` a part of them is held out.
+        validation: frames in place of those that ``data.validation`` names.
+        test: frames in place of those that ``data.test`` names.
+
+    Returns:
+        By arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``. Of a task with several tables, by
+        pattern or level, each of these has such results.
+    """
+    frames = {}
+    for part, given in {"pairs": pairs, "validation": validation, "test": test}.items():
+        if given is not None:
+            frames[part] = given
+
+    experiment = prepare(recipe, overwrite, frames)
+    leads = is_leader()
+
+    with locked(experiment.folder / LOCK) if leads else nullcontext():
+        if leads:
+            claim(experiment.recipe, overwrite)
+
+        report = Report(experiment)
+        for seed in experiment.seeds:
+            isp = fit_isp(experiment, seed)
+            camera = add_noise(experiment, isp, report)
+
+            for arm in experiment.recipe.arms:
+                network = train_arm(experiment, camera, arm, seed)
+                if leads:
+                    report.add(arm, network, score_arm(experiment, camera, arm, seed, network))
+
+        if leads:
+            write_report(report)
+
+        return report.results
+
+
+def prepare(recipe: Recipe, overwrite: bool, frames: dict[str, Sequence[Pair]]) -> Experiment:
+    """An experiment with everything that could be missing or wrong opened or tried, before anything is fitted."""
+    recipe = name_given_pairs(recipe, frames)
+    folder = require_free(recipe, overwrite)
+    require_trainable(recipe.device, recipe.devices, recipe.train.precision, recipe.train.logger)
+
+    task = TASKS[recipe.kind](recipe)
+    classical = find_classical(recipe.classical, shown=is_leader())
+    if recipe.noise != "camera":
+        noise_model(recipe.noise)
+
+    estimators = {}
+    starts = {}
+    for label, arm in recipe.arms.items():
+        config = recipe.network_of(label)
+        network = first_network(config, seed=0)
+        estimators[label] = ESTIMATORS.make(arm.estimator)
+        estimators[label].require(network)
+        task.require_network(network, config.start or type(network).__name__)
+        starts[label] = start_of(config)
+
+    methods = task.open_methods(classical, [find_denoiser(name) for name in recipe.untouched])
+
+    inputs = open_inputs(recipe, frames, task)
+    say(*inputs.lines(recipe))
+    inputs, unreadable = inputs.read()
+    say(*unreadable)
+    inputs = hide_clean_frames(recipe, inputs)
+    require_usable(recipe, inputs.pairs, inputs.validation)
+
+    return Experiment(recipe, task, folder, inputs, unreadable, classical, methods, estimators, starts)
+
+
+def hide_clean_frames(recipe: Recipe, inputs: Inputs) -> Inputs:
+    """The inputs in memory; if no arm sees clean frames, nothing but the test knows one from here on."""
+    pairs, validation = list(inputs.pairs), inputs.validation
+    if recipe.self_supervised:
+        pairs = [drop_clean(pair) for pair in pairs]
+        validation = [drop_clean(pair) for pair in validation]
+
+    pictures = inputs.pictures
+    if recipe.data.pictures == OWN_PICTURES:
+        pictures = PairPictures(pairs)
+
+    return replace(inputs, pairs=pairs, validation=validation, pictures=pictures)
+
+
+def add_noise(experiment: Experiment, isp: Any, report: Report) -> Camera:
+    """The noise of a seed, and the frames and trials that have it; those of the first seed, if its law is the same."""
+    recipe = experiment.recipe
+    if report.camera is not None and recipe.noise != "camera":
+        report.camera = report.camera.with_isp(isp)
+        return report.camera
+
+    camera = Camera.of(experiment, isp, noise_for(isp, recipe.noise))
+    if report.camera is None and is_leader():
+        arms = [name for name, arm in recipe.arms.items() if arm.sees_clean and arm.augmented < 1.0]
+        report.noise_note = training_noise_note(experiment.inputs.pairs, camera.noise, arms)
+        say(added_noise_note(camera.trials), report.noise_note)
+        if recipe.self_supervised:
+            say(faintness_note(camera.pairs))
+
+    report.camera = camera
+    return camera
+
+
+def find_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
+    """The classical denoisers of a recipe; BM3D is left out if its wheel is missing, which is printed if ``shown``.
+
+    Raises:
+        ValueError: if another filter's library is missing, or a filter or setting is unknown.
+    """
+    missing = FILTERS["BM3D"].missing()
+    kept = []
+    for spec in specs:
+        if missing and split_spec(spec)[0] == "BM3D":
+            continue
+        kept.append(spec)
+
+    if shown and len(kept) < len(specs):
+        print(f"classical: BM3D is left out: {missing}")
+
+    require_classical(kept)
+    return kept
+
+
+def run_kind(kind: str, settings: Any, overwrite: bool = False) -> Any:
+    """Run the settings of a kind of experiment, a task or a comparison of methods."""
+    if kind in TASKS:
+        return run(settings, overwrite)
+
+    return EXPERIMENTS[kind](settings, overwrite)
+
+
+def dry_run(kind: str, settings: Any, overwrite: bool = False) -> None:
+    """Print what data a training would use, and try the run in its shortest form in a temporary folder.
+
+    Args:
+        kind: of the experiment.
+        settings: its recipe.
+        overwrite: as for the run itself.
+    """
+    folder = require_free(settings, overwrite)
+    if kind in TASKS:
+        print("\n".join(open_inputs(settings, {}).lines(settings)))
+
+    with TemporaryDirectory() as elsewhere, redirect_stdout(io.StringIO()) as output:
+        run_kind(kind, replace(settings.shortest(), out=elsewhere))
+
+    notes = [line for line in output.getvalue().splitlines() if line.startswith("note: ")]
+    verdict = "it runs, but see the note above" if notes else "no problems found"
+    print("\n".join([*notes, f"Dry run: {verdict}, nothing written to {folder}"]))

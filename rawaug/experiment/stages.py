@@ -1,0 +1,357 @@
+"""The stages of a run: fit the ISP, train an arm, score it; and what they need to know.
+
+A stage writes a file and the hash of what the file depends on, and is skipped where the file has this hash already.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import denoisers
+from denoisers.network import Denoiser
+from rawaug.bayer import CFA
+from rawaug.camera.fit import fit
+from rawaug.data.pairs import stamps
+from rawaug.errors import extra
+from rawaug.evaluation.scores import Row, group_rows, score, summary
+from rawaug.evaluation.trials import Trial
+from rawaug.experiment.inputs import Inputs
+from rawaug.files import find_weights, fingerprint, sha256, write_json
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import NoiseModel, camera_law
+from rawaug.progress import progress
+from rawaug.registry import Spec
+from rawaug.tasks.base import Task
+from rawaug.tasks.settings import Recipe
+from rawaug.training.config import weights_key
+from rawaug.training.estimators import Supervised
+from rawaug.training.loop import train
+from rawaug.training.state import Start
+
+PLAIN, ENSEMBLE = "plain", "self_ensemble"
+"""How a denoiser is scored, in this order."""
+
+Summaries = dict[str, dict[str, Any]]
+"""By :data:`PLAIN` and :data:`ENSEMBLE`, a summary of scores."""
+
+Results = dict[str, Any]
+"""By arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``; of several tables, by table first."""
+
+
+@dataclass
+class Experiment:
+    """A recipe with everything that it names, opened.
+
+    Attributes:
+        recipe: what is run.
+        task: what is special about its kind of image.
+        folder: of the run.
+        inputs: the frames and pictures.
+        unreadable: lines that name frames which cannot be read.
+        classical: the filters to compare with.
+        methods: the denoisers to compare with, see :meth:`rawaug.tasks.base.Task.open_methods`.
+        estimators: by arm.
+        starts: by arm, the weights that it continues from.
+    """
+
+    recipe: Recipe
+    task: Task
+    folder: Path
+    inputs: Inputs
+    unreadable: list[str]
+    classical: list[Spec]
+    methods: list[Any]
+    estimators: dict[str, Supervised]
+    starts: dict[str, Start | None]
+
+    @property
+    def seeds(self) -> range:
+        """The seeds of the runs."""
+        return range(self.recipe.seed, self.recipe.seed + self.recipe.seeds)
+
+    def arm_folder(self, arm: str, seed: int) -> Path:
+        """The folder of an arm's weights, log and scores."""
+        return self.folder / f"seed{seed}" / arm
+
+
+@dataclass
+class Camera:
+    """The ISP and the noise of a seed, and the frames and trials that have this noise.
+
+    Attributes:
+        experiment: whose frames these are.
+        isp: fitted with this seed, or the recipe's own.
+        noise: is added to clean RAW.
+        pairs: the real training frames, as the task's arms take them.
+        validation: the validation frames, likewise.
+        trials: the test frames with their noise.
+    """
+
+    experiment: Experiment
+    isp: DictionaryISP
+    noise: NoiseModel
+    pairs: Sequence[Any]
+    validation: Sequence[Any]
+    trials: Sequence[Trial]
+    _noisy: dict[str, list[Row]] = field(default_factory=dict)
+    _watched: dict[CFA, Sequence[Trial]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, experiment: Experiment, isp: DictionaryISP, noise: NoiseModel) -> Camera:
+        """The frames and trials with this noise."""
+        task, inputs = experiment.task, experiment.inputs
+        pairs = task.training_frames(inputs.pairs, isp)
+        validation = task.training_frames(inputs.validation, isp)
+        return cls(experiment, isp, noise, pairs, validation, task.test_trials(inputs.test, isp, noise))
+
+    def with_isp(self, isp: DictionaryISP) -> Camera:
+        """The same noise, frames and trials behind the ISP of another seed."""
+        return replace(self, isp=isp, _watched={})
+
+    def pattern(self, arm: str) -> CFA:
+        """The CFA that an arm is trained for."""
+        return self.experiment.task.pattern(self.experiment.starts[arm], self.isp)
+
+    def validation_trials(self, arm: str) -> Sequence[Trial]:
+        """The frozen samples by which the weights of an arm are chosen."""
+        cfa = self.pattern(arm)
+        if cfa not in self._watched:
+            task, pictures = self.experiment.task, self.experiment.inputs.pictures
+            isp = change_cfa(self.isp, cfa)
+            self._watched[cfa] = task.validation_trials(self.validation, pictures, isp, self.noise)
+
+        return self._watched[cfa]
+
+    def noisy_rows(self, group: str) -> list[Row]:
+        """The scores of the input itself in a table."""
+        if not self._noisy:
+            rows = score([self.experiment.task.input], self.trials)
+            self._noisy.update(group_by_table(self.experiment.task, rows))
+
+        return self._noisy[group]
+
+
+def is_leader() -> bool:
+    """Whether this is the one of several training processes that writes and evaluates."""
+    with extra("train"):
+        from lightning_fabric.utilities.rank_zero import rank_zero_only
+
+    return getattr(rank_zero_only, "rank", 0) == 0
+
+
+def change_cfa(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
+    """The ISP of the same camera behind a CFA: itself, or a copy if it had another."""
+    if isp.cfa == cfa:
+        return isp
+
+    other = copy.deepcopy(isp)
+    other.configure(cfa=str(cfa))
+    return other
+
+
+# -- fit ---------------------------------------------------------------------------------------------------------------
+
+
+def fit_isp(experiment: Experiment, seed: int) -> DictionaryISP:
+    """The ISP of the few pairs, or the recipe's own."""
+    recipe, pairs = experiment.recipe, experiment.inputs.pairs
+    if recipe.camera is not None:
+        weights = find_weights(recipe.camera)
+        isp = DictionaryISP.from_pretrained(weights)
+        isp.info["key"] = sha256(weights)
+        return isp
+
+    path = experiment.folder / f"seed{seed}" / "isp.safetensors"
+    settings = {**asdict(recipe.isp), "seed": seed}
+    measures_noise = recipe.noise == "camera"
+    key = fingerprint("isp", settings, stamps(pairs), measures_noise, recipe.self_supervised)
+
+    if path.is_file():
+        isp = DictionaryISP.from_pretrained(path)
+        if isp.info.get("key") == key:
+            if is_leader():
+                print(f"already fitted: {path}")
+            return isp
+
+    isp = fit(pairs, noise="on" if measures_noise else "off", **settings)
+    isp.info["key"] = key
+    isp.save(path)
+    return isp
+
+
+# -- train -------------------------------------------------------------------------------------------------------------
+
+
+def train_arm(experiment: Experiment, camera: Camera, arm: str, seed: int) -> Denoiser:
+    """The network of an arm, trained, or loaded if it has been trained with the same settings."""
+    recipe, inputs = experiment.recipe, experiment.inputs
+    folder = experiment.arm_folder(arm, seed)
+    path = folder / "denoiser.safetensors"
+    key = arm_key(experiment, camera, arm, seed)
+
+    if path.is_file():
+        model, info = denoisers.load(path)
+        if info.get("key") == key:
+            print(f"already trained: {path}")
+            return model
+
+    isp = change_cfa(camera.isp, camera.pattern(arm))
+    stream = experiment.task.stream(arm, camera.pairs, inputs.pictures, isp, camera.noise, seed)
+    model = train(
+        stream,
+        camera.validation_trials(arm),
+        recipe.network_of(arm),
+        recipe.loop_of(arm),
+        folder,
+        seed,
+        device=recipe.device,
+        devices=recipe.devices,
+        label=f"seed {seed}, {arm}",
+        estimator=experiment.estimators[arm],
+        choose=bool(inputs.validation),
+        key=key,
+    )
+
+    if is_leader():
+        denoisers.save(model, path, info_of_arm(experiment, camera, arm, seed, key))
+        (folder / "last.pt").unlink(missing_ok=True)
+
+    return model
+
+
+def info_of_arm(experiment: Experiment, camera: Camera, arm: str, seed: int, key: str) -> dict[str, Any]:
+    """What the file of an arm's weights says of its training."""
+    recipe, inputs, start = experiment.recipe, experiment.inputs, experiment.starts[arm]
+    noise: Any = recipe.noise
+    if noise == "camera":
+        noise = camera_law(camera.isp.info["noise"]).spec()
+
+    steps = recipe.loop_of(arm).steps
+    cfa = str(camera.pattern(arm))
+    info = {"key": key, "cfa": cfa, "noise": noise, "steps": steps, "seed": seed, "arm": arm}
+    if not recipe.arms[arm].sees_clean:
+        info["estimator"] = recipe.arms[arm].estimator
+    if start is not None:
+        info["start"] = recipe.network_of(arm).start
+        info["start_sha256"] = start.sha256
+    info["real_pairs"] = [pair.name for pair in inputs.pairs]
+    info["pictures"] = recipe.data.pictures
+    return info
+
+
+def arm_key(experiment: Experiment, camera: Camera, arm: str, seed: int) -> str:
+    """Hash the settings and frames that the weights of an arm depend on."""
+    recipe, inputs, task = experiment.recipe, experiment.inputs, experiment.task
+    data, start = recipe.data, experiment.starts[arm]
+
+    real = camera.isp.info["key"], recipe.noise, data.pairs, stamps(inputs.pairs)
+    pictures = data.pictures, len(inputs.pictures), data.max_pixels
+    start_hash = None if start is None else start.sha256
+    how = recipe.target, asdict(recipe.arms[arm]), experiment.estimators[arm].revision, start_hash
+
+    validation = None
+    if inputs.validation:
+        validation = data.validation, data.validation_crop, stamps(inputs.validation), task.validation_key()
+
+    key = weights_key(recipe.network_of(arm), recipe.loop_of(arm), (seed, *real, *pictures, *how), validation)
+    more = task.samples_key()
+    return fingerprint(key, *more) if more else key
+
+
+# -- score -------------------------------------------------------------------------------------------------------------
+
+
+def score_arm(experiment: Experiment, camera: Camera, arm: str, seed: int, network: Denoiser) -> dict[str, Summaries]:
+    """The arm's summaries by table; those in its file are kept."""
+    recipe, task = experiment.recipe, experiment.task
+    path = experiment.arm_folder(arm, seed) / "evaluation.json"
+    key = scores_key(experiment, sha256(path.with_name("denoiser.safetensors")))
+
+    kinds = [PLAIN]
+    if recipe.self_ensemble and task.ensembles:
+        kinds.append(ENSEMBLE)
+
+    tables = read_scores(path, key)
+    missing = [kind for kind in kinds if not tables or any(kind not in table for table in tables.values())]
+    if not missing:
+        print(f"already evaluated: {path}")
+
+    for kind in missing:
+        views = recipe.views if kind == ENSEMBLE else 1
+        denoiser = task.denoiser(arm, network, camera.pattern(arm), views)
+        for group, result in score_tables(camera, denoiser, f"evaluate {arm}, {kind}").items():
+            tables.setdefault(group, {})[kind] = result
+            name = f"{arm}, seed {seed}, {kind}" + (f", {group}" if group else "")
+            print(f"evaluated {name}: {result.get('psnr', math.nan):.2f} dB: {path}")
+        write_json({"key": key, **without_tables(tables)}, path)
+
+    return {group: {kind: table[kind] for kind in kinds} for group, table in tables.items()}
+
+
+def read_scores(path: Path, key: str) -> dict[str, Summaries]:
+    """The summaries by table in a file of this key; none if there is no such file."""
+    if not path.is_file():
+        return {}
+
+    content = json.loads(path.read_text())
+    if content.pop("key", None) != key:
+        return {}
+
+    tables: dict[str, Summaries] = {"": content} if PLAIN in content else content
+    return tables
+
+
+def score_tables(camera: Camera, denoiser: Any, label: str) -> dict[str, dict[str, Any]]:
+    """The summaries of a denoiser by table; those whose images it does not take are left out."""
+    task = camera.experiment.task
+    trials = (trial for trial in camera.trials if task.can_denoise(denoiser, trial))
+    rows = group_by_table(task, score([denoiser], trials, label))
+    return {group: summary(of_group, camera.noisy_rows(group)) for group, of_group in rows.items()}
+
+
+def group_by_table(task: Task, rows: Any) -> dict[str, list[Row]]:
+    """Rows by the table that they belong to."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(task.group(row), []).append(row)
+
+    return groups
+
+
+def scores_key(experiment: Experiment, digest: str) -> str:
+    """Hash what the scores of an arm depend on besides the noise and the arm's own settings.
+
+    ``digest`` is that of its weights.
+    """
+    recipe = experiment.recipe
+    frames = recipe.data.test, recipe.data.test_crop, recipe.data.bin, stamps(experiment.inputs.test)
+    return fingerprint(digest, *frames, recipe.views, *experiment.task.trials_key())
+
+
+def score_methods(camera: Camera, methods: Mapping[str, Sequence[Any]]) -> dict[str, dict[str, Any]]:
+    """The summaries of the denoisers that arms are compared with, by table and name; one trial in memory at a time."""
+    task = camera.experiment.task
+    rows: dict[str, list[Row]] = {group: [] for group in methods}
+    for trial in progress(camera.trials, label="other denoisers", unit="image"):
+        group = task.group(trial)
+        denoisers = [one for one in methods[group] if task.can_denoise(one, trial)]
+        rows[group] += score(denoisers, [trial])
+
+    others: dict[str, dict[str, Any]] = {}
+    for group, of_group in rows.items():
+        others[group] = {}
+        for name, of_one in group_rows(of_group).items():
+            others[group][name] = summary(of_one, camera.noisy_rows(group))
+
+    return others
+
+
+def without_tables(by_table: Mapping[str, Any]) -> Any:
+    """What a file has of several tables: all of them by name, or the only one, which has none."""
+    return by_table[""] if set(by_table) == {""} else dict(by_table)

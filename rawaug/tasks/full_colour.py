@@ -1,0 +1,212 @@
+r"""A truth of full colour that no demosaicing has made, its mosaics, and what LibRaw makes of them.
+
+.. math:: x = (R, (G_r + G_b) / 2, B), \qquad y \sim N(M x, \mathrm{shot\_var}\, M x + \mathrm{read\_var})
+
+The truth x takes each pixel from one 2 x 2 cell of a finer frame, whose four sites are means around the cell's centre
+(:func:`rawaug.bayer.bin_mosaic`, ``together``), so that it has real optics, colours in register and little noise of its
+own; M keeps one colour a site. PSNR and SSIM are those of linear camera RGB, and of one fixed development of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from denoisers.network import PACKED
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data.development import exposure_of, render_rgb
+from rawaug.data.pairs import Pair
+from rawaug.errors import extra
+from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise
+from rawaug.io import RawFrame, write_dng
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import NoiseModel, noise_model
+from rawaug.tasks.raw import RawTask
+from rawaug.tasks.settings import NoiseSetting, Recipe
+from rawaug.training.state import Start
+
+LIBRAW = ("VNG", "PPG", "AHD", "DCB", "DHT", "AAHD")
+"""LibRaw's demosaicings by its names."""
+
+LEAST = 512
+"""The smallest side that LibRaw's interpolation of X-Trans takes."""
+
+BLACK, WHITE = 1024, 65535
+"""Black and white level of the DNGs that LibRaw demosaics."""
+
+
+def full_colour(pair: Pair) -> Tensor:
+    """The truth of a frame: linear camera RGB ``(1, 3, H/2, W/2)`` cut to even sides, each pixel from one cell."""
+    red, green, other_green, blue = bayer.pack(pair.raw[None], pair.cfa).unbind(1)
+    rgb = torch.stack([red, (green + other_green) / 2, blue], dim=1)
+    height, width = (side // 2 * 2 for side in rgb.shape[-2:])
+    return rgb[..., :height, :width].contiguous()
+
+
+def rgb_trial(
+    pair: Pair, noise: NoiseModel, ways: Mapping[str, str] | None = None, cfa: str = CFA.RGGB, **about: Any
+) -> Trial:
+    """A frame as a test case in the domain ``rgb``: noisy RAW of a pattern against its truth of full colour.
+
+    Args:
+        pair: the frame, of which each cell becomes a pixel.
+        noise: drawn on the mosaic of the truth; of every 2 x 2 square the same in all patterns.
+        ways: the demosaicings, by the names of rows, that follow a denoiser of RAW.
+        cfa: the pattern.
+        about: other attributes of the trial, such as ``condition``.
+    """
+    rgb = full_colour(pair)
+    squares = bayer.pack(bayer.pattern(cfa).mosaic(rgb), CFA.RGGB)
+    noisy, variance, levels = freeze_noise(squares, noise, 0, TEST_NOISE, pair.name)
+    noisy, variance = in_pattern(noisy, cfa), in_pattern(variance, cfa)
+
+    follow = {}
+    for name, method in (ways or {}).items():
+        follow[name] = partial(demosaic, pair=pair, method=method, cfa=cfa)
+
+    return Trial(
+        noisy,
+        rgb,
+        variance,
+        pair.name,
+        "rgb",
+        levels=levels,
+        cfa=bayer.canonical_cfa(cfa),
+        develop=partial(develop, pair=pair, exposure=exposure_of(bayer.pack_rgb(rgb, CFA.RGGB), pair)),
+        ways=follow,
+        **about,
+    )
+
+
+def in_pattern(squares: Tensor, cfa: str) -> Tensor:
+    """Squares of 2 x 2 as a denoiser takes their pattern: packed RAW if it is Bayer's, else the mosaic."""
+    if cfa == CFA.RGGB:
+        return squares
+
+    mosaic = bayer.unpack(squares, CFA.RGGB)
+    return bayer.pack(mosaic, cfa) if cfa in CFA.__members__ else mosaic
+
+
+def develop(image: Tensor, pair: Pair, exposure: float) -> Tensor:
+    """Linear RGB ``(1, 3, H, W)``, or packed RAW at its own size, to sRGB ``(3, H, W)`` in the frame's colours."""
+    rgb = image[0, [0, 1, 3]] if image.shape[1] == PACKED else image[0]
+    return render_rgb(rgb, pair.white_balance, pair.color_matrix, exposure, least=None)
+
+
+def mosaic_of(image: Tensor, cfa: str) -> Tensor:
+    """RAW as a denoiser takes it, packed or not, as the mosaic ``(1, 1, H, W)``."""
+    return image if image.shape[1] == 1 else bayer.unpack(image, cfa)
+
+
+def demosaic(image: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB) -> Tensor:
+    """RAW as a denoiser gives it to linear camera RGB ``(1, 3, H, W)``.
+
+    Args:
+        image: packed RAW ``(1, 4, H/2, W/2)``, or a mosaic ``(1, 1, H, W)``.
+        pair: the frame that it is of.
+        method: one of :data:`LIBRAW`, or of :func:`rawaug.bayer.demosaic` for Bayer's patterns; others have their own.
+        cfa: the pattern.
+    """
+    mosaic = mosaic_of(image, cfa)
+    if method in LIBRAW:
+        return libraw_demosaic(mosaic, pair, method, cfa)
+    if cfa in CFA.__members__:
+        return bayer.demosaic(mosaic, cfa, method)
+
+    return bayer.pattern(cfa).demosaic(mosaic)
+
+
+def libraw_demosaic(mosaic: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB, **more: Any) -> Tensor:
+    """A mosaic ``(1, 1, H, W)`` to linear camera RGB ``(1, 3, H, W)`` by LibRaw.
+
+    LibRaw works on white-balanced RAW, as in its own pictures, and clips at white what the gains lift beyond it, so
+    that the mosaic is scaled down before and the result up again.
+
+    Args:
+        mosaic: a small one is continued by its whole cells.
+        pair: the frame that it is of, whose colours LibRaw is given.
+        method: one of :data:`LIBRAW`; X-Trans has Markesteijn's interpolation, whatever is given.
+        cfa: the pattern of the mosaic.
+        more: arguments of rawpy's ``postprocess``.
+    """
+    with extra("raw"):
+        import rawpy
+
+    gains = torch.tensor(pair.white_balance).reshape(3, 1, 1) / min(pair.white_balance)
+    headroom = gains.max()
+
+    height, width = mosaic.shape[-2:]
+    period = bayer.pattern(cfa).period
+    rows, columns = _repeat_cells(height, period), _repeat_cells(width, period)
+    mosaic = (mosaic[0][:, rows][..., columns] / headroom).clamp(-BLACK / (WHITE - BLACK), 1.0)
+
+    colour = pair.white_balance, pair.white_balance, pair.color_matrix
+    frame = RawFrame(mosaic, cfa, (BLACK,) * 4, WHITE, *colour, pair.camera, name=pair.name)
+    settings = {
+        "demosaic_algorithm": rawpy.DemosaicAlgorithm[method],
+        "output_color": rawpy.ColorSpace.raw,
+        "gamma": (1, 1),
+        "no_auto_bright": True,
+        "output_bps": 16,
+        "adjust_maximum_thr": 0,
+        "user_flip": 0,
+        "user_wb": [*gains.flatten().tolist(), gains[1].item()],
+    }
+
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "frame.dng"
+        write_dng(path, frame)
+        with rawpy.imread(str(path)) as raw:
+            values = raw.postprocess(**settings | more)
+
+    rgb = torch.from_numpy(values).permute(2, 0, 1).float() / 65535 * headroom / gains
+    return rgb[None, :, :height, :width]
+
+
+def _repeat_cells(side: int, period: int) -> Tensor:
+    """Numbers of the lines of a side, which go on with its whole cells if LibRaw would find it too small."""
+    lines = torch.arange(side if period == 2 else max(side, LEAST))
+    return torch.where(lines < side, lines, lines % (side // period * period))
+
+
+@dataclass
+class FullColourRecipe(Recipe):
+    """A recipe whose validation and test frames are truths of full colour.
+
+    Args:
+        test_noise: of these frames, in place of ``noise``.
+    """
+
+    from_pictures: ClassVar[bool] = True
+    test_noise: NoiseSetting = "cycleisp_sidd"
+
+
+class FullColourTask(RawTask):
+    """Denoisers that are compared in full colour: their truth is a frame whose cells become pixels."""
+
+    together = True
+    compared_in = "linear camera RGB"
+
+    def __init__(self, recipe: FullColourRecipe) -> None:
+        super().__init__(recipe)
+        self.noise = noise_model(recipe.test_noise)
+
+    def pattern(self, start: Start | None, isp: DictionaryISP) -> CFA:
+        """RGGB, whatever the ISP's is."""
+        return CFA.RGGB
+
+    def validation_key(self) -> Any:
+        """The noise of the frames."""
+        return self.recipe.test_noise
+
+    def test_noise(self) -> Any:
+        """``test_noise``."""
+        return self.recipe.test_noise

@@ -1,0 +1,120 @@
+"""Mosaics of every pattern: a mosaic and the planes of its colours in, the mosaic out, one network for all.
+
+The truth is mosaicked anew in each pattern. Results are demosaiced by LibRaw, X-Trans by Markesteijn's interpolation;
+Quad-Bayer, which LibRaw does not know, by :meth:`rawaug.bayer.Pattern.demosaic`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from denoisers.mosaic import lines_before, with_planes
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data.pairs import Pair
+from rawaug.evaluation.trials import Trial, make_trials
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import NoiseModel
+from rawaug.plugin.augment import RawAugment
+from rawaug.seeding import derive_seed
+from rawaug.tasks.base import TASKS
+from rawaug.tasks.full_colour import FullColourRecipe, FullColourTask, mosaic_of, rgb_trial
+from rawaug.training.stream import MosaicCrops, TrainingStream
+
+
+@dataclass
+class MosaicRecipe(FullColourRecipe):
+    """Networks for mosaics of every pattern.
+
+    Args:
+        patterns: shares of the patterns in training, by name.
+        test_patterns: those of validation and test frames.
+    """
+
+    kind: ClassVar[str] = "mosaic"
+    patterns: dict[str, float] = field(default_factory=lambda: {"RGGB": 0.4, "XTRANS": 0.4, "QUAD-RGGB": 0.2})
+    test_patterns: list[str] = field(default_factory=lambda: ["RGGB", "XTRANS", "QUAD-RGGB"])
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in (*self.patterns, *self.test_patterns):
+            bayer.pattern(name)
+
+        shares = self.patterns.values()
+        if not shares or min(shares) < 0 or not sum(shares) > 0:
+            raise ValueError(f"patterns: shares must be at least 0, and one above, got {self.patterns}")
+
+
+def mosaic_trial(pair: Pair, cfa: str, noise: NoiseModel) -> Trial:
+    """A frame as a test case of a pattern, in the domain ``rgb``: packed RAW if it is Bayer's, else a mosaic."""
+    method = "bilinear" if cfa.startswith("QUAD") else "AHD"
+    return rgb_trial(pair, noise, {"": method}, cfa, condition=cfa)
+
+
+def planes_trial(pair: Pair, cfa: str, noise: NoiseModel) -> Trial:
+    """A frame as a network of mosaics takes it, with the planes of its colours: ``(1, 4, H, W)``, domain ``raw``.
+
+    It begins at the line from which the network is trained to meet the pattern.
+    """
+    trial = mosaic_trial(pair, cfa, noise)
+    assert trial.variance is not None
+
+    pattern = bayer.pattern(cfa)
+    top, left = (-lines % pattern.period for lines in lines_before(pattern))
+    raw = mosaic_of(trial.noisy, cfa)[..., top:, left:]
+    variance = mosaic_of(trial.variance, cfa)[..., top:, left:]
+    clean = pattern.mosaic(trial.clean)[..., top:, left:]
+
+    noisy = with_planes(raw, pattern.shift(top, left))
+    return Trial(noisy, clean, variance, pair.name, condition=cfa)
+
+
+@TASKS.register("mosaic")
+class MosaicTask(FullColourTask):
+    """One network on patterns drawn at random, scored in each."""
+
+    settings = MosaicRecipe
+    ensembles = False
+
+    def stream(
+        self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
+    ) -> TrainingStream:
+        """Crops of pictures as RAW of all patterns."""
+        settings, train = self.recipe.arms[arm], self.recipe.train
+        augment = RawAugment(isp, noise, draw=settings.draw)
+        crops = MosaicCrops(pictures, augment, train.crop, settings.zoom, self.recipe.patterns)
+        return TrainingStream(None, crops, train.batch, 1.0, derive_seed(seed, "stream"))
+
+    def validation_trials(
+        self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
+    ) -> Sequence[Trial]:
+        """The frames in every pattern."""
+        trials = []
+        for cfa in self.recipe.test_patterns:
+            for pair in frames:
+                trials.append(planes_trial(pair, cfa, self.noise))
+
+        return trials
+
+    def test_trials(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
+        """The frames in every pattern."""
+        cases = [(cfa, k) for cfa in self.recipe.test_patterns for k in range(len(frames))]
+        return make_trials(cases, lambda case: mosaic_trial(frames[case[1]], case[0], self.noise))
+
+    def samples_key(self) -> Sequence[Any]:
+        """The patterns."""
+        return self.recipe.patterns, self.recipe.test_patterns
+
+    def trials_key(self) -> Sequence[Any]:
+        """The noise and the patterns of the test."""
+        return self.recipe.test_noise, self.recipe.test_patterns
+
+    def group(self, trial: Any) -> str:
+        """The pattern."""
+        return str(trial.condition)
+
+    def can_denoise(self, denoiser: Any, trial: Trial) -> bool:
+        """Networks of mosaics take any pattern, other denoisers Bayer's."""
+        return denoiser.of_any is not None or trial.condition in CFA.__members__

@@ -1,0 +1,93 @@
+"""RAW: packed noisy RAW in, packed RAW out, trained on real frames, on pictures, or on both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from rawaug.bayer import CFA
+from rawaug.data.pairs import Pair
+from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.evaluation.trials import Trial, make_trials, trial_of
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import NoiseModel
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
+from rawaug.registry import Spec
+from rawaug.seeding import derive_seed
+from rawaug.tasks.base import TASKS, Task
+from rawaug.training.estimators import ESTIMATORS, SelfSupervised
+from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, noisy_frame, r2r_trials
+from rawaug.training.stream import WATCHED, PictureCrops, RealCrops, Source, TrainingStream, freeze_samples
+
+
+@TASKS.register("raw")
+class RawTask(Task):
+    """Denoisers of RAW in one of Bayer's patterns, with clean targets or from noisy frames alone."""
+
+    def training_frames(self, pairs: Sequence[Pair], isp: DictionaryISP) -> Sequence[Any]:
+        """The pairs, or a :class:`NoisyFrame` of each if no arm sees clean ones."""
+        if not self.recipe.self_supervised:
+            return pairs
+
+        return [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
+
+    def stream(
+        self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
+    ) -> TrainingStream:
+        """Crops of the frames, and of pictures as RAW, in the arm's shares."""
+        settings = self.recipe.arms[arm]
+        train = self.recipe.train
+        seed = derive_seed(seed, "stream")
+        estimator = ESTIMATORS.make(settings.estimator)
+
+        augment = None
+        if settings.augmented:
+            augment = RawAugment(isp, noise, draw=settings.draw, target=settings.srgb or self.recipe.target)
+
+        real: Source | None = None
+        synthetic: Source | None = None
+        if isinstance(estimator, SelfSupervised):
+            if frames and settings.augmented < 1.0:
+                real = NoisyCrops(frames, estimator, train.crop, isp.cfa)
+            if augment is not None:
+                frozen = FrozenPictures(pictures, augment, derive_seed(seed, "pictures"), estimator.shots)
+                synthetic = NoisyCrops(frozen, estimator, train.crop, isp.cfa)
+        else:
+            if frames:
+                real = RealCrops(frames, noise, train.crop, isp.cfa)
+            if augment is not None:
+                synthetic = PictureCrops(RawPairs(pictures, augment, train.crop, zoom=settings.zoom))
+
+        return TrainingStream(real, synthetic, train.batch, settings.augmented, seed)
+
+    def validation_trials(
+        self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
+    ) -> Sequence[Trial]:
+        """The frames with frozen noise, or as r2r pairs if no arm sees clean ones; without any, pictures as RAW."""
+        if frames and not self.recipe.self_supervised:
+            return [trial_of(pair, noise, isp.cfa) for pair in frames]
+
+        augment = RawAugment(isp, noise, target=self.recipe.target)
+        if self.recipe.self_supervised:
+            frozen = frames or FrozenPictures(pictures, augment, derive_seed("validation"))[:WATCHED]
+            return r2r_trials(frozen, isp.cfa)
+
+        return freeze_samples(PictureCrops(RawPairs(pictures, augment, self.recipe.train.crop)), "validation")
+
+    def test_trials(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
+        """The frames with captured or frozen noise, in the pattern of the ISP."""
+        return make_trials(frames, lambda pair: trial_of(pair, noise, isp.cfa))
+
+    def denoiser(self, name: str, network: nn.Module, pattern: CFA, views: int = 1) -> RawDenoiser:
+        """The network in tiles, for its own pattern."""
+        return RawDenoiser.of(network, self.recipe.device, name=name, cfa=pattern, views=views, checked=False)
+
+    def open_methods(self, classical: Sequence[Spec], untouched: Sequence[Path]) -> list[RawDenoiser]:
+        """Filters and trained denoisers of mosaics."""
+        filters = [RawDenoiser.of(spec) for spec in classical]
+        trained = [RawDenoiser.of(file, self.recipe.device, name=file.stem) for file in untouched]
+        return [one.require_mosaic() for one in (*filters, *trained)]

@@ -1,0 +1,82 @@
+"""Linear camera RGB: packed noisy RAW in, full colour out, beside denoisers of RAW followed by each demosaicing.
+
+The demosaicings are those of :func:`rawaug.bayer.demosaic`, and LibRaw's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from torch import Tensor
+
+from denoisers.files import DEFAULT
+from rawaug import bayer
+from rawaug.denoising.denoiser import Noisy
+from rawaug.evaluation.scores import NOISY
+from rawaug.evaluation.trials import Trial, make_trials
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import NoiseModel
+from rawaug.plugin.targets import Target
+from rawaug.tasks.base import TASKS
+from rawaug.tasks.full_colour import LIBRAW, FullColourRecipe, FullColourTask, rgb_trial
+
+
+@dataclass
+class RgbRecipe(FullColourRecipe):
+    """Networks that demosaic and denoise at once.
+
+    Args:
+        demosaicing: what each denoiser of RAW, of ``classical`` and ``untouched``, is followed by: bilinear, malvar, or
+            LibRaw's VNG, PPG, AHD, DCB, DHT or AAHD.
+    """
+
+    kind: ClassVar[str] = "rgb"
+    target: ClassVar[Target] = "rgb"
+    classical: list[str | dict[str, Any]] = field(default_factory=lambda: ["NonLocalMeans"])
+    untouched: list[str] = field(default_factory=lambda: [DEFAULT])
+    demosaicing: list[str] = field(default_factory=lambda: ["malvar", "AHD", "DCB"])
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        known = *bayer.STENCILS, *LIBRAW
+        for name in self.demosaicing:
+            if name not in known:
+                raise ValueError(f"demosaicing {name!r} is unknown; use one of {', '.join(known)}")
+
+
+class MalvarInput:
+    """The noisy input, demosaiced by Malvar, He and Cutler's interpolation."""
+
+    name, takes = NOISY.name, "raw"
+
+    def __call__(self, given: Noisy) -> Tensor:
+        return bayer.demosaic(bayer.unpack(given.image, given.cfa), given.cfa, "malvar")
+
+
+@TASKS.register("rgb")
+class RgbTask(FullColourTask):
+    """Networks that demosaic, too."""
+
+    settings = RgbRecipe
+    upscale = 2
+    input = MalvarInput()
+
+    def validation_trials(
+        self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
+    ) -> Sequence[Trial]:
+        """The frames with the noise of the test; without any, pictures as RAW."""
+        if not frames:
+            return super().validation_trials(frames, pictures, isp, noise)
+
+        return [rgb_trial(pair, self.noise) for pair in frames]
+
+    def test_trials(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
+        """The frames in RGGB, with every demosaicing."""
+        ways = {method: method for method in self.recipe.demosaicing}
+        return make_trials(frames, lambda pair: rgb_trial(pair, self.noise, ways))
+
+    def trials_key(self) -> Sequence[Any]:
+        """The noise of the test."""
+        return (self.recipe.test_noise,)

@@ -1,0 +1,287 @@
+r"""Developed pictures: sRGB in and out, tested on real pairs, or on frames with noise in RAW that LibRaw develops.
+
+.. math:: x = L(y + n), \qquad \operatorname{var}(n) = \mathrm{shot\_var} \cdot y + \mathrm{read\_var}
+
+L is LibRaw's own way from a DNG to sRGB: its demosaicing (AHD), its colours and its tone curve, not the forward pass
+that a training with camera noise has seen, though ``ahd`` is a relative. The truth is L(y). Noise is keyed by (frame,
+levels), the same for every method. Beside the arms stand classical filters on sRGB, whose strength validation chooses
+for each level, and trained RAW denoisers, which are given the levels and developed after. Real pairs are those of
+:mod:`rawaug.data.picture_pairs`, as ``cc15:DIR``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+from tempfile import TemporaryDirectory
+from typing import Any, ClassVar
+
+from torch import Tensor, nn
+
+from denoisers.files import DEFAULT
+from rawaug import bayer
+from rawaug.bayer import CFA, noise_variance
+from rawaug.data.folders import Kept
+from rawaug.data.pairs import Middles, Pair, SomePairs
+from rawaug.data.picture_pairs import PicturePair, PicturePairs, is_picture_pairs, open_picture_pairs
+from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser
+from rawaug.denoising.pictures import PictureDenoiser
+from rawaug.evaluation.figures import Panels, crops_at_100, panels_of
+from rawaug.evaluation.picture_trials import picture_trials
+from rawaug.evaluation.scores import score
+from rawaug.evaluation.trials import Trial
+from rawaug.io import RawFrame, develop, write_dng
+from rawaug.io.pictures import write_picture
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import NoiseModel, noise_model
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.targets import Target
+from rawaug.progress import progress
+from rawaug.registry import Spec, spec_label, split_spec
+from rawaug.seeding import derive_seed, keyed_generator
+from rawaug.tasks.base import TASKS, Task
+from rawaug.tasks.settings import Recipe
+from rawaug.training.srgb_noise import NoisyPictures, SrgbSamples, noise_on_srgb
+from rawaug.training.stream import PictureCrops, TrainingStream
+
+BLACK, WHITE = 8192.0, 65535.0
+"""Black and white level of the DNG: room for noise below black."""
+
+DEVIATIONS = (0.01, 0.015, 0.022, 0.033, 0.05, 0.075, 0.11, 0.16)
+"""The deviations of white noise that a filter can be told, of which validation chooses one."""
+
+REAL = "real"
+"""The name of the table of real pairs, whose level is not known."""
+
+_WITHOUT_PLANES = ("NonLocalMeans", "TotalVariation", "Wavelet")
+
+
+@dataclass
+class SrgbRecipe(Recipe):
+    """A comparison of blind denoisers of sRGB by what they are trained on.
+
+    ``noise`` is that of training. ``data.validation`` and ``data.test`` may be real pairs of developed pictures, too;
+    networks are told no level.
+
+    Args:
+        rivals: denoisers of RAW to compare with, by name or file, in place of ``untouched``.
+        levels: (shot_var, read_var) of the RAW noise of validation and test frames, a table each.
+    """
+
+    kind: ClassVar[str] = "srgb"
+    target: ClassVar[Target] = "srgb"
+    from_pictures: ClassVar[bool] = True
+    rivals: list[str] = field(default_factory=lambda: [DEFAULT])
+    levels: list[tuple[float, float]] = field(default_factory=lambda: [(5e-4, 1e-6), (2e-3, 1e-5), (8e-3, 1e-4)])
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.levels or self.data.validation is None:
+            raise ValueError("levels and data.validation: give at least one level and frames to choose weights on")
+        if self.untouched:
+            raise ValueError("untouched: denoisers to compare with are named in rivals")
+
+        for label, arm in self.arms.items():
+            network = self.network_of(label)
+            reads_level = arm.told is not None
+            settings = network.settings.get("channels"), network.settings.get("variance_map", True)
+            if network.start is None and settings != (3, reads_level):
+                wanted = f"channels: 3, variance_map: {str(reads_level).lower()}"
+                raise ValueError(f"denoiser.settings: the network of arms.{label} has {wanted}, as told says")
+
+        for spec in self.classical:
+            name, _ = split_spec(spec)
+            if name not in _WITHOUT_PLANES:
+                raise ValueError(f"classical: {name} is for RAW; on sRGB use one of {', '.join(_WITHOUT_PLANES)}")
+
+
+@TASKS.register("srgb")
+class SrgbTask(Task):
+    """Denoisers of developed pictures."""
+
+    settings = SrgbRecipe
+    compared_in = "developed sRGB"
+    ensembles = False
+
+    def open(self, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Any]:
+        """Open frames, or real pairs of developed pictures."""
+        if isinstance(spec, str) and is_picture_pairs(spec):
+            return open_picture_pairs(spec)
+
+        return super().open(spec, split, clean)
+
+    def prepare(self, frames: Sequence[Any], part: str) -> Sequence[Any]:
+        """Frames as of RAW; real pairs are counted and cropped alone."""
+        if not isinstance(frames, PicturePairs):
+            return super().prepare(frames, part)
+
+        data = self.recipe.data
+        count = getattr(data, f"{part}_count")
+        crop = getattr(data, f"{part}_crop")
+        chosen = SomePairs(frames, range(len(frames))[:count])
+        return Kept(chosen if crop is None else Middles(chosen, crop))
+
+    def stream(
+        self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
+    ) -> TrainingStream:
+        """Crops of pictures with the camera's noise, with noise drawn on them, or with both in the arm's shares."""
+        settings, train = self.recipe.arms[arm], self.recipe.train
+
+        camera = None
+        if settings.srgb_noise is None or settings.srgb_share < 1.0:
+            augment = RawAugment(isp, noise, draw=settings.draw, target=settings.srgb or "srgb")
+            camera = PictureCrops(RawPairs(pictures, augment, train.crop, zoom=settings.zoom))
+
+        drawn = None
+        if settings.srgb_noise is not None:
+            drawn = NoisyPictures(pictures, noise_on_srgb(settings.srgb_noise), train.crop, settings.zoom)
+
+        samples = SrgbSamples(camera, drawn, settings.srgb_share, settings.told)
+        return TrainingStream(None, samples, train.batch, 1.0, derive_seed(seed, "stream"))
+
+    def validation_trials(
+        self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
+    ) -> Sequence[Trial]:
+        """The frames at every level, developed."""
+        return srgb_trials(frames, self.recipe.levels, "develop validation")
+
+    def test_trials(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
+        """The frames at every level, developed."""
+        return srgb_trials(frames, self.recipe.levels, "develop test")
+
+    def validation_key(self) -> Any:
+        """The levels."""
+        return self.recipe.levels
+
+    def trials_key(self) -> Sequence[Any]:
+        """The levels."""
+        return (self.recipe.levels,)
+
+    def test_noise(self) -> Any:
+        """Noise is that of each table's level."""
+        return None
+
+    def denoiser(self, name: str, network: nn.Module, pattern: CFA, views: int = 1) -> PictureDenoiser:
+        """The network in tiles; one that reads a level estimates it."""
+        return PictureDenoiser.of_network(name, network, self.recipe.device)
+
+    def open_methods(self, classical: Sequence[Spec], untouched: Sequence[Path]) -> list[Any]:
+        """The rivals, denoisers of RAW; filters are made for each level, see :meth:`methods_for`."""
+        return [RawDenoiser.of(name, self.recipe.device).require_mosaic() for name in self.recipe.rivals]
+
+    def group(self, trial: Any) -> str:
+        """The level."""
+        return str(trial.strength)
+
+    def methods_for(self, group: str, methods: Sequence[Any], validation: Sequence[Any]) -> list[Any]:
+        """Filters, each at the strength that is best on validation frames of this level, and the rivals."""
+        same_level = [trial for trial in validation if trial.strength == group]
+        filters = [best_filter(spec, same_level or validation) for spec in self.recipe.classical]
+        rivals = [] if group == REAL else list(methods)
+        return [*filters, *rivals]
+
+    def panels(self, methods: Any, trials: Sequence[Trial]) -> list[Panels]:
+        """The first frame of each level."""
+        panels = []
+        for group, of_group in methods.items():
+            first = next(trial for trial in trials if trial.strength == group)
+            panels.append(panels_of(of_group, first))
+
+        return panels
+
+    def save_picture(self, panels: Sequence[Panels], path: Path) -> Path:
+        """Write crops at 100 %, a level in each row."""
+        write_picture(path, crops_at_100(panels))
+        return path
+
+    def command_of_weights(self, path: Path) -> str:
+        """The command that denoises pictures with the weights of an arm."""
+        return f"rawaug denoise IN.jpg OUT.jpg --denoiser {path}"
+
+    def command_of_method(self, name: str) -> str:
+        """The command that denoises pictures with a filter, or RAW with a rival."""
+        method = name.partition(", ")[0]
+        for rival in self.recipe.rivals:
+            if method == Path(rival).stem:
+                return f"rawaug denoise IN.dng OUT.dng --denoiser {rival}"
+
+        for spec in self.recipe.classical:
+            if method == spec_label(spec):
+                return f"rawaug denoise IN.jpg OUT.jpg --denoiser {split_spec(spec)[0]}"
+
+        return ""
+
+    def notes(self, test: Sequence[Any]) -> dict[str, Any]:
+        """The mean variance of the own noise of the test frames, in RAW, where it is known."""
+        own = {}
+        for pair in test:
+            if isinstance(pair, Pair) and pair.own_noise is not None:
+                own[pair.name] = noise_variance(pair.raw, *pair.own_noise).mean().item()
+
+        return {"own_noise": own}
+
+
+def level_name(levels: Levels) -> str:
+    """A level's name in tables and files."""
+    return f"{levels[0]:g}, {levels[1]:g}"
+
+
+def srgb_trials(pairs: Sequence[Any], levels: Sequence[Levels], label: str) -> list[Trial]:
+    """Every frame at every level as LibRaw develops it, in the domain ``srgb``, with the RAW before; a pair of pictures
+    as it is.
+    """
+    trials: list[Trial] = []
+    for pair in progress(pairs, label=label, unit="frame"):
+        if isinstance(pair, PicturePair):
+            (trial,) = picture_trials([pair])
+            trials.append(replace(trial, condition="", strength=REAL))
+            continue
+
+        clean = developed(pair.raw, pair)
+        packed = bayer.pack(pair.raw[None], pair.cfa)
+        ways = {"then LibRaw": partial(_unpacked_and_developed, pair=pair)}
+
+        for level in levels:
+            noise = noise_model(level)
+            params = noise.sample(1, keyed_generator("developed noise", pair.name, *map(str, level)))
+            noisy, variance = noise.apply_with_variance(packed, params)
+
+            raw = Noisy(noisy, variance, level, pair.cfa)
+            image = _unpacked_and_developed(noisy, pair)
+            strength = level_name(level)
+            trials.append(Trial(image, clean, None, pair.name, "srgb", strength=strength, raw=raw, ways=ways))
+
+    return trials
+
+
+def _unpacked_and_developed(packed: Tensor, pair: Pair) -> Tensor:
+    return developed(bayer.unpack(packed, pair.cfa)[0], pair)
+
+
+def developed(mosaic: Tensor, pair: Pair) -> Tensor:
+    """What LibRaw makes of a mosaic ``(1, H, W)`` in the colours of its pair: sRGB ``(1, 3, H, W)`` of 8 bits."""
+    mosaic = mosaic.clamp(-BLACK / (WHITE - BLACK), 1.0)
+    colour = pair.white_balance, pair.white_balance, pair.color_matrix
+    frame = RawFrame(mosaic, pair.cfa, (BLACK,) * 4, WHITE, *colour, "rawaug", name=pair.name)
+
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "frame.dng"
+        write_dng(path, frame)
+        return develop(path)[None] / 255.0
+
+
+def best_filter(spec: Spec, trials: Sequence[Trial]) -> PictureDenoiser:
+    """The filter of the deviation with the highest mean PSNR on these trials."""
+    best, best_psnr = None, float("-inf")
+    for deviation in DEVIATIONS:
+        denoiser = replace(PictureDenoiser.of_filter(spec, deviation), name=spec_label(spec))
+        psnr = fmean(row.psnr for row in score([denoiser], trials))
+        if best is None or psnr > best_psnr:
+            best, best_psnr = denoiser, psnr
+
+    assert best is not None
+    return best

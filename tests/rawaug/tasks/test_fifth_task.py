@@ -1,0 +1,93 @@
+"""A fifth task is one file: the mean of a burst, trained, scored, shown and reported as every other task is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rawaug.cli import main
+
+BURST = '''
+"""RAW of a burst: the mean of several shots of a scene in, packed RAW out."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+from rawaug.noise import noise_model
+from rawaug.tasks.base import TASKS
+from rawaug.tasks.raw import RawTask
+from rawaug.tasks.settings import Recipe
+
+
+@dataclass
+class BurstRecipe(Recipe):
+    """Denoisers of the mean of a burst.
+
+    Args:
+        shots: number of shots of a scene.
+    """
+
+    kind: ClassVar[str] = "burst"
+    from_pictures: ClassVar[bool] = True
+    shots: int = 4
+
+
+@TASKS.register("burst")
+class BurstTask(RawTask):
+    """A mean of shots has a share of the variance of one."""
+
+    settings = BurstRecipe
+
+    def __init__(self, recipe):
+        super().__init__(recipe)
+        shot_var, read_var = recipe.noise
+        self.noise = noise_model((shot_var / recipe.shots, read_var / recipe.shots))
+
+    def stream(self, arm, frames, pictures, isp, noise, seed):
+        return super().stream(arm, frames, pictures, isp, self.noise, seed)
+
+    def validation_trials(self, frames, pictures, isp, noise):
+        return super().validation_trials(frames, pictures, isp, self.noise)
+
+    def test_trials(self, frames, isp, noise):
+        clean = [replace(pair, noisy=None, shot_var=None, read_var=None) for pair in frames]
+        return super().test_trials(clean, isp, self.noise)
+
+    def group(self, trial):
+        return f"{self.recipe.shots} shots"
+
+    def samples_key(self):
+        return (self.recipe.shots,)
+'''
+
+RECIPE = """
+experiment: burst
+name: burst
+camera: universal
+data: {pairs: null, pictures: "tiny:", validation: null, test: "tiny:validation", test_count: 1}
+denoiser: {name: UNet, settings: {width: 4, scales: 2}}
+noise: [4.0e-3, 4.0e-5]
+train: {steps: 2, batch: 2, crop: 32}
+arms: {pictures: {augmented: 1.0}}
+self_ensemble: false
+device: cpu
+"""
+
+
+@pytest.mark.usefixtures("tiny")
+def test_a_fifth_task_is_one_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "burst.py").write_text(BURST)
+    (tmp_path / "burst.yaml").write_text(RECIPE)
+    command = ["--import", str(tmp_path / "burst.py"), "run", str(tmp_path / "burst.yaml"), "--out", str(tmp_path)]
+    assert main([*command[:4], "--keys"]) == 0
+    assert "shots of a scene" in capsys.readouterr().out
+    assert main(command) == main([*command, "--shots", "1", "--name", "one"]) == 0
+
+    burst = json.loads((tmp_path / "burst" / "results.json").read_text())["4 shots"]
+    single = json.loads((tmp_path / "one" / "results.json").read_text())["1 shots"]
+    psnr = [table["results"]["pictures"][0]["plain"]["psnr_noisy"] for table in (burst, single)]
+    assert psnr[0] == pytest.approx(psnr[1] + 6.02, abs=0.05), "a mean of four shots has a quarter of the variance"
+    for name in ("picture.png", "report.html", "report_scores_4_shots.csv"):
+        assert (tmp_path / "burst" / name).is_file()
