@@ -92,8 +92,12 @@ def content_of(path: str | Path) -> Content:
     path = Path(path)
     require_file(path)
     with path.open("rb") as file:
-        content = _by_bytes(file)
+        return content_of_opened(file, path)
 
+
+def content_of_opened(file: BinaryIO, path: Path) -> Content:
+    """:func:`content_of` a file that is open at its beginning."""
+    content = _by_bytes(file)
     if content.kind == "other" or content.format == "TIFF":
         return _by_extension(path.suffix.lower(), content)
     return content

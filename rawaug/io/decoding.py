@@ -20,9 +20,9 @@ import numpy as np
 
 from rawaug.errors import extra, how_to_install
 from rawaug.files import require_file
-from rawaug.io.content import content_of, reads_avif, reads_heic
+from rawaug.io.content import content_of_opened, reads_avif, reads_heic
 from rawaug.io.directories import COMPRESSION, DamagedTags, TiffFile
-from rawaug.io.headers import Headers, read_headers
+from rawaug.io.headers import Headers, headers_of_opened, png_fault
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.profiles import profile_of_code_points
 
@@ -31,11 +31,12 @@ MAX_PIXELS = 2**26
 
 MAX_CHANNELS = 4
 
-_LINEAR_FORMATS = ("openexr", "hdr")
-_WITH_ASSOCIATED_ALPHA = ("tiff", "openexr")
+_LINEAR_FORMATS = ("OpenEXR", "Radiance")
+_WITH_ASSOCIATED_ALPHA = ("TIFF", "OpenEXR")
 """Formats whose colours may be multiplied by alpha already."""
 _UPRIGHT = ("JPEG XL", "HEIC", "JPEG 2000")
 """Formats that their decoders turn upright, whatever EXIF says."""
+_FLOATS = ("half", "float", "double")
 _BITS = 258
 _JPEG_IN_TIFF = 7
 
@@ -80,14 +81,18 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, coarse: bool = False) -> De
     """
     require_file(path, "picture file")
     require_utf8(path)
-    content = content_of(path)
+    with path.open("rb") as file:
+        content = content_of_opened(file, path)
+        headers = headers_of_opened(file, content.format)
     if content.kind == "raw":
         raise ValueError(f"{path}: is camera RAW ({content.format}), not a developed picture; develop it first")
-
-    headers = read_headers(path, content.format)
     if headers.animated:
         raise ValueError(f"{path}: is an animation; save a single frame")
 
+    if content.format == "PNG":
+        fault = png_fault(path)
+        if fault is not None:
+            raise OSError(f"{path}: cannot be read as a picture (PNG: {fault}); copy it again")
     if content.format in ("HEIC", "AVIF"):
         return _decode_heif(path, content.format, max_pixels, headers)
     if content.format == "BMP":
@@ -99,8 +104,10 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, coarse: bool = False) -> De
 
 def require_utf8(path: Path) -> None:
     """Raise OSError if the name is not UTF-8, which the libraries need."""
-    if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # how Python represents bytes that are not UTF-8
-        raise OSError(f"{os.fsencode(path)!r}: cannot be opened because its name is not UTF-8; rename it")
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:  # Python represents bytes that are not UTF-8 by letters that have no code in it
+        raise OSError(f"{os.fsencode(path)!r}: cannot be opened because its name is not UTF-8; rename it") from None
 
 
 def require_size(path: Path, height: int, width: int, channels: int, max_pixels: int) -> None:
@@ -117,12 +124,15 @@ def require_size(path: Path, height: int, width: int, channels: int, max_pixels:
 # -- OpenImageIO -------------------------------------------------------------------------------------------------------
 
 
-def open_image(path: Path) -> Any:
+def open_image(path: Path, may_have_alpha: bool = True) -> Any:
     """OpenImageIO's reader of a file, which leaves colours as they are under their alpha."""
     oiio = load_oiio()
-    config = oiio.ImageSpec()
-    config.attribute("oiio:UnassociatedAlpha", 1)
-    source = oiio.ImageInput.open(str(path), config)
+    if may_have_alpha:
+        config = oiio.ImageSpec()
+        config.attribute("oiio:UnassociatedAlpha", 1)
+        source = oiio.ImageInput.open(str(path), config)
+    else:
+        source = oiio.ImageInput.open(str(path))
     if source is None:
         raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {reason(oiio) or 'no reason given'})")
     return source
@@ -146,16 +156,17 @@ def reason(source: Any) -> str:
 
 
 def _decode_with_oiio(path: Path, name: str, max_pixels: int, coarse: bool, headers: Headers) -> Decoded:
-    source = open_image(path)
+    source = open_image(path, name != "JPEG")
     spec = source.spec()
     require_size(path, spec.height * spec.depth, spec.width, spec.nchannels, max_pixels)
-    if name == "JPEG" and _is_float(spec):
+    stored = str(spec.format)
+    if name == "JPEG" and stored in _FLOATS:
         source.close()
         return _decode_with_pillow(path, "JPEG", max_pixels, headers)
 
     has_alpha = _require_grey_or_rgb(spec, path)
     profile = spec.getattribute("ICCProfile")
-    kind = _number_type(spec, path)
+    kind = _number_type(stored, path)
     if coarse and kind == "uint16" and profile is None and not has_alpha:
         kind = "uint8"
 
@@ -164,16 +175,14 @@ def _decode_with_oiio(path: Path, name: str, max_pixels: int, coarse: bool, head
     except UnicodeDecodeError as error:  # OpenImageIO's binding, of texts in the header
         raise OSError(f"{path}: cannot be read as a picture (its header is damaged: {error}); copy it again") from error
     fault = reason(source)  # also set where a decoder padded a truncated file
-    format_name = source.format_name()
-    # a GIF is marked as animated only if its frames have a duration
-    moves = spec.get_int_attribute("oiio:Movie") or (format_name == "gif" and source.seek_subimage(1, 0))
+    moves = name != "JPEG" and _moves(source, spec)
     source.close()
     if moves:
         raise ValueError(f"{path}: is an animation; save a single frame")
     if pixels is None or fault:
         raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {fault or 'no reason given'})")
 
-    associated = format_name in _WITH_ASSOCIATED_ALPHA and not spec.get_int_attribute("oiio:UnassociatedAlpha")
+    associated = name in _WITH_ASSOCIATED_ALPHA and not spec.get_int_attribute("oiio:UnassociatedAlpha")
     orientation = headers.orientation
     if orientation is None:
         orientation = spec.get_int_attribute("Orientation", 1)
@@ -184,23 +193,24 @@ def _decode_with_oiio(path: Path, name: str, max_pixels: int, coarse: bool, head
         alpha=pixels[..., -1:] if has_alpha else None,
         associated=associated,
         format=name,
-        linear=format_name in _LINEAR_FORMATS,
+        linear=name in _LINEAR_FORMATS,
         profile=None if profile is None else bytes(profile),
         orientation=orientation,
         headers=headers,
     )
 
 
-def _is_float(spec: Any) -> bool:
-    oiio = load_oiio()
-    return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+def _moves(source: Any, spec: Any) -> bool:
+    """Whether there are several frames; a GIF is marked so only if they have a duration."""
+    if spec.get_int_attribute("oiio:Movie"):
+        return True
+    return source.format_name() == "gif" and bool(source.seek_subimage(1, 0))
 
 
-def _number_type(spec: Any, path: Path) -> str:
-    """The type that the numbers are read in: their own, or the next that holds them."""
-    if _is_float(spec):
+def _number_type(name: str, path: Path) -> str:
+    """The type that numbers are read in: their own, or the next that holds them."""
+    if name in _FLOATS:
         return "float"
-    name = str(spec.format)
     if name not in ("uint8", "uint16"):
         raise ValueError(f"{path}: holds {name} numbers; a picture has 8 or 16 bits, or floating point")
     return name
@@ -209,10 +219,12 @@ def _number_type(spec: Any, path: Path) -> str:
 def _require_grey_or_rgb(spec: Any, path: Path) -> bool:
     """Whether there is alpha; ValueError if a conversion to RGB would need a profile or a choice of channels."""
     stored = spec.get_string_attribute("tiff:ColorSpace") or spec.get_string_attribute("jpeg:ColorSpace")
-    if any(name in stored for name in ("CMYK", "YCCK", "LAB", "separated")):
+    if stored and any(name in stored for name in ("CMYK", "YCCK", "LAB", "separated")):
         raise ValueError(f"{path}: is {stored}; convert it to sRGB first")
 
     names = tuple(spec.channelnames)
+    if names == ("R", "G", "B"):
+        return False
     if names == ("R", "G"):  # grey with alpha in JPEG XL
         return True
     more = names[1:] if len(names) < 3 else names[3:]

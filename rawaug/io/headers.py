@@ -26,6 +26,7 @@ XMP_TAG = 700
 
 _MOST_CHUNKS = 2**20
 _MOST_BYTES = 2**26
+_PIECE = 2**20
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 _XMP_ORIENTATION = re.compile(rb"""tiff:Orientation(?:>|=["'])([1-8])\b""")
 
@@ -59,14 +60,19 @@ class Headers(NamedTuple):
 
 def read_headers(path: Path, name: str) -> Headers:
     """The metadata of a file of the format ``name``; what is damaged or unknown is left out."""
+    with path.open("rb") as file:
+        return headers_of_opened(file, name)
+
+
+def headers_of_opened(file: BinaryIO, name: str) -> Headers:
+    """:func:`read_headers` of a file that is open."""
     reader = _READERS.get(name)
     if reader is None:
         return Headers()
-    with path.open("rb") as file:
-        try:
-            return reader(file)
-        except (DamagedTags, struct.error, zlib.error, ValueError, IndexError):
-            return Headers()
+    try:
+        return reader(file)
+    except (DamagedTags, struct.error, zlib.error, ValueError, IndexError):
+        return Headers()
 
 
 def orientation_of_exif(exif: bytes | None) -> int | None:
@@ -95,14 +101,14 @@ def jpeg_segments(file: BinaryIO) -> Iterator[Segment]:
     """The segments of a JPEG before its first scan."""
     file.seek(2)
     while True:
-        head = file.read(2)
-        while len(head) == 2 and head[1] == 0xFF:  # bytes of 255 may fill the space before a marker
+        head = file.read(4)
+        while len(head) == 4 and head[1] == 0xFF:  # bytes of 255 may fill the space before a marker
             head = head[1:] + file.read(1)
-        if len(head) < 2 or head[0] != 0xFF or head[1] in (_START_OF_SCAN, _END_OF_IMAGE):
+        if len(head) < 4 or head[0] != 0xFF or head[1] in (_START_OF_SCAN, _END_OF_IMAGE):
             return
-        (length,) = struct.unpack(">H", file.read(2))
-        data = file.read(length - 2)
-        if len(data) < length - 2:
+        length = int.from_bytes(head[2:], "big") - 2
+        data = file.read(length)
+        if len(data) < length or length < 0:
             return
         yield Segment(head[1], data)
 
@@ -144,6 +150,33 @@ def png_chunks(file: BinaryIO) -> Iterator[Chunk]:
             return
         yield Chunk(name, place + 8, length)
         place += 12 + length
+
+
+def png_fault(path: Path) -> str | None:
+    """What is wrong with the chunks of a PNG that hold its pixels; None if they are whole.
+
+    libpng would write this to the standard error stream, beside the line that names the file.
+    """
+    name = b""
+    with path.open("rb") as file:
+        for chunk in png_chunks(file):
+            name = chunk.name
+            if name == b"IEND":
+                return None
+            if name[:1].isupper() and _checksum(file, chunk) != file.read(4):
+                return f"chunk {name.decode('latin-1')} has a wrong checksum"
+    return f"it ends behind chunk {name.decode('latin-1')}" if name else "it ends in its header"
+
+
+def _checksum(file: BinaryIO, chunk: Chunk) -> bytes:
+    """The checksum of a chunk as it should be; the file is then at the one that it has."""
+    file.seek(chunk.place)
+    left, checksum = chunk.length, zlib.crc32(chunk.name)
+    while left:
+        data = file.read(min(left, _PIECE))
+        checksum = zlib.crc32(data, checksum)
+        left -= len(data)
+    return struct.pack(">I", checksum)
 
 
 def chunk_data(file: BinaryIO, chunk: Chunk) -> bytes:

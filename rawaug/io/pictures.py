@@ -77,7 +77,8 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
     picture = decode(path, max_pixels, coarse=True)
     pixels = _as_srgb(_over_black(picture), picture, path)
     upright = turn(torch.from_numpy(pixels).permute(2, 0, 1), view_of_orientation(picture.orientation))
-    return upright.contiguous()
+    # NumPy puts the planes apart several times faster than PyTorch
+    return torch.from_numpy(np.ascontiguousarray(upright.numpy()))
 
 
 def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:

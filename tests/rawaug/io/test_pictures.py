@@ -410,3 +410,19 @@ def test_exif_has_the_last_word_on_the_orientation(tmp_path: Path) -> None:
     description = '<rdf:Description xmlns:tiff="http://ns.adobe.com/tiff/1.0/" tiff:Orientation="1"/>'
     (tmp_path / "a.jpg").write_bytes(with_xmp(stored.getvalue(), description))
     assert read_picture(tmp_path / "a.jpg").shape == (3, 37, 24)
+
+
+@pytest.mark.parametrize("damage", ["cut", "bit"])
+def test_a_damaged_png_is_one_line_and_libpng_is_silent(
+    tmp_path: Path, damage: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_picture(tmp_path / "a.png", SRGB)
+    data = bytearray((tmp_path / "a.png").read_bytes())
+    if damage == "cut":
+        del data[len(data) // 2 :]
+    else:
+        data[len(data) // 2] ^= 1
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(OSError, match=r"a\.png: cannot be read as a picture \(PNG: "):
+        read_picture(tmp_path / "a.png")
+    assert capfd.readouterr().err == ""
