@@ -12,8 +12,9 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from denoisers.files import DEFAULT
 from rawaug.commands import YAML
-from rawaug.commands.denoise import chosen
+from rawaug.commands.denoise import choose_denoiser
 from rawaug.data.sidd import BLOCKS, SiddBenchmark, write_submission
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.files import require_writable
@@ -50,7 +51,10 @@ def run(
     if kind != "sidd" or not path:
         raise ValueError(f"{benchmark}: no benchmark; use sidd:PATH")
     require_writable(out)
-    submit(path, out, chosen(denoiser, classical, self_ensemble, device).require_mosaic())
+    spec = DEFAULT if denoiser is None and classical is None else denoiser
+    made = choose_denoiser(spec, classical, self_ensemble, device)
+    assert made is not None
+    submit(path, out, made.require_mosaic())
     print(f"submission: {out}")
 
 

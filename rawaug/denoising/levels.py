@@ -32,12 +32,12 @@ variances, or the levels of other files."""
 
 LOOSE = 0.9
 """R^2 below which an estimate is called uncertain."""
-_GIVEN = "--noise '[shot_var, read_var]'"
 DISAGREE = 1.75
 """Ratio of the variances at the mean signal, by the tag and by the estimate, from which ``auto`` takes the estimate.
 
 On frames whose noise is known the estimate is right within 1.24; a denoiser that is told half the variance leaves most
 of the noise."""
+_BY_HAND = "--noise '[shot_var, read_var]'"
 
 
 class UnknownNoise(ValueError):
@@ -56,32 +56,40 @@ def find_levels(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, s
     if isinstance(noise, MeasuredLevels):
         return *_of_law(noise, frame), "camera"
     if isinstance(noise, Mapping):
-        if (shot := (frame.camera, frame.iso)) not in noise:
-            raise UnknownNoise(f"{frame.name}: no other file is of {frame.camera} at its ISO")
-        return *noise[shot], f"other files of {frame.camera} at ISO {frame.iso:g}"
+        return _of_other_files(noise, frame)
     if not isinstance(noise, str):
         fixed = FixedLevels.of(noise)
         return fixed.shot_var, fixed.read_var, "given"
+
     if noise == "auto":
         return _automatic(frame)
     if noise == "estimate":
         return _estimate(frame)
-    if noise != "profile":
-        return *_published_levels(frame, noise), noise
-    if frame.noise_profile is None:
-        raise UnknownNoise(f"{frame.name}: has no NoiseProfile tag; pass --noise estimate or {_GIVEN}")
-    return *frame.noise_profile, "profile"
+    if noise == "profile":
+        return _profile(frame)
+    return *_published_levels(frame, noise), noise
 
 
 def _automatic(frame: RawFrame) -> tuple[float, float, str]:
     if frame.noise_profile is not None:
         return _check_profile(frame, frame.noise_profile)
     try:
-        return _estimate(frame)
+        shot_var, read_var, source = _estimate(frame)
     except UnknownNoise:
         with suppress(ValueError):
             return *_published_levels(frame, frame.camera), f"published for {frame.camera}"
         raise
+
+    for remark in frame.remarks:
+        source += f"; {remark}, and is not used"
+    return shot_var, read_var, source
+
+
+def _profile(frame: RawFrame) -> tuple[float, float, str]:
+    if frame.noise_profile is not None:
+        return *frame.noise_profile, "profile"
+    reason = "; ".join(frame.remarks) or "has no NoiseProfile tag"
+    raise UnknownNoise(f"{frame.name}: {reason}; pass --noise estimate or {_BY_HAND}")
 
 
 def _estimate(frame: RawFrame) -> tuple[float, float, str]:
@@ -89,10 +97,12 @@ def _estimate(frame: RawFrame) -> tuple[float, float, str]:
     try:
         estimate = estimate_noise(frame.mosaic, frame.cfa)
     except ValueError as error:
-        raise UnknownNoise(f"{frame.name}: {error}; or pass {_GIVEN} or a camera's name") from None
+        raise UnknownNoise(f"{frame.name}: {error}; or pass {_BY_HAND} or a camera's name") from None
+
     source = f"estimate, R^2 {estimate.r2:.2f}"
     if estimate.r2 < LOOSE:
         source += ": uncertain, the points follow no line"
+
     least = 0.0
     with suppress(ValueError):
         least = _published_levels(frame, frame.camera)[1] / 2
@@ -103,9 +113,10 @@ def _estimate(frame: RawFrame) -> tuple[float, float, str]:
 
 def _published_levels(frame: RawFrame, name: str) -> tuple[float, float]:
     if not isinstance(noise_levels(name), (EldLevels, ProfileLevels)) and name not in camera_names():
-        raise ValueError(f"noise {name!r} is no camera; use auto, profile, estimate, the name of one, or {_GIVEN}")
+        raise ValueError(f"noise {name!r} is no camera; use auto, profile, estimate, the name of one, or {_BY_HAND}")
     if frame.iso is None:
-        raise UnknownNoise(f"{frame.name}: has no ISO tag, needed for {name}'s noise levels; pass {_GIVEN}")
+        raise UnknownNoise(f"{frame.name}: has no ISO tag, needed for {name}'s noise levels; pass {_BY_HAND}")
+
     try:
         levels = noise_levels(name, iso=frame.iso)
     except ValueError as error:
@@ -122,21 +133,31 @@ def _check_profile(frame: RawFrame, profile: tuple[float, float]) -> tuple[float
         estimate = estimate_noise(frame.mosaic, frame.cfa)
     except ValueError:  # too little of the frame is flat to tell
         return *profile, "profile"
+
     signal = frame.mosaic.mean().clamp_min(0.0).item()
-    told, found = (shot * signal + read for shot, read in (profile, (estimate.shot_var, estimate.read_var)))
-    if max(told, found) < DISAGREE * min(told, found) or found <= 0:
+    by_tag = profile[0] * signal + profile[1]
+    by_estimate = estimate.shot_var * signal + estimate.read_var
+    if by_estimate <= 0 or max(by_tag, by_estimate) < DISAGREE * min(by_tag, by_estimate):
         return *profile, "profile"
-    return estimate.shot_var, estimate.read_var, f"estimate; the NoiseProfile tag says {told / found:.2g} times as much"
+    ratio = by_tag / by_estimate
+    return estimate.shot_var, estimate.read_var, f"estimate; the NoiseProfile tag says {ratio:.2g} times as much"
 
 
 def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:
-    known = {law.camera, frame.camera} - {"unknown"}
-    if len(known) > 1:
+    cameras = {law.camera, frame.camera} - {"unknown"}
+    if len(cameras) > 1:
         raise ValueError(f"{frame.name}: is from {frame.camera}, but the noise law is of {law.camera}; use another")
     try:
         return law.at(frame.iso)
     except ValueError as error:
-        raise UnknownNoise(f"{frame.name}: {error}; pass --noise estimate or {_GIVEN}") from None
+        raise UnknownNoise(f"{frame.name}: {error}; pass --noise estimate or {_BY_HAND}") from None
+
+
+def _of_other_files(levels: Shots, frame: RawFrame) -> tuple[float, float, str]:
+    shot = frame.camera, frame.iso
+    if shot not in levels:
+        raise UnknownNoise(f"{frame.name}: no other file is of {frame.camera} at its ISO")
+    return *levels[shot], f"other files of {frame.camera} at ISO {frame.iso:g}"
 
 
 def load_noise(noise: Noise, denoiser: RawDenoiser) -> Noise:
@@ -145,12 +166,17 @@ def load_noise(noise: Noise, denoiser: RawDenoiser) -> Noise:
     Raises:
         ValueError: if the file holds no camera's noise law.
     """
-    if not isinstance(noise, str) or not (noise == "camera" or noise.endswith(".safetensors")):
+    if not isinstance(noise, str):
         return noise
-    stored = denoiser.info if noise == "camera" else DictionaryISP.from_pretrained(noise).info
+    if noise == "camera":
+        file, stored = denoiser.name, denoiser.info
+    elif noise.endswith(".safetensors"):
+        file, stored = noise, DictionaryISP.from_pretrained(noise).info
+    else:
+        return noise
+
     law = stored.get("noise")
     if not isinstance(law, Mapping) or not ("shot_var" in law or law.get("name") == "MeasuredNoise"):
-        file = denoiser.name if noise == "camera" else noise
         raise ValueError(f"{file}: holds no camera's noise law; give an ISP's file that does, or --noise estimate")
     return camera_law(law)
 

@@ -14,7 +14,6 @@ of eight turns as for RAW.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,12 +30,8 @@ from rawaug import bayer
 from rawaug.denoising.denoiser import CPU, Noisy, progress_by
 from rawaug.denoising.foreign import AGAIN, load_published
 from rawaug.errors import extra
-from rawaug.files import read_tensors, require_file, require_writable
-from rawaug.io.content import Listing, list_files
-from rawaug.io.isolated import isolated
-from rawaug.io.stored import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
+from rawaug.files import read_tensors
 from rawaug.kernels.runtime import find_device, has_fast_bfloat16
-from rawaug.progress import progress
 from rawaug.registry import Spec, spec_label, suggest
 
 PICTURES = "rawaug-srgb"
@@ -201,88 +196,3 @@ def _spread_parts(srgb: Tensor) -> Iterator[Tensor]:
     for top in tops:
         for left in lefts:
             yield srgb[..., top : top + _SIDE, left : left + _SIDE].contiguous()
-
-
-@dataclass(frozen=True)
-class DenoisedPicture:
-    """What was done to a file; ``removed`` is the deviation of what was taken away, in units of 1/255."""
-
-    source: Path
-    out: Path
-    removed: float
-    seconds: float
-
-
-def denoise_picture(
-    source: str | Path, out: str | Path, denoiser: PictureDenoiser, overwrite: bool = False
-) -> DenoisedPicture:
-    """Denoise a developed picture to a JPEG, PNG, TIFF or WebP, with its EXIF, its ICC profile and its orientation.
-
-    The source may be of any format that :func:`rawaug.io.read_picture` takes, HEIC among them.
-
-    Raises:
-        FileNotFoundError, OSError: if a file is missing, damaged, or cannot be written.
-        ValueError: if ``out`` is the source, is there already, or has another extension, or the picture cannot be
-            denoised: it is too large or too small, CMYK, animated, or holds linear light.
-    """
-    source, out = Path(source), Path(out)
-    if out.suffix.lower() not in PICTURE_FORMATS:
-        raise ValueError(f"{out}: {source} is a developed picture; its output is one of {', '.join(PICTURE_FORMATS)}")
-    require_file(source, "picture")
-    if out.exists() and out.resolve() == source.resolve():
-        raise ValueError(f"{out}: is the input file; give another name")
-    if out.exists() and not overwrite:
-        raise ValueError(f"{out}: exists; give another name, or --overwrite to replace it")
-    require_writable(out)
-    start = time.perf_counter()
-    stored: StoredPicture = isolated(read_stored, source)
-    srgb = stored.srgb
-    height, width = srgb.shape[-2:]
-    if min(height, width) < 2:
-        raise ValueError(f"{source}: is {width} x {height} pixels; at least 2 x 2 needed")
-    denoised = denoiser(Noisy(srgb[None]))[0]
-    removed = 255.0 * (denoised - srgb).square().mean().sqrt().item()
-    write_stored(out, denoised, stored)
-    return DenoisedPicture(source, out, removed, time.perf_counter() - start)
-
-
-def list_denoised(source: Path) -> Listing:
-    """The pictures of a folder that are denoised under their own names, and by kinds what is left out.
-
-    Raises:
-        ValueError: if there is none; the message says what there is.
-    """
-    listing = list_files(source, PICTURE_FORMATS, "not a picture that is known")
-    for what, kind in listing.left_out.items():
-        if what in ("picture", "HEIC picture", "AVIF picture"):
-            kind.advice = f"not written; denoise each to one of {', '.join(PICTURE_FORMATS)}"
-    if not listing.files:
-        there = "; ".join(listing.lines()) or f"supported extensions are {', '.join(PICTURE_FORMATS)}"
-        raise ValueError(f"{source}: contains no picture file; {there}")
-    return listing
-
-
-def denoise_pictures(
-    source: str | Path, out: str | Path, denoiser: PictureDenoiser, overwrite: bool = False
-) -> tuple[list[DenoisedPicture], dict[str, str]]:
-    """Denoise the pictures of a folder and its subfolders under the same names; those that are there are left.
-
-    Returns what was done, and the reason for each file that failed. :func:`list_denoised` tells what is left out.
-    """
-    source, out = Path(source), Path(out)
-    if out.resolve().is_relative_to(source.resolve()):
-        raise ValueError(f"{out}: is inside the source folder {source}; choose an output folder outside it")
-    done: list[DenoisedPicture] = []
-    broken: dict[str, str] = {}
-    for file in progress(list_denoised(source).files, label="denoise", unit="file", leave=True):
-        target = out / file.relative_to(source)
-        if target.exists() and not overwrite:
-            continue
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            done.append(denoise_picture(file, target, denoiser, overwrite))
-        except (OSError, ValueError) as error:
-            if isinstance(error, OSError) and error.filename in (str(target), str(target.parent)):
-                raise  # what cannot be written, such as to a full disk, is no fault of the file
-            broken[str(file)] = str(error)
-    return done, broken

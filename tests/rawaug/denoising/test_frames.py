@@ -22,9 +22,12 @@ from rawaug.bayer import CFA, mosaic, pack, unpack
 from rawaug.cli import main
 from rawaug.commands.denoise import run
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
-from rawaug.denoising.frames import denoise_file, denoise_folder
+from rawaug.denoising.files import denoise_file, denoise_folder
+from rawaug.denoising.frames import OTHER_PATTERNS, FrameDenoiser
 from rawaug.denoising.levels import find_levels
+from rawaug.denoising.sources import RawFiles
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng
+from rawaug.io.raw import MONOCHROME
 from rawaug.noise import noise_levels
 
 LEVELS = (1e-3, 1e-5)
@@ -91,7 +94,7 @@ def test_a_frame_of_any_pattern_becomes_cleaner_where_it_stands(
 
 def test_a_denoiser_that_changes_nothing_gives_the_source_back(tmp_path: Path, bayer_dng: Dng, identity: Path) -> None:
     source = shot(tmp_path / "a.dng", bayer_dng, orientation=6)
-    result = denoise_file(source, tmp_path / "out" / "b.dng", identity)
+    result = denoise_file(source, tmp_path / "out" / "b.dng", RawFiles(identity))
     assert (result.shot_var, result.read_var, result.noise_source) == (*LEVELS, "profile") and result.below_zero == 0
     before, after = read_raw(source), read_raw(tmp_path / "out" / "b.dng")
     assert torch.equal(before.mosaic, after.mosaic)
@@ -130,7 +133,7 @@ def test_greens_that_differ_are_balanced_and_kept_on_request(
 
 def test_below_the_digital_number_0_is_counted(tmp_path: Path, bayer_dng: Dng, adding: Callable[[float], Path]) -> None:
     source = shot(tmp_path / "a.dng", bayer_dng, black=0)
-    result = denoise_file(source, tmp_path / "b.dng", adding(-0.1))
+    result = denoise_file(source, tmp_path / "b.dng", RawFiles(adding(-0.1)))
     expected = (read_raw(source).mosaic < 0.1 - 0.5 / 16383).float().mean().item()
     assert result.below_zero == pytest.approx(expected, abs=1e-3) and expected > 0.01
     assert read_raw(tmp_path / "b.dng").mosaic.min() == 0
@@ -191,11 +194,11 @@ def test_a_strength_below_1_leaves_that_much_of_the_noise(
     tmp_path: Path, bayer_dng: Dng, adding: Callable[[float], Path]
 ) -> None:
     source, brighter = shot(tmp_path / "a.dng", bayer_dng), adding(0.1)
-    denoise_file(source, tmp_path / "b.dng", RawDenoiser.of(brighter, strength=0.75))
+    denoise_file(source, tmp_path / "b.dng", RawFiles(RawDenoiser.of(brighter, strength=0.75)))
     before, after = read_raw(source), read_raw(tmp_path / "b.dng")
     assert (after.mosaic - before.mosaic).mean().item() == pytest.approx(0.075, abs=1e-4)
     assert after.noise_profile == pytest.approx((LEVELS[0] / 16, LEVELS[1] / 16))
-    denoise_file(source, tmp_path / "c.dng", RawDenoiser.of(brighter, strength=0.0))
+    denoise_file(source, tmp_path / "c.dng", RawFiles(RawDenoiser.of(brighter, strength=0.0)))
     assert torch.equal(read_raw(tmp_path / "c.dng").mosaic, before.mosaic)
 
 
@@ -250,7 +253,7 @@ def test_a_full_disk_ends_a_folder_in_one_line(
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
         write_dng(path, *rest, **colours)
 
-    monkeypatch.setattr("rawaug.denoising.frames.write_dng", write)
+    monkeypatch.setattr("rawaug.denoising.sources.write_dng", write)
     assert main(["denoise", str(source), str(out), "--denoiser", str(identity)]) == 2
     said = capsys.readouterr().err.strip().splitlines()
     assert "b.dng" in said[-1] and "No space left on device" in said[-1] and "c.dng" not in str(said)
@@ -270,7 +273,7 @@ def test_folders_are_resumed_and_fail_where_a_file_is_broken(
     assert (out / "a.dng").is_file() and (out / "sub" / "a.dng").is_file() and "broken.nef" in said.out
     assert said.err.strip().splitlines()[-1].endswith("1 of its files could not be denoised, listed above")
     (out / "sub" / "a.dng").unlink()
-    again = denoise_folder(source, out, identity)
+    again = denoise_folder(source, out, RawFiles(identity))
     assert (len(again.files), again.existing, len(again.broken)) == (1, 1, 1)
     assert "denoise.json: made with noise auto, not estimate" in refused(*command, "--noise", "estimate")
     assert "made with strength None, not 0.5" in refused(*command, "--strength", "0.5")
@@ -290,7 +293,7 @@ def test_of_unknown_noise_files_of_the_same_camera_and_iso_tell(tmp_path: Path, 
     (tmp_path / "in").mkdir()
     for name, frame in frames.items():
         write_dng(tmp_path / "in" / f"{name}.dng", frame)
-    result = denoise_folder(tmp_path / "in", tmp_path / "out", identity)
+    result = denoise_folder(tmp_path / "in", tmp_path / "out", RawFiles(identity))
     assert [done.source.stem for done in result.files] == ["b", "a"]
     assert (result.files[1].shot_var, result.files[1].read_var) == pytest.approx(LEVELS)
     assert result.files[1].noise_source == "other files of Maker One at ISO 400"
@@ -309,7 +312,10 @@ def test_wrong_wishes_are_refused_before_anything_is_written(
 ) -> None:
     monkeypatch.setitem(sys.modules, "bm3d", None)
     source, folder, out = shot(tmp_path / "a.dng", bayer_dng), tmp_path / "in", tmp_path / "b.dng"
+    shots = tmp_path / "shots"
     folder.mkdir()
+    shots.mkdir()
+    shot(shots / "a.dng", bayer_dng)
     for wish, message in (
         (["--device", "cdua"], "device 'cdua' is unknown; use one of auto, cpu, cuda"),
         (["--device", "cuda"], "this machine has none"),
@@ -323,16 +329,16 @@ def test_wrong_wishes_are_refused_before_anything_is_written(
         (["--denoiser", identity, "--linear"], "does not demosaic; use rawaug-joint"),
         (["--denoiser", joint], "demosaics too, to a linear DNG; add --linear"),
         (["--denoiser", joint, "--linear", "--strength", "0.5"], "--strength 0.5: of a linear DNG it is 1"),
-        (["--denoiser", joint, "--linear", "--preview", "p.png"], "--preview p.png: is of mosaics"),
+        (["--denoiser", joint, "--linear", "--preview", "p.png"], "--preview p.png: --linear does not support it"),
     ):
         assert message in refused("denoise", source, out, *wish)
     for names, message in (
         ((source, source), "is the input file"),
         ((source, tmp_path / "b.tif"), "name ending in .dng"),
-        ((tmp_path / "gone.dng", out), "gone.dng: no such RAW file"),
-        ((folder, out, "--preview", "p.jpg"), "is for one file"),
+        ((tmp_path / "gone.dng", out), "gone.dng: no such file"),
+        ((shots, tmp_path / "out", "--preview", "p.jpg"), "give a folder"),
         ((folder, out), "in is a folder, and so is its output; give a name without .dng"),
-        ((folder, folder / "out"), "choose an output folder outside"),
+        ((shots, shots / "out"), "choose an output folder outside"),
     ):
         assert message in refused("denoise", *names, "--denoiser", identity)
     assert not out.exists()
@@ -383,3 +389,79 @@ def test_a_link_to_itself_is_refused_in_one_line(name: str, tmp_path: Path) -> N
     (tmp_path / name).symlink_to(tmp_path / name)
     with pytest.raises(OSError, match=rf"{name}: cannot be opened"):
         run(str(tmp_path / name), str(tmp_path / f"out-{name}"))
+
+
+def test_a_folder_has_a_preview_of_each_file(tmp_path: Path, bayer_dng: Dng, identity: Path) -> None:
+    (tmp_path / "in" / "sub").mkdir(parents=True)
+    shot(tmp_path / "in" / "a.dng", bayer_dng), shot(tmp_path / "in" / "sub" / "a.dng", bayer_dng, orientation=6)
+    command = ["denoise", str(tmp_path / "in"), str(tmp_path / "out"), "--denoiser", str(identity)]
+    assert main([*command, "--preview", str(tmp_path / "previews")]) == 0
+    assert read_picture(tmp_path / "previews" / "a.jpg").shape == (3, 96, 128)
+    assert read_picture(tmp_path / "previews" / "sub" / "a.jpg").shape == (3, 128, 96)
+
+
+def test_a_folder_names_what_is_left_out(
+    tmp_path: Path, bayer_dng: Dng, identity: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "in").mkdir()
+    shot(tmp_path / "in" / "a.dng", bayer_dng)
+    for name in ("a.x3f", "b.x3f", "a.jpg", "notes.txt"):
+        (tmp_path / "in" / name).write_bytes(b"")
+    assert main(["denoise", str(tmp_path / "in"), str(tmp_path / "out"), "--denoiser", str(identity)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 4 and "2 RAW files left out (.x3f 2): there is no decoder" in lines[2]
+
+
+def test_the_shipped_denoiser_of_each_pattern_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    by_pattern = FrameDenoiser(noise=LEVELS)
+    for cfa in ("GBRG", "XTRANS", "QUAD-RGGB", MONOCHROME):
+        frame = RawFrame(torch.full((1, 96, 96), 0.2), cfa)
+        expected = OTHER_PATTERNS if cfa in ("XTRANS", "QUAD-RGGB") else "rawaug-small"
+        assert by_pattern.denoiser_of(frame).name == expected
+    scene = 0.2 + 0.01 * torch.randn(1, 96, 96, generator=torch.Generator().manual_seed(0))
+    write_dng(tmp_path / "a.dng", RawFrame(scene, "XTRANS", (512.0,) * 4, 16383.0, noise_profile=(4e-4, 2e-5)))
+    assert main(["denoise", str(tmp_path / "a.dng"), str(tmp_path / "b.dng")]) == 0
+    assert read_raw(tmp_path / "b.dng").mosaic.std() < 0.002
+    named = FrameDenoiser("rawaug-small", noise=LEVELS)
+    with pytest.raises(ValueError, match="rawaug-xtrans"):
+        named(RawFrame(scene, "XTRANS"))
+
+
+def test_a_monochrome_frame_is_denoised_as_one_plane(tmp_path: Path) -> None:
+    ramp = torch.linspace(0.05, 0.5, 192).expand(1, 128, 192)
+    noise = torch.randn(ramp.shape, generator=torch.Generator().manual_seed(0))
+    noisy = ramp + noise * (LEVELS[0] * ramp + LEVELS[1]).sqrt()
+    write_dng(tmp_path / "a.dng", RawFrame(noisy, MONOCHROME, (512.0,) * 4, 16383.0, noise_profile=LEVELS))
+    assert main(["denoise", str(tmp_path / "a.dng"), str(tmp_path / "b.dng"), "--preview", "p.png"]) == 0
+    denoised = read_raw(tmp_path / "b.dng", monochrome=True)
+    assert denoised.cfa == MONOCHROME and denoised.noise_profile is None
+    assert (denoised.mosaic - ramp).square().mean() < (noisy - ramp).square().mean() / 20
+    for i in (0, 1):
+        for j in (0, 1):  # no site of the four is another than its neighbours
+            assert abs((denoised.mosaic - ramp)[0, i::2, j::2].mean()) < 2e-3
+    picture = read_picture("p.png")
+    assert (picture[0] == picture[1]).all() and (picture[1] == picture[2]).all()
+
+
+@pytest.mark.parametrize("profile", [(1e-3, -1e-5), (0.0, 0.0), (float("nan"), 1e-5)])
+def test_a_noise_profile_out_of_range_is_told_and_replaced(
+    profile: tuple[float, float],
+    tmp_path: Path,
+    bayer_dng: Dng,
+    identity: Path,
+    capsys: pytest.CaptureFixture[str],
+    refused: Callable[..., str],
+) -> None:
+    numbers = (gradient().mosaic[0] * (16383 - 511) + 511).round().numpy().astype(np.uint16)
+    source = bayer_dng(tmp_path / "a.dng", numbers, black=(511,), white=16383, noise_profile=profile)
+    command = ["denoise", str(source), str(tmp_path / "b.dng"), "--denoiser", str(identity)]
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "NoiseProfile is out of range" in said and "(estimate" in said
+    assert "out of range" in refused(*command, "--overwrite", "--noise", "profile")
+
+
+def test_raw_under_another_name_is_denoised_as_raw(tmp_path: Path, bayer_dng: Dng, identity: Path) -> None:
+    source = shot(tmp_path / "a.dng", bayer_dng).rename(tmp_path / "a.tif")
+    assert main(["denoise", str(source), str(tmp_path / "b.dng"), "--denoiser", str(identity)]) == 0
+    assert torch.equal(read_raw(source).mosaic, read_raw(tmp_path / "b.dng").mosaic)

@@ -15,7 +15,9 @@ from rawaug.commands.denoise import is_picture
 from rawaug.commands.denoise import run as denoise
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
-from rawaug.denoising.pictures import PictureDenoiser, denoise_pictures, estimate_level
+from rawaug.denoising.files import denoise_folder
+from rawaug.denoising.pictures import PictureDenoiser, estimate_level
+from rawaug.denoising.sources import PictureFiles
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, register
 from rawaug.io.pictures import read_picture, write_picture
 
@@ -112,9 +114,9 @@ def test_files_and_folders_of_pictures(tmp_path: Path, capsys: pytest.CaptureFix
     denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "a.png"))
     assert "noise of" in capsys.readouterr().out
     assert error(read_picture(tmp_path / "a.png") / 255.0) < 0.5 * error(noisy())
-    done, broken = denoise_pictures(tmp_path / "in", tmp_path / "out", PictureDenoiser.of("rawaug-srgb@5"))
-    assert [one.out.name for one in done] == ["a.png"]
-    assert list(broken) == [str(tmp_path / "in" / "b.jpg")]
+    result = denoise_folder(tmp_path / "in", tmp_path / "out", PictureFiles(PictureDenoiser.of("rawaug-srgb@5")))
+    assert [one.out.name for one in result.files] == ["a.png"]
+    assert list(result.broken) == [str(tmp_path / "in" / "b.jpg")]
     with pytest.raises(ValueError, match="exists; give another name"):
         denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "a.png"))
     with pytest.raises(ValueError, match="is a developed picture; --linear is for RAW"):

@@ -1,0 +1,185 @@
+"""Files and folders, denoised: what is the same for RAW and pictures.
+
+A folder's results stand under the same names in another folder, and those that are there already are left. A file that
+cannot be read, or whose decoder crashes or hangs, is named and counted, and the others go on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Generic
+
+from rawaug.denoising.frames import require_output
+from rawaug.denoising.levels import UnknownNoise
+from rawaug.denoising.sources import PREVIEWS, Files, T
+from rawaug.files import one_at_a_time, require_file, require_same_settings, require_writable
+from rawaug.progress import progress
+
+SETTINGS = "denoise.json"
+"""The file in a folder of results that says how they were made."""
+
+
+@dataclass
+class DenoisedFolder(Generic[T]):
+    """What was done to a folder.
+
+    Attributes:
+        files: what was done to each file.
+        existing: how many results were there already.
+        broken: the reason for each file that failed, by its path.
+        left_out: a line for each kind of file that was not denoised.
+    """
+
+    files: list[T] = field(default_factory=list)
+    existing: int = 0
+    broken: dict[str, str] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+
+
+def denoise_file(
+    source: str | Path,
+    out: str | Path,
+    kind: Files[T],
+    *,
+    preview: str | Path | None = None,
+    overwrite: bool = False,
+) -> T:
+    """Denoise one file.
+
+    Args:
+        source: the file.
+        out: the result; its folder is made.
+        kind: how files of this kind are denoised.
+        preview: a .jpg or .png of the result of a RAW file as LibRaw develops it.
+        overwrite: replace ``out`` and ``preview`` if they exist.
+
+    Returns:
+        What was done.
+
+    Raises:
+        FileNotFoundError, OSError: if a file is missing or cannot be read or written.
+        ValueError: if the source cannot be denoised, or ``out`` has another extension, is the source itself, or is
+            there already.
+    """
+    source, out = Path(source), Path(out)
+    require_file(source, kind.what)
+    if out.resolve() == source.resolve():
+        raise ValueError(f"{out}: is the input file; give another name")
+    require_output(out, overwrite, kind.formats, kind.format_advice)
+
+    if preview is None:
+        return kind.denoise(source, out)
+    preview = Path(preview)
+    require_output(preview, overwrite, PREVIEWS, "the preview is a .jpg or .png")
+    kind.require_preview(preview)
+    return kind.denoise(source, out, preview)
+
+
+@one_at_a_time(lambda source, out, *_, **__: Path(out))
+def denoise_folder(
+    source: str | Path,
+    out: str | Path,
+    kind: Files[T],
+    *,
+    previews: str | Path | None = None,
+    overwrite: bool = False,
+) -> DenoisedFolder[T]:
+    """Denoise the files of a folder and its subfolders; existing results are left.
+
+    Args:
+        source: the folder.
+        out: the folder of the results.
+        kind: how files of this kind are denoised.
+        previews: a folder for a JPEG of each result of a RAW file as LibRaw develops it.
+        overwrite: replace existing results.
+
+    Returns:
+        What was done, and what was not.
+
+    Raises:
+        OSError: if a result cannot be written.
+        ValueError: if the folder holds no file of this kind, two of them would have the same result, none can be
+            denoised, or ``out`` holds results of other settings.
+    """
+    source, out = Path(source), Path(out)
+    listing = kind.listing(source)
+    targets = _targets(source, out, kind, listing.files)
+    previews_of = _preview_targets(out, kind, targets, previews)
+
+    require_writable(out, folder=True)
+    if kind.settings is not None:
+        require_same_settings(out / SETTINGS, kind.settings, overwrite)
+
+    result: DenoisedFolder[T] = DenoisedFolder(left_out=listing.lines())
+    unknown = []
+    for file in progress(listing.files, label="denoise", unit="file", leave=True):
+        target = targets[file]
+        if target.exists() and not overwrite:
+            result.existing += 1
+            continue
+        try:
+            result.files.append(kind.denoise(file, target, previews_of.get(file), isolate=True))
+        except UnknownNoise as error:
+            unknown.append(file)
+            result.broken[str(file)] = f"noise unknown: {_with_name(error, file)}"
+        except (OSError, ValueError) as error:
+            _raise_if_unwritable(error, target, previews_of.get(file))
+            result.broken[str(file)] = f"broken: {_with_name(error, file)}"
+
+    informed = kind.informed_by(result.files)
+    if informed is not None:
+        for file in unknown:
+            try:
+                result.files.append(informed.denoise(file, targets[file], previews_of.get(file), isolate=True))
+            except UnknownNoise:
+                continue
+            del result.broken[str(file)]
+
+    if len(result.broken) == len(targets):
+        raise ValueError(f"{source}: none of its {len(targets)} files can be denoised; {min(result.broken.values())}")
+    return result
+
+
+def _targets(source: Path, out: Path, kind: Files[T], files: list[Path]) -> dict[Path, Path]:
+    """The result of each file."""
+    if out.resolve().is_relative_to(source.resolve()):
+        raise ValueError(f"{out}: is inside the source folder {source}; choose an output folder outside it")
+
+    targets: dict[Path, Path] = {}
+    taken: set[Path] = set()
+    for file in files:
+        target = out / kind.target(file.relative_to(source))
+        if target in taken:
+            raise ValueError(f"{file}: another file of {file.parent} has this stem, and both would become {target}")
+        taken.add(target)
+        targets[file] = target
+    return targets
+
+
+def _preview_targets(
+    out: Path, kind: Files[T], targets: dict[Path, Path], previews: str | Path | None
+) -> dict[Path, Path]:
+    """The preview of each file, in the subfolders of ``previews``; none without such a folder."""
+    if previews is None:
+        return {}
+    folder = Path(previews)
+    kind.require_preview(folder)
+    if folder.suffix.lower() in PREVIEWS and not folder.is_dir():
+        raise ValueError(f"--preview {folder}: the source is a folder, and so are its previews; give a folder")
+    require_writable(folder, folder=True)
+
+    return {file: folder / target.relative_to(out).with_suffix(".jpg") for file, target in targets.items()}
+
+
+def _raise_if_unwritable(error: Exception, *files: Path | None) -> None:
+    """Raise an error of writing, such as to a full disk, which is no fault of the source."""
+    if not isinstance(error, OSError):
+        return
+    for file in files:
+        if file is not None and error.filename in (str(file), str(file.parent)):
+            raise error
+
+
+def _with_name(error: Exception, file: Path) -> str:
+    return str(error) if file.stem in str(error) else f"{file}: {error}"
