@@ -19,5 +19,10 @@ def run(path: str, /, *, first: int | None = None, settings: Annotated[PairSetti
     """
     report = check(path, first, **vars(settings or PairSettings()))
     print(report)
+    counts = []
     if report.broken:
-        raise ValueError(f"{path}: {len(report.broken)} damaged, listed above")
+        counts.append(f"{len(report.broken)} damaged")
+    if report.unfit:
+        counts.append(f"{len(report.unfit)} not usable")
+    if counts:
+        raise ValueError(f"{path}: {', '.join(counts)}, listed above")

@@ -44,12 +44,14 @@ class PartReport:
     examined: int = 0
     counts: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     broken: list[str] = field(default_factory=list)
+    unfit: list[str] = field(default_factory=list)
 
     def add_broken(self, error: Exception) -> None:
-        """Note a damaged item; a file of many blocks is one line."""
+        """Note an item that is damaged, or whole but of a kind that is not used; a file of many blocks is one line."""
+        lines = self.broken if isinstance(error, OSError) else self.unfit
         line = " ".join(str(error).split())
-        if line not in self.broken:
-            self.broken.append(line)
+        if line not in lines:
+            lines.append(line)
 
     def __str__(self) -> str:
         examined = "" if self.examined == self.items else f", {self.examined} examined"
@@ -59,7 +61,11 @@ class PartReport:
             shown = ", ".join(f"{escape(value)} ({count})" for value, count in counts.most_common(_SHOWN))
             lines.append(f"  {what}: {shown}{more}")
         lines.append(f"  damaged: {len(self.broken) or 'none'}")
-        return "\n".join([*lines, *(f"    {escape(line)}" for line in self.broken)])
+        lines += [f"    {escape(line)}" for line in self.broken]
+        if self.unfit:
+            lines.append(f"  whole, but not usable: {len(self.unfit)}")
+            lines += [f"    {escape(line)}" for line in self.unfit]
+        return "\n".join(lines)
 
 
 @dataclass
@@ -75,7 +81,13 @@ class DataReport:
 
     @property
     def broken(self) -> list[str]:
+        """The reasons of damaged items."""
         return [line for part in self.parts for line in part.broken]
+
+    @property
+    def unfit(self) -> list[str]:
+        """The reasons of items that are whole but not usable, such as a linear DNG among mosaics."""
+        return [line for part in self.parts for line in part.unfit]
 
     def __str__(self) -> str:
         return "\n".join([escape(self.path), *map(str, self.parts), *self.left_out])
@@ -187,7 +199,7 @@ def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartRep
     try:
         items = open_part()
     except (OSError, ValueError) as error:
-        part.add_broken(error)
+        part.broken.append(" ".join(str(error).split()))
         return part
     part.items = len(items)
     part.examined = part.items if first is None else min(first, part.items)
@@ -223,6 +235,8 @@ def _facts(opening: bytes, index: int) -> dict[str, str]:
         facts["levels"] = "shot_var {:.1e}, read_var {:.1e}".format(*levels)
     if item.camera != "unknown":
         facts["cameras"] = item.camera
+    if isinstance(item, RawFrame) and item.remarks:
+        facts["tags that are not used"] = "; ".join(item.remarks)
     if item.iso:
         facts["iso"] = f"{item.iso:g}"
     return facts

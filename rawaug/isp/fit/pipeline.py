@@ -28,7 +28,15 @@ from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.descent import Descent, cycle_error, reading_error, train_encoders, train_jointly, with_better_tone
 from rawaug.isp.fit.samples import FitFrames, FramePair, FrameSummary, PixelSamples, sample_pixels
-from rawaug.isp.fit.start import REACH_ATOMS, FrameColour, Tie, fit_fall_off, least_squares, set_dictionaries
+from rawaug.isp.fit.start import (
+    FEWEST_PIXELS,
+    REACH_ATOMS,
+    FrameColour,
+    Tie,
+    fit_fall_off,
+    least_squares,
+    set_dictionaries,
+)
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.own_cameras import Camera
 from rawaug.isp.stages import LensShading, Stage
@@ -71,6 +79,7 @@ def fit_isp(
     config = config or FitConfig()
     reading = progress_of(pairs, label="read", unit="frame", shown=progress)
     frames = sample_pixels(reading, config.pixels, config.seed, config.noisy)
+    _require_pixels(frames)
     path = None if state is None else Path(state)
     descent = Descent(path, _key(config, frames, camera), config.seed, progress)
 
@@ -89,6 +98,14 @@ def fit_isp(
     fit.isp.info["registered"] = sum(shot.registered for shot in frames.shots)
     fit.isp.info |= {"frames": [shot.name for shot in frames.shots], "steps": config.steps, "seed": config.seed}
     return fit.isp.eval()
+
+
+def _require_pixels(frames: FitFrames) -> None:
+    """Raise ValueError if a frame has too few pixels that are not clipped, such as a black one."""
+    known = frames.pixels.known[:, :, 0].sum(2)
+    for shot, counts in zip(frames.shots, known, strict=True):
+        if (counts < FEWEST_PIXELS).any():
+            raise ValueError(f"{shot.name}: too few unclipped pixels to fit; use a better exposed frame or more pixels")
 
 
 def _key(config: FitConfig, frames: FitFrames, camera: Camera | None) -> str:

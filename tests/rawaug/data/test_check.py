@@ -139,3 +139,16 @@ def test_kinds_of_data_are_opened_as_everywhere(monkeypatch: pytest.MonkeyPatch)
     assert set(report.parts[0].counts) >= {"sizes", "cfas"}
     with pytest.raises(ValueError, match=r"reel:test: unknown kind of data; .*\(nearest: real\)"):
         check("reel:test")
+
+
+def test_a_linear_dng_is_not_called_damaged_and_odd_tags_are_counted(
+    tmp_path: Path, bayer_dng: Callable[..., Path]
+) -> None:
+    numbers = np.random.default_rng(0).integers(0, 4096, (32, 48)).astype(np.uint16)
+    bayer_dng(tmp_path / "a.dng", numbers, noise_profile=(-1.0, 0.0))
+    bayer_dng(tmp_path / "b.dng", np.stack([numbers] * 3, -1), cfa=None)
+    (part,) = check(tmp_path).parts
+    assert not part.broken
+    (reason,) = part.unfit
+    assert "b.dng" in reason and "linear DNG" in reason
+    assert list(part.counts["tags that are not used"]) == ["NoiseProfile is out of range: -1, 0"]

@@ -10,6 +10,7 @@ import pytest
 import torch
 from scipy.optimize import nnls
 
+from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig, fit_isp
@@ -224,3 +225,17 @@ def test_one_frame_whose_metadata_lie_does_not_spoil_the_others(
     isp = fit_isp([*exact_pairs, liar], replace(SHORT, steps=40), progress=False)
     torch.testing.assert_close(isp.colour.atoms(), camera_matrix.expand(4, 3, 3), atol=0.02, rtol=0)
     assert error_db(isp, exact_pair("unseen", (1.7, 1.0, 1.6), 9)) > 60.0
+
+
+def test_a_frame_without_unclipped_pixels_is_named() -> None:
+    white = torch.full((3, 64, 64), 255, dtype=torch.uint8)
+    blown = Pair(
+        name="IMG_1",
+        srgb=white,
+        raw=torch.ones(1, 64, 64),
+        cfa=CFA.RGGB,
+        white_balance=(2.0, 1.0, 1.5),
+        color_matrix=torch.eye(3),
+    )
+    with pytest.raises(ValueError, match="IMG_1: too few unclipped pixels"):
+        fit_isp([blown], FitConfig(pixels=256), progress=False)
