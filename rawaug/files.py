@@ -240,6 +240,12 @@ def read_tensors(
     return header, tensors
 
 
+def read_metadata(path: str | Path) -> dict[str, str]:
+    """The metadata of any safetensors file, without its tensors; ValueError if it is damaged."""
+    header, _ = _opened(path, "copy or download it again", tensors=False)
+    return header
+
+
 def read_header(path: str | Path) -> dict[str, str]:
     """The header of a rawaug file, without its tensors."""
     advice = "give one written by rawaug fit, rawaug run or denoisers.save, or copy it again"

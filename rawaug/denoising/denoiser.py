@@ -25,11 +25,11 @@ from denoisers.classical import FILTERS, Stabilised
 from denoisers.files import find_denoiser, list_shipped
 from denoisers.mosaic import BayerAdapter, MosaicDRUNet, denoise_mosaic
 from denoisers.network import DENOISERS, PACKED
-from denoisers.pbrid import PBRID
 from rawaug import bayer
 from rawaug.bayer import CFA, crop_to_cfa, noise_variance
-from rawaug.denoising.foreign import AGAIN, STRIDE, BiasFreeDnCNN, OnnxNetwork, load_published
-from rawaug.files import parse_object, read_header, read_tensors, sha256
+from rawaug.denoising.foreign import STRIDE, OnnxNetwork
+from rawaug.denoising.weights import read_network
+from rawaug.files import parse_object, read_header, sha256
 from rawaug.io import RawFrame
 from rawaug.kernels.runtime import find_device, has_fast_bfloat16
 from rawaug.noise import anscombe
@@ -143,15 +143,19 @@ class RawDenoiser:
             >>> denoiser(Noisy.of(torch.rand(1, 4, 32, 48), (1e-3, 1e-5), "RGGB")).shape
             torch.Size([1, 4, 32, 48])
         """
-        found = spec if isinstance(spec, cls) else _found(spec, changes.get("name"))
-        network = found.model(None)
+        denoiser = spec if isinstance(spec, cls) else _resolve(spec, changes.get("name"))
+        network = denoiser.model(None)
         if isinstance(network, nn.Module) and not isinstance(network, OnnxNetwork):
             where = find_device(str(device))
             network.to(where, memory_format=torch.channels_last)  # type: ignore[call-overload]
             mixed = precision == "auto" and getattr(network, "mixed", False) and has_fast_bfloat16(where)
             changes = {"device": where, "mixed": mixed, **changes}
-        made = replace(found, **changes)
-        return replace(made, settings={**made.settings, "self_ensemble": made.views > 1}) if made.settings else made
+
+        denoiser = replace(denoiser, **changes)
+        if denoiser.settings:
+            denoiser = replace(denoiser, settings={**denoiser.settings, "self_ensemble": denoiser.views > 1})
+
+        return denoiser
 
     def require_mosaic(self) -> RawDenoiser:
         """This denoiser; ValueError if it gives full colour, which cannot be compared with a mosaic."""
@@ -267,60 +271,70 @@ def require_classical(specs: Sequence[Spec]) -> None:
             raise ValueError(f"classical: {split_spec(spec)[0]}: {reason}")
 
 
-def _found(spec: Any, name: str | None) -> RawDenoiser:
+def _resolve(spec: Any, name: str | None) -> RawDenoiser:
+    """The denoiser of an object or of a name, on the CPU; arguments as of :meth:`RawDenoiser.of`."""
     if isinstance(spec, nn.Module):
-        return _of_network(type(spec).__name__, spec, {})
+        return _of_network(type(spec).__name__, spec, {}, CFA.RGGB)
     if callable(spec):
         return _of_function(spec, name)
-    if isinstance(spec, Mapping):
+    if isinstance(spec, Mapping) or str(spec) in FILTERS:
         return _of_filter(spec)
-    path = Path(spec)
-    if path.suffix == ".onnx":
+
+    return _of_file(spec)
+
+
+def denoiser_file(spec: str | Path) -> Path | None:
+    """The file of a network that a name or a path stands for; None for a filter or a function."""
+    is_file = Path(spec).suffix in (".safetensors", ".onnx") or str(spec) in list_shipped()
+    return find_denoiser(spec) if is_file else None
+
+
+def _of_file(spec: str | Path) -> RawDenoiser:
+    """The network of a file, or of a shipped denoiser by its name."""
+    suffix = Path(spec).suffix
+    if not suffix and str(spec) not in list_shipped():
+        known = [*list_shipped(), *FILTERS]
+        raise ValueError(
+            f"{spec}: no such denoiser{suggest(spec, known)}; give one of {', '.join(known)}, "
+            "a .safetensors or an .onnx"
+        )
+
+    if suffix == ".onnx":
+        path = Path(spec)
         network = OnnxNetwork(path)
-        return replace(_of_network(path.stem, network, network.info), settings=_hashed(path))
-    if path.suffix or str(spec) in list_shipped():
-        return replace(_of_weights(find_denoiser(spec)), settings=_hashed(find_denoiser(spec)))
-    if str(spec) in FILTERS:
-        return _of_filter(str(spec))
-    known = [*list_shipped(), *FILTERS]
-    raise ValueError(
-        f"{spec}: no such denoiser{suggest(spec, known)}; give one of {', '.join(known)}, a .safetensors or an .onnx"
-    )
+        denoiser = _of_network(path.stem, network, network.info, CFA(network.info.get("cfa", "RGGB")))
+    else:
+        path = find_denoiser(spec)
+        file = read_network(path)
+        if file.image != RawDenoiser.takes:
+            raise ValueError(f"{path}: denoises developed pictures, not RAW; give it a .jpg, .png or .tif")
+        denoiser = _of_network(file.name, file.network, file.info, file.cfa)
+
+    return replace(denoiser, settings={"denoiser": path.stem, "denoiser_sha256": sha256(path)})
 
 
-def _hashed(path: Path) -> dict[str, Any]:
-    return {"denoiser": path.stem, "denoiser_sha256": sha256(path)}
-
-
-def _of_weights(path: Path) -> RawDenoiser:
-    """A denoiser of a file of rawaug's, PMRID's, BF-DnCNN's or PBRID's weights: the tensors say which."""
-    metadata, tensors = read_tensors(path, AGAIN)
-    if "conv00" in tensors:
-        return replace(_of_network("BF-DnCNN", BiasFreeDnCNN(tensors), {}), cfa=None)
-    if "conv0.conv.weight" in tensors and metadata.get("format") != "rawaug":
-        return _of_network("PMRID, published weights", load_published(denoisers.PMRID(), path), {})
-    if "rec_blocks.m_head.weight" in tensors:
-        return _of_network("PBRID, published weights", load_published(PBRID(), path), {})
-    if "conv00.weight" in tensors or str(parse_object(metadata.get("config", "{}")).get("channels", PACKED)) == "3":
-        raise ValueError(f"{path}: denoises developed pictures, not RAW; give it a .jpg, .png or .tif")
-    if metadata.get("format") != "rawaug":
-        raise ValueError(f"{path}: weights of no known denoiser; give a network or a function from Python")
-    arm = path.resolve().parent.name  # rawaug run writes ARM/denoiser.safetensors
-    return _of_network(arm if path.stem == "denoiser" else path.stem, *denoisers.load(path))
-
-
-def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> RawDenoiser:
+def _of_network(name: str, network: nn.Module, info: Mapping[str, Any], cfa: CFA | None) -> RawDenoiser:
     """A network; one that does not say so takes a variance if its ``forward`` has two arguments."""
-    of_any = network if isinstance(network, MosaicDRUNet) else None
-    network = network if of_any is None else BayerAdapter(of_any)
+    of_any = None
+    if isinstance(network, MosaicDRUNet):
+        of_any = network
+        network = BayerAdapter(of_any)
+
     reads = getattr(network, "reads_variance", None)
-    reads = _takes_two(network.forward) if reads is None else reads
-    if not isinstance(network, (denoisers.Denoiser, BayerAdapter, OnnxNetwork, BiasFreeDnCNN, PBRID)):
-        network = _Foreign(network, bool(reads))
-    made = network.eval()
-    upscale, own = getattr(made, "upscale", 1), CFA(info.get("cfa", "RGGB"))
-    about: dict[str, Any] = {"info": info, "reads_levels": bool(reads), "upscale": upscale, "of_any": of_any}
-    return RawDenoiser(name=name, model=lambda levels: made, cfa=own, **about)
+    if reads is None:
+        reads = _takes_two(network.forward)
+        network = _Foreign(network, reads)
+
+    evaluated = network.eval()
+    return RawDenoiser(
+        name=name,
+        model=lambda levels: evaluated,
+        cfa=cfa,
+        of_any=of_any,
+        info=info,
+        reads_levels=bool(reads),
+        upscale=getattr(evaluated, "upscale", 1),
+    )
 
 
 class _Foreign(nn.Module):

@@ -124,6 +124,8 @@ class BiasFreeDnCNN(nn.Module):
         weights: of the convolutions, ``(n, m, 3, 3)``, by names whose order is theirs.
     """
 
+    reads_variance = True
+
     def __init__(self, weights: Mapping[str, Tensor]) -> None:
         super().__init__()
         self.layers = nn.ParameterList([weights[name] for name in sorted(weights)])

@@ -28,9 +28,8 @@ from denoisers.classical import FILTERS
 from denoisers.files import find_denoiser, list_shipped
 from rawaug import bayer
 from rawaug.denoising.denoiser import CPU, Noisy, progress_by
-from rawaug.denoising.foreign import AGAIN, load_published
+from rawaug.denoising.weights import read_network
 from rawaug.errors import extra
-from rawaug.files import read_tensors
 from rawaug.kernels.runtime import find_device, has_fast_bfloat16
 from rawaug.registry import Spec, spec_label, suggest
 
@@ -154,15 +153,11 @@ def _network(spec: str) -> tuple[str, nn.Module]:
             f"{spec}: no such denoiser of pictures{suggest(spec, list_shipped())}; give one of {PICTURES}, or "
             "a .safetensors of rawaug run srgb or of FFDNet's authors"
         )
-    path = find_denoiser(spec)
-    metadata, tensors = read_tensors(path, AGAIN)
-    if "conv00.weight" in tensors and metadata.get("format") != "rawaug":
-        return "FFDNet, published weights", load_published(denoisers.FFDNet(), path)
-    network = denoisers.load(path)[0]
-    if network.channels != 3:
+    file = read_network(find_denoiser(spec))
+    if file.image != PictureDenoiser.takes:
         raise ValueError(f"{spec}: denoises RAW, not pictures; use {PICTURES}")
-    arm = path.resolve().parent.name
-    return arm if path.stem == "denoiser" else path.stem, network
+
+    return file.name, file.network
 
 
 def _denoise_at(network: Any, srgb: Tensor, level: float) -> Tensor:

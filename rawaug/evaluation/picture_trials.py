@@ -10,17 +10,23 @@ between the noisy picture and the clean one, so that they do not depend on the d
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug.data.picture_pairs import PicturePair
+from rawaug.data.picture_pairs import PicturePair, open_picture_pairs
+from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.errors import extra
+from rawaug.evaluation.comparison import Comparison
+from rawaug.evaluation.evaluate import Evaluation
 from rawaug.evaluation.scores import NOISY, Denoiser, group_rows, score, summary
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial, make_trials
+from rawaug.files import write_json
+from rawaug.version import __version__
 
 PUBLISHED, REGISTERED = "as published", "registered"
 BORDER = 4
@@ -71,8 +77,59 @@ def picture_scores(denoisers: Sequence[Denoiser], pairs: Sequence[Any]) -> dict[
 
 def print_pictures(data: str, result: Mapping[str, Any]) -> None:
     """The table of :func:`picture_scores`."""
-    cells = [
-        [name, *(f"{by[c]['psnr']:.2f} / {by[c]['ssim']:.4f}" for c in (PUBLISHED, REGISTERED))]
-        for name, by in result["rows"].items()
-    ]
-    print_rows(f"PSNR in dB / SSIM, {data}, {result['pictures']} pictures", ["denoiser", PUBLISHED, REGISTERED], cells)
+    rows = []
+    for name, by_condition in result["rows"].items():
+        cells = [name]
+        for condition in (PUBLISHED, REGISTERED):
+            scores = by_condition[condition]
+            cells.append(f"{scores['psnr']:.2f} / {scores['ssim']:.4f}")
+        rows.append(cells)
+
+    title = f"PSNR in dB / SSIM, {data}, {result['pictures']} pictures"
+    print_rows(title, ["denoiser", PUBLISHED, REGISTERED], rows)
+
+
+def evaluate_pictures(asked: Evaluation) -> dict[str, Any]:
+    """Score a denoiser of pictures, beside classical filters; the result, as in the JSON.
+
+    ``plain`` holds the result with the default number of views, where more are asked for.
+    """
+    if asked.noise is not None or asked.bin != 1 or asked.report:
+        raise ValueError(f"{asked.data}: has developed pictures; --noise, --bin and --report are for RAW")
+
+    plain = PictureDenoiser.of(asked.denoiser, asked.device)
+    filters = [PictureDenoiser.of(str(spec)) for spec in asked.classical]
+    denoisers = [plain, *filters]
+    main = plain
+    if asked.views > 1:
+        main = replace(plain, name=f"{plain.name}, {asked.views} views", views=asked.views)
+        denoisers.insert(1, main)
+
+    pairs = open_picture_pairs(asked.data, asked.settings.noisy, asked.settings.clean)
+    scores = picture_scores(denoisers, pairs)
+    print_pictures(asked.data, scores)
+
+    rows = scores["rows"]
+    result = {
+        "kind": "denoiser",
+        "data": asked.data,
+        "version": __version__,
+        **rows[main.name][PUBLISHED],
+        "registered": rows[main.name][REGISTERED],
+    }
+    if asked.views > 1:
+        result |= {"self_ensemble": True, "views": asked.views, "plain": rows[plain.name][PUBLISHED]}
+    if filters:
+        result["classical"] = {one.name: rows[one.name] for one in filters}
+
+    asked.write(result)
+    return result
+
+
+def compare_pictures(asked: Comparison) -> None:
+    """Compare denoisers of pictures; the table is printed, and written as JSON."""
+    denoisers = [PictureDenoiser.of(spec, asked.device) for spec in asked.denoisers]
+    result = picture_scores(denoisers, open_picture_pairs(asked.data))
+    print_pictures(asked.data, result)
+    if asked.json:
+        write_json({"data": asked.data, **result}, asked.json)

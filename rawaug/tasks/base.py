@@ -17,6 +17,8 @@ from rawaug.data import open_pairs
 from rawaug.data.folders import Kept
 from rawaug.data.pairs import Binned, Middles, Pair, SomePairs
 from rawaug.data.picture_pairs import is_picture_pairs
+from rawaug.evaluation.comparison import Comparison, compare_raw
+from rawaug.evaluation.evaluate import Evaluation, evaluate_raw
 from rawaug.evaluation.figures import Panels, panels_of, save_picture
 from rawaug.evaluation.page import select_for_page
 from rawaug.evaluation.scores import NOISY
@@ -30,6 +32,16 @@ from rawaug.training.stream import TrainingStream
 
 TASKS = Registry("task", "rawaug.tasks", "rawaug.tasks")
 """Subclasses of :class:`Task`, by the name in a recipe's key ``experiment``."""
+
+
+def task_of(data: str) -> type[Task]:
+    """The task whose images a test set, ``kind:path``, holds: RAW, unless another task reads it."""
+    for name in TASKS:
+        task: type[Task] = TASKS[name]
+        if task.reads(data):
+            return task
+
+    return Task
 
 
 class Task(ABC):
@@ -61,6 +73,11 @@ class Task(ABC):
         self.recipe: Any = recipe
 
     # -- files
+
+    @classmethod
+    def reads(cls, data: str) -> bool:
+        """Whether a name of a test set is one of this kind of image alone."""
+        return False
 
     def open(self, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Any]:
         """Open the frames that a key of ``data`` names, or a sequence of them.
@@ -101,6 +118,18 @@ class Task(ABC):
             frames = Middles(frames, crop)
 
         return Kept(frames)
+
+    # -- one denoiser on a test set, and several
+
+    @staticmethod
+    def evaluate(asked: Evaluation) -> dict[str, Any]:
+        """Score a denoiser on a test set, see :mod:`rawaug.evaluation.evaluate`."""
+        return evaluate_raw(asked)
+
+    @staticmethod
+    def benchmark(asked: Comparison) -> None:
+        """Compare denoisers on a test set, see :mod:`rawaug.evaluation.comparison`."""
+        compare_raw(asked)
 
     # -- networks
 

@@ -29,8 +29,10 @@ from rawaug.data.pairs import Middles, Pair, SomePairs
 from rawaug.data.picture_pairs import PicturePair, PicturePairs, is_picture_pairs, open_picture_pairs
 from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser
 from rawaug.denoising.pictures import PictureDenoiser
+from rawaug.evaluation.comparison import Comparison
+from rawaug.evaluation.evaluate import Evaluation
 from rawaug.evaluation.figures import Panels, crops_at_100, panels_of
-from rawaug.evaluation.picture_trials import picture_trials
+from rawaug.evaluation.picture_trials import compare_pictures, evaluate_pictures, picture_trials
 from rawaug.evaluation.scores import score
 from rawaug.evaluation.trials import Trial
 from rawaug.io import RawFrame, develop, write_dng
@@ -106,6 +108,21 @@ class SrgbTask(Task):
     settings = SrgbRecipe
     compared_in = "developed sRGB"
     ensembles = False
+
+    @classmethod
+    def reads(cls, data: str) -> bool:
+        """Whether the test set is of developed pictures."""
+        return is_picture_pairs(data)
+
+    @staticmethod
+    def evaluate(asked: Evaluation) -> dict[str, Any]:
+        """Score a denoiser on real pairs."""
+        return evaluate_pictures(asked)
+
+    @staticmethod
+    def benchmark(asked: Comparison) -> None:
+        """Compare denoisers on real pairs."""
+        compare_pictures(asked)
 
     def open(self, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Any]:
         """Open frames, or real pairs of developed pictures."""

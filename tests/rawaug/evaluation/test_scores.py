@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
 import denoisers
 from rawaug.bayer import CFA
@@ -78,7 +79,7 @@ def test_a_denoiser_that_does_nothing_scores_as_its_input(
     assert all(result[f"{key}_worst25"] <= result[key] <= result[f"{key}_best25"] for key in figures)
     assert result["psnr_srgb"] == pytest.approx(result["psnr_srgb_noisy"], abs=1e-3)
     shown: list[dict[str, Any]] = []
-    monkeypatch.setattr("rawaug.commands.evaluate.print_scores", shown.append)
+    monkeypatch.setattr("rawaug.evaluation.evaluate.print_scores", shown.append)
     again = evaluate(str(identity), data="given:", self_ensemble=True, report=str(tmp_path / "new" / "page.html"))
     assert shown == [result, again]  # known before the views are scored
     assert again["plain"]["psnr"] == pytest.approx(again["psnr"], abs=1e-3)  # the network changes nothing
@@ -132,7 +133,7 @@ def test_classical_denoisers_stand_beside_it(identity: Path, given: list[Pair]) 
     for name, gain in {"Wavelet": 3.0, "TotalVariation": 2.0}.items():
         scores = result["classical"][name]
         assert scores["psnr"] > result["psnr_noisy"] + gain and scores["psnr_srgb"] > result["psnr_srgb_noisy"] + gain
-    with pytest.raises(ValueError, match="classical filter 'Median' is unknown; use one of BM3D, NonLocalMeans"):
+    with pytest.raises(ValueError, match="classical filter 'Median' is unknown; use one of BM3D"):
         evaluate(str(identity), data="given:", classical=["Median"])
 
 
@@ -222,3 +223,21 @@ def test_frames_that_cannot_be_read_are_named_and_the_rest_is_scored(
     assert [image["name"] for image in result["images"]] == ["0"] and len(result["broken"]) == 1 and page.is_file()
     (crops / "0.npy").write_bytes(b"")
     assert main(arguments) == 2 and "none of the 2 frames can be read" in capsys.readouterr().err
+
+
+def test_whatever_is_benchmarked_can_be_evaluated(middles: list[Pair], tmp_path: Path) -> None:
+    """A filter, published weights and an ONNX file, by the one resolver."""
+    generator = torch.Generator().manual_seed(0)
+    shapes = {"conv00": (4, 1, 3, 3), "conv01": (1, 4, 3, 3)}
+    weights = {name: 1e-3 * torch.randn(shape, generator=generator) for name, shape in shapes.items()}
+    save_file(weights, tmp_path / "published.safetensors")
+    del middles[1:]
+
+    filtered = evaluate("NonLocalMeans", data="given:")
+    published = evaluate(str(tmp_path / "published.safetensors"), data="given:")
+    assert filtered["psnr"] > filtered["psnr_noisy"] + 1 and "weights_sha256" not in filtered
+    assert published["psnr"] == pytest.approx(published["psnr_noisy"], abs=0.5) and published["weights_sha256"]
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        evaluate("nowhere.onnx", data="given:")
+    with pytest.raises(ValueError, match="no such denoiser"):
+        evaluate("rawaug-smal", data="given:")

@@ -1,0 +1,151 @@
+"""``rawaug benchmark`` of RAW from start to end: denoisers by name, tables, JSON and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rawaug.data import open_pairs
+from rawaug.data.pairs import Binned, SomePairs
+from rawaug.denoising.denoiser import RawDenoiser, shipped_of_mosaics
+from rawaug.evaluation.benchmark import (
+    TOLD,
+    benchmark,
+    costs_of,
+    crops,
+    display_strength,
+    noise_note,
+    strengths_of,
+    tables,
+    trials,
+)
+from rawaug.evaluation.evaluate import denoiser_of
+from rawaug.evaluation.figures import plot_costs
+from rawaug.evaluation.page import Figure, Page
+from rawaug.evaluation.tables import print_rows
+from rawaug.evaluation.trials import Measured, Trial, own_noise_note
+from rawaug.files import write_json
+
+ALWAYS = "NonLocalMeans"
+"""The filter that is in every table, as the shipped denoisers of mosaics are."""
+
+ON_PAGE = 4
+"""Largest number of frames on the page."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What ``rawaug benchmark`` is asked to compare.
+
+    Attributes:
+        denoisers: names or files.
+        data: clean frames, or real pairs of pictures, by a path or ``kind:path``.
+        bin: the frames are binned by this factor.
+        count: number of frames.
+        crop: side of the middles that are used, in pixels of the mosaic.
+        noise: in place of the four strengths; None for these.
+        iso: ISO values of the camera that ``noise`` names.
+        seed: of the noise.
+        device: where networks run.
+        json: the file that gets the result; None for none.
+        report: the page that gets tables and crops; None for none.
+    """
+
+    denoisers: Sequence[str]
+    data: str
+    bin: int = 1
+    count: int = 6
+    crop: int = 384
+    noise: Any = None
+    iso: list[float] | None = None
+    seed: int = 0
+    device: str = "cpu"
+    json: str | None = None
+    report: str | None = None
+
+
+def compare_raw(asked: Comparison) -> None:
+    """Compare denoisers of RAW on the same frozen noise; tables are printed, and written as JSON and as a page."""
+    strengths = strengths_of(asked.noise, asked.iso)
+    denoisers = open_denoisers(asked)
+
+    pairs = open_pairs(asked.data, split="test")
+    chosen = SomePairs(pairs, range(len(pairs))[: asked.count])
+    frames = Binned(Measured(chosen, asked.count), asked.bin)
+    cases = trials(frames, asked.crop, asked.seed, strengths)
+
+    noise = noise_note(cases, strengths, asked.seed)
+    facts = {"data": asked.data, "bin": asked.bin, "crop": asked.crop, "seed": asked.seed, "noise": noise}
+    result = {**facts, **benchmark(denoisers, cases)}
+
+    for title, head, cells in tables(result):
+        print_rows(title, ["denoiser", *head], [[name, *row] for name, row in cells.items()])
+    notes = notes_of(result)
+    print("\n".join([*notes, noise]))
+
+    if asked.json:
+        write_json(result, asked.json)
+    if asked.report:
+        page = page_of(asked, result, denoisers, cases, notes)
+        print(f"page: {page.write(Path(asked.report), settings_of(asked))}")
+
+
+def open_denoisers(asked: Comparison) -> list[RawDenoiser]:
+    """The denoisers of the table; one whose name is taken goes by its spec."""
+    by_name: dict[str, RawDenoiser] = {}
+    for spec in dict.fromkeys((ALWAYS, *shipped_of_mosaics(), *asked.denoisers)):
+        denoiser = denoiser_of(spec, asked.device).require_mosaic()
+        name = spec if denoiser.name in by_name else denoiser.name
+        by_name[name] = replace(denoiser, name=name)
+
+    return list(by_name.values())
+
+
+def notes_of(result: dict[str, Any]) -> list[str]:
+    """Lines below the tables."""
+    summaries = {}
+    for name, row in result["rows"].items():
+        if name == "noisy input":
+            continue
+        for strength, scores in row["scores"][TOLD].items():
+            summaries[f"{name} ({strength})"] = scores
+
+    notes = ["GMAC and s: a megapixel of the mosaic. sRGB: after one fixed development."]
+    note = own_noise_note(summaries)
+    if note:
+        notes.append(note)
+    notes.append(f"noisy input: {result['hash']} (equal hashes, comparable figures)")
+    return notes
+
+
+def page_of(
+    asked: Comparison,
+    result: dict[str, Any],
+    denoisers: Sequence[RawDenoiser],
+    cases: Sequence[Trial],
+    notes: Sequence[str],
+) -> Page:
+    """The page: tables, quality over cost, and crops of some frames by every denoiser."""
+    page = Page(f"Denoisers on {asked.data}", result["noise"])
+    page.add(texts=notes)
+    for title, head, cells in tables(result):
+        page.add(title, head=["", *head], rows=cells)
+
+    strength = display_strength(strengths_of(asked.noise, asked.iso))
+    costs = plot_costs(costs_of(result))
+    chart = Figure(costs, "PSNR over GMAC", "curve", f"{strength}, levels told")
+    page.add("Quality and cost", figures=[chart])
+
+    page.add("Pictures", texts=[f"Noise: {strength}, levels told; PSNR of RAW."])
+    for panels in crops(denoisers, cases, ON_PAGE):
+        page.add_frame(panels, asked.crop)
+
+    return page
+
+
+def settings_of(asked: Comparison) -> dict[str, Any]:
+    """The settings at the end of the page."""
+    keys = ("denoisers", "data", "bin", "count", "crop", "seed", "noise", "iso")
+    return {key: getattr(asked, key) for key in keys}

@@ -1,0 +1,177 @@
+"""One denoiser on a test set, beside classical filters: what ``rawaug evaluate`` measures of RAW."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from rawaug.data import open_pairs
+from rawaug.data.folders import Kept, Readable
+from rawaug.data.pair_folder import PairSettings
+from rawaug.data.pairs import Binned
+from rawaug.denoising.denoiser import RawDenoiser, denoiser_file
+from rawaug.evaluation.figures import panels_of
+from rawaug.evaluation.page import Page, select_for_page
+from rawaug.evaluation.scores import NOISY, Row, group_rows, score, summary
+from rawaug.evaluation.tables import print_scores
+from rawaug.evaluation.trials import Measured, Trial, make_trials, own_noise_note, trial_of
+from rawaug.files import sha256, write_json
+from rawaug.noise import NoiseSpec, noise_model
+from rawaug.registry import Spec
+from rawaug.version import __version__
+
+PRESET = "cycleisp_sidd"
+"""The noise of frames without a capture where the denoiser does not say which it was trained with."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What ``rawaug evaluate`` is asked to measure.
+
+    Attributes:
+        denoiser: a name or a file, see :meth:`rawaug.RawDenoiser.of`.
+        data: the test set, by a path or ``kind:path``.
+        views: 1, or 4 or 8 to score the self-ensemble, too.
+        noise: is added to frames without a capture; None for that of the denoiser's training.
+        seed: of that noise.
+        bin: the frames are binned by this factor.
+        classical: filters to score on the same noise.
+        device: where a network runs.
+        json: the file that gets the result; None for none.
+        report: the page that gets scores and crops; None for none.
+        settings: of ``pairs:PATH``.
+    """
+
+    denoiser: str
+    data: str
+    views: int = 1
+    noise: NoiseSpec | None = None
+    seed: int = 0
+    bin: int = 1
+    classical: Sequence[Spec] = ()
+    device: str = "cpu"
+    json: str | None = None
+    report: str | None = None
+    settings: PairSettings = field(default_factory=PairSettings)
+
+    def facts(self, kind: str, file: Path | None) -> dict[str, Any]:
+        """What the result says besides scores: the kind of weights, denoiser or isp, the hash of their file, ..."""
+        facts: dict[str, Any] = {"kind": kind, "data": self.data}
+        if file is not None:
+            facts["weights_sha256"] = sha256(file)
+        facts["version"] = __version__
+        if self.bin != 1:
+            facts["bin"] = self.bin
+
+        return facts
+
+    def write(self, result: Mapping[str, Any]) -> None:
+        """Write the result as JSON, if there is a file for it."""
+        if self.json is not None:
+            write_json(result, self.json)
+
+
+def evaluate_raw(asked: Evaluation) -> dict[str, Any]:
+    """Score a denoiser of RAW, print its tables and write its files; the result, as in the JSON.
+
+    The plain scores are printed and written first, then those of the self-ensemble and of filters, which take longer.
+    """
+    denoiser = replace(denoiser_of(asked.denoiser, asked.device), checked=False).require_mosaic()
+    filters = [RawDenoiser.of(spec) for spec in asked.classical]
+    noise = asked.noise or denoiser.info.get("noise", PRESET)
+    model = noise_model(noise)
+
+    pairs = open_pairs(asked.data, split="test", **vars(asked.settings))
+    frames = Readable(Kept(Binned(Measured(pairs), asked.bin)))
+    for _ in frames:
+        pass  # finds those that cannot be read
+    trials = make_trials(frames.kept(), lambda pair: trial_of(pair, model, denoiser.cfa, asked.seed))
+
+    facts = asked.facts("denoiser", denoiser_file(asked.denoiser))
+    unreadable = {"broken": frames.reasons()} if frames.broken else {}
+    noisy, plain = group_rows(_finite_rows([NOISY, denoiser], trials, "evaluate")).values()
+    plain_scores = summary(plain, noisy)
+    result = {**facts, "self_ensemble": False, "seed": asked.seed, **plain_scores, **unreadable}
+    print_scores(result)
+    asked.write(result)
+
+    if asked.views > 1 or filters:
+        ensemble = [replace(denoiser, name="views", views=asked.views)] if asked.views > 1 else []
+        rows = group_rows(_finite_rows([*ensemble, *filters], trials, "evaluate, the rest"))
+
+        if ensemble:
+            about = {"self_ensemble": True, "seed": asked.seed, "views": asked.views, "plain": plain_scores}
+            result = {**facts, **about, **summary(rows.pop("views"), noisy), **unreadable}
+        if filters:
+            result["classical"] = {name: summary(of_filter, noisy) for name, of_filter in rows.items()}
+        print_scores(result)
+        asked.write(result)
+
+    note = own_noise_note({"the denoiser": result, **result.get("classical", {})})
+    if note:
+        print(note)
+    if asked.report:
+        page = _page(asked, result, denoiser, filters, trials, noise)
+        settings = {"weights": asked.denoiser, "data": asked.data, "noise": asked.noise, "seed": asked.seed}
+        print(f"page: {page.write(Path(asked.report), settings)}")
+
+    return result
+
+
+def denoiser_of(spec: str, device: str = "cpu") -> RawDenoiser:
+    """What a word of the command line names, the only place where ``package.module:function`` is imported."""
+    module, colon, function = spec.partition(":")
+    if not colon or Path(spec).suffix in (".onnx", ".safetensors"):
+        return RawDenoiser.of(spec, device)
+
+    sys.path.insert(0, str(Path.cwd()))  # as python -m does
+    try:
+        denoiser = getattr(import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{spec}: cannot be imported: {error}") from None
+    finally:
+        sys.path.pop(0)
+
+    return RawDenoiser.of(denoiser, device, name=spec)
+
+
+def _finite_rows(denoisers: Sequence[Any], trials: Iterable[Trial], label: str) -> Iterator[Row]:
+    """The scores; ValueError at the first that is NaN, which damaged weights are at their first frame."""
+    for row in score(denoisers, trials, label):
+        require_finite(row.frame, row.psnr)
+        yield row
+
+
+def require_finite(frame: str, value: float) -> float:
+    """The score of a frame, unless it is NaN, which it is where weights are damaged."""
+    if math.isnan(value):
+        raise ValueError(f"{frame}: the result is not finite; the weights are damaged")
+
+    return value
+
+
+def _page(
+    asked: Evaluation,
+    result: Mapping[str, Any],
+    denoiser: RawDenoiser,
+    filters: Sequence[RawDenoiser],
+    trials: Sequence[Trial],
+    noise: NoiseSpec,
+) -> Page:
+    """The scores, and some frames noisy, denoised by each filter and by the denoiser, and clean."""
+    runs = {"plain": result.get("plain", result)}
+    if "plain" in result:
+        runs["self_ensemble"] = result
+
+    facts = {"Noise": noise, "Seed": str(asked.seed)}
+    title = f"{denoiser.name} on {asked.data}"
+    page = Page.of_scores(title, {denoiser.name: [runs]}, result.get("classical", {}), facts)
+    for trial in select_for_page(trials):
+        page.add_frame(panels_of([*filters, denoiser], trial))
+
+    return page
