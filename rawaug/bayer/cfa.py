@@ -16,7 +16,8 @@ from enum import StrEnum
 import torch
 from torch import Tensor
 
-N_VIEWS = 8  # flips and quarter turns of a picture: the dihedral group of the square
+N_VIEWS = 8
+"""The number of flips and quarter turns of a picture: the order of the square's dihedral group."""
 
 
 class CFA(StrEnum):
@@ -42,13 +43,18 @@ class CFA(StrEnum):
     @property
     def channels(self) -> tuple[tuple[int, int], tuple[int, int]]:
         """The cell as indices into RGB: ``((0, 1), (1, 2))`` for RGGB."""
-        a, b, c, d = ("RGB".index(colour) for colour in self.value)
-        return (a, b), (c, d)
+        indices = ["RGB".index(colour) for colour in self.value]
+        return (indices[0], indices[1]), (indices[2], indices[3])
 
     def shift(self, rows: int, columns: int) -> CFA:
         """The pattern of the mosaic that starts ``rows`` lower and ``columns`` further right."""
         cell = [self.value[:2], self.value[2:]]
-        return CFA("".join(cell[(i + rows) % 2][(j + columns) % 2] for i in (0, 1) for j in (0, 1)))
+
+        colours = ""
+        for i in (0, 1):
+            for j in (0, 1):
+                colours += cell[(i + rows) % 2][(j + columns) % 2]
+        return CFA(colours)
 
     def turn(self, view: int) -> CFA:
         """The pattern after :func:`turn` of a mosaic with even sides."""
@@ -57,7 +63,9 @@ class CFA(StrEnum):
 
     def shift_to(self, other: CFA) -> tuple[int, int]:
         """(rows, columns) in {0, 1} with ``self.shift(rows, columns) == other``."""
-        return next((i, j) for i in (0, 1) for j in (0, 1) if self.shift(i, j) == other)
+        red_row, red_column = self.sites[0]
+        other_row, other_column = other.sites[0]
+        return (red_row + other_row) % 2, (red_column + other_column) % 2
 
 
 def noise_variance(raw: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Tensor:
@@ -83,6 +91,7 @@ def pack(mosaic: Tensor, cfa: CFA | str) -> Tensor:
     """Pack a mosaic ``(..., 1, H, W)`` into planes R, Gr, Gb, B ``(..., 4, H/2, W/2)``; ValueError if a side is odd."""
     require_channels(mosaic, 1, "a mosaic")
     require_even(*mosaic.shape[-2:])
+
     plane = mosaic[..., 0, :, :]
     return torch.stack([plane[..., i::2, j::2] for i, j in CFA(cfa).sites], dim=-3)
 
@@ -92,6 +101,7 @@ def unpack(packed: Tensor, cfa: CFA | str) -> Tensor:
     require_channels(packed, 4, "packed RAW")
     *lead, _, height, width = packed.shape
     require_even(2 * height, 2 * width)
+
     mosaic = packed.new_empty(*lead, 1, 2 * height, 2 * width)
     for k, (i, j) in enumerate(CFA(cfa).sites):
         mosaic[..., 0, i::2, j::2] = packed[..., k, :, :]
@@ -102,8 +112,11 @@ def pack_rgb(rgb: Tensor, cfa: CFA | str) -> Tensor:
     """Pack full colour ``(..., 3, H, W)`` into planes ``(..., 4, H/2, W/2)``: each site keeps its own colour alone."""
     require_channels(rgb, 3, "an RGB image")
     require_even(*rgb.shape[-2:])
-    sites = zip((0, 1, 1, 2), CFA(cfa).sites, strict=True)
-    return torch.stack([rgb[..., c, i::2, j::2] for c, (i, j) in sites], dim=-3)
+
+    planes = []
+    for channel, (i, j) in zip((0, 1, 1, 2), CFA(cfa).sites, strict=True):
+        planes.append(rgb[..., channel, i::2, j::2])
+    return torch.stack(planes, dim=-3)
 
 
 def mosaic(rgb: Tensor, cfa: CFA | str) -> Tensor:
@@ -119,16 +132,26 @@ def turn(image: Tensor, view: int) -> Tensor:
     """
     if not 0 <= view < N_VIEWS:
         raise ValueError(f"view must be in [0, {N_VIEWS}), got {view}")
+
     if view & 4:
         image = image.transpose(-2, -1)
-    axes = [axis for bit, axis in ((2, -2), (1, -1)) if view & bit]
-    return image.flip(axes) if axes else image
+
+    axes = []
+    if view & 2:
+        axes.append(-2)
+    if view & 1:
+        axes.append(-1)
+    if not axes:
+        return image
+    return image.flip(axes)
 
 
 def turn_back(image: Tensor, view: int) -> Tensor:
     """Undo :func:`turn` of the same ``view`` on an image ``(..., H, W)``."""
-    flips = turn(image, view & 3)
-    return flips.transpose(-2, -1) if view & 4 else flips
+    image = turn(image, view & 3)
+    if view & 4:
+        image = image.transpose(-2, -1)
+    return image
 
 
 def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
@@ -180,37 +203,50 @@ def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False)
         >>> bin_mosaic(torch.rand(1, 16, 24), "GRBG", 4).shape
         torch.Size([1, 4, 6])
     """
-    if factor < 1 or any(side % (2 * factor) for side in raw.shape[-2:]):
-        raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} cannot be binned by {factor}; use multiples of 2 factor")
-    CFA(cfa)  # whatever the pattern of 2 x 2 sites, each is averaged with its own kind
+    height, width = raw.shape[-2:]
+    if factor < 1 or height % (2 * factor) or width % (2 * factor):
+        raise ValueError(f"a mosaic of {(height, width)} cannot be binned by {factor}; use multiples of 2 factor")
+    CFA(cfa)  # any Bayer pattern: each of its 2 x 2 sites is averaged with its own kind
+
     return unpack(bin_packed(pack(raw, CFA.RGGB), factor, together), CFA.RGGB)
 
 
 def bin_packed(packed: Tensor, factor: int, together: bool = False) -> Tensor:
     """Bin as :func:`bin_mosaic` does: packed RGGB ``(..., 4, h, w)`` to ``(..., 4, h / factor, w / factor)``."""
-    moves = [(2 * i - 1) * (-1 if together else factor - 1) / 4 for i in (0, 1)]
-    planes = zip(packed.unbind(-3), CFA.RGGB.sites, strict=True)
-    rows = ((_window_means(plane, -2, factor, moves[i]), moves[j]) for plane, (i, j) in planes)
-    return torch.stack([_window_means(row, -1, factor, move) for row, move in rows], -3)
+    reach = _window_offset(factor, together)
+
+    binned = []
+    for plane, (i, j) in zip(packed.unbind(-3), CFA.RGGB.sites, strict=True):
+        rows = _window_means(plane, -2, factor, (2 * i - 1) * reach)
+        binned.append(_window_means(rows, -1, factor, (2 * j - 1) * reach))
+    return torch.stack(binned, -3)
 
 
 def bin_mosaic_variance(factor: int, together: bool = False) -> float:
     """The variance that :func:`bin_mosaic` leaves of independent noise of variance 1: about ``1 / factor^2``."""
-    part = (-1 if together else factor - 1) / 4 % 1
+    part = _window_offset(factor, together) % 1
     return ((factor - 1 + part**2 + (1 - part) ** 2) / factor**2) ** 2
+
+
+def _window_offset(factor: int, together: bool) -> float:
+    """How far the windows of a cell's sites lie from its middle, in sites of a colour."""
+    if together:
+        return -0.25
+    return (factor - 1) / 4
 
 
 def _window_means(plane: Tensor, axis: int, factor: int, move: float) -> Tensor:
     """Average windows of ``factor`` sites of one colour, moved by ``move`` of its sites."""
-    first, part = math.floor(move), move % 1
+    first = math.floor(move)
     axis %= plane.ndim  # from here on nothing takes a size as a number, which an exported network would keep
     sites = torch.arange(plane.shape[axis], device=plane.device)
     windows = (*plane.shape[:axis], -1, factor, *plane.shape[axis + 1 :])
-    near, far = (
-        plane.index_select(axis, torch.minimum((sites + k).clamp_min(0), sites[-1:])).reshape(windows).mean(axis + 1)
-        for k in (first, first + 1)
-    )
-    return torch.lerp(near, far, part)
+
+    def means(start: int) -> Tensor:
+        inside = torch.minimum((sites + start).clamp_min(0), sites[-1:])
+        return plane.index_select(axis, inside).reshape(windows).mean(axis + 1)
+
+    return torch.lerp(means(first), means(first + 1), move % 1)
 
 
 def crop_to_cfa(mosaic: Tensor, cfa: CFA, target: CFA) -> Tensor:

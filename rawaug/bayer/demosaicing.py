@@ -12,6 +12,7 @@ like this. In flat areas noise decides, and leaves a maze of short lines, which 
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import product
 
 import torch
 import torch.nn.functional as F
@@ -19,8 +20,6 @@ from torch import Tensor
 
 from rawaug.bayer.cfa import CFA, require_channels, require_even
 
-# A colour that a site lacks, from its surroundings, in eighths: green at red or blue; a colour at a green whose
-# neighbours along the row have it (turned, along the column); red at blue or blue at red.
 STENCILS: dict[str, tuple[Tensor, Tensor, Tensor]] = {
     "bilinear": (
         torch.tensor([[0.0, 2, 0], [2, 0, 2], [0, 2, 0]]),
@@ -33,6 +32,11 @@ STENCILS: dict[str, tuple[Tensor, Tensor, Tensor]] = {
         torch.tensor([[0, 0, -1.5, 0, 0], [0, 2, 0, 2, 0], [-1.5, 0, 6, 0, -1.5], [0, 2, 0, 2, 0], [0, 0, -1.5, 0, 0]]),
     ),
 }
+"""How a site gets a colour that it lacks from its surroundings, in eighths, by the name of the method.
+
+The three stencils are for green at red or blue; for a colour at a green whose neighbours along the row have it (turned,
+along the column); and for red at blue or blue at red.
+"""
 
 
 def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:
@@ -48,15 +52,15 @@ def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:
     require_method(method)
     if method in DIRECTIONAL:
         return DIRECTIONAL[method](raw, CFA(cfa))
+
     stencils, kinds = demosaicing_stencils(cfa, method)
     edge = stencils.shape[-1] // 2
     padded = F.pad(raw, (edge, edge, edge, edge), mode="reflect")  # about the border sites: the pattern stays
-    found = torch.cat([raw, F.conv2d(padded, stencils[:, None].to(raw))], dim=1)
+    candidates = torch.cat([raw, F.conv2d(padded, stencils[:, None].to(raw))], dim=1)
+
     rgb = raw.new_empty(len(raw), 3, *raw.shape[-2:])
-    for channel, rows in enumerate(kinds):
-        for i, row in enumerate(rows):
-            for j, kind in enumerate(row):
-                rgb[:, channel, i::2, j::2] = found[:, kind, i::2, j::2]
+    for channel, i, j in product(range(3), range(2), range(2)):
+        rgb[:, channel, i::2, j::2] = candidates[:, kinds[channel][i][j], i::2, j::2]
     return rgb
 
 
@@ -67,75 +71,114 @@ def demosaicing_stencils(cfa: CFA | str, method: str) -> tuple[Tensor, list[list
     ``kinds[colour][row][column]`` is 0 where the site has the colour itself, else the number of its stencil from 1.
     """
     cross, along_row, diagonal = STENCILS[method]
-    own = CFA(cfa).channels
+    stencils = torch.stack([cross, along_row, along_row.T, diagonal]) / 8
+    cell = CFA(cfa).channels
+    green = 1
 
-    def kind(colour: int, i: int, j: int) -> int:
-        if own[i][j] == colour:
-            return 0
-        if own[i][j] == 1:
-            return 2 if own[i][1 - j] == colour else 3
-        return 1 if colour == 1 else 4
-
-    kinds = [[[kind(colour, i, j) for j in (0, 1)] for i in (0, 1)] for colour in range(3)]
-    return torch.stack([cross, along_row, along_row.T, diagonal]) / 8, kinds
+    kinds = [[[0, 0], [0, 0]], [[0, 0], [0, 0]], [[0, 0], [0, 0]]]
+    for colour, i, j in product(range(3), range(2), range(2)):
+        if cell[i][j] == colour:
+            kind = 0
+        elif cell[i][j] == green and cell[i][1 - j] == colour:
+            kind = 2
+        elif cell[i][j] == green:
+            kind = 3
+        elif colour == green:
+            kind = 1
+        else:
+            kind = 4
+        kinds[colour][i][j] = kind
+    return stencils, kinds
 
 
 def _along(raw: Tensor, axis: int) -> tuple[Tensor, Tensor]:
     """Estimate the other colour of a row, or column, at every site, and how much both change there."""
-    padded = F.pad(raw, (2, 2, 0, 0) if axis == -1 else (0, 0, 2, 2), mode="reflect")
-    far, near, own, after, last = (padded.narrow(axis, k, raw.shape[axis]) for k in range(5))
-    bend = 2 * own - far - last
-    return (near + after) / 2 + bend / 4, (near - after).abs() + bend.abs()
+    margins = {-1: (2, 2, 0, 0), -2: (0, 0, 2, 2)}
+    padded = F.pad(raw, margins[axis], mode="reflect")
+    side = raw.shape[axis]
+    second_before, before = padded.narrow(axis, 0, side), padded.narrow(axis, 1, side)
+    site = padded.narrow(axis, 2, side)
+    after, second_after = padded.narrow(axis, 3, side), padded.narrow(axis, 4, side)
+
+    bend = 2 * site - second_before - second_after
+    return (before + after) / 2 + bend / 4, (before - after).abs() + bend.abs()
 
 
 def _fill_colours(raw: Tensor, other: Tensor, cfa: CFA) -> Tensor:
     """Fill in the colours, given the green at red and blue sites: the differences to green are interpolated."""
-    red, first, second, blue = cfa.sites
+    red_site, *green_sites, blue_site = cfa.sites
+
     green = other.clone()
-    for i, j in (first, second):
+    for i, j in green_sites:
         green[..., i::2, j::2] = raw[..., i::2, j::2]
-    known = raw.new_zeros(len(raw), 2, *raw.shape[-2:])
-    for k, (i, j) in enumerate((red, blue)):
-        known[:, k, i::2, j::2] = (raw - green)[:, 0, i::2, j::2]
-    for axis, ends in ((-2, (0, 0, 1, 1)), (-1, (1, 1, 0, 0))):
-        padded = F.pad(known, ends, mode="reflect")
-        before, after = (padded.narrow(axis, k, known.shape[axis]) for k in (0, 2))
-        known = known + (before + after) / 2
-    spread = green + known
-    rgb = torch.stack([spread[:, 0], green[:, 0], spread[:, 1]], dim=1)
-    for k, (i, j) in ((0, red), (2, blue)):
-        rgb[:, k, i::2, j::2] = raw[:, 0, i::2, j::2]
+
+    # Red and blue less green, at first at their own sites alone; between two sites is the mean of both.
+    chroma = raw.new_zeros(len(raw), 2, *raw.shape[-2:])
+    for k, (i, j) in enumerate((red_site, blue_site)):
+        chroma[:, k, i::2, j::2] = (raw - green)[:, 0, i::2, j::2]
+    for axis, margins in ((-2, (0, 0, 1, 1)), (-1, (1, 1, 0, 0))):
+        padded = F.pad(chroma, margins, mode="reflect")
+        side = chroma.shape[axis]
+        before, after = padded.narrow(axis, 0, side), padded.narrow(axis, 2, side)
+        chroma = chroma + (before + after) / 2
+
+    red_blue = green + chroma
+    rgb = torch.stack([red_blue[:, 0], green[:, 0], red_blue[:, 1]], dim=1)
+    for channel, (i, j) in ((0, red_site), (2, blue_site)):
+        rgb[:, channel, i::2, j::2] = raw[:, 0, i::2, j::2]
     return rgb
 
 
 def _adams(raw: Tensor, cfa: CFA) -> Tensor:
-    (row, change), (column, change_down) = _along(raw, -1), _along(raw, -2)
-    share = (change < change_down).to(raw) + 0.5 * (change == change_down)
-    return _fill_colours(raw, torch.lerp(column, row, share), cfa)
+    """Demosaic with the green along which the mosaic changes least, or with the mean of both."""
+    along_row, change_in_row = _along(raw, -1)
+    along_column, change_in_column = _along(raw, -2)
+
+    row_share = (change_in_row < change_in_column).to(raw) + 0.5 * (change_in_row == change_in_column)
+    green = torch.lerp(along_column, along_row, row_share)
+    return _fill_colours(raw, green, cfa)
 
 
 def _ahd(raw: Tensor, cfa: CFA) -> Tensor:
-    pictures = [_fill_colours(raw, _along(raw, axis)[0], cfa) for axis in (-1, -2)]
-    steps = [_steps(picture) for picture in pictures]
+    """Demosaic along rows and along columns, and take each site from the picture that is more homogeneous around it."""
+    along_rows = _fill_colours(raw, _along(raw, -1)[0], cfa)
+    along_columns = _fill_colours(raw, _along(raw, -2)[0], cfa)
+    row_light, row_colour = _steps(along_rows)
+    column_light, column_colour = _steps(along_columns)
+
     # Of the picture along rows the steps along rows, and of the other those along columns, say what is alike here.
-    alike = [torch.minimum(steps[0][k][:, :2].amax(1), steps[1][k][:, 2:].amax(1))[:, None] for k in (0, 1)]
-    counts = [((light <= alike[0]) & (colour <= alike[1])).to(raw).sum(1, keepdim=True) for light, colour in steps]
-    row, column = (F.avg_pool2d(F.pad(count, (1, 1, 1, 1), mode="reflect"), 3, 1) for count in counts)
-    share = (row > column + 1e-3).to(raw) + 0.5 * ((row - column).abs() <= 1e-3)
-    return torch.lerp(pictures[1], pictures[0], share)
+    alike_light = torch.minimum(row_light[:, :2].amax(1), column_light[:, 2:].amax(1))[:, None]
+    alike_colour = torch.minimum(row_colour[:, :2].amax(1), column_colour[:, 2:].amax(1))[:, None]
+
+    def homogeneity(light: Tensor, colour: Tensor) -> Tensor:
+        alike = (light <= alike_light) & (colour <= alike_colour)
+        count = alike.to(raw).sum(1, keepdim=True)
+        return F.avg_pool2d(F.pad(count, (1, 1, 1, 1), mode="reflect"), 3, 1)
+
+    of_rows = homogeneity(row_light, row_colour)
+    of_columns = homogeneity(column_light, column_colour)
+    row_share = (of_rows > of_columns + 1e-3).to(raw) + 0.5 * ((of_rows - of_columns).abs() <= 1e-3)
+    return torch.lerp(along_columns, along_rows, row_share)
 
 
 def _steps(rgb: Tensor) -> tuple[Tensor, Tensor]:
     """Square the steps of light and of colour, ``(B, 4, H, W)``, to the neighbours left, right, above and below."""
-    found = []
-    for image in (rgb[:, 1:2], rgb[:, ::2] - rgb[:, 1:2]):
-        across, down = (image.diff(dim=axis).square().sum(1) for axis in (-1, -2))
-        near = [(across, (1, 0)), (across, (0, 1)), (down, (0, 0, 1, 0)), (down, (0, 0, 0, 1))]
-        found.append(torch.stack([F.pad(step, ends) for step, ends in near], dim=1))
-    return found[0], found[1]
+    green = rgb[:, 1:2]
+    return _squared_steps(green), _squared_steps(rgb[:, ::2] - green)
+
+
+def _squared_steps(image: Tensor) -> Tensor:
+    across = image.diff(dim=-1).square().sum(1)
+    down = image.diff(dim=-2).square().sum(1)
+
+    left, right = F.pad(across, (1, 0)), F.pad(across, (0, 1))
+    above, below = F.pad(down, (0, 0, 1, 0)), F.pad(down, (0, 0, 0, 1))
+    return torch.stack([left, right, above, below], dim=1)
 
 
 DIRECTIONAL = {"adams": _adams, "ahd": _ahd}
+"""The methods that choose between row and column, by name."""
+
 METHODS = (*STENCILS, *DIRECTIONAL)
 """The names of all demosaicings."""
 

@@ -16,6 +16,7 @@ by chance, the prediction makes the greens agree better, and what is left is noi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,20 +26,36 @@ from rawaug.bayer.cfa import CFA, pack, require_channels
 
 BLOCK = 16
 """Side of a block, in cells."""
+
 TILES = 8
-"""Tiles along each side of the frame, of which every other foretells the rest."""
+"""Number of tiles along each side of the frame; every other tile foretells the rest."""
+
 SURE = 4.0
-"""Standard deviations by which the tiles that agree better must be more than half of them; 1 in 30,000 by chance."""
+"""Significance threshold of the tiles that agree, in standard deviations; chance reaches it 1 in 30,000 times."""
+
 CLEAR = 5.0
-"""Standard errors above which a difference must be as well."""
+"""Significance threshold, in standard errors."""
+
 LARGEST = 0.06
-"""Greens that differ by more than this part of them are a pattern in the scene: no sensor does that."""
+"""The largest relative difference of a sensor's greens; a larger one is a pattern in the scene."""
+
 _CLIPPED = 0.98
-_GAIN_SD, _OFFSET_SD = 0.02, 1e-3  # coefficients are expected to be as small as this
+"""The signal from which a site counts as clipped."""
+
+_GAIN_SD, _OFFSET_SD = 0.02, 1e-3
+"""Standard deviations of the prior of the coefficients."""
+
 _LEAST_SD, _LEAST_SCALE = 1e-5, 0.5
-_LARGEST_SCALE = 2.0  # of the misfit: 0.8 for white noise, more for regular texture
+"""Lower limits of the blocks' standard deviation and of the misfit's scale."""
+
+_LARGEST_SCALE = 2.0
+"""Upper limit of the misfit's scale, which is 0.8 for white noise and more for regular texture."""
+
 _ROUNDS = 10
-_I, _J = torch.tensor([(i, j) for i in range(3) for j in range(3 - i)]).T  # powers of u and v in a quadratic
+"""Number of rounds of the robust fit."""
+
+_I, _J = torch.tensor([(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0)]).T
+"""The powers of u and v in a quadratic."""
 
 
 @dataclass(frozen=True)
@@ -74,29 +91,29 @@ def measure_greens(mosaic: Tensor, cfa: CFA | str) -> GreenDifference | None:
     Example:
         >>> light = torch.linspace(0.3, 0.4, 512).expand(1, 512, 512)
         >>> gains = torch.tensor([[1.0, 1.01], [0.99, 1.0]]).tile(256, 256)  # Gr 2 % above Gb
-        >>> found = measure_greens(light * gains, "RGGB")
-        >>> found.significant, round(found.share, 3)
+        >>> difference = measure_greens(light * gains, "RGGB")
+        >>> difference.significant, round(difference.share, 3)
         (True, 0.02)
     """
     if min(mosaic.shape[-2:]) < 2 * BLOCK * TILES:
         return None
-    terms, difference, sd, green, tile = _blocks(mosaic, cfa)
-    if len(sd) < TILES**2:
+    blocks = _blocks(mosaic, cfa)
+    if len(blocks.sd) < TILES**2:
         return None
-    found, covariance, scale = _fit(terms, difference, sd)
-    half, foretold = (tile // TILES + tile % TILES) % 2 == 0, torch.zeros_like(difference)
-    for known in (half, ~half):
-        foretold[~known] = terms[~known] @ _fit(terms[known], difference[known], sd[known])[0]
-    # Cauchy's loss, without and with the prediction
-    before, after = ((off / (2 * scale * sd)).square().log1p() for off in (difference, difference - foretold))
-    agree = torch.zeros(TILES**2, dtype=sd.dtype).index_add(0, tile, before - after)[tile.unique()].sign()
-    level = green.mean().clamp_min(1e-6)
-    share = float((terms @ found).square().mean().sqrt() / level)
-    error = float(((terms @ covariance) * terms).sum(1).mean().sqrt() / level)
-    sure = float(agree.sum()) >= SURE * len(agree) ** 0.5 and CLEAR * error < share < LARGEST
+
+    coefficients, covariance, scale = _fit(blocks.terms, blocks.difference, blocks.sd)
+    level = blocks.green.mean().clamp_min(1e-6)
+    share = float((blocks.terms @ coefficients).square().mean().sqrt() / level)
+    error = float(((blocks.terms @ covariance) * blocks.terms).sum(1).mean().sqrt() / level)
+    significant = (
+        CLEAR * error < share < LARGEST  # not by chance, and not a pattern of the scene
+        and scale < _LARGEST_SCALE
+        and _halves_agree(blocks, scale)
+    )
+
     gains = torch.zeros(3, 3, 3, dtype=torch.float64)
-    gains[:, _I, _J] = found[:-1].reshape(3, -1)
-    return GreenDifference(gains, float(found[-1]), share, error, sure and scale < _LARGEST_SCALE)
+    gains[:, _I, _J] = coefficients[:-1].reshape(3, -1)
+    return GreenDifference(gains, float(coefficients[-1]), share, error, significant)
 
 
 def balance_greens(mosaic: Tensor, cfa: CFA | str, difference: GreenDifference) -> Tensor:
@@ -110,60 +127,130 @@ def balance_greens(mosaic: Tensor, cfa: CFA | str, difference: GreenDifference) 
     Returns:
         A new mosaic ``(1, H, W)``.
     """
-    row, column, _ = _neighbours(mosaic)
-    down, along = (_powers(torch.linspace(-1, 1, side).to(mosaic)) for side in mosaic.shape[-2:])
-    gains, balanced = difference.gains.to(mosaic) / 2, mosaic.clone()
-    for sign, (i, j), red, blue in zip((-1, 1), CFA(cfa).sites[1:3], (row, column), (column, row), strict=True):
+    row_means, column_means, _ = _neighbours(mosaic)
+    height, width = mosaic.shape[-2:]
+    down = _powers(torch.linspace(-1, 1, height).to(mosaic))
+    along = _powers(torch.linspace(-1, 1, width).to(mosaic))
+    gains = difference.gains.to(mosaic) / 2
+    _, gr_site, gb_site, _ = CFA(cfa).sites
+
+    balanced = mosaic.clone()
+    for sign, (i, j), red, blue in (
+        (-1, gr_site, row_means, column_means),
+        (1, gb_site, column_means, row_means),
+    ):
         half = torch.full_like(mosaic[:, i::2, j::2], difference.offset / 2)
         for light, gain in zip((red, mosaic, blue), gains, strict=True):
             half.addcmul_(light[:, i::2, j::2], down[i::2] @ gain @ along[j::2].T)
-        site = mosaic[:, i::2, j::2]
-        balanced[:, i::2, j::2] = torch.where(site < 1, half.mul_(sign).add_(site).clamp_(max=1), site)
+
+        green = mosaic[:, i::2, j::2]
+        corrected = half.mul_(sign).add_(green).clamp_(max=1)
+        balanced[:, i::2, j::2] = torch.where(green < 1, corrected, green)
     return balanced
 
 
 def _neighbours(mosaic: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Means of the next sites in the row, in the column and on the diagonals of each site, ``(1, H, W)`` each."""
+    """Average the next sites in the row, in the column and on the diagonals of each site, ``(1, H, W)`` each."""
     padded = F.pad(mosaic, (1, 1, 1, 1), mode="reflect")  # about the border sites: the pattern stays
-    row, column = (padded[..., :-2] + padded[..., 2:]) / 2, (padded[:, :-2] + padded[:, 2:]) / 2
-    return row[:, 1:-1], column[..., 1:-1], (row[:, :-2] + row[:, 2:]) / 2
+    row = (padded[..., :-2] + padded[..., 2:]) / 2
+    column = (padded[:, :-2] + padded[:, 2:]) / 2
+    diagonals = (row[:, :-2] + row[:, 2:]) / 2
+    return row[:, 1:-1], column[..., 1:-1], diagonals
 
 
 def _powers(x: Tensor) -> Tensor:
-    """1, x and x^2, ``(N, 3)``."""
+    """Compute 1, x and x^2, ``(N, 3)``."""
     return torch.stack([torch.ones_like(x), x, x.square()], dim=-1)
 
 
-def _blocks(mosaic: Tensor, cfa: CFA | str) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The model's terms ``(N, 19)``, Gr - Gb, its deviation, green and the tile ``(N,)`` of blocks without clipping."""
+class _Blocks(NamedTuple):
+    """The equations of the N blocks of a frame in which nothing is clipped, float64.
+
+    Attributes:
+        terms: ``(N, 19)``, what the model's coefficients multiply: six powers of the place times R, G and B, and 1.
+        difference: ``(N,)``, Gr - Gb.
+        sd: ``(N,)``, the standard deviation of ``difference``.
+        green: ``(N,)``, the mean of both greens.
+        tile: ``(N,)``, the number of the tile, row by row.
+    """
+
+    terms: Tensor
+    difference: Tensor
+    sd: Tensor
+    green: Tensor
+    tile: Tensor
+
+
+def _blocks(mosaic: Tensor, cfa: CFA | str) -> _Blocks:
+    """Make the equations of a mosaic ``(1, H, W)``."""
     require_channels(mosaic, 1, "a mosaic")
     packed = pack(mosaic, cfa)
-    # each green less the mean of the other kind around it, so that a slope of the light is no difference
-    above = pack(mosaic - _neighbours(mosaic)[2], cfa)[1:3]
-    quarters = torch.cat([packed, above, above.square(), (packed >= _CLIPPED).any(0, keepdim=True).to(packed)])
-    # means weighted by a tent, as texture that a block cuts off would count as a difference
-    means = F.avg_pool2d(F.avg_pool2d(F.avg_pool2d(quarters, BLOCK // 2), 2, 1), 2, 1)[..., ::2, ::2].double()
+    clipped = (packed >= _CLIPPED).any(0, keepdim=True).to(packed)
+    # Each green less the mean of the other kind around it, so that a slope of the light is no difference.
+    diagonals = _neighbours(mosaic)[2]
+    excess = pack(mosaic - diagonals, cfa)[1:3]
+
+    # Means are weighted by a tent, as texture that a block cuts off would count as a difference.
+    planes = torch.cat([packed, excess, excess.square(), clipped])
+    halves = F.avg_pool2d(planes, BLOCK // 2)
+    means = F.avg_pool2d(F.avg_pool2d(halves, 2, 1), 2, 1)[..., ::2, ::2].double()
+    red, gr, gb, blue = means[:4]
+    gr_excess, gb_excess = means[4:6]
+    green = (gr + gb) / 2
+    difference = (gr_excess - gb_excess) / 2
+    variance = (means[6:8] - means[4:6].square()).clamp_min(0).mean(0)
+    sd = (variance.sqrt() / BLOCK).clamp_min(_LEAST_SD)
+
     rows, columns = means.shape[-2:]
+    u = _powers(_places(rows, mosaic.shape[-2]))
+    v = _powers(_places(columns, mosaic.shape[-1]))
+    place = u[:, None, _I] * v[None, :, _J]
+    terms = [place * red[..., None], place * green[..., None], place * blue[..., None], torch.ones_like(place[..., :1])]
+    tile_rows = torch.arange(rows) * TILES // rows
+    tile_columns = torch.arange(columns) * TILES // columns
+    tile = tile_rows[:, None] * TILES + tile_columns
+
     clear = means[8] == 0
-    sd = ((means[6:8] - means[4:6].square()).clamp_min(0).mean(0).sqrt() / BLOCK).clamp_min(_LEAST_SD)
-    u, v = (
-        _powers(2 * BLOCK * (2 * torch.arange(n, dtype=torch.float64) + 1) / side - 1)
-        for n, side in zip((rows, columns), mosaic.shape[-2:], strict=True)
-    )
-    place, green = u[:, None, _I] * v[None, :, _J], (means[1] + means[2]) / 2
-    terms = [place * light[..., None] for light in (means[0], green, means[3])] + [torch.ones_like(place[..., :1])]
-    tiles = (torch.arange(rows) * TILES // rows)[:, None] * TILES + torch.arange(columns) * TILES // columns
-    return torch.cat(terms, -1)[clear], ((means[4] - means[5]) / 2)[clear], sd[clear], green[clear], tiles[clear]
+    return _Blocks(torch.cat(terms, -1)[clear], difference[clear], sd[clear], green[clear], tile[clear])
+
+
+def _places(count: int, side: int) -> Tensor:
+    """Where the middles of ``count`` blocks lie along a side, from -1 to 1, ``(count,)``."""
+    middles = BLOCK * (2 * torch.arange(count, dtype=torch.float64) + 1)
+    return 2 * middles / side - 1
 
 
 def _fit(terms: Tensor, difference: Tensor, sd: Tensor) -> tuple[Tensor, Tensor, float]:
-    """The coefficients ``(19,)`` by robust ridge regression, their covariance, and by what ``sd`` is too small."""
+    """Fit the coefficients ``(19,)`` by robust ridge regression: these, their covariance, and by what ``sd`` is too
+    small.
+    """
     prior = torch.tensor([_GAIN_SD**-2] * (terms.shape[1] - 1) + [_OFFSET_SD**-2], dtype=terms.dtype)
-    found, covariance, scale = torch.zeros_like(prior), torch.diag(1 / prior), 1.0
-    for _ in range(_ROUNDS if len(sd) else 0):
-        off = (difference - terms @ found) / sd
-        scale = max(1.4826 * float(off.abs().median()), _LEAST_SCALE)
-        weight = 1 / (scale * sd).square() / (1 + (off / (2 * scale)).square())
+    coefficients, covariance, scale = torch.zeros_like(prior), torch.diag(1 / prior), 1.0
+    if len(sd) == 0:
+        return coefficients, covariance, scale
+
+    for _ in range(_ROUNDS):
+        misfit = (difference - terms @ coefficients) / sd
+        scale = max(1.4826 * float(misfit.abs().median()), _LEAST_SCALE)
+        weight = 1 / (scale * sd).square() / (1 + (misfit / (2 * scale)).square())
+
         covariance = torch.linalg.inv(terms.T @ (weight[:, None] * terms) + torch.diag(prior))
-        found = covariance @ (terms.T @ (weight * difference))
-    return found, covariance, scale
+        coefficients = covariance @ (terms.T @ (weight * difference))
+    return coefficients, covariance, scale
+
+
+def _halves_agree(blocks: _Blocks, scale: float) -> bool:
+    """Whether each half of the frame, a chessboard of tiles, foretells the other in clearly more tiles than not."""
+    white = (blocks.tile // TILES + blocks.tile % TILES) % 2 == 0
+    prediction = torch.zeros_like(blocks.difference)
+    for half in (white, ~white):
+        coefficients, _, _ = _fit(blocks.terms[half], blocks.difference[half], blocks.sd[half])
+        prediction[~half] = blocks.terms[~half] @ coefficients
+
+    def loss(misfit: Tensor) -> Tensor:
+        return (misfit / (2 * scale * blocks.sd)).square().log1p()  # Cauchy's
+
+    gain = loss(blocks.difference) - loss(blocks.difference - prediction)
+    gain_of_tiles = torch.zeros(TILES**2, dtype=gain.dtype).index_add(0, blocks.tile, gain)
+    agreement = gain_of_tiles[blocks.tile.unique()].sign()
+    return float(agreement.sum()) >= SURE * len(agreement) ** 0.5

@@ -7,7 +7,8 @@ one-hot planes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -52,14 +53,18 @@ class Pattern:
         return _BY_ROWS[self._rows_from(rows, columns)]
 
     def _rows_from(self, top: int, left: int) -> tuple[str, ...]:
-        lines = [self.rows[(i + top) % self.period] for i in range(self.period)]
-        return tuple("".join(line[(j + left) % self.period] for j in range(self.period)) for line in lines)
+        """The rows of the cell that begins at another origin."""
+        top, left = top % self.period, left % self.period
+        lower_first = self.rows[top:] + self.rows[:top]
+        return tuple(row[left:] + row[:left] for row in lower_first)
 
     def channels(self, height: int, width: int) -> Tensor:
         """The colour of each site as an index into RGB, int64 ``(H, W)``."""
-        cell = torch.tensor([["RGB".index(colour) for colour in row] for row in self.rows])
-        times = (-(-height // self.period), -(-width // self.period))
-        return cell.repeat(*times)[:height, :width]
+        flat = ["RGB".index(colour) for colour in "".join(self.rows)]
+        cell = torch.tensor(flat).reshape(self.period, self.period)
+
+        down, across = math.ceil(height / self.period), math.ceil(width / self.period)
+        return cell.repeat(down, across)[:height, :width]
 
     def planes(self, height: int, width: int) -> Tensor:
         """Make one plane for each colour, 1 at its sites and 0 elsewhere, float32 ``(3, H, W)``, as networks take."""
@@ -77,8 +82,11 @@ class Pattern:
         The mean is that of the sites of the colour nearby, with the weights of a tent as wide as the cell (normalised
         convolution: Knutsson and Westin, CVPR 1993); of Bayer's patterns it is bilinear interpolation.
         """
-        planes, inverse = (kept.to(raw) for kept in _sites(self.name, *raw.shape[-2:]))
-        return torch.where(planes > 0, raw, _tent(raw * planes, self.period) * inverse)
+        planes, inverse_weights = _sites(self.name, *raw.shape[-2:])
+        planes = planes.to(raw)
+
+        means = _tent(raw * planes, self.period) * inverse_weights.to(raw)
+        return torch.where(planes > 0, raw, means)
 
     def crop(self, raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
         """Crop a mosaic ``(..., H, W)`` at whole cells, so that the pattern begins at the corner again.
@@ -99,8 +107,11 @@ class Pattern:
         """Find the row and column, less than the period, from which a turned mosaic reads the pattern again."""
         cell = self.channels(self.period, self.period)
         turned = turn(cell, view)
-        sites = [(i, j) for i in range(self.period) for j in range(self.period)]
-        return next((i, j) for i, j in sites if torch.equal(turned.roll((-i, -j), (0, 1)), cell))
+
+        for i, j in product(range(self.period), repeat=2):
+            if torch.equal(turned.roll((-i, -j), (0, 1)), cell):
+                return i, j
+        raise ValueError(f"{self.name} does not come back in any place of view {view}")
 
     def turn_keeping(self, raw: Tensor, view: int) -> Tensor:
         """Turn ``(..., H, W)`` as :func:`turn` does, and crop to the whole cells of the pattern.
@@ -114,59 +125,75 @@ class Pattern:
         height, width = raw.shape[-2:]
         if height % self.period or width % self.period:
             raise ValueError(f"{height} x {width} must be multiples of {self.period} to turn {self.name}; crop it")
-        turned, (rows, columns) = turn(raw, view), self.shift_after(view)
-        height, width = turned.shape[-2] - bool(rows) * self.period, turned.shape[-1] - bool(columns) * self.period
+
+        turned = turn(raw, view)
+        height, width = turned.shape[-2:]
+        rows, columns = self.shift_after(view)
+        if rows:
+            height -= self.period
+        if columns:
+            width -= self.period
         if height < 1 or width < 1:
             raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} is too small to turn while keeping {self.name}")
+
         return turned[..., rows : rows + height, columns : columns + width]
 
 
 def _tent(image: Tensor, period: int) -> Tensor:
     """Filter ``(B, C, H, W)`` by a separable tent that reaches half a cell to each side; beyond the edges is 0."""
     reach = period // 2
-    for axis in (-2, -1):
+
+    for axis, margins in ((-2, (0, 0, reach, reach)), (-1, (reach, reach))):
         side = image.shape[axis]
-        padded = F.pad(image, (0, 0, reach, reach) if axis == -2 else (reach, reach))
+        padded = F.pad(image, margins)
         image = padded.narrow(axis, reach, side) * (reach + 1.0)
         for step in range(1, reach + 1):
             for start in (reach - step, reach + step):
                 image.add_(padded.narrow(axis, start, side), alpha=reach + 1.0 - step)
+
     return image
 
 
 @lru_cache(maxsize=4)
 def _sites(name: str, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Make the planes of a pattern, and one over the sum of the tent's weights on them, each ``(1, 3, H, W)``."""
-    known = pattern(name)
-    planes = known.planes(height, width)[None]
-    return planes, 1.0 / _tent(planes, known.period)
+    array = pattern(name)
+    planes = array.planes(height, width)[None]
+    return planes, 1.0 / _tent(planes, array.period)
+
+
+def _bayer(cfa: CFA) -> Pattern:
+    return Pattern(cfa.value, (cfa.value[:2], cfa.value[2:]))
 
 
 def _quad(cfa: CFA) -> Pattern:
-    first, second = (2 * cfa.value[k] + 2 * cfa.value[k + 1] for k in (0, 2))
+    a, b, c, d = cfa.value
+    first, second = a + a + b + b, c + c + d + d
     return Pattern(f"QUAD-{cfa.value}", (first, first, second, second))
 
 
 _XTRANS = Pattern("XTRANS", ("GBGGRG", "RGRBGB", "GBGGRG", "GRGGBG", "BGBRGR", "GRGGBG"))
+_ALL = (*map(_bayer, CFA), *map(_quad, CFA), _XTRANS)
 
-PATTERNS: dict[str, Pattern] = {
-    **{cfa.value: Pattern(cfa.value, (cfa.value[:2], cfa.value[2:])) for cfa in CFA},
-    **{_quad(cfa).name: _quad(cfa) for cfa in CFA},
-    _XTRANS.name: _XTRANS,
-}
+PATTERNS: dict[str, Pattern] = {array.name: array for array in _ALL}
 """The patterns by name."""
 
-
-def _phases() -> Iterator[Pattern]:
-    """Yield every known pattern and what it reads from other origins, such as ``XTRANS+1+2``."""
-    yield from PATTERNS.values()
-    for known in PATTERNS.values():
-        for i, j in product(range(known.period), repeat=2):
-            yield Pattern(f"{known.name}+{i}+{j}", known._rows_from(i, j))
-
+_BY_NAME: dict[str, Pattern] = {}
+"""The patterns by every name, also those from other origins such as ``XTRANS+1+2``; one cell has one pattern."""
 
 _BY_ROWS: dict[tuple[str, ...], Pattern] = {}
-_BY_NAME = {phase.name: _BY_ROWS.setdefault(phase.rows, phase) for phase in _phases()}
+"""The patterns, from all origins, by the rows of their cells."""
+
+
+def _add(name: str, rows: tuple[str, ...]) -> None:
+    _BY_NAME[name] = _BY_ROWS.setdefault(rows, Pattern(name, rows))
+
+
+for _array in _ALL:
+    _add(_array.name, _array.rows)
+for _array in _ALL:
+    for _i, _j in product(range(_array.period), repeat=2):
+        _add(f"{_array.name}+{_i}+{_j}", _array._rows_from(_i, _j))
 
 
 def pattern_name(rows: Sequence[str]) -> str | None:
@@ -176,14 +203,18 @@ def pattern_name(rows: Sequence[str]) -> str | None:
         >>> pattern_name(["GRBGBR", "BGGRGG", "RGGBGG", "GBRGRB", "RGGBGG", "BGGRGG"])
         'XTRANS+1+1'
     """
-    found = _BY_ROWS.get(tuple(rows))
-    return None if found is None else found.name
+    array = _BY_ROWS.get(tuple(rows))
+    if array is None:
+        return None
+    return array.name
 
 
 def canonical_cfa(cfa: str) -> str:
     """Give the :class:`CFA` of a Bayer pattern, the name of any other; ValueError if there is no such pattern."""
     name = pattern(cfa).name
-    return CFA(name) if name in CFA.__members__ else name
+    if name in CFA.__members__:
+        return CFA(name)
+    return name
 
 
 def plane_indices(cfa: str) -> Tensor:
@@ -193,12 +224,13 @@ def plane_indices(cfa: str) -> Tensor:
         >>> plane_indices("GRBG").tolist(), plane_indices("XTRANS").shape
         ([[1, 0], [3, 2]], torch.Size([6, 6]))
     """
-    known = pattern(cfa)
-    if known.name not in CFA.__members__:
-        return torch.tensor((0, 1, 3))[known.channels(known.period, known.period)]
+    array = pattern(cfa)
+    if array.name not in CFA.__members__:
+        return torch.tensor((0, 1, 3))[array.channels(array.period, array.period)]
+
     cell = torch.zeros(2, 2, dtype=torch.int64)
-    for number, place in enumerate(CFA(known.name).sites):
-        cell[place] = number
+    for number, site in enumerate(CFA(array.name).sites):
+        cell[site] = number
     return cell
 
 

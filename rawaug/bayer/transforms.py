@@ -30,10 +30,13 @@ class _Transform(nn.Module, ABC):
 
         self._calls += 1
         worker = get_worker_info()
-        return keyed_generator(self.seed, type(self).__name__, worker.seed if worker else 0, self._calls, *rank_key())
+        worker_seed = worker.seed if worker else 0
+        return keyed_generator(self.seed, type(self).__name__, worker_seed, self._calls, *rank_key())
 
     def apply(self, raw: Any, params: Tensor | None = None) -> Any:
-        return super().apply(raw) if params is None else self._apply_params(raw, params)
+        if params is None:
+            return super().apply(raw)
+        return self._apply_params(raw, params)
 
     @abstractmethod
     def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor: ...
@@ -58,17 +61,22 @@ class RandomCrop(_Transform):
 
     def __init__(self, size: int | tuple[int, int], seed: int = 0) -> None:
         super().__init__(seed)
-        self.size = (size, size) if isinstance(size, int) else size
-        if any(side % 2 or side < 2 for side in self.size):
-            raise ValueError(f"crop must be even and at least 2, got {size}")
+        if isinstance(size, int):
+            size = (size, size)
+        for side in size:
+            if side % 2 or side < 2:
+                raise ValueError(f"crop must be even and at least 2, got {size[0]} x {size[1]}")
+        self.size = size
 
     def sample(self, height: int, width: int, generator: torch.Generator) -> Tensor:
         """Draw top and left of a crop of a mosaic of ``height`` x ``width``, ``(2,)``."""
         rows, columns = self.size
         if height < rows or width < columns:
             raise ValueError(f"{height} x {width} is smaller than the crop {rows} x {columns}; choose a smaller crop")
-        free = ((height - rows) // 2 + 1, (width - columns) // 2 + 1)
-        return 2 * torch.stack([torch.randint(n, (), generator=generator) for n in free])
+
+        top = torch.randint((height - rows) // 2 + 1, (), generator=generator)
+        left = torch.randint((width - columns) // 2 + 1, (), generator=generator)
+        return 2 * torch.stack([top, left])
 
     def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor:
         top, left = params.tolist()
@@ -96,7 +104,9 @@ class RandomTurn(_Transform):
 
     def __init__(self, cfa: CFA | str, keep_cfa: bool = True, quarter: bool = True, seed: int = 0) -> None:
         super().__init__(seed)
-        self.cfa, self.keep_cfa, self.views = CFA(cfa), keep_cfa, N_VIEWS if quarter else N_VIEWS // 2
+        self.cfa = CFA(cfa)
+        self.keep_cfa = keep_cfa
+        self.views = N_VIEWS if quarter else N_VIEWS // 2
 
     def sample(self, generator: torch.Generator) -> Tensor:
         """Draw the view, a scalar."""
@@ -104,7 +114,9 @@ class RandomTurn(_Transform):
 
     def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor:
         view = int(params)
-        return pattern(self.cfa).turn_keeping(raw, view) if self.keep_cfa else turn(raw, view)
+        if self.keep_cfa:
+            return pattern(self.cfa).turn_keeping(raw, view)
+        return turn(raw, view)
 
     def forward(self, raw: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Turn ``(..., H, W)`` by a view drawn from ``generator``."""
