@@ -22,6 +22,8 @@ from rawaug.kernels import runtime
 R = TypeVar("R")
 
 _ON_GPU = ("unprocess", "shot_read")
+"""The passes that have a Triton kernel."""
+
 _failed: list[str] = []
 """Names of the errors that Triton's kernels have raised; after one they are not tried again."""
 
@@ -42,6 +44,7 @@ def fastest(name: str, image: Tensor, *args: Any, otherwise: Callable[[], R]) ->
     """
     if name in _ON_GPU and can_use_triton(image):
         return try_kernel(lambda: getattr(import_module("rawaug.kernels.gpu"), name)(image, *args), otherwise)
+
     if image.device.type == "cpu" and runtime.has_numba():
         result: R = getattr(import_module("rawaug.kernels.cpu"), name)(image, *args)
         return result
@@ -56,6 +59,7 @@ def try_kernel(kernel: Callable[[], R], otherwise: Callable[[], R]) -> R:
         raise
     except Exception as error:  # whatever a compiler, its driver or its cache may raise
         _failed.append(type(error).__name__)
-        reason = f"{type(error).__name__}: {(str(error).splitlines() or [''])[-1]}"
+        last_line = str(error).strip().rpartition("\n")[2]
+        reason = f"{type(error).__name__}: {last_line}"
         warnings.warn(f"rawaug's GPU kernel is unavailable, using PyTorch instead: {reason}", stacklevel=3)
         return otherwise()

@@ -27,25 +27,37 @@ from rawaug.kernels.planes import smooth as smooth
 from rawaug.kernels.reference import INCREMENTS, MULTIPLIERS, ROUNDS, Camera, Display
 from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
 
-_TILE = 256  # cells of RAW in a tile
-_NOISE_TILE = 512  # cells of noise in a tile
+_TILE = 256
+"""Number of cells of RAW in a tile."""
+
+_NOISE_TILE = 512
+"""Number of cells of noise in a tile."""
 
 _ZERO, _ONE, _FAR = np.float32(0), np.float32(1), np.float32(np.inf)
-_LEAST = np.float32(-125)  # the exponent at which a mask counts as 0; below it floats would become denormal
+_LEAST = np.float32(-125)
+"""The exponent at which a mask counts as 0; below it floats would become denormal."""
 
-_M0, _M1 = (np.uint64(m) for m in MULTIPLIERS)
-_K0, _K1 = (np.uint32(k) for k in INCREMENTS)
+_M0, _M1 = np.uint64(MULTIPLIERS[0]), np.uint64(MULTIPLIERS[1])
+_K0, _K1 = np.uint32(INCREMENTS[0]), np.uint32(INCREMENTS[1])
 _32 = np.uint64(32)
 _QUARTER_TURN = np.int32(2**30)
 
-# In falling powers: 2^f within 7.5e-8 on [0, 1], relative; ln(1 + m) / m within 2.6e-8 for 1 + m between sqrt(1/2) and
-# sqrt(2); sin(pi / 2 sqrt(s)) / sqrt(s) within 6.7e-9 on [0, 1].
-_EXP2 = tuple(np.float32(c) for c in (1.8775839e-3, 8.9893471e-3, 0.055826288, 0.24015364, 0.69315308, 0.99999994))
-_LOG = tuple(
-    np.float32(c)
-    for c in (0.08960108, -0.14482562, 0.14917466, -0.16543691, 0.19958405, -0.25002947, 0.3333416, -0.49999979, 1.0)
+
+def _polynomial(*coefficients: float) -> tuple[np.float32, ...]:
+    """The coefficients of a polynomial, in falling powers."""
+    return tuple(np.float32(coefficient) for coefficient in coefficients)
+
+
+_EXP2 = _polynomial(1.8775839e-3, 8.9893471e-3, 0.055826288, 0.24015364, 0.69315308, 0.99999994)
+"""2^f, within 7.5e-8 on [0, 1], relative."""
+
+_LOG = _polynomial(
+    0.08960108, -0.14482562, 0.14917466, -0.16543691, 0.19958405, -0.25002947, 0.3333416, -0.49999979, 1.0
 )
-_SINE = tuple(np.float32(c) for c in (1.5167854e-4, -4.6741581e-3, 0.079689927, -0.64596379, 1.57079637))
+"""ln(1 + m) / m, within 2.6e-8 for 1 + m between sqrt(1/2) and sqrt(2)."""
+
+_SINE = _polynomial(1.5167854e-4, -4.6741581e-3, 0.079689927, -0.64596379, 1.57079637)
+"""sin(pi / 2 sqrt(s)) / sqrt(s), within 6.7e-9 on [0, 1]."""
 
 
 def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
@@ -54,20 +66,40 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     raw = torch.empty(batch, 4, height // 2, width // 2, dtype=torch.float32)
     if not raw.numel():
         return raw
-    picture, out = srgb.detach().contiguous().numpy(), raw.numpy()
+
     entries = camera.curves.shape[1] if camera.curves.numel() else len(camera.table)
     in_bytes = srgb.dtype == torch.uint8
-    scale = np.float32((entries - 1) / (255.0 if in_bytes else 1.0))
-    # Absent parts are None, so that no code is compiled for them.
-    table, curves, attention, colour, frame, shading, sites = (
-        value.contiguous().numpy() if value.numel() else None for value in camera if isinstance(value, Tensor)
-    )
-    codes, curves = (curves, None) if in_bytes and entries == 256 else (None, curves)
-    knee, ceiling = np.float32(camera.knee), np.float32(white)
+    largest_code = 255.0 if in_bytes else 1.0
+    scale = np.float32((entries - 1) / largest_code)
 
-    settings = (scale, table, codes, curves, attention, colour, knee, frame, shading, sites, ceiling)
-    run_over_rows(batch * height, width, partial(_raw_rows, picture, *settings, out))
+    codes, curves = None, _present(camera.curves)
+    if in_bytes and entries == 256:
+        codes, curves = curves, None
+    convert = partial(
+        _raw_rows,
+        srgb.detach().contiguous().numpy(),
+        scale,
+        _present(camera.table),
+        codes,
+        curves,
+        _present(camera.attention),
+        _present(camera.colour),
+        np.float32(camera.knee),
+        _present(camera.frame),
+        _present(camera.shading),
+        _present(camera.sites),
+        np.float32(white),
+        raw.numpy(),
+    )
+    run_over_rows(batch * height, width, convert)
     return raw
+
+
+def _present(part: Tensor) -> np.ndarray | None:
+    """A part of the settings as an array; None if it is empty, so that no code is compiled for it."""
+    if not part.numel():
+        return None
+    return part.detach().contiguous().numpy()
 
 
 def render(linear: Tensor, display: Display) -> Tensor:
@@ -87,11 +119,11 @@ def develop(raw: Tensor, display: Display, cfa: CFA | str, methods: Sequence[str
     Returns:
         sRGB ``(B, 3, H, W)`` in [0, 1].
     """
-    used = sorted(set(methods))
-    weights = np.stack([_site_weights(CFA(cfa), method) for method in used])
     padded = F.pad(raw.detach(), (2, 2, 2, 2), mode="reflect")  # about the border sites: the pattern stays
-    which = np.array([used.index(method) for method in methods])
-    return _render_rows(padded, weights, which, (len(raw), 3, *raw.shape[2:]), display)
+    names = sorted(set(methods))
+    weights = np.stack([_site_weights(CFA(cfa), name) for name in names])
+    numbers = np.array([names.index(method) for method in methods])
+    return _render_rows(padded, weights, numbers, (len(raw), 3, *raw.shape[2:]), display)
 
 
 def _render_rows(
@@ -100,12 +132,12 @@ def _render_rows(
     srgb = torch.empty(tuple(shape), dtype=torch.float32)
     if not srgb.numel():
         return srgb
+
     batch, _, height, width = shape
-    pixels, out = source.numpy(), srgb.numpy()
-    # Absent parts are None, so that no code is compiled for them.
-    settings = tuple(value.detach().contiguous().numpy() if value.numel() else None for value in display)
-    run = partial(_srgb_rows, pixels, weights, methods, *settings, out)
-    run_over_rows(batch * height, 3 * width, run)
+    settings = map(_present, display)
+    run_over_rows(
+        batch * height, 3 * width, partial(_srgb_rows, source.numpy(), weights, methods, *settings, srgb.numpy())
+    )
     return srgb
 
 
@@ -115,10 +147,11 @@ def _site_weights(cfa: CFA, method: str) -> np.ndarray:
     stencils, kinds = demosaicing_stencils(cfa, method)
     edge = 2 - stencils.shape[-1] // 2
     around = F.pad(stencils, (edge, edge, edge, edge))
-    own = torch.eye(6)[:1]
+
+    measured = torch.eye(6)[:1]  # a site that has the colour: its own value alone
     sums = torch.stack([around[:, i, j] for i, j in ((2, 2), (2, 1), (1, 2), (1, 1), (2, 0), (0, 2))], dim=1)
-    chosen = torch.cat([own, sums])[torch.tensor(kinds)]  # (colour, row, column, sum)
-    return chosen.permute(1, 0, 3, 2).repeat(1, 1, 1, _TILE // 2).contiguous().numpy()
+    weights = torch.cat([measured, sums])[torch.tensor(kinds)]  # (colour, row, column, sum)
+    return weights.permute(1, 0, 3, 2).repeat(1, 1, 1, _TILE // 2).contiguous().numpy()
 
 
 @intrinsic
@@ -155,9 +188,12 @@ def _interpolation(context, build, signature: Signature, values):  # type: ignor
         flags = ("contract",)
         return build.fadd(a, build.fmul(build.fsub(b, a, flags=flags), t, flags=flags), flags=flags)
 
-    below, above = (mix(load(n), load(build.add(n, layer)), spread(w, 8)) for n in (node, build.add(node, row)))
-    pair = mix(below, above, spread(v, 8))
+    def along_w(node):  # type: ignore[no-untyped-def]
+        return mix(load(node), load(build.add(node, layer)), spread(w, 8))
+
+    pair = mix(along_w(node), along_w(build.add(node, row)), spread(v, 8))
     mixed = mix(pick(pair, [0, 1, 2, 3]), pick(pair, [4, 5, 6, 7]), spread(u, 4))
+
     for lane in range(3):
         build.store(build.extract_element(mixed, ir.Constant(index, lane)), address(out, signature.args[7], at))
         at = build.add(at, plane)
@@ -165,15 +201,30 @@ def _interpolation(context, build, signature: Signature, values):  # type: ignor
 
 
 @compile_part
+def _at_least(x, limit):  # type: ignore[no-untyped-def]
+    """The larger of two numbers; the limit in place of NaN."""
+    return x if x > limit else limit
+
+
+@compile_part
+def _at_most(x, limit):  # type: ignore[no-untyped-def]
+    """The smaller of two numbers; the limit in place of NaN."""
+    return x if x < limit else limit
+
+
+@compile_part
+def _clip(x, white):  # type: ignore[no-untyped-def]
+    """A signal, white at most; NaN stays NaN."""
+    return white if x > white else x
+
+
+@compile_part
 def _cell_of(value, scale, last):  # type: ignore[no-untyped-def]
     """Find the node below a value, at most ``last``, and the share of the way to the next; values are clamped."""
-    # Comparisons in this order send NaN to node 0: an index must never be out of bounds.
-    x = np.float32(value) * scale
-    x = x if x > _ZERO else _ZERO
-    top = np.float32(last + 1)
-    x = x if x < top else top
-    node = np.int32(x)
-    node = node if node < last else last
+    # NaN goes to node 0: an index must never be out of bounds.
+    x = _at_least(np.float32(value) * scale, _ZERO)
+    x = _at_most(x, np.float32(last + 1))
+    node = _at_most(np.int32(x), last)
     return node, x - np.float32(node)
 
 
@@ -191,12 +242,13 @@ def _look_up(red, green, blue, scale, table, nodes, shares, halves, out):  # typ
         b, w = _cell_of(blue[j], scale, last)
         nodes[j] = np.int32(4) * (r + size * (g + size * b))
         shares[0, j], shares[1, j], shares[2, j] = u, v, w
-    flat, found = table.reshape(-1), out.reshape(-1)
+
+    flat_table, flat_out = table.reshape(-1), out.reshape(-1)
     row, layer = np.int64(4) * size, np.int64(4) * size * size
     for j in range(len(red)):
         at = (j >> halves) + (j & halves) * (3 * _TILE)
         u, v, w = shares[0, j], shares[1, j], shares[2, j]
-        _interpolate(flat, np.int64(nodes[j]), row, layer, u, v, w, found, at, np.int64(_TILE))
+        _interpolate(flat_table, np.int64(nodes[j]), row, layer, u, v, w, flat_out, at, np.int64(_TILE))
 
 
 @compile_part
@@ -205,6 +257,7 @@ def _through_curve(plane, scale, curve, nodes, shares, out):  # type: ignore[no-
     last, share = np.int32(len(curve) - 2), shares[0]
     for j in range(len(plane)):
         nodes[j], share[j] = _cell_of(plane[j], scale, last)
+
     even, odd = out[0], out[1]
     for j in range(len(plane) // 2):
         a, b = np.uint32(nodes[2 * j]), np.uint32(nodes[2 * j + 1])  # unsigned, or negative ones are looked for
@@ -228,10 +281,10 @@ def _fall_off(frame, row, first, shading, out):  # type: ignore[no-untyped-def]
     x = frame[1] + np.float32(row) * frame[3] + np.float32(first) * frame[5]
     dy, dx = np.float32(2) * frame[4], np.float32(2) * frame[5]
     a, b, c = shading[0], shading[1], shading[2]
+
     for j in range(len(out)):
         v, u = y + np.float32(j) * dy, x + np.float32(j) * dx
-        exponent = -(a * v * v + (b * v + c * u) * u)
-        exponent = exponent if exponent > _LEAST else _LEAST
+        exponent = _at_least(-(a * v * v + (b * v + c * u) * u), _LEAST)
         whole = np.int32(exponent) - np.int32(1)
         rest = exponent - np.float32(whole)
         p = _EXP2[0]
@@ -247,24 +300,25 @@ def _develop(x2, colour, channel, knee, mask, white, out):  # type: ignore[no-un
     m0, m1, m2 = colour[3, 0], colour[3, 1], colour[3, 2]
     floor, rise = colour[4, channel], colour[5, channel]
     slope = _ONE / (_ONE - knee)
+
     for j in range(len(out)):
         red, green, blue = x2[0, j], x2[1, j], x2[2, j]
-        m = (m0 * red + m1 * green + m2 * blue - knee) * slope
-        m = m if m > _ZERO else _ZERO
-        m = m if m < _ONE else _ONE
+        m = _at_least((m0 * red + m1 * green + m2 * blue - knee) * slope, _ZERO)
+        m = _at_most(m, _ONE)
+
         y = c0 * red + c1 * green + c2 * blue
         y *= (floor + rise * (m * m)) * mask[j]
-        out[j] = white if y > white else y
+        out[j] = _clip(y, white)
 
 
 @compile_part
-def _attend(x4, channel, table, nodes, shares, found, white, out):  # type: ignore[no-untyped-def]
+def _attend(x4, channel, table, nodes, shares, attention, white, out):  # type: ignore[no-untyped-def]
     """Multiply one channel of x4 ``(3, n)`` by the attention, which depends on all three."""
     count, scale = len(out), np.float32(len(table) - 1)
-    _look_up(x4[0, :count], x4[1, :count], x4[2, :count], scale, table, nodes, shares, 0, found)
+    _look_up(x4[0, :count], x4[1, :count], x4[2, :count], scale, table, nodes, shares, 0, attention)
+
     for j in range(count):
-        y = x4[channel, j] * found[0, 0, j]
-        out[j] = white if y > white else y
+        out[j] = _clip(x4[channel, j] * attention[0, 0, j], white)
 
 
 @compile_loop
@@ -276,12 +330,14 @@ def _raw_rows(  # type: ignore[no-untyped-def]
     nodes, shares = np.empty(2 * _TILE, np.int32), np.empty((3, 2 * _TILE), np.float32)
     x2, attended = np.empty((2, 3, _TILE), np.float32), np.empty((2, 3, _TILE), np.float32)
     x4, mask = np.empty((3, _TILE), np.float32), np.ones(_TILE, np.float32)
+
     for row in range(start, stop):
         b, i = divmod(row, height)
         red, green, blue = srgb[b, 0, i], srgb[b, 1, i], srgb[b, 2, i]
         for first in range(0, width, _TILE):
             last = min(first + _TILE, width)
             pixels = slice(2 * first, 2 * last)
+
             if table is not None:
                 _look_up(red[pixels], green[pixels], blue[pixels], scale, table, nodes, shares, 1, x2)
             if codes is not None:
@@ -290,6 +346,7 @@ def _raw_rows(  # type: ignore[no-untyped-def]
             if curves is not None:
                 for c in range(3):
                     _through_curve(srgb[b, c, i, pixels], scale, curves[b], nodes, shares, x2[:, c])
+
             for k in range(len(sites)):
                 if sites[k, 0] != i % 2:
                     continue
@@ -306,6 +363,7 @@ def _raw_rows(  # type: ignore[no-untyped-def]
 
 @compile_part
 def _pairs(one, other, out):  # type: ignore[no-untyped-def]
+    """Add two rows."""
     for j in range(len(out)):
         out[j] = one[j] + other[j]
 
@@ -326,6 +384,7 @@ def _demosaic(mosaic, row, first, weights, sums, out):  # type: ignore[no-untype
     _pairs(sums[6], sums[7], sums[3, :n])
     _pairs(own, own[4:], sums[4, :n])
     _pairs(mosaic[row, first + 2 :], mosaic[row + 4, first + 2 :], sums[5, :n])
+
     for c in range(3):
         _add_weighted(weights[c, 0], own[2:], weights[c, 1], sums[1], False, out[c])
         for k in (2, 4):
@@ -334,6 +393,7 @@ def _demosaic(mosaic, row, first, weights, sums, out):  # type: ignore[no-untype
 
 @compile_part
 def _add_weighted(a, x, b, y, more, out):  # type: ignore[no-untyped-def]
+    """Write a x + b y to ``out``; with ``more``, add it to what is there."""
     for j in range(len(out)):
         out[j] = (out[j] if more else _ZERO) + (a[j] * x[j] + b[j] * y[j])
 
@@ -342,10 +402,8 @@ def _add_weighted(a, x, b, y, more, out):  # type: ignore[no-untyped-def]
 def _root(x, c0, c1, c2, out):  # type: ignore[no-untyped-def]
     """Compute the root of one channel of x2, held to [0, 1], from x3 ``(3, n)``."""
     for j in range(len(out)):
-        y = c0 * x[0, j] + c1 * x[1, j] + c2 * x[2, j]
-        y = y if y > _ZERO else _ZERO
-        y = y if y < _ONE else _ONE
-        out[j] = np.sqrt(y)
+        y = _at_least(c0 * x[0, j] + c1 * x[1, j] + c2 * x[2, j], _ZERO)
+        out[j] = np.sqrt(_at_most(y, _ONE))
 
 
 @compile_part
@@ -355,6 +413,7 @@ def _at_curve(root, curve, nodes, shares, out):  # type: ignore[no-untyped-def]
     scale = np.float32(len(curve) - 1)
     for j in range(len(out)):
         nodes[j], shares[j] = _cell_of(root[j], scale, last)
+
     for j in range(len(out)):
         a = np.uint32(nodes[j])
         out[j] = curve[a] + (curve[a + np.uint32(1)] - curve[a]) * shares[j]
@@ -369,19 +428,22 @@ def _srgb_rows(  # type: ignore[no-untyped-def]
     nodes, shares = np.empty(_TILE, np.int32), np.empty((3, _TILE), np.float32)
     x, root, mask = np.empty((3, _TILE), np.float32), np.empty((3, _TILE), np.float32), np.ones(_TILE, np.float32)
     sums = np.empty((8, _TILE), np.float32)
-    found, half = np.empty((2, 3, _TILE), np.float32), np.ones(6, np.float32)
+    looked_up, half = np.empty((2, 3, _TILE), np.float32), np.ones(6, np.float32)
     half[4:] = np.float32(0.5)  # the mask is made for every second pixel
+
     for row in range(start, stop):
         b, i = divmod(row, height)
         for first in range(0, width, _TILE):
             last = min(first + _TILE, width)
             n = last - first
+
             if weights is None:
                 for c in range(3):
                     for j in range(n):  # faster than slices
                         x[c, j] = source[b, c, i, first + j]
             else:
                 _demosaic(source[b, 0], i, first, weights[methods[b], i % 2], sums, x[:, :n])
+
             if shading is not None:
                 _fall_off(frame[b] * half, i, 2 * first, shading, mask[:n])
                 for c in range(3):
@@ -389,29 +451,30 @@ def _srgb_rows(  # type: ignore[no-untyped-def]
                         x[c, j] /= mask[j]
             if attention is not None:
                 scale = np.float32(len(attention) - 1)
-                _look_up(x[0, :n], x[1, :n], x[2, :n], scale, attention, nodes, shares, 0, found)
+                _look_up(x[0, :n], x[1, :n], x[2, :n], scale, attention, nodes, shares, 0, looked_up)
                 for c in range(3):
                     for j in range(n):
-                        x[c, j] *= found[0, 0, j]
+                        x[c, j] *= looked_up[0, 0, j]
+
             white = gains[b, 3]
             for c in range(3):
                 gain = gains[b, c]
                 for j in range(n):
-                    y = x[c, j] * gain
-                    x[c, j] = y if y < white else white
+                    x[c, j] = _at_most(x[c, j] * gain, white)
+
             for c in range(3):
                 _root(x, matrix[b, c, 0], matrix[b, c, 1], matrix[b, c, 2], root[c, :n])
+
             if curves is not None:
                 for c in range(3):
                     _at_curve(root[c, :n], curves[b], nodes, shares[0], srgb[b, c, i, first:last])
             if table is not None:
                 scale = np.float32(len(table) - 1)
-                _look_up(root[0, :n], root[1, :n], root[2, :n], scale, table, nodes, shares, 0, found)
+                _look_up(root[0, :n], root[1, :n], root[2, :n], scale, table, nodes, shares, 0, looked_up)
                 for c in range(3):
                     for j in range(n):
-                        y = found[0, c, j]
-                        y = y if y > _ZERO else _ZERO
-                        srgb[b, c, i, first + j] = y if y < _ONE else _ONE
+                        y = _at_least(looked_up[0, c, j], _ZERO)
+                        srgb[b, c, i, first + j] = _at_most(y, _ONE)
 
 
 def shot_read(clean: Tensor, levels: Tensor, keys: list[int], white: float, mapped: bool) -> tuple[Tensor, Tensor]:
@@ -429,20 +492,26 @@ def shot_read(clean: Tensor, levels: Tensor, keys: list[int], white: float, mapp
     """
     noisy = torch.empty_like(clean, memory_format=torch.contiguous_format)
     variance = torch.empty_like(noisy if mapped else noisy[:, :, :0])
-    signal, out = clean.detach().contiguous().numpy(), noisy.numpy()
     if not noisy.numel():
         return noisy, variance
-    var = variance.numpy() if mapped else None  # then no code is compiled for it
-    variances = levels.detach().to("cpu", torch.float32).numpy()
-    key = np.array([(k & 0xFFFFFFFF, k >> 32) for k in keys], dtype=np.uint32)
-    ceiling = np.float32(white)
+
     batch, _, height, width = clean.shape
-    run_over_rows(batch * height, 4 * width, partial(_noise_rows, signal, variances, key, ceiling, out, var))
+    add_noise = partial(
+        _noise_rows,
+        clean.detach().contiguous().numpy(),
+        levels.detach().to("cpu", torch.float32).numpy(),
+        np.array([(key & 0xFFFFFFFF, key >> 32) for key in keys], dtype=np.uint32),
+        np.float32(white),
+        noisy.numpy(),
+        _present(variance),
+    )
+    run_over_rows(batch * height, 4 * width, add_noise)
     return noisy, variance
 
 
 @compile_part
 def _words(key, first, count, words):  # type: ignore[no-untyped-def]
+    """Draw the four words of each cell from ``first`` on, as :func:`rawaug.kernels.reference.philox` does."""
     for i in range(count):
         a, b, c, d = np.uint32(first + i), np.uint32(0), np.uint32(0), np.uint32(0)
         low, high = key[0], key[1]
@@ -460,6 +529,7 @@ def _log(x):  # type: ignore[no-untyped-def]
     bits = np.float32(x).view(np.int32)
     exponent = (bits - np.int32(0x3F3504F3)) >> np.int32(23)  # mantissa in [1 / sqrt(2), sqrt(2))
     m = np.int32(bits - (exponent << np.int32(23))).view(np.float32) - _ONE
+
     p = _LOG[0]
     for k in range(1, len(_LOG)):
         p = p * m + _LOG[k]
@@ -473,6 +543,7 @@ def _sine(turn):  # type: ignore[no-untyped-def]
     folded = turn
     if turn > _QUARTER_TURN or turn < -_QUARTER_TURN:
         folded = np.int32(np.int32(-(2**31)) - turn)
+
     x = np.float32(folded) * np.float32(2.0**-30)
     square = x * x
     p = _SINE[0]
@@ -483,30 +554,30 @@ def _sine(turn):  # type: ignore[no-untyped-def]
 
 @compile_part
 def _normals(words, count, normals):  # type: ignore[no-untyped-def]
+    """Turn the words of cells ``(4, count)`` into as many normals, two by two (Box and Muller)."""
     for pair in (0, 2):
         for i in range(count):
             u = (np.float32(words[pair, i]) + np.float32(0.5)) * np.float32(2.0**-32)
-            square = np.float32(-2) * _log(u)
-            radius = np.sqrt(square if square > _ZERO else _ZERO)
+            radius = np.sqrt(_at_least(np.float32(-2) * _log(u), _ZERO))
             turn = np.int32(words[pair + 1, i])
             normals[pair, i] = radius * _sine(np.int32(turn + _QUARTER_TURN))
             normals[pair + 1, i] = radius * _sine(turn)
 
 
 @compile_part
-def _disturb(signal, normals, shot, read, white, noisy):  # type: ignore[no-untyped-def]
+def _disturb(signal, normals, shot_var, read_var, white, noisy):  # type: ignore[no-untyped-def]
+    """Add noise to a row of one plane."""
     for j in range(len(signal)):
-        y = signal[j]
-        light = y if y > _ZERO else _ZERO
-        value = y + np.sqrt(shot * light + read) * normals[j]
-        noisy[j] = white if value > white else value
+        light = _at_least(signal[j], _ZERO)
+        deviation = np.sqrt(shot_var * light + read_var)
+        noisy[j] = _clip(signal[j] + deviation * normals[j], white)
 
 
 @compile_part
-def _law(noisy, shot, read, variance):  # type: ignore[no-untyped-def]
+def _law(noisy, shot_var, read_var, variance):  # type: ignore[no-untyped-def]
+    """Compute the variance of a row of one plane."""
     for j in range(len(noisy)):
-        light = noisy[j] if noisy[j] > _ZERO else _ZERO
-        variance[j] = shot * light + read
+        variance[j] = shot_var * _at_least(noisy[j], _ZERO) + read_var
 
 
 @compile_loop
@@ -514,15 +585,17 @@ def _noise_rows(clean, levels, keys, white, noisy, variance, start, stop):  # ty
     """Add noise to rows ``start`` to ``stop`` of all pictures' rows of cells, counted through the batch."""
     height, width = clean.shape[2], clean.shape[3]
     words, normals = np.empty((4, _NOISE_TILE), np.uint32), np.empty((4, _NOISE_TILE), np.float32)
+
     for row in range(start, stop):
         b, i = divmod(row, height)
-        shot, read = levels[b, 0], levels[b, 1]
-        for left in range(0, width, _NOISE_TILE):
-            count = min(_NOISE_TILE, width - left)
-            right = left + count
-            _words(keys[b], i * width + left, count, words)
+        shot_var, read_var = levels[b, 0], levels[b, 1]
+        for first in range(0, width, _NOISE_TILE):
+            count = min(_NOISE_TILE, width - first)
+            cells = slice(first, first + count)
+            _words(keys[b], i * width + first, count, words)
             _normals(words, count, normals)
+
             for k in range(4):
-                _disturb(clean[b, k, i, left:right], normals[k], shot, read, white, noisy[b, k, i, left:right])
+                _disturb(clean[b, k, i, cells], normals[k], shot_var, read_var, white, noisy[b, k, i, cells])
                 if variance is not None:
-                    _law(noisy[b, k, i, left:right], shot, read, variance[b, k, i, left:right])
+                    _law(noisy[b, k, i, cells], shot_var, read_var, variance[b, k, i, cells])

@@ -23,11 +23,15 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     batch, _, height, width = srgb.shape
     h, w = height // 2, width // 2
     raw = torch.empty(batch, 4, h, w, device=srgb.device, dtype=torch.float32)
+
     nodes = max(camera.table.shape[0], camera.attention.shape[0])
     entries = camera.curves.shape[1] if camera.curves.numel() else 0
-    scale = ((entries or nodes) - 1) / (255.0 if srgb.dtype == torch.uint8 else 1.0)
+    largest_code = 255.0 if srgb.dtype == torch.uint8 else 1.0
+    scale = ((entries or nodes) - 1) / largest_code
     sites = [i + 2 * j + 4 * channel for i, j, channel in camera.sites.tolist()]
-    tensors = [part.contiguous() for part in camera if isinstance(part, Tensor)][:-1]  # all but the sites
+    parts = (camera.table, camera.curves, camera.attention, camera.colour, camera.frame, camera.shading)
+    tensors = [part.contiguous() for part in parts]
+
     with torch.cuda.device_of(srgb):  # which need not be the current one
         _raw_cells[(triton.cdiv(h * w, _RAW_BLOCK), batch)](
             srgb.contiguous(), *tensors, raw, h, w, scale, camera.knee, white, *sites,
@@ -90,9 +94,11 @@ def _site(  # type: ignore[no-untyped-def]
     inside = cell < h * w
     row, column = cell // w * 2 + SITE % 2, cell % w * 2 + SITE // 2 % 2
     pixel = row.to(tl.int64) * (2 * w) + column
+
     r = tl.load(srgb + pixel, mask=inside, other=0).to(tl.float32) * scale
     g = tl.load(srgb + 4 * size + pixel, mask=inside, other=0).to(tl.float32) * scale
     b = tl.load(srgb + 8 * size + pixel, mask=inside, other=0).to(tl.float32) * scale
+
     if ENTRIES:
         r, g, b = _curve(curve, r, ENTRIES), _curve(curve, g, ENTRIES), _curve(curve, b, ENTRIES)
     else:
@@ -112,6 +118,7 @@ def _site(  # type: ignore[no-untyped-def]
         x = tl.load(frame + 1) + i * tl.load(frame + 3) + j * tl.load(frame + 5)
         vertical = tl.load(shading) * y * y
         shade = tl.exp2(-(vertical + (tl.load(shading + 1) * y + tl.load(shading + 2) * x) * x))
+
     x4 = _channel(colour, SITE // 4, r, g, b, m * m, shade)
     if ATTENDS:
         last = NODES - 1.0
@@ -157,12 +164,14 @@ def shot_read(clean: Tensor, levels: Tensor, keys: list[int], white: float, mapp
     batch, _, height, width = clean.shape
     noisy = torch.empty_like(clean)
     variance = torch.empty_like(noisy if mapped else noisy[:, :, :0])
-    signed = torch.tensor([key - 2**64 if key >= 2**63 else key for key in keys], device=clean.device)
+    signed = [key - 2**64 if key >= 2**63 else key for key in keys]
+    seeds = torch.tensor(signed, device=clean.device)
     variances = levels.to(clean.device, torch.float32).contiguous()
+
     grid = (triton.cdiv(height * width, _NOISE_BLOCK), batch)
     with torch.cuda.device_of(clean):  # which need not be the current one
         _noise_cells[grid](
-            clean, variances, signed, noisy, variance, height * width, white, mapped,
+            clean, variances, seeds, noisy, variance, height * width, white, mapped,
             BLOCK=_NOISE_BLOCK, enable_fp_fusion=True,
         )  # fmt: skip
     return noisy, variance
@@ -201,9 +210,11 @@ def _noise_cells(clean, levels, keys, noisy, variance, cells, white, MAP: tl.con
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = cell < cells
     shot, read = tl.load(levels + 2 * picture), tl.load(levels + 2 * picture + 1)
+
     a, b, c, d = tl.randint4x(tl.load(keys + picture), cell)
     red, green_r = _pair(a, b)
     green_b, blue = _pair(c, d)
+
     size = cells.to(tl.int64)
     at = picture * 4 * size + cell
     _disturb(clean, red, noisy, variance, at, inside, shot, read, white, MAP)

@@ -13,7 +13,7 @@ from rawaug.bayer import CFA, demosaic
 from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
 
 _MARGIN = 6
-"""Green looks 2 sites around, colour 1, steps of colour 1 and their count 1; 6 is even, so that the pattern stays."""
+"""Number of sites around a picture: green looks 2 around, colour 1, its steps 1 and their count 1; it must be even."""
 _HALF, _QUARTER, _TWO = np.float32(0.5), np.float32(0.25), np.float32(2)
 
 
@@ -21,6 +21,7 @@ def demosaic_directional(raw: Tensor, cfa: CFA, method: str) -> Tensor:
     """Demosaic ``(B, 1, H, W)``, float32 on the CPU, to ``(B, 3, H, W)``; only ``adams`` and ``ahd`` have loops."""
     if method not in ("adams", "ahd"):
         return demosaic(raw, cfa, method)
+
     batch, _, height, width = raw.shape
     rgb = torch.empty(batch, 3, height, width)
     for mosaic, out in zip(raw.detach().numpy()[:, 0], rgb.numpy(), strict=True):
@@ -36,6 +37,7 @@ def _rows(mosaic, red_row, red_column, homogeneous, rgb, start, stop):  # type: 
     rows, width = own.shape
     first = (start + red_row) % 2  # of the rows with red
     pictures = np.zeros((2, 3, rows, width), np.float32)  # along rows, along columns
+
     for i in range(2, rows - 2):
         for j in range(2, width - 2):
             _green(own, i, j, (i + first + j + red_column) % 2 == 1, homogeneous, pictures)
@@ -43,9 +45,11 @@ def _rows(mosaic, red_row, red_column, homogeneous, rgb, start, stop):  # type: 
     for d in range(directions):
         for i in range(3, rows - 3):
             _colours(own, i, (i + first) % 2 == 0, red_column, pictures[d])
+
     lead = np.zeros((rows, width), np.int8)
     if homogeneous:
         _leads(pictures, lead)
+
     for i in range(_MARGIN, rows - _MARGIN):
         for j in range(_MARGIN, width - _MARGIN):
             total = np.int32(1)
@@ -54,24 +58,31 @@ def _rows(mosaic, red_row, red_column, homogeneous, rgb, start, stop):  # type: 
                 for k in range(-1, 2):
                     total += lead[i + k, j - 1] + lead[i + k, j] + lead[i + k, j + 1]
             for c in range(3):
-                row, column = pictures[0, c, i, j], pictures[1, c, i, j]
-                value = row if total > 0 else column if total < 0 else _HALF * (row + column)
+                value = pictures[0, c, i, j]
+                if total < 0:
+                    value = pictures[1, c, i, j]
+                elif total == 0:
+                    value = _HALF * (pictures[0, c, i, j] + pictures[1, c, i, j])
                 rgb[c, start + i - _MARGIN, j - _MARGIN] = value
 
 
 @compile_part
-def _green(own, i, j, known, homogeneous, pictures):  # type: ignore[no-untyped-def]
+def _green(own, i, j, measured, homogeneous, pictures):  # type: ignore[no-untyped-def]
     """Fill in the green of a site in both pictures; without ``homogeneous`` the first has that of the lesser change."""
     here = own[i, j]
-    if known:
+    if measured:
         pictures[0, 1, i, j] = pictures[1, 1, i, j] = here
         return
-    left, right, above, below = own[i, j - 1], own[i, j + 1], own[i - 1, j], own[i + 1, j]
+
+    before, after, above, below = own[i, j - 1], own[i, j + 1], own[i - 1, j], own[i + 1, j]
     bend = _TWO * here - own[i, j - 2] - own[i, j + 2]
     bend_down = _TWO * here - own[i - 2, j] - own[i + 2, j]
-    row, column = (left + right) * _HALF + bend * _QUARTER, (above + below) * _HALF + bend_down * _QUARTER
+    row = (before + after) * _HALF + bend * _QUARTER
+    column = (above + below) * _HALF + bend_down * _QUARTER
+
     if not homogeneous:
-        change, change_down = abs(left - right) + abs(bend), abs(above - below) + abs(bend_down)
+        change = abs(before - after) + abs(bend)
+        change_down = abs(above - below) + abs(bend_down)
         if change > change_down:
             row = column
         elif change == change_down:
@@ -82,7 +93,10 @@ def _green(own, i, j, known, homogeneous, pictures):  # type: ignore[no-untyped-
 @compile_part
 def _colours(own, i, with_red, red_column, picture):  # type: ignore[no-untyped-def]
     """Fill in red and blue of a row: green plus the mean difference to green of the colour's sites nearby."""
-    green, near, far = picture[1], 0 if with_red else 2, 2 if with_red else 0
+    green, near, far = picture[1], 2, 0
+    if with_red:
+        near, far = 0, 2
+
     for j in range(3, own.shape[1] - 3):
         across = (own[i, j - 1] - green[i, j - 1]) + (own[i, j + 1] - green[i, j + 1])
         down = (own[i - 1, j] - green[i - 1, j]) + (own[i + 1, j] - green[i + 1, j])
@@ -108,52 +122,60 @@ def _leads(pictures, lead):  # type: ignore[no-untyped-def]
                     light = green[i, j] - green[i2, j2]
                     warm, cold = red[i, j] - red[i2, j2] - light, blue[i, j] - blue[i2, j2] - light
                     steps[d, down, 0, i, j], steps[d, down, 1, i, j] = light * light, warm * warm + cold * cold
+
     # The picture along rows is judged by its steps along rows, that along columns by its steps along columns.
     of_rows, of_columns = steps[0, 0], steps[1, 1]
     for i in range(4, rows - 4):
         for j in range(4, width - 4):
             light = min(max(of_rows[0, i, j - 1], of_rows[0, i, j]), max(of_columns[0, i - 1, j], of_columns[0, i, j]))
             colour = min(max(of_rows[1, i, j - 1], of_rows[1, i, j]), max(of_columns[1, i - 1, j], of_columns[1, i, j]))
-            found = 0
+
+            more = 0
             for d in range(2):
                 across, down = steps[d, 0], steps[d, 1]
                 number = np.int32((across[0, i, j - 1] <= light) & (across[1, i, j - 1] <= colour))
                 number += (across[0, i, j] <= light) & (across[1, i, j] <= colour)
                 number += (down[0, i - 1, j] <= light) & (down[1, i - 1, j] <= colour)
                 number += (down[0, i, j] <= light) & (down[1, i, j] <= colour)
-                found += number if d == 0 else -number
-            lead[i, j] = found
+                more += number if d == 0 else -number
+            lead[i, j] = more
 
 
 def smooth(planes: Tensor, taps: Tensor) -> Tensor:
-    """``(B, N, H, W)``, float32 on the CPU, each picture filtered with its own ``(B, K)`` taps along both axes.
+    """Filter each picture of ``(B, N, H, W)``, float32 on the CPU, with its own taps ``(B, K)`` along both axes.
 
-    The first tap is the middle one, the others stand on both sides of it. The edge is repeated beyond the edge.
+    The first tap is the middle one, the others stand on both sides of it. Beyond the border the last values are
+    repeated.
     """
     batch, count, height, width = planes.shape
     image = planes.contiguous().numpy().reshape(batch * count, height, width)
-    weights = F.pad(taps.float(), (0, 1 - taps.shape[1] % 2)).repeat_interleave(count, 0).numpy()  # an odd number
+    odd_taps = F.pad(taps.float(), (0, 1 - taps.shape[1] % 2))
+    weights = odd_taps.repeat_interleave(count, 0).numpy()
+
     out = torch.empty(batch, count, height, width)
-    given = (image, weights, out.numpy().reshape(image.shape))
-    run_over_rows(len(image) * height, width, lambda start, stop: _smooth_rows(*given, start, stop))
+    filter_rows = partial(_smooth_rows, image, weights, out.numpy().reshape(image.shape))
+    run_over_rows(len(image) * height, width, filter_rows)
     return out
 
 
 @compile_loop
 def _smooth_rows(image, weights, out, start, stop):  # type: ignore[no-untyped-def]
-    """Rows ``start`` to ``stop`` of all planes: down the columns into a row with margins, then along it, two taps at a
-    time.
+    """Filter rows ``start`` to ``stop`` of all planes, two taps at a time.
+
+    A row is filtered down the columns into a line with margins, and then along the line.
     """
     _, height, width = image.shape
     margin = weights.shape[1] - 1
     line = np.empty(width + 2 * margin, np.float32)
     middle = line[margin : margin + width]
+
     for row in range(start, stop):
         plane, y = row // height, row % height
         taps, own, result = weights[plane], image[plane, y], out[plane, y]
         reach = margin
         while reach > 0 and taps[reach] == 0 and taps[reach - 1] == 0:
             reach -= 2
+
         for x in range(width):
             middle[x] = taps[0] * own[x]
         for k in range(1, reach, 2):
@@ -162,6 +184,7 @@ def _smooth_rows(image, weights, out, start, stop):  # type: ignore[no-untyped-d
             first, second = taps[k], taps[k + 1]
             for x in range(width):
                 middle[x] += first * (a[x] + b[x]) + second * (c[x] + d[x])
+
         line[margin - reach : margin] = middle[0]
         line[margin + width : margin + width + reach] = middle[width - 1]
         for x in range(width):

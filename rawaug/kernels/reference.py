@@ -71,14 +71,23 @@ def mask_frame(place: list[int], height: int, width: int, centre: tuple[float, f
         centre: (y, x) of the mask.
     """
     top, left, frame_height, frame_width, view, rows = (*place, 0, 0)[:6]
-    step = rows / height if rows else 1.0
+    step = 1.0
+    if rows:
+        step = rows / height
     half_diagonal = 0.5 * math.hypot(frame_height, frame_width)
 
     def position(i: int, j: int) -> tuple[float, float]:
-        i, j = height - 1 - i if view & 2 else i, width - 1 - j if view & 1 else j
-        row, column = (j, i) if view & 4 else (i, j)
-        y = ((row + 0.5) * step + top - frame_height / 2) / half_diagonal - centre[0]
-        return y, ((column + 0.5) * step + left - frame_width / 2) / half_diagonal - centre[1]
+        """Where pixel (i, j) of the picture lies in the frame; its view is undone first."""
+        if view & 2:
+            i = height - 1 - i
+        if view & 1:
+            j = width - 1 - j
+        if view & 4:
+            i, j = j, i
+
+        y = ((i + 0.5) * step + top - frame_height / 2) / half_diagonal
+        x = ((j + 0.5) * step + left - frame_width / 2) / half_diagonal
+        return y - centre[0], x - centre[1]
 
     (y, x), down, right = position(0, 0), position(1, 0), position(0, 1)
     return [y, x, down[0] - y, down[1] - x, right[0] - y, right[1] - x]
@@ -101,11 +110,14 @@ def unprocess(srgb: Tensor, camera: Camera, white: float, band: int = BAND) -> T
     pictures, rows = batch, height
     if srgb.device.type == "cpu":
         pictures, rows = 1, max(2, band // max(width, 1) // 2 * 2)
-    for b in range(0, batch, pictures):
-        own = slice(b, b + pictures)
-        camera_here = camera._replace(curves=camera.curves[own], colour=camera.colour[own], frame=camera.frame[own])
+
+    for first in range(0, batch, pictures):
+        group = slice(first, first + pictures)
+        settings = camera._replace(curves=camera.curves[group], colour=camera.colour[group], frame=camera.frame[group])
         for top in range(0, height, rows):
-            _develop(srgb[own, :, top : top + rows], camera_here, top, raw[own, :, top // 2 : (top + rows) // 2])
+            cells = slice(top // 2, (top + rows) // 2)
+            _develop(srgb[group, :, top : top + rows], settings, top, raw[group, :, cells])
+
     return raw.clamp_(max=white)
 
 
@@ -114,8 +126,10 @@ def look_up(table: Tensor, x: Tensor) -> Tensor:
     batch, _, height, width = x.shape
     half = 127.5 if x.dtype == torch.uint8 else 0.5
     points = (x / half - 1.0).permute(0, 2, 3, 1).reshape(1, batch, height, width, 3)
-    found = F.grid_sample(table.permute(3, 0, 1, 2)[None], points.to(table), padding_mode="border", align_corners=True)
-    return found[0].transpose(0, 1)
+
+    cube = table.permute(3, 0, 1, 2)[None]
+    values = F.grid_sample(cube, points.to(table), padding_mode="border", align_corners=True)
+    return values[0].transpose(0, 1)
 
 
 def apply_curves(curves: Tensor, x: Tensor) -> Tensor:
@@ -125,6 +139,7 @@ def apply_curves(curves: Tensor, x: Tensor) -> Tensor:
     """
     if x.dtype == torch.uint8 and curves.shape[1] == 256:
         return _take(curves, x.int())
+
     unit = x / 255.0 if x.dtype == torch.uint8 else x.clamp(0.0, 1.0)
     position = unit * (curves.shape[1] - 1)
     left = position.int().clamp_max(curves.shape[1] - 2)
@@ -132,8 +147,11 @@ def apply_curves(curves: Tensor, x: Tensor) -> Tensor:
 
 
 def _take(curves: Tensor, index: Tensor) -> Tensor:
-    taken = [curve.index_select(0, own.flatten()) for curve, own in zip(curves, index, strict=True)]
-    return torch.stack(taken).reshape(index.shape) if taken else curves.new_empty(index.shape)
+    """Take the entries ``index`` ``(B, C, H, W)`` of each picture's curve."""
+    values = curves.new_empty(index.shape)
+    for b in range(len(index)):
+        values[b] = curves[b].index_select(0, index[b].flatten()).reshape(index.shape[1:])
+    return values
 
 
 class Display(NamedTuple):
@@ -160,13 +178,18 @@ class Display(NamedTuple):
 def render(linear: Tensor, display: Display) -> Tensor:
     """Develop camera colour x5 ``(B, 3, H, W)``, float32, to sRGB in [0, 1]; the pass is differentiable."""
     mask = fall_off(display, 0, *linear.shape[-2:])
-    x = linear if mask is None else linear / mask
+    x = linear
+    if mask is not None:
+        x = linear / mask
+
     if display.attention.numel():
         x = x * look_up(display.attention, x)[:, :1]
+
     # A saturated sensor is balanced at its least gain alone; as RAW developers do, all channels are clipped there, or
     # highlights would turn magenta.
     gains, white = display.gains[:, :3, None, None], display.gains[:, 3:, None, None]
     x = torch.minimum(x * gains, white)
+
     # The root spreads the dark tones, where an inverse tone curve is steep, over more of the table's nodes.
     root = torch.einsum("bij,bjhw->bihw", display.matrix, x).clamp(1e-12, 1.0).sqrt()
     if display.curves.numel():
@@ -178,9 +201,12 @@ def _develop(srgb: Tensor, camera: Camera, top: int, raw: Tensor) -> None:
     """Convert rows of pictures from ``top`` on, and write them to ``raw``."""
     x2 = apply_curves(camera.curves, srgb) if camera.curves.numel() else look_up(camera.table, srgb)[:, :3]
     mask = fall_off(camera, top, *srgb.shape[-2:])
+
     for plane, (i, j, channel) in enumerate(camera.sites.tolist()):
         here = x2[..., i::2, j::2]
-        shade = mask if mask is None else mask[..., i::2, j::2]
+        shade = mask
+        if mask is not None:
+            shade = mask[..., i::2, j::2]
         if camera.attention.numel():
             x4 = _channels(here, camera, slice(0, 3), shade)
             raw[:, plane] = x4[:, channel] * look_up(camera.attention, x4)[:, 0]
@@ -190,11 +216,15 @@ def _develop(srgb: Tensor, camera: Camera, top: int, raw: Tensor) -> None:
 
 def _channels(x2: Tensor, camera: Camera, channels: slice, mask: Tensor | None) -> Tensor:
     """Compute some channels of x4 times the mask."""
-    rows, mean, floor, rise = camera.colour[:, :3], camera.colour[:, 3:4], camera.colour[:, 4], camera.colour[:, 5]
+    rows, mean = camera.colour[:, :3], camera.colour[:, 3:4]
+    floor, rise = camera.colour[:, 4], camera.colour[:, 5]
+
     m = torch.einsum("bck,bkhw->bchw", mean, x2).sub_(camera.knee).div_(1.0 - camera.knee).clamp_(0.0, 1.0).square_()
     factor = torch.addcmul(floor[:, channels, None, None], m, rise[:, channels, None, None])
     x4 = torch.einsum("bck,bkhw->bchw", rows[:, channels], x2).mul_(factor)
-    return x4 if mask is None else x4.mul_(mask)
+    if mask is not None:
+        x4.mul_(mask)
+    return x4
 
 
 def fall_off(camera: Camera | Display, top: int, height: int, width: int) -> Tensor | None:
@@ -204,12 +234,13 @@ def fall_off(camera: Camera | Display, top: int, height: int, width: int) -> Ten
     """
     if not camera.shading.numel():
         return None
+
     i = torch.arange(top, top + height, device=camera.frame.device)[:, None]
     j = torch.arange(width, device=camera.frame.device)
-    y, x = (
-        start + i * down + j * right
-        for start, down, right in (camera.frame[:, axis::2, None, None].unbind(1) for axis in (0, 1))
-    )
+    y_start, x_start, y_down, x_down, y_right, x_right = camera.frame[..., None, None].unbind(1)
+    y = y_start + i * y_down + j * y_right
+    x = x_start + i * x_down + j * x_right
+
     a, b, c = camera.shading
     return torch.exp2(-(a * y * y + (b * y + c * x) * x))[:, None]
 
@@ -219,8 +250,10 @@ def philox(key: int, counters: Tensor) -> Tensor:
     zero = torch.zeros_like(counters)
     a, b, c, d = counters, zero, zero, zero
     low, high = key & _LOW, key >> 32
+
     for _ in range(ROUNDS):
-        (high_a, low_a), (high_c, low_c) = _product(a, MULTIPLIERS[0]), _product(c, MULTIPLIERS[1])
+        high_a, low_a = _product(a, MULTIPLIERS[0])
+        high_c, low_c = _product(c, MULTIPLIERS[1])
         a, b, c, d = high_c ^ b ^ low, low_c, high_a ^ d ^ high, low_a
         low, high = (low + INCREMENTS[0]) & _LOW, (high + INCREMENTS[1]) & _LOW
     return torch.stack([a, b, c, d])
@@ -230,9 +263,11 @@ def normals(key: int, height: int, width: int) -> Tensor:
     """Draw standard normals for the planes of a packed picture, float32 ``(4, H, W)``; cells are counted row by row."""
     w = philox(key, torch.arange(height * width))
     radius = (w[0::2].float() + 0.5).mul_(2.0**-32).log_().mul_(-2.0).sqrt_()
-    turn = torch.where(w[1::2] < 2**31, w[1::2], w[1::2] - 2**32).double().mul_(2.0 * math.pi / 2**32)
-    drawn = torch.stack([radius * turn.cos().float(), radius * turn.sin().float()], dim=1)
-    return drawn.reshape(4, height, width)
+
+    signed = torch.where(w[1::2] < 2**31, w[1::2], w[1::2] - 2**32)
+    angle = signed.double().mul_(2.0 * math.pi / 2**32)
+    pairs = torch.stack([radius * angle.cos().float(), radius * angle.sin().float()], dim=1)
+    return pairs.reshape(4, height, width)
 
 
 def _product(x: Tensor, factor: int) -> tuple[Tensor, Tensor]:

@@ -36,21 +36,33 @@ def find_device(name: str, key: str = "device", count: int = 1) -> torch.device:
     kind, _, number = name.partition(":")
     if kind not in KINDS or (number and not number.isdigit()):
         raise ValueError(f"{key} {name!r} is unknown; use one of {', '.join(KINDS)}{suggest(kind, KINDS)}")
-    found = {"cuda": torch.cuda.device_count(), "mps": int(torch.backends.mps.is_available())}
-    present = next((gpu for gpu, devices in found.items() if devices), None)
+
+    devices = {"cuda": torch.cuda.device_count(), "mps": int(torch.backends.mps.is_available())}
     if kind in ("auto", "gpu"):
-        kind = present or ("cpu" if kind == "auto" else "cuda")
-    if kind != "cpu" and int(number or 0) + count > found[kind]:
-        raise ValueError(f"{key} {name!r}: {count} needed, this machine has {found[kind] or 'none'}; use cpu or auto")
-    return torch.device(f"{kind}:{number}" if number else kind)
+        if devices["cuda"]:
+            kind = "cuda"
+        elif devices["mps"]:
+            kind = "mps"
+        else:
+            kind = "cpu" if kind == "auto" else "cuda"
+
+    if kind != "cpu" and int(number or 0) + count > devices[kind]:
+        raise ValueError(f"{key} {name!r}: {count} needed, this machine has {devices[kind] or 'none'}; use cpu or auto")
+    if number:
+        kind = f"{kind}:{number}"
+    return torch.device(kind)
 
 
 def has_fast_bfloat16(device: torch.device) -> bool:
     """Whether dense convolutions take less time in bfloat16 there: with AVX-512 BF16, AMX, or on newer GPUs."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
-    able: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)() if device.type == "cpu" else {}
-    return bool(able.get("avx512_bf16") or able.get("amx_bf16"))
+    if device.type != "cpu":
+        return False
+
+    get_capabilities = getattr(torch.cpu, "get_capabilities", dict)  # PyTorch has it from 2.7 on
+    capabilities: dict[str, Any] = get_capabilities()
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
 
 
 @contextmanager
@@ -79,8 +91,12 @@ def eager(function: Callable[P, R]) -> Callable[P, R]:
     return run
 
 
-_GRAIN = 2**15  # with fewer numbers waking a thread costs more than it saves
-_PIECES = 4  # pieces of work for each thread, so that a late one does not hold up the others
+_GRAIN = 2**15
+"""The fewest numbers for which waking a thread pays."""
+
+_PIECES = 4
+"""Pieces of work for each thread, so that a late one does not hold up the others."""
+
 _OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 """Fused multiply-adds are allowed: they do not depend on the order of pixels or threads."""
 
@@ -133,6 +149,7 @@ def run_over_rows(rows: int, width: int, run: Callable[[int, int], None]) -> Non
     if threads == 1 or pieces < 2:
         run(0, rows)
         return
+
     waiting = deque(pairwise(rows * piece // pieces for piece in range(pieces + 1)))
 
     def work() -> None:
