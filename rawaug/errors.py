@@ -18,7 +18,12 @@ def escape(text: object) -> str:
         >>> escape("a\nb\x1b[2Jc ü 写真")
         'a\\nb\\x1b[2Jc ü 写真'
     """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text))
+    characters = []
+    for character in str(text):
+        if not character.isprintable():
+            character = character.encode("unicode_escape").decode("ascii")
+        characters.append(character)
+    return "".join(characters)
 
 
 class MissingExtra(ImportError):
@@ -46,9 +51,10 @@ def extra(name: str) -> Iterator[None]:
 
 
 def how_to_install(name: str) -> str:
-    """Say in words how the extra ``name`` is installed, from the checkout if this is one."""
+    """Give the command that installs the extra ``name``, from the checkout if this is one."""
     checkout = Path(__file__).parents[1]
-    return f"run: pip install '{checkout if (checkout / 'setup.cfg').is_file() else 'rawaug'}[{name}]'"
+    package = str(checkout) if (checkout / "setup.cfg").is_file() else "rawaug"
+    return f"run: pip install '{package}[{name}]'"
 
 
 _MEMORY = "out of memory; use a smaller batch, crop or tile"
@@ -66,7 +72,7 @@ _WAYS_OUT = (
     ),
     (r"no space left on device|pytorchstreamwriter", "the disk is full; free some space"),
 )
-"""Patterns of an error's text in lower case, the first of which counts, and the advice."""
+"""Patterns of an error's text in lower case, and advice. The first pattern that matches counts."""
 
 
 def resource_error(error: BaseException) -> str | None:
@@ -79,9 +85,12 @@ rawaug data check, then run the same command again'
     """
     if isinstance(error, MemoryError):
         return f"{_MEMORY}, then run the same command again"
+
     text = str(error).lower()
-    found = next((way for pattern, way in _WAYS_OUT if re.search(pattern, text, re.DOTALL)), None)
-    return None if found is None else f"{found}, then run the same command again"
+    for pattern, advice in _WAYS_OUT:
+        if re.search(pattern, text, re.DOTALL):
+            return f"{advice}, then run the same command again"
+    return None
 
 
 def strip_traceback(text: str) -> str:

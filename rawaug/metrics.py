@@ -15,18 +15,21 @@ import torch.nn.functional as F
 from torch import Tensor
 
 WINDOW = 11
+"""Side of SSIM's window in pixels."""
+
 PATCH = 256
 """Side of the mosaic patches over which an ISP's PSNR_r is averaged."""
 
 
 def _as_floats(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Both in float32, or in float64 where one is: half precision would lose squares below 6e-8, from 72 dB on."""
+    """Convert both to float32, or to float64 if one is; half precision would lose squares below 6e-8, from 72 dB on."""
     if a.shape != b.shape:
         raise ValueError(f"images differ in shape: {tuple(a.shape)} and {tuple(b.shape)}")
     if not (a.is_floating_point() and b.is_floating_point()):
         raise ValueError(f"images must be floating point with data range 1, got {a.dtype} and {b.dtype}")
     if a.ndim < 2 or 0 in a.shape[1:]:
         raise ValueError(f"images must be a batch (B, ...) of one or more values each, got {tuple(a.shape)}")
+
     dtype = torch.float64 if torch.float64 in (a.dtype, b.dtype) else torch.float32
     return a.to(dtype), b.to(dtype)
 
@@ -62,4 +65,5 @@ def worst_and_best_quarter(values: list[float]) -> tuple[float, float]:
     """Average the lowest and the highest 25 % of the values, at least one value each."""
     ordered = sorted(values)
     count = max(1, round(len(ordered) / 4))
-    return sum(ordered[:count]) / count, sum(ordered[-count:]) / count
+    worst, best = ordered[:count], ordered[-count:]
+    return sum(worst) / count, sum(best) / count

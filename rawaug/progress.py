@@ -1,6 +1,6 @@
 """Progress on stderr: a bar in a terminal; elsewhere, as in the log of a job, one plain line every 30 seconds.
 
-The environment variable ``RAWAUG_PROGRESS_SECONDS`` sets another interval. What takes less prints no line.
+The environment variable ``RAWAUG_PROGRESS_SECONDS`` sets another interval. Work that takes less time prints no line.
 """
 
 from __future__ import annotations
@@ -40,23 +40,27 @@ def progress(
     shown: bool = True,
     stream: TextIO | None = None,
 ) -> Any:
-    """Count items as they are iterated over; ``set_postfix_str(text, refresh=False)`` of the result adds a text.
+    """Count items while they are iterated over.
+
+    The result's method ``set_postfix_str(text, refresh=False)`` adds a text to the bar.
 
     Args:
-        items: what is iterated over.
-        label: stands before the bar.
-        unit: what one item is called, in the singular.
+        items: the items to iterate over.
+        label: the text before the bar.
+        unit: the noun for one item, in the singular.
         total: the number of items, if they have no length.
-        initial: how many were done before.
+        initial: the number of items that were done before.
         leave: whether a finished bar stays in the terminal.
         shown: whether anything is printed.
-        stream: where to, stderr by default.
+        stream: the stream to print to; stderr by default.
     """
     stream = stream or sys.stderr
     settings: dict[str, Any] = {"desc": label, "unit": unit, "total": total, "initial": initial}
     settings["disable"] = not shown or _quiet.get()
+
     if stream.isatty() or tqdm is not terminal_tqdm:  # tqdm.auto is another class in a notebook
         return tqdm(items, file=stream, leave=leave, **settings)
+
     seconds = float(os.environ.get("RAWAUG_PROGRESS_SECONDS", "30"))
     settings |= {"mininterval": seconds, "maxinterval": seconds, "delay": seconds, "miniters": 1}
     return _Lines(items, file=stream, leave=False, bar_format=_LINE, **settings)

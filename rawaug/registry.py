@@ -46,21 +46,25 @@ def split_spec(spec: Spec) -> tuple[str, dict[str, Any]]:
     """
     if isinstance(spec, str):
         return spec, {}
-    given = dict(spec) if isinstance(spec, Mapping) else {}
-    settings = given.get("settings") or {}
-    if (
-        not isinstance(given.get("name"), str)
-        or not isinstance(settings, Mapping)
-        or given.keys() - {"name", "settings"}
-    ):
-        raise ValueError(f"expected a name or {{name: ..., settings: {{...}}}}, got {given or spec!r}")
-    return given["name"], dict(settings)
+    if not isinstance(spec, Mapping) or not spec.keys() <= {"name", "settings"}:
+        raise _not_a_spec(spec)
+
+    name, settings = spec.get("name"), spec.get("settings") or {}
+    if not isinstance(name, str) or not isinstance(settings, Mapping):
+        raise _not_a_spec(spec)
+    return name, dict(settings)
+
+
+def _not_a_spec(spec: object) -> ValueError:
+    return ValueError(f"expected a name or {{name: ..., settings: {{...}}}}, got {spec!r}")
 
 
 def spec_label(spec: Spec) -> str:
     """Write a spec in one line, for tables: its name and settings."""
     name, settings = split_spec(spec)
-    return " ".join([name, *(f"{key}={value}" for key, value in settings.items())])
+    for key, value in settings.items():
+        name += f" {key}={value}"
+    return name
 
 
 def check_settings(
@@ -78,13 +82,21 @@ def check_settings(
         ValueError: if one is unknown, missing, or not of the plain type that the signature names.
     """
     parameters = inspect.signature(function).parameters
-    takes = [key for key, p in parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
-    for key in [key for key in settings if key not in takes]:
-        raise ValueError(f"{label} has no setting {key!r}; it has {', '.join(takes) or 'none'}{suggest(key, takes)}")
-    for key in takes:
-        if parameters[key].default is inspect.Parameter.empty and key not in {*settings, *given}:
-            raise ValueError(f"{label} needs the setting {key!r}")
-    return {key: _of_type(value, parameters[key], f"{label}: {key}") for key, value in settings.items()}
+    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    names = [name for name, parameter in parameters.items() if parameter.kind not in variadic]
+
+    for key in settings:
+        if key not in names:
+            choices = ", ".join(names) or "none"
+            raise ValueError(f"{label} has no setting {key!r}; it has {choices}{suggest(key, names)}")
+    for name in names:
+        if parameters[name].default is inspect.Parameter.empty and name not in {*settings, *given}:
+            raise ValueError(f"{label} needs the setting {name!r}")
+
+    arguments = {}
+    for key, value in settings.items():
+        arguments[key] = _of_type(value, parameters[key], f"{label}: {key}")
+    return arguments
 
 
 def require_between(key: str, value: object, least: float, most: float) -> None:
@@ -103,26 +115,32 @@ def require_between(key: str, value: object, least: float, most: float) -> None:
         Traceback (most recent call last):
         ValueError: width must be a whole number from 1 to 4096, got 1000000000
     """
-    whole = isinstance(least, int) and isinstance(most, int)
-    kind = (int,) if whole else (int, float)
-    if isinstance(value, bool) or not isinstance(value, kind) or not least <= value <= most:
-        raise ValueError(f"{key} must be a {'whole ' * whole}number from {least} to {most}, got {value!r:.100}")
+    types: tuple[type, ...] = (int, float)
+    noun = "number"
+    if isinstance(least, int) and isinstance(most, int):
+        types, noun = (int,), "whole number"
+
+    if isinstance(value, bool) or not isinstance(value, types) or not least <= value <= most:
+        raise ValueError(f"{key} must be a {noun} from {least} to {most}, got {value!r:.100}")
 
 
 def suggest(name: object, known: Iterable[str]) -> str:
     """Suggest the known name that is nearest, as ``" (nearest: UNet)"``; nothing if none is near."""
     by_key = {candidate.casefold(): candidate for candidate in known}
     near = difflib.get_close_matches(str(name).casefold(), by_key, n=1)
-    return f" (nearest: {by_key[near[0]]})" if near else ""
+    if not near:
+        return ""
+    return f" (nearest: {by_key[near[0]]})"
 
 
 class Registry(Mapping[str, Any]):
     """Things of one kind by name, in alphabetical order.
 
     Args:
-        kind: what one of them is called in messages.
-        group: of the entry points of other packages.
-        packages: whose modules register the built-in ones; one is imported when those before it lack a name.
+        kind: the noun for one of them in messages.
+        group: the group of the entry points by which other packages add theirs.
+        packages: the packages whose modules register the built-in ones. A package is imported when those before it lack
+            a name.
 
     Example:
         >>> filters = Registry("filter", "rawaug.filters", "denoisers")
@@ -146,9 +164,10 @@ class Registry(Mapping[str, Any]):
         """Decorator: let the class or function be found by ``name``, which no other thing may have."""
 
         def add(thing: T) -> T:
-            known = self._things.get(name, thing)
-            if known is not thing and _path(known) != _path(thing):  # a module may be run again, as in a notebook
-                raise ValueError(f"{self.kind} {name!r} is {_path(known)} already; give {_path(thing)} another name")
+            namesake = self._things.get(name, thing)
+            if _path(namesake) != _path(thing):  # a module may be run again, as in a notebook
+                raise ValueError(f"{self.kind} {name!r} is {_path(namesake)} already; give {_path(thing)} another name")
+
             self._things[name] = thing
             return thing
 
@@ -157,13 +176,14 @@ class Registry(Mapping[str, Any]):
     def __getitem__(self, name: str) -> Any:
         while name not in self._things and self._unimported:
             self._import_next()
+
         if name not in self._things:
             if name not in self._entry_points:
                 raise UnknownName(
                     f"{self.kind} {name!r} is unknown; use one of {', '.join(self)}{suggest(name, self)}; "
                     f"one of your own: rawaug --import FILE.py COMMAND, or an entry point in {self.group}"
                 )
-            self._things[name] = self._loaded(name)
+            self._things[name] = self._load(name)
         return self._things[name]
 
     def __contains__(self, name: object) -> bool:
@@ -179,12 +199,17 @@ class Registry(Mapping[str, Any]):
 
     def name_of(self, thing: Any) -> str | None:
         """Find the name that a thing is registered under; None if it is not."""
-        return next((name for name in (*self._things, *self) if self[name] is thing), None)
+        for name in (*self._things, *self):
+            if self[name] is thing:
+                return name
+        return None
 
     def make(self, spec: Spec, **defaults: Any) -> Any:
         """Make a thing with the settings of its spec; ``defaults`` fill in what these leave out."""
         name, settings = split_spec(spec)
-        return self[name](**{**defaults, **check_settings(f"{self.kind} {name}", self[name], settings, defaults)})
+        thing = self[name]
+        arguments = check_settings(f"{self.kind} {name}", thing, settings, defaults)
+        return thing(**{**defaults, **arguments})
 
     def _import_next(self) -> None:
         package = self._unimported[0]
@@ -196,15 +221,15 @@ class Registry(Mapping[str, Any]):
     def _entry_points(self) -> dict[str, Any]:
         from importlib.metadata import entry_points
 
-        found: dict[str, Any] = {}
+        points: dict[str, Any] = {}
         for point in entry_points(group=self.group):
-            if point.name in found or point.name in self._things:
+            if point.name in points or point.name in self._things:
                 warnings.warn(f"{point.value} is ignored: there is a {self.kind} {point.name!r} already", stacklevel=2)
             else:
-                found[point.name] = point
-        return found
+                points[point.name] = point
+        return points
 
-    def _loaded(self, name: str) -> Any:
+    def _load(self, name: str) -> Any:
         point = self._entry_points[name]
         try:
             return point.load()
@@ -213,17 +238,26 @@ class Registry(Mapping[str, Any]):
 
 
 def _path(thing: Any) -> str:
-    thing = getattr(thing, "func", thing)  # of functools.partial
+    """Where a thing is defined, of a ``functools.partial`` its function."""
+    thing = getattr(thing, "func", thing)
     return f"{thing.__module__}.{thing.__qualname__}"
 
 
 def _of_type(value: Any, parameter: inspect.Parameter, label: str) -> Any:
     """Return the value if it is of the parameter's type; only plain types are checked here."""
-    hint, default = parameter.annotation, parameter.default
-    expected = _PLAIN.get(hint if isinstance(hint, str) else getattr(hint, "__name__", ""))
-    value = tuple(value) if isinstance(value, list) else value
-    if expected is None and isinstance(default, tuple):
-        expected = (tuple,)
-    if expected is not None and (not isinstance(value, expected) or (isinstance(value, bool) and bool not in expected)):
-        raise ValueError(f"{label} must be {expected[-1].__name__}, got {value!r}")
+    if isinstance(value, list):
+        value = tuple(value)
+
+    hint = parameter.annotation
+    if not isinstance(hint, str):
+        hint = getattr(hint, "__name__", "")
+    types = _PLAIN.get(hint)
+    if types is None and isinstance(parameter.default, tuple):
+        types = (tuple,)
+    if types is None:
+        return value
+
+    number_as_flag = isinstance(value, bool) and bool not in types
+    if not isinstance(value, types) or number_as_flag:
+        raise ValueError(f"{label} must be {types[-1].__name__}, got {value!r}")
     return value

@@ -26,9 +26,12 @@ def keyed_generator(*keys: int | str, device: torch.device | str = "cpu") -> tor
 
 def rank_key() -> tuple[int, ...]:
     """The rank as a key that separates the draws of distributed processes; empty for rank 0 and for a single one."""
-    distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
-    rank = torch.distributed.get_rank() if distributed else 0
-    return (rank,) if rank else ()
+    if not torch.distributed.is_available() or not torch.distributed.is_initialized():
+        return ()
+    rank = torch.distributed.get_rank()
+    if rank == 0:
+        return ()
+    return (rank,)
 
 
 @contextmanager

@@ -23,7 +23,7 @@ _CANON = """
 1000D Rebel XS, Kiss F; 1100D Rebel T3, Kiss X50; 1200D Rebel T5, Kiss X70; 1300D Rebel T6, Kiss X80;
 2000D Rebel T7, Kiss X90; 4000D Rebel T100; M50 Kiss M
 """
-"""EOS cameras, each with its names elsewhere; "Digital" before them is left out. Source: LibRaw's list of cameras."""
+"""EOS cameras, each with its names on other continents, without "Digital". Source: LibRaw's list of cameras."""
 
 _MARKS = {"i": 1, "ii": 2, "iii": 3, "iv": 4, "v": 5, "vi": 6, "vii": 7}
 _ROMAN = r"(i{1,3}|iv|v|vii?)(a?)\b"
@@ -48,19 +48,34 @@ def camera_key(name: str) -> str:
     text = " ".join(name.casefold().split())
     for pattern, instead in _LINES:
         text = re.sub(pattern, instead, text)
-    text = _MARK.sub(lambda found: "m" + "".join(str(_MARKS.get(part, part or "")) for part in found.groups()), text)
-    key = re.sub(r"[\W_]", "", text)
-    return _elsewhere().get(key.replace("digital", ""), key)
+    text = _MARK.sub(_mark_in_digits, text)
+
+    key = _letters_and_digits(text)
+    return _canon_keys().get(key.replace("digital", ""), key)
+
+
+def _mark_in_digits(match: re.Match[str]) -> str:
+    """Write a mark as ``m2``, whatever its form was."""
+    mark = "m"
+    for part in match.groups(default=""):
+        mark += str(_MARKS.get(part, part))
+    return mark
+
+
+def _letters_and_digits(text: str) -> str:
+    return re.sub(r"[\W_]", "", text)
 
 
 @lru_cache(maxsize=1)
-def _elsewhere() -> dict[str, str]:
-    rows = (row.split(maxsplit=1) for row in _CANON.split(";"))
-    return {
-        "canon" + re.sub(r"[\W_]", "", name.casefold().replace(" ii", "m2")): f"canon{own.casefold()}"
-        for own, names in rows
-        for name in names.split(",")
-    }
+def _canon_keys() -> dict[str, str]:
+    """The keys of EOS cameras by the keys of their other names."""
+    keys = {}
+    for row in _CANON.split(";"):
+        number, names = row.split(maxsplit=1)
+        for name in names.split(","):
+            other = _letters_and_digits(name.casefold().replace(" ii", "m2"))
+            keys[f"canon{other}"] = f"canon{number.casefold()}"
+    return keys
 
 
 def similar_cameras(part: str, known: Iterable[str]) -> list[str]:
@@ -73,7 +88,12 @@ def similar_cameras(part: str, known: Iterable[str]) -> list[str]:
         ['Canon EOS 5D Mark II']
     """
     key, words = camera_key(part), part.casefold().split()
-    return [name for name in known if key in camera_key(name) or all(word in name.casefold() for word in words)]
+
+    similar = []
+    for name in known:
+        if key in camera_key(name) or all(word in name.casefold() for word in words):
+            similar.append(name)
+    return similar
 
 
 def find_camera(name: str, known: Iterable[str]) -> str:
@@ -86,17 +106,20 @@ def find_camera(name: str, known: Iterable[str]) -> str:
         >>> find_camera("nikon  d750", ["Nikon D750", "Nikon D7500"]), find_camera("Sony a7 III", ["Sony ILCE-7M3"])
         ('Nikon D750', 'Sony ILCE-7M3')
     """
-    known, key = list(dict.fromkeys(known)), camera_key(name)
+    candidates = list(dict.fromkeys(known))
     exact = " ".join(name.casefold().split())
     by_key: dict[str, str] = {}
-    for candidate in known:
+    for candidate in candidates:
         if " ".join(candidate.casefold().split()) == exact:
             return candidate
         by_key.setdefault(camera_key(candidate), candidate)
+
+    key = camera_key(name)
     if key in by_key:
         return by_key[key]
-    similar = similar_cameras(name, known)[:3] or [
-        by_key[near] for near in difflib.get_close_matches(key, by_key, 3, 0.8)
-    ]
+
+    similar = similar_cameras(name, candidates)[:3]
+    if not similar:
+        similar = [by_key[near] for near in difflib.get_close_matches(key, by_key, 3, 0.8)]
     hint = f"; similar: {', '.join(similar)}" if similar else ""
     raise ValueError(f"camera {name!r} is not listed{hint}; rawaug info cameras lists all")
