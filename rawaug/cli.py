@@ -25,6 +25,8 @@ from rawaug.progress import hide_progress
 from rawaug.version import __version__
 
 BAD_INPUT = 2
+"""Exit status after an error of the user's."""
+
 COMMANDS = {
     "benchmark": "Compare denoisers on the same frozen noise over clean references.",
     "denoise": "Denoise a RAW file to DNG, a JPEG, PNG or TIFF to another, or a folder of either.",
@@ -40,9 +42,12 @@ COMMANDS = {
     "synth": "Write noisy and clean RAW pairs made from sRGB pictures.",
 }
 """Modules of :mod:`rawaug.commands`, each with a function ``run`` whose docstring opens with this line."""
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""Numbers of glibc's malloc.h."""
+
 NETWORKS = ("benchmark", "denoise", "evaluate", "run")
-"""Commands that take memory in huge pages and keep it, where Linux can: page faults took a third of their time."""
+"""Commands that run networks. They take memory in huge pages and keep it, as page faults took a third of their time."""
 
 app = App(
     name="rawaug",
@@ -115,6 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # names of files need not fit the terminal's encoding
             stream.reconfigure(errors="backslashreplace")
+
     if words[:1] and words[0] in NETWORKS:
         _keep_memory()
     if not words or words[0] in ("-h", "--help"):
@@ -123,21 +129,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 app[point.name]
     if words[:1] == ["run"] and {"-h", "--help"} & set(words[2:]):  # of a recipe: its keys
         words = [*words[:2], "--keys"]
+
     try:
         app.meta(words, exit_on_error=False, print_error=False)
         return 0
     except BrokenPipeError:  # the reader has closed the pipe, as with `| head`
         return 0
     except (ValueError, OSError, MissingExtra, CycloptsError) as error:
-        said = _one_line(error)
+        text = _one_line(error)
     except (RuntimeError, MemoryError) as error:
-        if (lacking := resource_error(error)) is None:
+        shortage = resource_error(error)
+        if shortage is None:
             raise
-        said = lacking
+        text = shortage
     except KeyboardInterrupt:
         print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
         return 130
-    print(f"rawaug: {escape(said)}", file=sys.stderr)
+
+    print(f"rawaug: {escape(text)}", file=sys.stderr)
     return BAD_INPUT
 
 

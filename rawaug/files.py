@@ -26,28 +26,34 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 OF_NO_DATASET = (".DS_Store", "Thumbs.db")
+"""Files that macOS and Windows leave in folders."""
 
 LOCK = "rawaug.lock"
 """Name of the lock file in an output folder."""
 
 MOST_BYTES = 2**32
-"""More than any picture, RAW file or array of a dataset has: larger files are refused before they are read."""
+"""Largest size of an input file; larger ones are refused before they are read."""
 
 WEIGHTS = Path(__file__).parent / "weights"
 """The folder of the shipped ISPs."""
 
 
 def yaml_value(text: str) -> Any:
-    """Plain values of YAML 1.2, in which ``1e-4`` is a number, and ``on``, ``off``, ``yes`` and ``no`` are words."""
+    """Parse plain values of YAML 1.2, in which ``1e-4`` is a number, and ``on``, ``off``, ``yes`` and ``no`` are words.
+
+    Raises:
+        ValueError: if the text is not YAML.
+    """
     import yaml
 
     class Loader(yaml.SafeLoader):
         pass
 
-    Loader.yaml_implicit_resolvers = {
-        first: [(tag, words) for tag, words in known if first in "tTfF" or not tag.endswith(":bool")]
-        for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
-    }
+    Loader.yaml_implicit_resolvers = {}
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items():
+        if first not in "tTfF":
+            resolvers = [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":bool")]
+        Loader.yaml_implicit_resolvers[first] = resolvers
 
     number = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$")
     Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+0123456789"))
@@ -99,8 +105,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+
     key = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]  # the name itself may be as long as a name can be
-    partial, lock = path.with_name(f".{key}.partial"), path.with_name(f".{key}.lock")
+    partial = path.with_name(f".{key}.partial")
+    lock = path.with_name(f".{key}.lock")
     try:
         with FileLock(lock):
             try:
@@ -118,17 +126,25 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def locked(file: Path) -> Iterator[None]:
-    """Hold the lock ``file``. Its folder is made, and removed again if it stays empty."""
+    """Hold the lock ``file`` in this block.
+
+    Its folder is made if need be, and then removed again if it stays empty.
+
+    Raises:
+        ValueError: if another run holds the lock.
+        OSError: if the folder is removed meanwhile.
+    """
     from filelock import FileLock, Timeout
 
     folder = file.absolute().parent
-    made = not folder.exists()
+    is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(file, timeout=0)
     try:
         lock.acquire()
     except Timeout:
         raise ValueError(f"{folder}: in use by another run ({file.name}); wait for it, or choose another") from None
+
     try:
         yield
         if not file.exists():
@@ -136,7 +152,7 @@ def locked(file: Path) -> Iterator[None]:
     finally:
         file.unlink(missing_ok=True)  # while it is locked: whoever waits for this file tries again
         lock.release()
-        if made and folder.is_dir() and not any(folder.iterdir()):
+        if is_new and folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
 
 
@@ -156,24 +172,30 @@ def one_at_a_time(folder: Callable[..., Path | None]) -> Callable[[Callable[P, R
 
 
 def to_json(value: Any, indent: int | None = None) -> str:
-    """JSON; paths become text, tensors lists, infinity and NaN, which JSON does not have, null."""
+    """Write JSON: paths become text, tensors lists, and infinity and NaN, which JSON does not have, null."""
     return json.dumps(_finite(value), indent=indent, allow_nan=False)
 
 
 def _finite(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, Tensor):
         return _finite(value.tolist())
     if isinstance(value, Mapping):
         return {key: _finite(inner) for key, inner in value.items()}
-    return [_finite(inner) for inner in value] if isinstance(value, (list, tuple)) else value
+    if isinstance(value, (list, tuple)):
+        return [_finite(inner) for inner in value]
+    return value
 
 
 def parse_object(text: str) -> dict[str, Any]:
-    """A JSON object from a file of others; ValueError if it is anything else, or a number in it is not finite."""
+    """Parse a JSON object from an untrusted file.
+
+    Raises:
+        ValueError: if the text is anything else, or a number in it is not finite.
+    """
 
     def finite(number: str) -> float:
         if not math.isfinite(float(number)):
@@ -198,9 +220,13 @@ def require_writable(path: str | Path, option: str = "", folder: bool = False) -
     path = Path(path)
     if path.is_dir() and not folder:
         raise OSError(f"{path}: cannot be written: is a folder; give the name of a file")
-    above = next(place for place in (path, *path.absolute().parents) if place.exists() and (folder or place != path))
+
+    above = path if folder else path.absolute().parent
+    while not above.exists():
+        above = above.absolute().parent
     if not above.is_dir():
         raise OSError(f"{path}: cannot be written: {above} is not a folder")
+
     try:
         tempfile.TemporaryFile(dir=above).close()
     except OSError as error:
@@ -208,6 +234,7 @@ def require_writable(path: str | Path, option: str = "", folder: bool = False) -
 
 
 def write_json(value: Any, path: str | Path) -> None:
+    """Write a JSON file, whole or not at all."""
     text = to_json(value, indent=1)
     with replacing(path) as partial:
         partial.write_text(f"{text}\n", encoding="utf-8")
@@ -218,21 +245,29 @@ def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path
     from safetensors.torch import save
 
     content = save({name: tensor.contiguous() for name, tensor in tensors.items()}, dict(header))
-    end = 8 + int.from_bytes(content[:8], "little")  # the library writes the header in an order that changes
-    ordered = json.dumps(json.loads(content[8:end]), sort_keys=True).encode()
-    ordered += b" " * (-len(ordered) % 8)
+
+    # The library writes the header in an order that changes from run to run.
+    end = 8 + int.from_bytes(content[:8], "little")
+    sorted_header = json.dumps(json.loads(content[8:end]), sort_keys=True).encode()
+    sorted_header += b" " * (-len(sorted_header) % 8)
     with replacing(path) as partial:
-        partial.write_bytes(len(ordered).to_bytes(8, "little") + ordered + content[end:])
+        partial.write_bytes(len(sorted_header).to_bytes(8, "little") + sorted_header + content[end:])
 
 
 def read_tensors(
     path: str | Path, advice: str, infinite: Collection[str] = ()
 ) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Header and tensors of a safetensors file, on the CPU; those named in ``infinite`` may hold infinity.
+    """Read the header and the tensors of a safetensors file, on the CPU.
 
-    ValueError if it cannot be read, or a value is not finite; ``advice`` ends the message.
+    Args:
+        path: the file.
+        advice: the end of messages: what to do.
+        infinite: names of tensors that may hold infinity.
+
+    Raises:
+        ValueError: if the file cannot be read, or a value is not finite.
     """
-    header, tensors = _opened(path, advice, tensors=True)
+    header, tensors = _read_safetensors(path, advice, with_tensors=True)
     for name, tensor in tensors.items():
         values = tensor.float() if tensor.is_floating_point() else tensor  # 8 bits have no test of their own
         if not (values.isfinite().all() or (name in infinite and not values.isnan().any())):
@@ -247,41 +282,61 @@ def read_metadata(path: str | Path) -> dict[str, str]:
 
 
 def read_header(path: str | Path) -> dict[str, str]:
-    """The header of a rawaug file, without its tensors."""
+    """Read the header of a rawaug file, without its tensors; ValueError if it is none."""
     advice = "give one written by rawaug fit, rawaug run or denoisers.save, or copy it again"
-    header, _ = _opened(path, advice, tensors=False)
+    header, _ = _read_safetensors(path, advice, with_tensors=False)
     if header.get("format") != "rawaug" or "kind" not in header:
         raise ValueError(f"{path}: not a rawaug file; give one written by rawaug fit or rawaug run")
     return header
 
 
-def _opened(path: str | Path, advice: str, tensors: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
+def _read_safetensors(path: str | Path, advice: str, with_tensors: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
+    tensors = {}
     try:
         with safe_open(str(path), framework="pt") as file:
-            names = file.keys() if tensors else ()
-            return dict(file.metadata() or {}), {name: file.get_tensor(name) for name in names}
+            header = dict(file.metadata() or {})
+            if with_tensors:
+                for name in file.keys():  # noqa: SIM118  (it is no mapping)
+                    tensors[name] = file.get_tensor(name)
+            return header, tensors
     except (SafetensorError, OSError, ValueError, TypeError, RuntimeError, KeyError, AttributeError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{path}: not a readable safetensors file ({reason}); {advice}") from error
 
 
 def find_weights(name: str | Path, *more: Path) -> Path:
-    """The file of weights ``name``: a path, or the name of an ISP that is shipped with the package."""
+    """Find the file of weights ``name``: a path, or the name of an ISP that is shipped with the package.
+
+    Args:
+        name: the path or the name.
+        more: folders in which to look besides.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+    """
     folders = (WEIGHTS, *more)
-    paths = [Path(name)] if Path(name).suffix else [folder / f"{name}.safetensors" for folder in folders]
-    if (found := next(filter(Path.is_file, paths), None)) is not None:
-        return found
-    shipped = ", ".join(sorted(p.stem for folder in folders for p in folder.glob("*.safetensors")))
+    if Path(name).suffix:
+        candidates = [Path(name)]
+    else:
+        candidates = [folder / f"{name}.safetensors" for folder in folders]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+
+    names: list[str] = []
+    for folder in folders:
+        names += [file.stem for file in folder.glob("*.safetensors")]
+    shipped = ", ".join(sorted(names))
     raise FileNotFoundError(f"{name}: not found; give a .safetensors file or a shipped name ({shipped})")
 
 
 def digest(*parts: bytes) -> str:
-    """SHA-256 of the parts, one after the other, in hexadecimal."""
+    """Compute the SHA-256 of the parts, one after the other, in hexadecimal."""
     return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
 def sha256(path: str | Path) -> str:
-    """The SHA-256 of a file in hexadecimal, computed as it is read."""
+    """Compute the SHA-256 of a file, in hexadecimal, while it is read."""
     require_file(path)
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -302,29 +357,34 @@ def require_file(path: str | Path, what: str = "file") -> None:
 
 
 def fingerprint(*settings: Any) -> str:
-    """A short hash of settings, equal if and only if they are."""
+    """Hash settings to 16 hexadecimal digits, which are equal if the settings are."""
     return digest(json.dumps(settings, sort_keys=True, default=str).encode())[:16]
 
 
 def require_same_settings(path: Path, settings: Mapping[str, object], overwrite: bool = False) -> None:
     """Write the settings of a folder's files to ``path``, or require that they equal those stored there."""
-    if path.is_file() and not overwrite:
-        try:
-            known = json.loads(path.read_text())
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{path}: not valid JSON ({error.msg}); choose another folder") from None
-        for key in known | dict(settings):
-            value, asked = known.get(key), settings.get(key)
-            if asked != value:
-                raise ValueError(f"{path}: made with {key} {value}, not {asked}; choose another folder")
+    if overwrite or not path.is_file():
+        write_json(dict(settings), path)
         return
-    write_json(dict(settings), path)
+
+    try:
+        stored = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: not valid JSON ({error.msg}); choose another folder") from None
+    for key in stored | dict(settings):
+        before, now = stored.get(key), settings.get(key)
+        if before != now:
+            raise ValueError(f"{path}: made with {key} {before}, not {now}; choose another folder")
 
 
 def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iterator[Path]:
-    """The files of a folder and its subfolders, unordered, links to folders not followed; ``extensions`` in lower case.
+    """Yield the files of a folder and its subfolders, in no order; links to folders are not followed.
 
-    What macOS and Windows leave beside one's files is no part of a dataset. No folder, no files.
+    Files that macOS and Windows leave there are left out. If there is no such folder, there are no files.
+
+    Args:
+        folder: the folder.
+        extensions: the endings that count, in lower case.
     """
 
     def refuse(error: OSError) -> None:
@@ -334,12 +394,19 @@ def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iter
     for parent, folders, files in os.walk(folder, onerror=refuse):
         folders[:] = [name for name in folders if name != "__MACOSX"]
         for file in files:
-            if file.lower().endswith(extensions) and not file.startswith("._") and file not in OF_NO_DATASET:
+            if file.startswith("._") or file in OF_NO_DATASET:
+                continue
+            if file.lower().endswith(extensions):
                 yield Path(parent, file)
 
 
 def files_in(path: str | Path, what: str, extensions: tuple[str, ...] = ("",)) -> list[Path]:
-    """:func:`files_below`, sorted, or ``path`` itself where it is a file; one of them at least."""
+    """List the files of a folder as :func:`files_below` does, sorted, or the file ``path`` itself.
+
+    Raises:
+        FileNotFoundError: if there is no such file or folder.
+        ValueError: if the folder has no such file.
+    """
     path = Path(path)
     if not path.is_dir():
         require_file(path, f"{what} file or folder")

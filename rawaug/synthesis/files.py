@@ -33,11 +33,16 @@ from rawaug.plugin.targets import Target
 from rawaug.version import __version__
 
 LONGEST_STEM = 200
-"""Bytes of a picture's name in those of its pairs, which have at most 255."""
+"""Largest number of bytes of a picture's name in the names of its pairs, which have at most 255."""
 
 _WHITE = 65535
+"""White level of DNGs."""
+
 _BLACK_STEP = 256
+"""Black levels of DNGs are multiples of it."""
+
 _SHADING_NODES = (25, 33)
+"""Rows and columns of a gain map."""
 
 Format = Literal["dng", "npz", "tiff", "png", "webdataset"]
 TARGETS: dict[Format, tuple[Target, ...]] = {"dng": ("raw",), "png": ("srgb",)}
@@ -91,20 +96,25 @@ class PairMaker:
             OSError, ValueError: if the picture cannot be read, or changes meanwhile.
         """
         srgb = trim_to_even(read_picture(picture, self.max_pixels)).contiguous()
-        content = sha256(picture)
+        settings = self.settings
+        origin = Origin(str(picture), sha256(picture), settings.isp_sha256, settings.config.to_json())
 
-        def made() -> Iterator[tuple[int, RawPair]]:
+        def make_pairs() -> Iterator[tuple[int, RawPair]]:
             for number in numbers:
-                params = self.augment.sample(srgb, pair_generator(self.settings.seed, key, number))
+                params = self.augment.sample(srgb, pair_generator(settings.seed, key, number))
                 yield number, self.augment.apply(srgb, params)
 
-        return Origin(str(picture), content, self.settings.isp_sha256, self.settings.config.to_json()), made()
+        return origin, make_pairs()
 
 
 def pair_levels(pair: RawPair) -> dict[str, float]:
-    """``shot_var`` and ``read_var`` of a pair, where its noise has these."""
+    """Get ``shot_var`` and ``read_var`` of a pair, if its noise has them."""
     noise = pair.params.noise
-    return {key: noise[key].item() for key in ("shot_var", "read_var") if key in noise}
+    levels = {}
+    for key in ("shot_var", "read_var"):
+        if key in noise:
+            levels[key] = noise[key].item()
+    return levels
 
 
 def replay_pair(
@@ -122,13 +132,16 @@ def replay_pair(
     Raises:
         ValueError: if the picture or the ISP has changed.
     """
-    config, found = AugmentConfig.from_json(origin.settings), Path(picture or origin.picture)
+    config = AugmentConfig.from_json(origin.settings)
     config = replace(config, isp=str(isp or config.isp))
     if sha256(find_weights(config.isp)) != origin.isp_sha256:
         raise ValueError(f"{label}: the ISP {config.isp} is not the one this pair was made with")
-    srgb = trim_to_even(read_picture(found))
-    if sha256(found) != origin.picture_sha256:
-        raise ValueError(f"{label}: the picture {found} has changed since this pair was made")
+
+    path = Path(picture or origin.picture)
+    srgb = trim_to_even(read_picture(path))
+    if sha256(path) != origin.picture_sha256:
+        raise ValueError(f"{label}: the picture {path} has changed since this pair was made")
+
     pair: RawPair = config.make().apply(srgb, params)
     return pair
 
@@ -144,10 +157,18 @@ class PictureTask:
     """
 
     def __init__(self, picture: Path, key: str, stem: Path, per_image: int) -> None:
-        self.picture, self.key, self.stem = picture, key, stem
-        self.numbers = [k for k in range(per_image) if not Path(f"{stem}_{k}.safetensors").exists()]
-        self.pictures, self.existing, self.todo = 1, per_image - len(self.numbers), bool(self.numbers)
-        self.broken: dict[str, str] = {}  # what cannot be read is tried again
+        self.picture = picture
+        self.key = key
+        self.stem = stem
+        self.numbers = []
+        for number in range(per_image):
+            if not Path(f"{stem}_{number}.safetensors").exists():
+                self.numbers.append(number)
+
+        self.pictures = 1
+        self.existing = per_image - len(self.numbers)
+        self.todo = bool(self.numbers)
+        self.broken: dict[str, str] = {}  # a picture that cannot be read is tried again
 
     def make(self, maker: PairMaker) -> tuple[int, dict[str, str]]:
         """Write the missing pairs; return their number, and the reason if the picture cannot be read."""
@@ -155,6 +176,7 @@ class PictureTask:
             origin, pairs = maker.pairs(self.picture, self.key, self.numbers)
         except (OSError, ValueError) as error:
             return 0, {self.key: str(error)}
+
         for number, pair in pairs:
             write_pair(Path(f"{self.stem}_{number}"), pair, maker.augment, maker.settings.format, origin)
         return len(self.numbers), {}
@@ -173,15 +195,16 @@ def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: 
         ValueError: if the pairs of two pictures would have the same names.
     """
     stems = Counter(picture.with_suffix("") for picture in pictures)
-    taken: dict[Path, Path] = {}
+    picture_of: dict[Path, Path] = {}
     for picture in pictures:
-        bare = picture.with_suffix("")
-        own = bare if stems[bare] == 1 else bare.with_name(picture.name.replace(".", "_"))
-        if taken.setdefault(own, picture) != picture:
-            raise ValueError(
-                f"{picture}: its pairs would have the same names as those of {taken[own].name}; rename one"
-            )
-        stem = out / own.relative_to(source).with_name(_short(own.name))
+        stem = picture.with_suffix("")
+        if stems[stem] > 1:
+            stem = stem.with_name(picture.name.replace(".", "_"))
+        namesake = picture_of.setdefault(stem, picture)
+        if namesake != picture:
+            raise ValueError(f"{picture}: its pairs would have the same names as those of {namesake.name}; rename one")
+
+        stem = out / stem.relative_to(source).with_name(_short(stem.name))
         yield PictureTask(picture, picture.relative_to(source).as_posix(), stem, per_image)
 
 
@@ -210,8 +233,17 @@ def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, o
 
 def _images(pair: RawPair, augment: RawAugment) -> dict[str, Tensor]:
     """The images of a pair, ``(C, H, W)`` each, by the end of their files' names."""
-    noisy = {"_noisy": pair.noisy} if augment.burst is None else {f"_noisy_{k}": x for k, x in enumerate(pair.noisy)}
-    return {end: x if len(x) == 3 else augment.mosaic(x) for end, x in {"_clean": pair.clean, **noisy}.items()}
+    images = {"_clean": pair.clean}
+    if augment.burst is None:
+        images["_noisy"] = pair.noisy
+    else:
+        for number, frame in enumerate(pair.noisy):
+            images[f"_noisy_{number}"] = frame
+
+    for end, image in images.items():
+        if len(image) != 3:
+            images[end] = augment.mosaic(image)
+    return images
 
 
 def _write_dngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
@@ -226,7 +258,7 @@ def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> None:
 
 def _write_tiffs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
     for end, image in _images(pair, augment).items():
-        if augment.target == "srgb":  # which viewers take integers for
+        if augment.target == "srgb":  # viewers expect integers
             image = (image * 65535.0).round().to(torch.uint16)
         write_tiff(Path(f"{stem}{end}.tif"), image, _metadata(pair, augment))
 
@@ -256,22 +288,25 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
     Raises:
         ValueError: if ``rawaug synth`` has not written the file, or the picture or the ISP has changed.
     """
-    drawn, header = load_params(params), read_header(params)
+    header = read_header(params)
     if "origin" not in header:
         raise ValueError(f"{params}: not written by rawaug synth; use RawAugment.apply")
-    return replay_pair(drawn, Origin(**json.loads(header["origin"])), params, picture, isp)
+
+    origin = Origin(**json.loads(header["origin"]))
+    return replay_pair(load_params(params), origin, params, picture, isp)
 
 
 def _metadata(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
     """The metadata of a pair in NPZ and TIFF; colour that cannot be inverted is left out."""
     if augment.target == "srgb":
         return pair_levels(pair)
-    stated: dict[str, Any] = {"cfa": augment.cfa, **pair_levels(pair)}
+
+    metadata: dict[str, Any] = {"cfa": augment.cfa, **pair_levels(pair)}
     try:
         white_balance, matrix, _ = _color(pair, augment)
     except (ValueError, RuntimeError):
-        return stated
-    return stated | {"white_balance": list(white_balance), "color_matrix": matrix.tolist()}
+        return metadata
+    return metadata | {"white_balance": list(white_balance), "color_matrix": matrix.tolist()}
 
 
 def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[dict[str, RawFrame], float]:
@@ -295,32 +330,40 @@ def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[dict[str, RawFram
         "gain_maps": _shading_maps(augment, pair),
     }
     levels = pair_levels(pair)
-    profile = (levels["shot_var"], levels["read_var"]) if len(levels) == 2 else None
-    frames = {
-        end: RawFrame(mosaic=mosaic, noise_profile=None if end == "_clean" else profile, **metadata)
-        for end, mosaic in _images(pair, augment).items()
-    }
+    profile = None
+    if len(levels) == 2:
+        profile = levels["shot_var"], levels["read_var"]
+
+    frames = {}
+    for end, mosaic in _images(pair, augment).items():
+        if end == "_clean":
+            frames[end] = RawFrame(mosaic=mosaic, noise_profile=None, **metadata)
+        else:
+            frames[end] = RawFrame(mosaic=mosaic, noise_profile=profile, **metadata)
     return frames, stops
 
 
 def _color(pair: RawPair, augment: RawAugment) -> tuple[tuple[float, float, float], Tensor, float]:
     """White balance, the matrix from white-balanced camera colour to linear sRGB, and the stops of underexposure."""
-    # with raw = C x / gains for linear sRGB x, grey is s / gains in the camera, where s are the sums of C's rows: the
-    # white balance is gains / s, whose green is the exposure, and C with its rows over s is the matrix's inverse
-    isp = pair.params.isp
-    matrix = isp.matrix if augment.isp.find(ColorCorrection) else torch.eye(3)
+    # With raw = C x / gains for linear sRGB x, grey is s / gains in the camera, where s are the sums of C's rows: the
+    # white balance is gains / s, whose green is the exposure, and C with its rows over s is the matrix's inverse.
+    setting = pair.params.isp
+    matrix = setting.matrix if augment.isp.find(ColorCorrection) else torch.eye(3)
+    gains = setting.gains if augment.isp.find(WhiteBalance) else torch.ones(3)
     grey = matrix.sum(1)
-    balance = (isp.gains if augment.isp.find(WhiteBalance) else torch.ones(3)) / grey
+    balance = gains / grey
     if not balance.min() > 0:
         raise ValueError(f"a DNG cannot store the white balance {balance.tolist()} of this pair; it must be positive")
+
     red, green, blue = balance.tolist()
     return (red / green, 1.0, blue / green), torch.linalg.inv(matrix / grey[:, None]), math.log2(green)
 
 
 def _black(darkest: float) -> float:
     """The lowest multiple of 256 at which ``darkest`` is a digital number: d = y (white - black) + black >= 0."""
-    needed = max(0.0, -darkest) / (1 + max(0.0, -darkest)) * _WHITE
-    return float(_BLACK_STEP * max(1, math.ceil(needed / _BLACK_STEP)))
+    depth = max(0.0, -darkest)
+    black = depth / (1 + depth) * _WHITE
+    return float(_BLACK_STEP * max(1, math.ceil(black / _BLACK_STEP)))
 
 
 def _shading_maps(augment: RawAugment, pair: RawPair) -> tuple[GainMap, ...]:
@@ -328,13 +371,15 @@ def _shading_maps(augment: RawAugment, pair: RawPair) -> tuple[GainMap, ...]:
     lens = augment.isp.find(LensShading)
     if lens is None:
         return ()
+
     height, width = augment.mosaic(pair.clean).shape[-2:]
     rows, columns = _SHADING_NODES
     y = torch.linspace(0, height, rows) - height / 2
     x = torch.linspace(0, width, columns) - width / 2
     place = torch.stack(torch.meshgrid(y, x, indexing="ij"))[None] / (0.5 * (height**2 + width**2) ** 0.5)
     mask = lens.mask(place.to(frame_coordinates(1, 1)))[0]
-    corrected = GainMap(
+
+    correction = GainMap(
         area=(0, 0, height, width),
         pitch=(1, 1),
         planes=(0, 1),
@@ -342,4 +387,4 @@ def _shading_maps(augment: RawAugment, pair: RawPair) -> tuple[GainMap, ...]:
         spacing=(1 / (rows - 1), 1 / (columns - 1)),
         gains=1 / mask.detach(),
     )
-    return (corrected,)
+    return (correction,)

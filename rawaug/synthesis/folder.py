@@ -92,38 +92,47 @@ def synth(
     """
     start = time.perf_counter()
     source, out = Path(source), Path(out)
-    if source.is_dir() and out.resolve().is_relative_to(source := source.resolve()):
-        raise ValueError(f"{out}: is inside the picture folder {source}; choose an output folder outside it")
+    if source.is_dir():
+        source = source.resolve()
+        if out.resolve().is_relative_to(source):
+            raise ValueError(f"{out}: is inside the picture folder {source}; choose an output folder outside it")
     listing = list_pictures(source)
     pictures = listing.files
-    source = source.parent if source.is_file() else source
-    fixed = _settings(format, per_image, seed, AugmentConfig(**settings))
+    if source.is_file():
+        source = source.parent
+
     if workers is not None and workers < 0:
         raise ValueError(f"workers must be at least 0, got {workers}")
     part, parts = parse_shard(shard)
-    PairMaker(fixed, max_pixels)  # raises for a wrong name here, not in a worker
-    stored, tasks = fixed.to_json(), list[Task]()
-    with locked(out / (LOCK if parts == 1 else f"rawaug-{part}-of-{parts}.lock")):
+    run_settings = _settings(format, per_image, seed, AugmentConfig(**settings))
+    PairMaker(run_settings, max_pixels)  # raises for a wrong name here, not in a worker
+
+    lock = LOCK if parts == 1 else f"rawaug-{part}-of-{parts}.lock"
+    stored = run_settings.to_json()
+    tasks: list[Task] = []
+    with locked(out / lock):
         if format == "webdataset":
             tasks += shards.shard_tasks(pictures, source, out, per_image, per_shard)
-            stored["isp"] = Path(fixed.config.isp).name  # its path differs between machines
+            stored["isp"] = Path(run_settings.config.isp).name  # its path differs between machines
             stored |= shards.shard_settings(pictures, source, per_image, per_shard, max_pixels)
         else:
             tasks += picture_tasks(pictures, source, out, per_image)
         require_same_settings(out / "synth.json", stored)
-        result = _run(out, tasks[part - 1 :: parts], fixed, max_pixels, workers)
+
+        result = _run(out, tasks[part - 1 :: parts], run_settings, max_pixels, workers)
         if format == "webdataset":
-            shards.write_index(out, len(tasks), fixed)
+            shards.write_index(out, len(tasks), run_settings)
+
     result.left_out = listing.lines()
     result.seconds = time.perf_counter() - start
     if result.pictures and len(result.broken) == result.pictures:
-        count, reason = result.pictures, min(result.broken.values())
-        raise ValueError(f"{source}: none of its {count} pictures can be read; {reason}")
+        reason = min(result.broken.values())
+        raise ValueError(f"{source}: none of its {result.pictures} pictures can be read; {reason}")
     return result
 
 
 def parse_shard(shard: str) -> tuple[int, int]:
-    """K and N of ``"K/N"``; ValueError unless K is from 1 to N."""
+    """Split ``"K/N"`` into K and N; ValueError unless K is from 1 to N."""
     first, _, second = shard.partition("/")
     if not (first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second)):
         raise ValueError(f"shard must be K/N with K from 1 to N, as 3/32, got {shard!r}")
@@ -131,26 +140,37 @@ def parse_shard(shard: str) -> tuple[int, int]:
 
 
 def _settings(format: Format, per_image: int, seed: int, config: AugmentConfig) -> Settings:
-    if format not in get_args(Format) or per_image < 1:
-        wanted = f"format must be one of {', '.join(get_args(Format))} and per_image at least 1"
-        raise ValueError(f"{wanted}, got {format} and {per_image}")
-    isp, target = Path(config.isp), config.target_name
+    formats = get_args(Format)
+    if format not in formats or per_image < 1:
+        rule = f"format must be one of {', '.join(formats)} and per_image at least 1"
+        raise ValueError(f"{rule}, got {format} and {per_image}")
+
+    target = config.target_name
     if target not in TARGETS.get(format, (target,)):
-        able = [name for name in get_args(Format) if target in TARGETS.get(name, (target,))]
-        raise ValueError(f"format {format} cannot hold target {target!r}; use {', '.join(able)}")
-    config = replace(config, isp=str(isp.resolve() if isp.suffix else isp))
-    return Settings(format, config, sha256(find_weights(isp)), seed)
+        others = [name for name in formats if target in TARGETS.get(name, (target,))]
+        raise ValueError(f"format {format} cannot hold target {target!r}; use {', '.join(others)}")
+
+    isp = Path(config.isp)
+    if isp.suffix:
+        isp = isp.resolve()
+    return Settings(format, replace(config, isp=str(isp)), sha256(find_weights(isp)), seed)
 
 
 def _run(out: Path, tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Synthesis:
-    result = Synthesis(out, sum(task.pictures for task in tasks), existing=sum(task.existing for task in tasks))
+    result = Synthesis(out)
+    todo: list[Task] = []
     for task in tasks:
+        result.pictures += task.pictures
+        result.existing += task.existing
         result.broken |= task.broken
-    todo = [task for task in tasks if task.todo]
+        if task.todo:
+            todo.append(task)
+
     outcomes = _run_tasks(todo, settings, max_pixels, workers)
-    for made, broken in progress(outcomes, label="synth", unit="file", total=len(todo), leave=True):
-        result.made += made
+    for count, broken in progress(outcomes, label="synth", unit="file", total=len(todo), leave=True):
+        result.made += count
         result.broken |= broken
+
     result.broken = dict(sorted(result.broken.items()))
     return result
 
@@ -161,12 +181,18 @@ _maker: PairMaker
 
 
 def _run_tasks(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[Outcome]:
-    workers = min(len(tasks), os.cpu_count() or 1 if workers is None else workers)
+    if workers is None:
+        workers = os.cpu_count() or 1
+    workers = min(len(tasks), workers)
     if workers < 1:
         _prepare(settings, max_pixels)
-        yield from map(_make, tasks)
+        for task in tasks:
+            yield _make(task)
         return
-    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+
+    method = "spawn"
+    if "forkserver" in multiprocessing.get_all_start_methods():
+        method = "forkserver"
     context = multiprocessing.get_context(method)
     pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(settings, max_pixels))
     try:
@@ -182,7 +208,7 @@ def _run_tasks(tasks: Sequence[Task], settings: Settings, max_pixels: int, worke
 
 
 def _start_worker(settings: Settings, max_pixels: int) -> None:
-    """Single-threaded; ignores Ctrl-C, which the parent handles; exits when the parent dies."""
+    """Prepare a worker: it has one thread, leaves Ctrl-C to the parent, and exits when the parent dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:

@@ -16,7 +16,7 @@ import json
 import os
 import tarfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from rawaug.plugin.targets import Burst
 from rawaug.synthesis.files import Origin, PairMaker, Settings, pair_levels, replay_pair
 
 PER_SHARD = 500
-"""Pictures in a shard: of half a megapixel each, two gigabytes."""
+"""Default number of pictures in a shard, which has two gigabytes if they have half a megapixel each."""
 
 _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 
@@ -48,14 +48,22 @@ class ShardTask:
     """
 
     def __init__(self, path: Path, first: int, source: Path, names: Sequence[str], per_image: int) -> None:
-        self.path, self.first, self.source, self.names, self.per_image = path, first, source, names, per_image
-        known = _read_record(path)
-        self.pictures, self.existing = len(names), int(known.get("nsamples", 0))
-        self.broken, self.todo = dict(known.get("broken", {})), not known
+        self.path = path
+        self.first = first
+        self.source = source
+        self.names = names
+        self.per_image = per_image
+
+        record = _read_record(path)
+        self.pictures = len(names)
+        self.existing = int(record.get("nsamples", 0))
+        self.broken: dict[str, str] = dict(record.get("broken", {}))
+        self.todo = not record
 
     def make(self, maker: PairMaker) -> tuple[int, dict[str, str]]:
         """Write the shard; return the number of its pairs, and the reason for each picture that cannot be read."""
-        made, broken = 0, dict[str, str]()
+        count = 0
+        broken: dict[str, str] = {}
         with replacing(self.path) as partial, tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as tar:
             for index, name in enumerate(self.names, self.first):
                 picture = self.source / name
@@ -66,11 +74,12 @@ class ShardTask:
                     continue
                 for number, pair in pairs:
                     _add_sample(tar, f"{index:08d}_{number}", pair, _describe(pair, maker, origin, name, number))
-                    made += 1
+                    count += 1
+
         size = self.path.stat().st_size
-        record = {"url": self.path.name, "nsamples": made, "filesize": size, "broken": broken}
+        record = {"url": self.path.name, "nsamples": count, "filesize": size, "broken": broken}
         write_json(record, _record_path(self.path))
-        return made, broken
+        return count, broken
 
 
 def _shard_path(out: Path, number: int) -> Path:
@@ -84,7 +93,9 @@ def _record_path(shard: Path) -> Path:
 def _read_record(shard: Path) -> dict[str, Any]:
     """The record that marks a shard as complete, empty if there is none."""
     record = _record_path(shard)
-    return parse_object(record.read_text()) if record.is_file() else {}
+    if not record.is_file():
+        return {}
+    return parse_object(record.read_text())
 
 
 def shard_tasks(
@@ -101,11 +112,13 @@ def shard_tasks(
     """
     if per_shard < 1:
         raise ValueError(f"per_shard must be at least 1, got {per_shard}")
+
     names = _names(pictures, source)
-    return [
-        ShardTask(_shard_path(out, k), start, source, names[start : start + per_shard], per_image)
-        for k, start in enumerate(range(0, len(names), per_shard))
-    ]
+    tasks = []
+    for number, first in enumerate(range(0, len(names), per_shard)):
+        shard = _shard_path(out, number)
+        tasks.append(ShardTask(shard, first, source, names[first : first + per_shard], per_image))
+    return tasks
 
 
 def shard_settings(
@@ -135,16 +148,24 @@ def _names(pictures: Sequence[Path], source: Path) -> tuple[str, ...]:
 
 def _describe(pair: RawPair, maker: PairMaker, origin: Origin, name: str, number: int) -> dict[str, Any]:
     """The JSON of a sample; paths are relative, so that machines with other folders write the same bytes."""
-    own = asdict(origin) | {"picture": name, "number": number, "cfa": maker.augment.cfa}
-    own["settings"]["isp"] = Path(own["settings"]["isp"]).name
-    height, width = (pair.clean if len(pair.clean) == 3 else maker.augment.mosaic(pair.clean)).shape[-2:]
+    sample = asdict(origin) | {"picture": name, "number": number, "cfa": maker.augment.cfa}
+    sample["settings"]["isp"] = Path(sample["settings"]["isp"]).name
+
+    image = pair.clean
+    if len(image) != 3:
+        image = maker.augment.mosaic(image)
+    height, width = image.shape[-2:]
     params = {key: value.tolist() for key, value in pair.params.tensors().items()}
-    return own | pair_levels(pair) | {"height": height, "width": width, "params": params}
+    return sample | pair_levels(pair) | {"height": height, "width": width, "params": params}
 
 
-def _add_sample(tar: tarfile.TarFile, key: str, pair: RawPair, described: Mapping[str, Any]) -> None:
-    text = json.dumps(described, sort_keys=True).encode()
-    for ending, content in {"clean.npy": _npy(pair.clean), "json": text, "noisy.npy": _npy(pair.noisy)}.items():
+def _add_sample(tar: tarfile.TarFile, key: str, pair: RawPair, sample: Mapping[str, Any]) -> None:
+    contents = {
+        "clean.npy": _npy(pair.clean),
+        "json": json.dumps(sample, sort_keys=True).encode(),
+        "noisy.npy": _npy(pair.noisy),
+    }
+    for ending, content in contents.items():
         entry = tarfile.TarInfo(f"{key}.{ending}")  # of nobody, at the epoch
         entry.size = len(content)
         tar.addfile(entry, io.BytesIO(content))
@@ -156,21 +177,22 @@ def _npy(tensor: Tensor) -> bytes:
     return content.getvalue()
 
 
-def replay_sample(described: Mapping[str, Any], pictures: str | Path, isp: str | Path | None = None) -> RawPair:
+def replay_sample(sample: Mapping[str, Any], pictures: str | Path, isp: str | Path | None = None) -> RawPair:
     """Make the pair ``(4, h, w)`` of a sample again from its JSON, bit for bit as in its shard.
 
     Args:
-        described: the sample's JSON.
+        sample: the sample's JSON.
         pictures: the folder that the shards were made from.
         isp: the ISP's file, unless it is a shipped one.
 
     Raises:
         ValueError: if the picture or the ISP has changed.
     """
-    tensors = {key: torch.tensor(value) for key, value in described["params"].items()}
-    origin = Origin(**{key: described[key] for key in Origin.__dataclass_fields__ if key in described})
-    picture = Path(pictures) / described["picture"]
-    return replay_pair(AugmentParams.from_tensors(tensors), origin, described["picture"], picture, isp)
+    tensors = {key: torch.tensor(value) for key, value in sample["params"].items()}
+    params = AugmentParams.from_tensors(tensors)
+    origin = Origin(**{field.name: sample[field.name] for field in fields(Origin) if field.name in sample})
+    picture = Path(pictures) / sample["picture"]
+    return replay_pair(params, origin, sample["picture"], picture, isp)
 
 
 def write_index(out: Path, count: int, settings: Settings) -> None:
@@ -178,7 +200,10 @@ def write_index(out: Path, count: int, settings: Settings) -> None:
     records = [_read_record(_shard_path(out, number)) for number in range(count)]
     if not all(records):
         return
-    shards = [{key: record[key] for key in ("url", "nsamples", "filesize")} for record in records]
+
+    shards = []
+    for record in records:
+        shards.append({"url": record["url"], "nsamples": record["nsamples"], "filesize": record["filesize"]})
     index = {"__kind__": "wids-shard-index-v1", "wids_version": 1, "name": "rawaug pairs", "shardlist": shards}
     write_json(index, out / "index.json")
     with replacing(out / "README.md") as partial:
@@ -189,17 +214,35 @@ def dataset_card(shards: Sequence[Mapping[str, Any]], settings: Settings) -> str
     """Write the text of the dataset card, with the header that Hugging Face reads."""
     from jinja2 import Environment, PackageLoader
 
-    pairs, size = (sum(shard[key] for shard in shards) for key in ("nsamples", "filesize"))
-    config, burst = settings.config, settings.config.burst
-    rows = settings.to_json() | {"isp": f"{Path(config.isp).name} (SHA-256 {settings.isp_sha256})"}
+    pairs = sum(shard["nsamples"] for shard in shards)
+    size = sum(shard["filesize"] for shard in shards)
+    config = settings.config
+
+    rows = settings.to_json()
+    rows["isp"] = f"{Path(config.isp).name} (SHA-256 {rows.pop('isp_sha256')})"
+    del rows["format"]
+    other_pattern = config.cfa
+    if config.cfa in CFA.__members__:
+        other_pattern = None
+    frames = config.burst
+    if isinstance(frames, Burst):
+        frames = frames.frames
+
     templates = Environment(loader=PackageLoader(__package__, ""), trim_blocks=True, keep_trailing_newline=True)
     return templates.get_template("card.md").render(
-        category=next((name for limit, name in _SIZES if pairs < limit), "n>10M"),
+        category=_size_category(pairs),
         pairs=pairs,
         shards=len(shards),
         gigabytes=f"{size / 1e9:.3g}",
-        rows={key: rows[key] for key in rows if key not in ("format", "isp_sha256")},
+        rows=rows,
         target=config.target_name,
-        cfa=None if (config.cfa or "RGGB") in CFA.__members__ else config.cfa,
-        frames=burst.frames if isinstance(burst, Burst) else burst,
+        cfa=other_pattern,
+        frames=frames,
     )
+
+
+def _size_category(pairs: int) -> str:
+    for limit, name in _SIZES:
+        if pairs < limit:
+            return name
+    return "n>10M"
