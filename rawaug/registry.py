@@ -115,12 +115,13 @@ def require_between(key: str, value: object, least: float, most: float) -> None:
         Traceback (most recent call last):
         ValueError: width must be a whole number from 1 to 4096, got 1000000000
     """
-    types: tuple[type, ...] = (int, float)
     noun = "number"
+    is_valid = isinstance(value, (int, float)) and not isinstance(value, bool) and least <= value <= most
     if isinstance(least, int) and isinstance(most, int):
-        types, noun = (int,), "whole number"
+        noun = "whole number"
+        is_valid = is_valid and isinstance(value, int)
 
-    if isinstance(value, bool) or not isinstance(value, types) or not least <= value <= most:
+    if not is_valid:
         raise ValueError(f"{key} must be a {noun} from {least} to {most}, got {value!r:.100}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,22 +29,37 @@ class Example(NamedTuple):
 
 
 COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue"}
-_ATOMS = 60  # colour atoms drawn, at most
+"""The colours of the plots by channel."""
+
+_ATOMS = 60
+"""Maximum number of colour atoms in a plot."""
+
 _BINS = 24
-_MOST = 2**16  # values of a colour
-_FEWEST = 50  # values in a bin of the signal, for its variance to mean something
+"""Number of bins of the signal."""
+
+_MOST = 2**16
+"""Maximum number of values of a colour; of more, evenly spaced ones are used."""
+
+_FEWEST = 50
+"""Minimum number of values in a bin of the signal for estimating a variance."""
 
 
-def histograms(drawn: Example) -> np.ndarray:
+def histograms(example: Example) -> np.ndarray:
     """Plot how often RAW has each value, by colour: clean as a line, noisy as an area; uint8 ``(H, W, 3)``."""
     figure, axis = _figure()
-    clean, noisy = (_by_colour(drawn, raw) for raw in (drawn.pair.clean, drawn.pair.noisy))
+    clean = _by_colour(example, example.pair.clean)
+    noisy = _by_colour(example, example.pair.noisy)
     edges = torch.linspace(-0.05, 1.0, 106)
-    for (name, colour), a, b in zip(COLOURS.items(), clean, noisy, strict=True):
-        for values, style in ((b, {"fill": True, "alpha": 0.25, "linewidth": 0}), (a, {"linewidth": 1.2})):
-            share = torch.histc(values, len(edges) - 1, -0.05, 1.0) / values.numel()
-            axis.stairs(share.numpy(), edges.numpy(), color=colour, **style)
+
+    def shares(values: Tensor) -> np.ndarray:
+        count: np.ndarray = torch.histc(values, len(edges) - 1, -0.05, 1.0).numpy()
+        return count / values.numel()
+
+    for (name, colour), clean_values, noisy_values in zip(COLOURS.items(), clean, noisy, strict=True):
+        axis.stairs(shares(noisy_values), edges.numpy(), color=colour, fill=True, alpha=0.25, linewidth=0)
+        axis.stairs(shares(clean_values), edges.numpy(), color=colour, linewidth=1.2)
         axis.plot([], [], color=colour, label=name)
+
     axis.set(xlabel="RAW value, black 0, white 1", xlim=(-0.05, 1.0))
     axis.set(ylabel="share of values", yscale="log", ylim=(1e-6, 1))
     _plain_numbers(axis, axis.yaxis)
@@ -51,61 +67,84 @@ def histograms(drawn: Example) -> np.ndarray:
     return _pixels(figure)
 
 
-def tone_curve(drawn: Example) -> np.ndarray:
+def tone_curve(example: Example) -> np.ndarray:
     """Plot the drawn tone curve over those of the ISP."""
     figure, tone = _figure()
-    isp, setting = drawn.augment.isp, drawn.pair.params.isp
+    isp, setting = example.augment.isp, example.pair.params.isp
     code = np.arange(256)
+    title = "learned tone curve"
+
     if isp.tone is not None:
         tone.plot(code, isp.tone.curves[:, ::STEPS].T.numpy(), color="0.8", linewidth=0.8)
+        title = f"tone curve over {len(isp.tone.curves)} atoms"
     tone.plot(code, grey_curve(isp, setting).numpy(), color="tab:blue", linewidth=2)
-    title = "learned tone curve" if isp.tone is None else f"tone curve over {len(isp.tone.curves)} atoms"
     tone.set(xlabel="sRGB grey", ylabel="linear", title=title)
     return _pixels(figure)
 
 
-def colours(drawn: Example) -> np.ndarray:
+def colours(example: Example) -> np.ndarray:
     """Plot what the drawn matrix makes of colours, over what the colour atoms make of them."""
     figure, colour = _figure()
-    isp, setting = drawn.augment.isp, drawn.pair.params.isp
+    isp, setting = example.augment.isp, example.pair.params.isp
     atoms = isp.colour.atoms()
     patches = torch.cat([torch.eye(3), torch.tensor([[0.6, 0.35, 0.25], [0.25, 0.45, 0.65]])])
-    for matrices, size, alpha, edge in ((atoms[:_ATOMS], 12, 0.35, "none"), (setting.matrix[None], 110, 1.0, "black")):
-        seen = (patches @ matrices.mT).flatten(0, 1)
-        share = seen / seen.sum(dim=1, keepdim=True)
-        shown = encode_srgb(patches.repeat(len(matrices), 1)).numpy()
-        colour.scatter(share[:, 0], share[:, 1], s=size, c=shown, alpha=alpha, edgecolors=edge)
+
+    def scatter(matrices: Tensor, **style: Any) -> None:
+        """Draw what matrices ``(N, 3, 3)`` make of the patches."""
+        in_camera = (patches @ matrices.mT).flatten(0, 1)
+        share = in_camera / in_camera.sum(dim=1, keepdim=True)
+        srgb = encode_srgb(patches.repeat(len(matrices), 1)).numpy()
+        colour.scatter(share[:, 0], share[:, 1], c=srgb, **style)
+
+    scatter(atoms[:_ATOMS], s=12, alpha=0.35, edgecolors="none")
+    scatter(setting.matrix[None], s=110, alpha=1.0, edgecolors="black")
+
     colour.set(xlabel="R / (R + G + B)", ylabel="G / (R + G + B)")
-    count = f"{_ATOMS} of {len(atoms)}" if len(atoms) > _ATOMS else str(len(atoms))
+    count = str(len(atoms))
+    if len(atoms) > _ATOMS:
+        count = f"{_ATOMS} of {len(atoms)}"
     colour.set(title=f"colours in the camera over {count} atoms")
     return _pixels(figure)
 
 
-def noise(drawn: Example) -> np.ndarray:
+def noise(example: Example) -> np.ndarray:
     """Plot the variance of noisy minus clean against the clean signal, by colour, and its law, on logarithmic axes."""
-    pair = drawn.pair
-    ramp = torch.logspace(-4, 0, 100)
+    pair, augment = example.pair, example.augment
     params = {name: value[None] for name, value in pair.params.noise.items()}
-    law = drawn.augment.noise.variance(ramp.expand(1, 4, 1, -1), params).mean(dim=(0, 1, 2))
-    layout = CFA(drawn.augment.cfa) if drawn.augment.pattern is None else CFA.RGGB  # noise models take four planes
-    clean = bayer.pack(drawn.augment.mosaic(pair.clean)[None], layout)
-    expected = bayer.unpack(drawn.augment.noise.variance(clean, params)[0], layout)
-    sites = (_by_colour(drawn, raw) for raw in (pair.clean, pair.noisy, expected))
-    measured = [variance_by_signal(*values) for values in zip(*sites, strict=True)]
+    ramp = torch.logspace(-4, 0, 100)
+    law = augment.noise.variance(ramp.expand(1, 4, 1, -1), params).mean(dim=(0, 1, 2))
+
+    layout = CFA.RGGB  # of other patterns too, as noise models take four planes
+    if augment.pattern is None:
+        layout = CFA(augment.cfa)
+    mosaic = bayer.pack(augment.mosaic(pair.clean)[None], layout)
+    expected = bayer.unpack(augment.noise.variance(mosaic, params)[0], layout)
+
     figure, axis = _figure()
-    for (name, colour), (signal, variance) in zip(COLOURS.items(), measured, strict=True):
+    highest = float(law[-1])
+    sites = zip(
+        COLOURS.items(),
+        _by_colour(example, pair.clean),
+        _by_colour(example, pair.noisy),
+        _by_colour(example, expected),
+        strict=True,
+    )
+    for (name, colour), clean_values, noisy_values, expected_values in sites:
+        signal, variance = variance_by_signal(clean_values, noisy_values, expected_values)
         axis.scatter(signal, variance, s=14, color=colour, label=f"{name}, measured")
+        if len(variance):
+            highest = max(highest, float(variance.max()))
     axis.plot(ramp, law, color="black", linewidth=1.2, label="law")
+
     axis.set(xscale="log", yscale="log", xlabel="clean signal", ylabel="variance of the noise")
     _plain_numbers(axis, axis.xaxis, axis.yaxis)
-    highest = max([float(law[-1]), *(float(variance.max()) for _, variance in measured if len(variance))])
     axis.set(xlim=(1e-4, 1), ylim=(float(law[0]) / 3, 3 * highest))
     axis.legend(fontsize=8)
     return _pixels(figure)
 
 
 def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean signal and mean square of the noise in logarithmic bins of the signal.
+    """Compute the mean signal and the mean square of the noise in logarithmic bins of the signal.
 
     Args:
         clean: values ``(N,)``.
@@ -115,21 +154,31 @@ def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[
     Returns:
         Mean and variance, each ``(K,)``, of the K bins that have enough values.
     """
-    seen = (clean > 1e-4) & (clean + 3.0 * expected.sqrt() < 1.0)
-    signal, square = clean[seen], (noisy[seen] - clean[seen]).square()
-    where = ((signal.log10() + 4) * (_BINS / 4)).long().clamp(0, _BINS - 1)
-    count = torch.bincount(where, minlength=_BINS)
-    sums = [torch.bincount(where, values.double(), minlength=_BINS) for values in (signal, square)]
+    usable = (clean > 1e-4) & (clean + 3.0 * expected.sqrt() < 1.0)
+    signal = clean[usable]
+    square = (noisy[usable] - signal).square()
+
+    bins = ((signal.log10() + 4) * (_BINS / 4)).long().clamp(0, _BINS - 1)
+    count = torch.bincount(bins, minlength=_BINS)
+    signal_sum = torch.bincount(bins, signal.double(), minlength=_BINS)
+    square_sum = torch.bincount(bins, square.double(), minlength=_BINS)
+
     enough = count >= _FEWEST
-    mean, variance = (total[enough] / count[enough] for total in sums)
-    return mean, variance
+    return signal_sum[enough] / count[enough], square_sum[enough] / count[enough]
 
 
-def _by_colour(drawn: Example, raw: Tensor) -> list[Tensor]:
+def _by_colour(example: Example, raw: Tensor) -> list[Tensor]:
     """The values of the red, green and blue sites, ``(N,)`` each; of many, evenly spaced ones."""
-    mosaic = raw if len(raw) == 1 else drawn.augment.mosaic(raw)
-    values = [mosaic[0][plane > 0] for plane in bayer.pattern(drawn.augment.cfa).planes(*mosaic.shape[-2:])]
-    return [of_colour[:: max(1, -(-len(of_colour) // _MOST))] for of_colour in values]
+    mosaic = raw
+    if len(raw) != 1:
+        mosaic = example.augment.mosaic(raw)
+
+    values = []
+    for plane in bayer.pattern(example.augment.cfa).planes(*mosaic.shape[-2:]):
+        of_colour = mosaic[0][plane > 0]
+        step = max(1, math.ceil(len(of_colour) / _MOST))
+        values.append(of_colour[::step])
+    return values
 
 
 def _figure() -> tuple[Any, Any]:

@@ -29,19 +29,19 @@ from rawaug.plugin.draw import Draw
 
 
 def as_html(panels: Sequence[Panel]) -> str:
-    """A grid of pictures with their titles, as HTML."""
+    """Lay out pictures with their titles as a grid in HTML."""
     templates = Environment(loader=PackageLoader(__package__, ""), autoescape=True)
     templates.filters["data_url"] = data_url
     return templates.get_template("panels.html").render(panels=panels)
 
 
 def message(text: str) -> str:
-    """An error as HTML."""
+    """Write an error as HTML."""
     return str(Markup('<div class="message" role="alert">{}</div>').format(escape(text)))
 
 
 def data_url(image: np.ndarray) -> str:
-    """uint8 ``(H, W, 3)`` as a JPEG of full colour resolution: noise stays noise."""
+    """Encode uint8 ``(H, W, 3)`` as a JPEG of full colour resolution, which keeps noise."""
     with extra("explore"):
         from PIL import Image
 
@@ -54,7 +54,7 @@ ANY, OWN = "any", "the ISP's"
 KELVINS = (2000, 2500, 2856, 3200, 4000, 5000, 5500, 6500, 7500, 10000)
 DENOISE = "Denoise"
 FIRST_SEED = 2
-"""Its first draw for the first built-in picture is ordinary noise; that of seed 0 is nearly the strongest."""
+"""The seed on the page at first; it gives the first built-in picture ordinary noise, 0 nearly the strongest."""
 
 
 def parse_look(values: Mapping[str, Any]) -> Look:
@@ -62,24 +62,33 @@ def parse_look(values: Mapping[str, Any]) -> Look:
     picture = values["picture"]
     if not picture:
         raise ValueError("choose a picture")
+
     light = values["light"]
+    if light.endswith(" K"):
+        light = int(light.removesuffix(" K"))
+    else:
+        light = _unless_any(light)
+    draw = Draw(
+        exposure=None if values["draw_exposure"] else values["exposure"],
+        light=light,
+        tone=_unless_any(values["tone"]),
+    )
+
     config = AugmentConfig(
         isp=values["isp"],
-        camera=_given(values["camera"]),
+        camera=_unless_any(values["camera"]),
         noise=values["noise"],
         iso=values["iso"] or None,
-        draw=Draw(
-            exposure=None if values["draw_exposure"] else values["exposure"],
-            light=int(light.removesuffix(" K")) if light.endswith(" K") else _given(light),
-            tone=_given(values["tone"]),
-        ),
+        draw=draw,
         cfa=None if values["cfa"] == OWN else values["cfa"],
     )
     return Look(str(picture), views.drop_inapplicable(config), int(values["seed"] or 0))
 
 
-def _given(choice: str) -> str | None:
-    return None if choice == ANY else choice
+def _unless_any(choice: str) -> str | None:
+    if choice == ANY:
+        return None
+    return choice
 
 
 def show(tab: str, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -100,8 +109,10 @@ def show(tab: str, values: Mapping[str, Any]) -> dict[str, Any]:
             return {"message": "", tab: images, "compared": f"{before.title} | {after.title}", **_code(look)}
         return {"message": "", tab: as_html(VIEWS[tab](look)), **_code(look)}
     except (ValueError, OSError, MissingExtra) as error:
-        empty: dict[str, Any] = {tab: None, "compared": ""} if tab == DENOISE else {tab: ""}
-        return {"message": message(str(error)), **empty, "python": "", "command": ""}
+        changes: dict[str, Any] = {"message": message(str(error)), "python": "", "command": ""}
+        if tab == DENOISE:
+            return changes | {tab: None, "compared": ""}
+        return changes | {tab: ""}
 
 
 def _code(look: Look) -> dict[str, str]:
@@ -121,7 +132,10 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None, isp: str
     with extra("explore"):
         import gradio as gr
 
-    choices = [(name, str(file)) for name, file in zip(names or [p.name for p in pictures], pictures, strict=True)]
+    if names is None:
+        names = [picture.name for picture in pictures]
+    choices = list(zip(names, map(str, pictures), strict=True))
+
     private = {"analytics_enabled": False, "delete_cache": (3600, 86400)}  # uploads go when the page stops
     with gr.Blocks(title="rawaug explore", fill_width=True, **private) as page:
         gr.HTML("<h1>Your pictures as RAW</h1>")
@@ -141,36 +155,41 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None, isp: str
 
 
 def _controls(gr: Any, choices: Sequence[tuple[str, str]], isp: str) -> dict[str, Any]:
-    shipped = sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))
-    isps = shipped if isp in shipped else [isp, *shipped]
-    usual, made = AugmentConfig(isp), dict[str, Any]()
+    isps = sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))
+    if isp not in isps:
+        isps.insert(0, isp)
     cameras = sorted(set(load_cameras().names), key=str.casefold)
+    kelvins = [f"{kelvin} K" for kelvin in KELVINS]
+    noise = str(AugmentConfig(isp).noise)
+
+    controls: dict[str, Any] = {}
     whole = {"num_choices_shown": None}  # in a list that is shown in part, a retyped choice gives way to the first one
     with gr.Group():
-        made["picture"] = gr.Dropdown(choices, value=choices[0][1] if choices else None, label="Picture", **whole)
+        controls["picture"] = gr.Dropdown(choices, value=choices[0][1] if choices else None, label="Picture", **whole)
         upload = gr.UploadButton("Open your own", size="sm", elem_id="upload")
     with gr.Group():
-        made["isp"] = gr.Dropdown(isps, value=isp, label="ISP")
-        made["camera"] = gr.Dropdown([ANY, *cameras], value=ANY, label="Camera", **whole)
-        made["light"] = gr.Dropdown([ANY, *(f"{k} K" for k in KELVINS), *LAMPS], value=ANY, label="Light", **whole)
-        made["tone"] = gr.Dropdown([ANY, *views.tone_names(isp)], value=ANY, label="Tone curve", **whole)
-        made["draw_exposure"] = gr.Checkbox(True, label="Draw the exposure at random")
-        made["exposure"] = gr.Slider(-4, 1, value=0, step=0.25, label="Exposure (stops)", interactive=False)
+        controls["isp"] = gr.Dropdown(isps, value=isp, label="ISP")
+        controls["camera"] = gr.Dropdown([ANY, *cameras], value=ANY, label="Camera", **whole)
+        controls["light"] = gr.Dropdown([ANY, *kelvins, *LAMPS], value=ANY, label="Light", **whole)
+        controls["tone"] = gr.Dropdown([ANY, *views.tone_names(isp)], value=ANY, label="Tone curve", **whole)
+        controls["draw_exposure"] = gr.Checkbox(True, label="Draw the exposure at random")
+        controls["exposure"] = gr.Slider(-4, 1, value=0, step=0.25, label="Exposure (stops)", interactive=False)
     with gr.Group():
-        made["noise"] = gr.Dropdown(views.noise_choices(isp), value=usual.noise, label="Noise", **whole)
-        made["iso"] = gr.Number(0, label="ISO", info=_about_iso(str(usual.noise)), interactive=False)
-        made["cfa"] = gr.Dropdown([OWN, *PATTERNS], value=OWN, label="CFA")
-        made["seed"] = gr.Number(FIRST_SEED, label="Seed", precision=0, minimum=0)
-    for name, control in made.items():
+        controls["noise"] = gr.Dropdown(views.noise_choices(isp), value=noise, label="Noise", **whole)
+        controls["iso"] = gr.Number(0, label="ISO", info=_about_iso(noise), interactive=False)
+        controls["cfa"] = gr.Dropdown([OWN, *PATTERNS], value=OWN, label="CFA")
+        controls["seed"] = gr.Number(FIRST_SEED, label="Seed", precision=0, minimum=0)
+    for name, control in controls.items():
         control.elem_id = name
-    shown = {"show_progress": "hidden", "api_visibility": "private"}
+
+    quiet = {"show_progress": "hidden", "api_visibility": "private"}
     upload.upload(
         lambda file: gr.update(choices=[*choices, (Path(file).name, file)], value=file),
         upload,
-        made["picture"],
-        **shown,
+        controls["picture"],
+        **quiet,
     )
-    return made
+    return controls
 
 
 def _tab(gr: Any, name: str, outputs: dict[str, Any]) -> Any:
@@ -195,38 +214,48 @@ def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, An
     def select(tab: str, *values: Any) -> list[Any]:
         return [tab, *redraw(tab, *values)]
 
-    # one after the other: the late answer to a tab's opening must not replace that to a newer setting
+    # One after the other: the late answer to a tab's opening must not replace that to a newer setting.
     quiet = {"show_progress": "hidden", "api_visibility": "private", "concurrency_id": "draw"}
     inputs, results = list(controls.values()), list(outputs.values())
-    moved = [page.load, *(control.change for control in inputs)]
-    gr.on(moved, redraw, [opened, *inputs], results, trigger_mode="always_last", **quiet)
+    triggers = [page.load, *(control.change for control in inputs)]
+    gr.on(triggers, redraw, [opened, *inputs], results, trigger_mode="always_last", **quiet)
     for name, tab in tabs.items():
         tab.select(partial(select, name), inputs, [opened, *results], **quiet)
-    isp, noise, drawn = (controls[name] for name in ("isp", "noise", "draw_exposure"))
-    fitting = [controls[name] for name in ("camera", "light", "tone", "noise")]
-    isp.change(partial(_update_choices, gr), [isp, controls["tone"], noise], fitting, **quiet)
+
+    isp, noise, draw_exposure = controls["isp"], controls["noise"], controls["draw_exposure"]
+    dependent = [controls["camera"], controls["light"], controls["tone"], noise]
+    isp.change(partial(_update_choices, gr), [isp, controls["tone"], noise], dependent, **quiet)
     noise.change(
         lambda name: gr.update(interactive=views.iso_range(name) is not None, info=_about_iso(name)),
         noise,
         controls["iso"],
         **quiet,
     )
-    drawn.change(lambda on: gr.update(interactive=not on), drawn, controls["exposure"], **quiet)
+    draw_exposure.change(lambda on: gr.update(interactive=not on), draw_exposure, controls["exposure"], **quiet)
 
 
 def _update_choices(gr: Any, isp: str, tone: str, noise: str) -> list[Any]:
     """Offer cameras, lights and tones of published cameras alone, and an ISP's own noise with this ISP alone."""
-    published, tones = bool(views.load_isp(isp).config.cameras), [ANY, *views.tone_names(isp)]
+    published = bool(views.load_isp(isp).config.cameras)
+    tones = [ANY, *views.tone_names(isp)]
     noises = views.noise_choices(isp)
-    toned = gr.update(interactive=published, choices=tones, **({} if tone in tones else {"value": ANY}))
-    usual = AugmentConfig().noise
-    noised = gr.update(choices=noises, **({} if noise in noises else {"value": usual}))
-    return [gr.update(interactive=published), gr.update(interactive=published), toned, noised]
+
+    tone_changes: dict[str, Any] = {"interactive": published, "choices": tones}
+    if tone not in tones:
+        tone_changes["value"] = ANY
+    noise_changes: dict[str, Any] = {"choices": noises}
+    if noise not in noises:
+        noise_changes["value"] = AugmentConfig().noise
+
+    camera, light = gr.update(interactive=published), gr.update(interactive=published)
+    return [camera, light, gr.update(**tone_changes), gr.update(**noise_changes)]
 
 
 def _about_iso(noise: str) -> str:
-    measured = views.iso_range(noise)
-    return f"0: drawn from {measured[0]:g} to {measured[1]:g}" if measured else "this noise model has no ISO"
+    limits = views.iso_range(noise)
+    if limits is None:
+        return "this noise model has no ISO"
+    return f"0: drawn from {limits[0]:g} to {limits[1]:g}"
 
 
 def make_server(page: Any) -> Any:
@@ -244,8 +273,9 @@ def make_server(page: Any) -> Any:
 
 def open_socket(host: str, port: int) -> socket.socket:
     """Open a socket for :func:`make_server`; port 0 takes any that is free. OSError if the port cannot be used."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        return socket.create_server((host, port), family=family)
     except OSError as error:
         raise OSError(f"port {port} of {host} cannot be used ({error.strerror}); choose another --port") from None
 

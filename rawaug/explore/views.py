@@ -42,12 +42,22 @@ from rawaug.plugin.pictures import trim_to_even
 from rawaug.plugin.targets import Srgb
 
 DRAWS = 8
+"""Number of draws side by side."""
+
 HEIGHT, WIDTH = 512, 768
-"""Largest part of a picture that is shown pixel by pixel."""
-_WHOLE_CELLS = 12  # parts begin at multiples of it, where the cells of all patterns do
+"""Largest height and width of the part of a picture that is shown pixel by pixel."""
+
+_WHOLE_CELLS = 12
+"""Parts begin at multiples of it, where the cells of all patterns do."""
+
 _THUMBNAIL = 384
+"""Longer side of the pictures between the stages."""
+
 _ZOOM = (24, 36)
+"""Height and width of the part of the mosaic that is magnified."""
+
 _SCALE = 8
+"""By how much it is magnified."""
 
 
 @dataclass(frozen=True)
@@ -66,18 +76,20 @@ def make_example(look: Look) -> Example:
 
 @lru_cache(maxsize=16)
 def _make_example(look: Look, changed: int) -> Example:
-    srgb, augment = _read_even(look.picture, changed), make_augment(look.config)
-    return Example(srgb, augment, augment(srgb, pair_generator(look.seed, Path(look.picture).name, 0)))
+    srgb = _read_even(look.picture, changed)
+    augment = make_augment(look.config)
+    pair = augment(srgb, pair_generator(look.seed, Path(look.picture).name, 0))
+    return Example(srgb, augment, pair)
 
 
 @lru_cache(maxsize=2)
 def _read_even(picture: str, changed: int) -> Tensor:
-    """The picture as it is augmented; ``changed`` stands for the state of the file."""
+    """Read a picture, sides even; ``changed`` stands for the state of the file."""
     return trim_to_even(read_picture(picture))
 
 
 def make_augment(config: AugmentConfig) -> RawAugment:
-    """Make what :meth:`AugmentConfig.make` makes, but bake an ISP only once."""
+    """Make an augmentation as :meth:`AugmentConfig.make` does, but bake each ISP only once."""
     baked = _baked(AugmentConfig(config.isp, config.camera, target=config.target, burst=config.burst, cfa=config.cfa))
     return baked.with_draws(with_iso(config.noise, config.iso), config.draw)
 
@@ -87,25 +99,28 @@ _baked = lru_cache(maxsize=4)(AugmentConfig.make)
 
 @lru_cache(maxsize=4)
 def load_isp(isp: str) -> DictionaryISP:
-    """An ISP by its name or path, which is kept in memory."""
+    """Load an ISP by its name or path; it is kept in memory."""
     return DictionaryISP.from_pretrained(isp)
 
 
 def tone_names(isp: str) -> list[str]:
-    """The names of an ISP's tone curves; it has none where its tone is learned."""
+    """List the names of an ISP's tone curves; an ISP with a learned tone has none."""
     return list(load_isp(isp).info.get("tones", []))
 
 
 def noise_choices(isp: str) -> list[str]:
-    """The names of noise: presets, measured cameras, and ``camera`` where the ISP's own was measured."""
-    own = ["camera"] if "noise" in load_isp(isp).info else []
-    return [*own, *(name for name in noise_names() if name not in NOISE)]
+    """List the names of noise: presets, measured cameras, and ``camera`` if the ISP's own was measured."""
+    names = [name for name in noise_names() if name not in NOISE]
+    if "noise" in load_isp(isp).info:
+        names.insert(0, "camera")
+    return names
 
 
 def iso_range(noise: str) -> tuple[float, float] | None:
-    """Lowest and highest ISO of a camera's noise; None where the noise does not depend on one."""
+    """Get the lowest and the highest ISO of a camera's noise; None if the noise does not depend on the ISO."""
     if noise == "camera":
         return None
+
     levels = noise_levels(noise)
     if isinstance(levels, ProfileLevels):
         return round(math.exp(levels.limits[:, 0].min())), round(math.exp(levels.limits[:, 1].max()))
@@ -114,7 +129,7 @@ def iso_range(noise: str) -> tuple[float, float] | None:
 
 
 def drop_inapplicable(config: AugmentConfig) -> AugmentConfig:
-    """The settings without those that do not apply to their ISP and noise.
+    """Leave out the settings that do not apply to their ISP and noise.
 
     A fitted ISP has no light, tone and camera to choose, and noise that is not a measured camera's has no ISO.
     """
@@ -128,25 +143,35 @@ def drop_inapplicable(config: AugmentConfig) -> AugmentConfig:
 
 
 def command(look: Look, out: str = "pairs") -> str:
-    """The command that writes the pair as ``NAME_0.npz``; with ``--per-image 8`` all eight draws of the page.
+    """Give the command that writes the pair as ``NAME_0.npz``; with ``--per-image 8`` it writes all eight draws.
 
     Example:
         >>> command(Look("cat.png", AugmentConfig(draw=Draw(light=5500, exposure=-0.5)), seed=3))
         'rawaug synth cat.png pairs --format npz --exposure=-0.5 --light 5500 --seed 3'
     """
-    words = ["rawaug", "synth", look.picture, out, "--format", "npz"]
     options: dict[str, Any] = {}
     for name, value in changes(look.config).items():
+        if not is_dataclass(value):
+            options[name] = value
+            continue
         prefix = "" if isinstance(value, Draw) else f"{name}."
-        options |= {prefix + key: one for key, one in changes(value).items()} if is_dataclass(value) else {name: value}
+        for key, inner in changes(value).items():
+            options[prefix + key] = inner
+
+    words = ["rawaug", "synth", look.picture, out, "--format", "npz"]
     for name, value in options.items():
-        text = "" if value is True else _text(value)
-        words += [f"--{name}={text}"] if text.startswith("-") else [f"--{name}", text] if text else [f"--{name}"]
+        text = _text(value)
+        if value is True:
+            words.append(f"--{name}")
+        elif text.startswith("-"):
+            words.append(f"--{name}={text}")
+        else:
+            words += [f"--{name}", text]
     return shlex.join([*words, "--seed", str(look.seed)])
 
 
 def python(look: Look) -> str:
-    """The Python that makes the pair.
+    """Give the Python code that makes the pair.
 
     Example:
         >>> print(python(Look("cat.png", AugmentConfig(noise="upi", draw=Draw(light=5500)))))
@@ -157,8 +182,10 @@ def python(look: Look) -> str:
         augment = rawaug.RawAugment.from_pretrained('universal', noise='upi', draw=rawaug.Draw(light=5500))
         pair = augment(read_picture('cat.png'), pair_generator(0, 'cat.png', 0))
     """
-    given = {"isp": look.config.isp, **changes(look.config)}
-    arguments = ", ".join([repr(given.pop("isp")), *(f"{name}={_as_code(value)}" for name, value in given.items())])
+    arguments = repr(look.config.isp)
+    for name, value in changes(look.config).items():
+        if name != "isp":
+            arguments += f", {name}={_as_code(value)}"
     return (
         "import rawaug\n"
         "from rawaug.io import read_picture\n"
@@ -169,21 +196,29 @@ def python(look: Look) -> str:
 
 
 def changes(settings: Any) -> dict[str, Any]:
-    """The fields of a dataclass that differ from their defaults."""
-    return {f.name: value for f in fields(settings) if (value := getattr(settings, f.name)) != f.default}
+    """Get the fields of a dataclass that differ from their defaults."""
+    values = {}
+    for field_ in fields(settings):
+        value = getattr(settings, field_.name)
+        if value != field_.default:
+            values[field_.name] = value
+    return values
 
 
 def _as_code(value: object) -> str:
     if not is_dataclass(value):
         return repr(value)
-    return f"rawaug.{type(value).__name__}({', '.join(f'{name}={one!r}' for name, one in changes(value).items())})"
+    arguments = [f"{name}={inner!r}" for name, inner in changes(value).items()]
+    return f"rawaug.{type(value).__name__}({', '.join(arguments)})"
 
 
 def _text(value: object) -> str:
-    """A value as the command line takes it: whole numbers without a point, levels as a list."""
+    """Write a value as the command line takes it: whole numbers without a point, levels as a list."""
     if isinstance(value, tuple):
         return str(list(value))
-    return f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else str(value)
+    if isinstance(value, float) and float(f"{value:g}") == value:
+        return f"{value:g}"
+    return str(value)
 
 
 class Panel(NamedTuple):
@@ -195,21 +230,25 @@ class Panel(NamedTuple):
 
 def pair(look: Look) -> list[Panel]:
     """The noisy and the clean RAW of the picture, developed; the PSNR is that of the RAW."""
-    made = make_example(look)
-    noisy, clean = (_crop(raw) for raw in (made.pair.noisy, made.pair.clean))
+    example = make_example(look)
+    noisy, clean = _crop(example.pair.noisy), _crop(example.pair.clean)
     quality = psnr(noisy[None], clean[None]).item()
-    shown = [_develop(made, raw) for raw in (noisy, clean)]
-    return [Panel(f"noisy: {_levels(made)}; {quality:.1f} dB", shown[0]), Panel(f"clean: {_setting(made)}", shown[1])]
+    return [
+        Panel(f"noisy: {_levels(example)}; {quality:.1f} dB", _develop(example, noisy)),
+        Panel(f"clean: {_setting(example)}", _develop(example, clean)),
+    ]
 
 
 @torch.no_grad()
 def stages(look: Look) -> list[Panel]:
     """The picture between the stages of the ISP, small; linear images through the sRGB curve."""
-    made = make_example(look)
-    factor = max(1, max(made.srgb.shape[-2:]) // _THUMBNAIL)
-    small = trim_to_even(F.avg_pool2d(made.srgb[None].float(), factor)[0].round().to(torch.uint8))
-    shown = stage_pictures(made.augment, small, _as_batch(made.pair.params.isp))
-    return [Panel(title, _to_uint8(image)) for title, image in shown.items()]
+    example = make_example(look)
+    factor = max(1, max(example.srgb.shape[-2:]) // _THUMBNAIL)
+    means = F.avg_pool2d(example.srgb[None].float(), factor)[0]
+    small = trim_to_even(means.round().to(torch.uint8))
+
+    pictures = stage_pictures(example.augment, small, _as_batch(example.pair.params.isp))
+    return [Panel(title, _to_uint8(image)) for title, image in pictures.items()]
 
 
 def stage_pictures(
@@ -227,102 +266,119 @@ def stage_pictures(
         By title pictures ``(3, H, W)`` in [0, 1], linear ones through the sRGB curve.
     """
     result = augment.isp.reverse(srgb[None], setting, coordinates=place, intermediates=True)
-    names = {f"x{stage.makes}": stage.name for stage in augment.isp.ordered_stages}
-    shown = {"sRGB x": srgb / 255.0}
+    stage_of = {f"x{stage.makes}": stage.name for stage in augment.isp.ordered_stages}
+
+    pictures = {"sRGB x": srgb / 255.0}
     image = srgb[None]
     for name, image in result.intermediates.items():
-        linear = image[0].clamp(0, 1)
-        shown[f"{name}: {names[name]}"] = linear if name == "x1" else encode_srgb(linear)
+        picture = image[0].clamp(0, 1)
+        if name != "x1":
+            picture = encode_srgb(picture)
+        pictures[f"{name}: {stage_of[name]}"] = picture
+
     sensor = pattern(augment.cfa)
-    mosaic = sensor.mosaic(image)
-    return shown | {f"RAW y: {sensor.name}, demosaiced": encode_srgb(sensor.demosaic(mosaic)[0].clamp(0, 1))}
+    demosaiced = sensor.demosaic(sensor.mosaic(image))[0]
+    pictures[f"RAW y: {sensor.name}, demosaiced"] = encode_srgb(demosaiced.clamp(0, 1))
+    return pictures
 
 
 def raw(look: Look) -> list[Panel]:
     """The mosaic magnified, histograms of clean and noisy RAW, and the packed planes."""
-    made = make_example(look)
-    mosaic = made.augment.mosaic(made.pair.noisy)
-    sensor = pattern(made.augment.cfa)
+    example = make_example(look)
+    mosaic = example.augment.mosaic(example.pair.noisy)
+    sensor = pattern(example.augment.cfa)
     near = _crop(mosaic, _ZOOM)
-    values = made.pair.clean.flatten()
-    gains = 1.0 / values[:: max(1, len(values) // 2**14)].quantile(0.99).clamp_min(1e-3)
+
+    values = example.pair.clean.flatten()
+    some = values[:: max(1, len(values) // 2**14)]
+    gains = 1.0 / some.quantile(0.99).clamp_min(1e-3)
     coloured = sensor.planes(*near.shape[-2:]) * encode_srgb((near * gains).clamp(0, 1))
     sites = _to_uint8(coloured).repeat(_SCALE, axis=0).repeat(_SCALE, axis=1)
     panels = [
         Panel(f"{sensor.name}: {near.shape[-2]} x {near.shape[-1]} sites, each in its colour", sites),
-        Panel("histograms", figures.histograms(made)),
+        Panel("histograms", figures.histograms(example)),
     ]
-    if made.augment.pattern is None:
-        for name, plane in zip(("R", "Gr", "Gb", "B"), _crop(made.pair.noisy), strict=True):
-            panels.append(
-                Panel(f"packed {name}", _to_uint8(encode_srgb((plane * gains).clamp(0, 1)).expand(3, -1, -1)))
-            )
+    if example.augment.pattern is None:
+        for name, plane in zip(("R", "Gr", "Gb", "B"), _crop(example.pair.noisy), strict=True):
+            grey = encode_srgb((plane * gains).clamp(0, 1))
+            panels.append(Panel(f"packed {name}", _to_uint8(grey.expand(3, -1, -1))))
     return panels
 
 
 def camera(look: Look) -> list[Panel]:
     """The drawn tone curve and colours, over the atoms of the ISP that they are mixed from."""
-    made = make_example(look)
+    example = make_example(look)
     return [
-        Panel(_setting(made), figures.tone_curve(made)),
-        Panel("large: red, green, blue, skin and sky by the drawn matrix; small: by the atoms", figures.colours(made)),
+        Panel(_setting(example), figures.tone_curve(example)),
+        Panel(
+            "large: red, green, blue, skin and sky by the drawn matrix; small: by the atoms", figures.colours(example)
+        ),
     ]
 
 
 def noise(look: Look) -> list[Panel]:
     """Measured variance of the noise against the law that it was drawn from."""
-    made = make_example(look)
-    return [Panel(f"noise of the pair and its law: {_levels(made)}", figures.noise(made))]
+    example = make_example(look)
+    return [Panel(f"noise of the pair and its law: {_levels(example)}", figures.noise(example))]
 
 
 @torch.no_grad()
 def draws(look: Look) -> list[Panel]:
     """Eight draws of camera, light, exposure and noise for the central part, at half size."""
     first = make_example(look)
-    augment, part, panels = first.augment, _crop(first.srgb), []
+    augment, part = first.augment, _crop(first.srgb)
     top, left, *_ = _centre(first.srgb)
     place = torch.tensor([[top, left, *first.srgb.shape[-2:], 0]])
+
+    panels = []
     for number in range(DRAWS):
         params = augment.sample(part[None], pair_generator(look.seed, Path(look.picture).name, number), place)
-        made = Example(part, augment, augment.apply(part[None], params).map(lambda tensor: tensor[0]))
-        panels.append(Panel(f"draw {number}: {_setting(made)}; {_levels(made)}", _develop(first, _half(made), 2)))
+        example = Example(part, augment, augment.apply(part[None], params).map(lambda tensor: tensor[0]))
+        title = f"draw {number}: {_setting(example)}; {_levels(example)}"
+        panels.append(Panel(title, _develop(first, _half(example), 2)))
     return panels
 
 
 def denoise(look: Look) -> list[Panel]:
     """Noisy on the left, denoised by the shipped network on the right, both developed."""
-    made = make_example(look)
-    if made.augment.pattern is not None:
-        raise ValueError(f"{DEFAULT} denoises Bayer RAW, not {made.augment.cfa}; choose a Bayer CFA")
-    cfa = CFA(made.augment.cfa)
-    noisy, clean, variance = (_crop(x)[None] for x in (made.pair.noisy, made.pair.clean, made.pair.variance))
-    result = _network()(Noisy(noisy, variance, cfa=cfa)).clamp(max=1.0)
-    before, after = (psnr(x, clean).item() for x in (noisy, result))
-    shown = [_develop(made, x[0]) for x in (noisy, result)]
-    return [Panel(f"noisy, {before:.1f} dB", shown[0]), Panel(f"denoised by {DEFAULT}, {after:.1f} dB", shown[1])]
+    example = make_example(look)
+    if example.augment.pattern is not None:
+        raise ValueError(f"{DEFAULT} denoises Bayer RAW, not {example.augment.cfa}; choose a Bayer CFA")
+
+    pair = example.pair
+    noisy, clean, variance = _crop(pair.noisy)[None], _crop(pair.clean)[None], _crop(pair.variance)[None]
+    denoised = _network()(Noisy(noisy, variance, cfa=CFA(example.augment.cfa))).clamp(max=1.0)
+    before, after = psnr(noisy, clean).item(), psnr(denoised, clean).item()
+    return [
+        Panel(f"noisy, {before:.1f} dB", _develop(example, noisy[0])),
+        Panel(f"denoised by {DEFAULT}, {after:.1f} dB", _develop(example, denoised[0])),
+    ]
 
 
 def srgb(look: Look) -> list[Panel]:
     """Noisy and clean as a camera's JPEG, developed and finished by the camera that made the RAW; denoised, too."""
-    made = make_example(look)
-    noisy, clean = (_crop(image) for image in (made.pair.noisy, made.pair.clean))
+    example = make_example(look)
+    noisy, clean = _crop(example.pair.noisy), _crop(example.pair.clean)
     quality = psnr(noisy[None], clean[None]).item()
-    assert made.augment.srgb is not None
-    method = made.augment.srgb.methods[int(made.pair.params.extras["demosaicing"])]
-    title = f"noisy: {_levels(made)}, demosaicing {method}; {quality:.1f} dB"
-    denoised = _picture_network()(Noisy(noisy[None]))
-    after = f"denoised by {PICTURES}, told no level; {psnr(denoised, clean[None]).item():.1f} dB"
-    shown = {title: noisy, after: denoised[0], "clean: developed and finished alike": clean}
-    return [Panel(name, _to_uint8(image)) for name, image in shown.items()]
+    assert example.augment.srgb is not None
+    method = example.augment.srgb.methods[int(example.pair.params.extras["demosaicing"])]
+
+    denoised = _picture_network()(Noisy(noisy[None]))[0]
+    after = psnr(denoised[None], clean[None]).item()
+    return [
+        Panel(f"noisy: {_levels(example)}, demosaicing {method}; {quality:.1f} dB", _to_uint8(noisy)),
+        Panel(f"denoised by {PICTURES} without a level; {after:.1f} dB", _to_uint8(denoised)),
+        Panel("clean: developed and finished alike", _to_uint8(clean)),
+    ]
 
 
 def burst(look: Look) -> list[Panel]:
     """Noisy frames of the scene from a hand that moves, each with noise of its own."""
-    made = make_example(look)
+    example = make_example(look)
     panels = []
-    for k, (down, right, angle) in enumerate(made.pair.params.extras["motion"].tolist()):
+    for k, (down, right, angle) in enumerate(example.pair.params.extras["motion"].tolist()):
         moved = f"{down:+.1f} pixels down, {right:+.1f} to the right, turned by {math.degrees(angle):+.2f} degrees"
-        panels.append(Panel(f"frame {k}: {moved}", _develop(made, _crop(made.pair.noisy[k]))))
+        panels.append(Panel(f"frame {k}: {moved}", _develop(example, _crop(example.pair.noisy[k]))))
     return panels
 
 
@@ -336,13 +392,14 @@ VIEWS: dict[str, Callable[[Look], list[Panel]]] = {
     "sRGB": srgb,
     "Burst": burst,
 }
-"""The tabs; beside them there is the one that compares the noisy picture with the denoised one."""
+"""The tabs, but for the one that compares the noisy picture with the denoised one."""
+
 FORMS: dict[str, dict[str, Any]] = {"sRGB": {"target": Srgb(finish=True)}, "Burst": {"burst": 4}}
-"""Target and burst of the pairs that a tab shows, if not those of the others."""
+"""The target and the burst of the tabs that need their own."""
 
 
 def with_tab(tab: str, look: Look) -> Look:
-    """The look with the target and the burst that a tab shows."""
+    """Set the target and the burst that a tab shows."""
     return replace(look, config=replace(look.config, **FORMS.get(tab, {})))
 
 
@@ -356,34 +413,41 @@ def _picture_network() -> PictureDenoiser:
     return PictureDenoiser.of(PICTURES)
 
 
-def _half(made: Example) -> Tensor:
+def _half(example: Example) -> Tensor:
     """Noisy RAW in three colours at half the size, ``(3, H/2, W/2)``: one pixel for each cell of a Bayer pattern."""
-    noisy = made.pair.noisy
-    if made.augment.pattern is None:
+    noisy = example.pair.noisy
+    if example.augment.pattern is None:
         return torch.stack([noisy[0], (noisy[1] + noisy[2]) / 2, noisy[3]])
-    return F.avg_pool2d(made.augment.pattern.demosaic(noisy[None]), 2)[0]
+    return F.avg_pool2d(example.augment.pattern.demosaic(noisy[None]), 2)[0]
 
 
-def _setting(made: Example) -> str:
+def _setting(example: Example) -> str:
     """The white balance of the draw, and the mean of its RAW, in words."""
-    red, green, blue = (made.pair.params.isp.gains / made.pair.params.isp.gains[1]).tolist()
-    return f"white balance {red:.2f}, {green:.0f}, {blue:.2f}; mean {made.pair.clean.mean().item():.3f}"
+    gains = example.pair.params.isp.gains
+    red, green, blue = (gains / gains[1]).tolist()
+    return f"white balance {red:.2f}, {green:.0f}, {blue:.2f}; mean {example.pair.clean.mean().item():.3f}"
 
 
-def _levels(made: Example) -> str:
-    levels = made.pair.params.noise
+def _levels(example: Example) -> str:
+    levels = example.pair.params.noise
     if not {"shot_var", "read_var"} <= levels.keys():
         return "noise without levels"
     return f"shot_var {levels['shot_var'].item():.2e}, read_var {levels['read_var'].item():.2e}"
 
 
 @torch.no_grad()
-def _develop(made: Example, part: Tensor, scale: int = 1) -> np.ndarray:
+def _develop(example: Example, part: Tensor, scale: int = 1) -> np.ndarray:
     """Develop the central part of RAW, or of linear RGB at 1 / ``scale`` of the size, by the setting of a draw."""
-    rgb = part if scale > 1 else pattern(made.augment.cfa).demosaic(made.augment.mosaic(part)[None])[0]
-    top, left, height, width = (place // scale for place in (*_centre(made.srgb)[:2], *made.srgb.shape[-2:]))
-    place = frame_coordinates(rgb.shape[-2], rgb.shape[-1], (top, left), (height, width))
-    return _to_uint8(made.augment.isp.forward_pixels(rgb[None], _as_batch(made.pair.params.isp), place)[0])
+    augment = example.augment
+    rgb = part
+    if scale == 1:
+        rgb = pattern(augment.cfa).demosaic(augment.mosaic(part)[None])[0]
+
+    top, left, *_ = _centre(example.srgb)
+    height, width = example.srgb.shape[-2:]
+    corner, frame = (top // scale, left // scale), (height // scale, width // scale)
+    place = frame_coordinates(rgb.shape[-2], rgb.shape[-1], corner, frame)
+    return _to_uint8(augment.isp.forward_pixels(rgb[None], _as_batch(example.pair.params.isp), place)[0])
 
 
 def _as_batch(setting: ISPParams) -> ISPParams:
@@ -392,21 +456,33 @@ def _as_batch(setting: ISPParams) -> ISPParams:
 
 def _centre(image: Tensor, size: tuple[int, int] = (HEIGHT, WIDTH)) -> tuple[int, int, int, int]:
     """Top, left, height and width of the central part of at most this size, in pixels of the mosaic."""
-    scale = 2 if image.shape[-3] == PACKED else 1
-    sides = [scale * side for side in image.shape[-2:]]
-    height, width = (min(side, most) for side, most in zip(sides, size, strict=True))
+    scale = _sites_per_value(image)
+    full_height, full_width = scale * image.shape[-2], scale * image.shape[-1]
+    height, width = min(full_height, size[0]), min(full_width, size[1])
+
     step = 2 * _WHOLE_CELLS
-    top, left = ((side - part) // step * _WHOLE_CELLS for side, part in zip(sides, (height, width), strict=True))
+    top = (full_height - height) // step * _WHOLE_CELLS
+    left = (full_width - width) // step * _WHOLE_CELLS
     return top, left, height, width
 
 
 def _crop(image: Tensor, size: tuple[int, int] = (HEIGHT, WIDTH)) -> Tensor:
-    scale = 2 if image.shape[-3] == PACKED else 1
-    top, left, height, width = (place // scale for place in _centre(image, size))
-    return image[..., top : top + height, left : left + width]
+    """Take the central part of an image."""
+    scale = _sites_per_value(image)
+    top, left, height, width = _centre(image, size)
+    rows = slice(top // scale, (top + height) // scale)
+    columns = slice(left // scale, (left + width) // scale)
+    return image[..., rows, columns]
+
+
+def _sites_per_value(image: Tensor) -> int:
+    """How many sites of the mosaic a value stands for along each side: 2 in packed RAW."""
+    if image.shape[-3] == PACKED:
+        return 2
+    return 1
 
 
 def _to_uint8(image: Tensor) -> np.ndarray:
-    """Floats ``(3, H, W)`` in [0, 1] to uint8 ``(H, W, 3)``."""
-    shown: np.ndarray = (image.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
-    return np.ascontiguousarray(shown)
+    """Convert floats ``(3, H, W)`` in [0, 1] to uint8 ``(H, W, 3)``."""
+    codes = (image.clamp(0, 1) * 255).round().to(torch.uint8)
+    return np.ascontiguousarray(codes.permute(1, 2, 0).numpy())

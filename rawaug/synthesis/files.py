@@ -110,7 +110,7 @@ class PairMaker:
 def pair_levels(pair: RawPair) -> dict[str, float]:
     """Get ``shot_var`` and ``read_var`` of a pair, if its noise has them."""
     noise = pair.params.noise
-    levels = {}
+    levels: dict[str, float] = {}
     for key in ("shot_var", "read_var"):
         if key in noise:
             levels[key] = noise[key].item()
