@@ -1,4 +1,4 @@
-"""What the subcommands of ``rawaug`` do, one file a command."""
+"""The subcommands of ``rawaug``, one file a command."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ OPTIONS = Parameter(name="*")
 
 
 def value_of(text: str) -> Any:
-    """What a word of the command line means: YAML, but ``demo:`` is a name and no mapping."""
+    """Parse a word of the command line as YAML, in which ``demo:`` is a name and no mapping."""
     value = yaml_value(text)
-    return text if isinstance(value, dict) and not text.lstrip().startswith("{") else value
+    if isinstance(value, dict) and not text.lstrip().startswith("{"):
+        return text
+    return value
 
 
 YAML = Parameter(converter=lambda _, tokens: value_of(tokens[0].value), n_tokens=1, json_list=False, metavar="VALUE")

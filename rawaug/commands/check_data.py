@@ -15,7 +15,7 @@ def run(path: str, /, *, first: int | None = None, settings: Annotated[PairSetti
     Args:
         path: a folder, a RAW file, or kind:PATH, such as pairs:PATH or real:test.
         first: read at most this many items of each kind.
-        settings: of pairs:PATH.
+        settings: CFA, levels and file names of pairs:PATH.
     """
     report = check(path, first, **vars(settings or PairSettings()))
     print(report)
@@ -25,4 +25,4 @@ def run(path: str, /, *, first: int | None = None, settings: Annotated[PairSetti
     if report.unfit:
         counts.append(f"{len(report.unfit)} not usable")
     if counts:
-        raise ValueError(f"{path}: {', '.join(counts)}, listed above")
+        raise ValueError(f"{path}: {', '.join(counts)}; they are listed above")

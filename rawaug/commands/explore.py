@@ -22,17 +22,19 @@ def run(pictures: str | None = None, /, *, isp: str = "universal", host: str = "
     """
     with extra("explore"):  # one line that names all that the page needs, before the pictures ask for theirs
         import gradio  # noqa: F401
+
     page = build(*choices(pictures), isp=isp)
-    with open_socket(host, port) as open_, suppress(KeyboardInterrupt):
-        print(f"{socket_url(open_)} (Ctrl-C stops it)", flush=True)
-        make_server(page).run(sockets=[open_])
+    with open_socket(host, port) as listener, suppress(KeyboardInterrupt):
+        print(f"{socket_url(listener)} (press Ctrl-C to stop)", flush=True)
+        make_server(page).run(sockets=[listener])
 
 
 def choices(pictures: str | None) -> tuple[list[Path], list[str]]:
-    """The files that can be chosen, and their names on the page."""
+    """List the pictures to choose from, and their names on the page."""
     if pictures is None:
         files = demo_files()
         return files, [f"{file.stem} (built in)" for file in files]
+
     files = list_pictures(pictures).files
-    above = pictures if Path(pictures).is_dir() else files[0].parent
-    return files, [file.relative_to(above).as_posix() for file in files]
+    folder = Path(pictures) if Path(pictures).is_dir() else Path(pictures).parent
+    return files, [file.relative_to(folder).as_posix() for file in files]

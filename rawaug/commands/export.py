@@ -29,23 +29,39 @@ from rawaug.noise import noise_model
 from rawaug.progress import progress
 
 OPSET = 18
-"""The version of ONNX's operators that a graph is written in."""
+"""The version of ONNX's operators that graphs are written in."""
+
 TOLERANCE = 1e-4
 """Largest difference between ONNX Runtime and PyTorch, white at 1."""
+
 NODES = 33
-"""Of a .cube along each axis."""
+"""Number of nodes of a .cube along each axis."""
 
 
 def write_onnx(
-    model: nn.Module, inputs: dict[str, Tensor], output: str, path: Path, stated: Mapping[str, str] | None = None
+    model: nn.Module, inputs: dict[str, Tensor], output: str, path: Path, metadata: Mapping[str, str] | None = None
 ) -> Any:
-    """Write ``model(*inputs)`` as ONNX of float32, with metadata; the ONNX Runtime session of it.
+    """Write ``model(*inputs)`` as ONNX of float32, and open it in ONNX Runtime.
 
     Batch, height and width of four-dimensional inputs are free.
+
+    Args:
+        model: the network.
+        inputs: examples of its inputs, by name.
+        output: the name of its output.
+        path: the file.
+        metadata: texts to store in the file.
+
+    Returns:
+        The session of ONNX Runtime.
     """
     with extra("export"):
         import onnx
-    free = {name: {0: "batch", 2: "h", 3: "w"} for name, value in inputs.items() if value.ndim == 4}
+
+    free_axes = {output: {0: "batch", 2: f"{output}_h", 3: f"{output}_w"}}
+    for name, value in inputs.items():
+        if value.ndim == 4:
+            free_axes[name] = {0: "batch", 2: "h", 3: "w"}
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # the exporter's own: checks of shapes are no part of the graph
         torch.onnx.export(
@@ -54,19 +70,24 @@ def write_onnx(
             str(path),
             input_names=list(inputs),
             output_names=[output],
-            dynamic_axes=free | {output: {0: "batch", 2: f"{output}_h", 3: f"{output}_w"}},
+            dynamic_axes=free_axes,
             opset_version=OPSET,
             dynamo=False,  # whose graph of a pyramid takes minutes
         )
-    if stated:
-        made = onnx.load(str(path))
-        onnx.helper.set_model_props(made, dict(stated))
-        onnx.save(made, str(path))
+
+    if metadata:
+        graph = onnx.load(str(path))
+        onnx.helper.set_model_props(graph, dict(metadata))
+        onnx.save(graph, str(path))
     return session_of(path)
 
 
 def difference_from(expected: Tensor, session: Any, inputs: Mapping[str, Tensor], path: Path) -> float:
-    """The largest difference between ONNX Runtime and PyTorch; ValueError if it is above :data:`TOLERANCE`."""
+    """Compute the largest difference between ONNX Runtime and PyTorch.
+
+    Raises:
+        ValueError: if it is above :data:`TOLERANCE`.
+    """
     (result,) = session.run(None, feeds(list(inputs), list(inputs.values())))
     difference = (torch.from_numpy(result) - expected).abs().max().item()
     if not difference <= TOLERANCE:
@@ -87,6 +108,7 @@ def export_cube(isp: DictionaryISP, out: str | Path, white_balance: Sequence[flo
         raise ValueError(
             f"{path}: an ISP is exported to a .cube; rawaug info WEIGHTS --json prints its atoms and curve"
         )
+
     setting = isp.typical_setting(white_balance)
     gains = " ".join(f"{gain:.4f}" for gain in setting.gains[0].tolist())
     lines = [
@@ -95,8 +117,9 @@ def export_cube(isp: DictionaryISP, out: str | Path, white_balance: Sequence[flo
         f"LUT_3D_SIZE {NODES}",
         "DOMAIN_MIN 0.0 0.0 0.0",
         "DOMAIN_MAX 1.0 1.0 1.0",
-        *(" ".join(f"{value:.7f}" for value in row) for row in isp.reverse_table(setting, NODES).tolist()),
     ]
+    for red, green, blue in isp.reverse_table(setting, NODES).tolist():
+        lines.append(f"{red:.7f} {green:.7f} {blue:.7f}")
     with replacing(path) as partial:
         partial.write_text("\n".join(lines) + "\n")
 
@@ -120,33 +143,50 @@ def run(
         print(f"{out}: {Path(out).stat().st_size / 1e6:.1f} MB")
         return
     if white_balance is not None:
-        raise ValueError(f"--white-balance: is for ISPs, and {weights} is a denoiser")
+        raise ValueError(f"--white-balance does not apply to {weights}, which is a denoiser; leave it out")
     print(export(weights, out))
 
 
 def export(denoiser: str | Path, out: str | Path) -> str:
-    """Write a denoiser as ONNX; the text tells the size of its file and its difference from PyTorch."""
+    """Write a denoiser as ONNX.
+
+    Args:
+        denoiser: a file of weights, or the name of a shipped denoiser.
+        out: the .onnx file.
+
+    Returns:
+        One line with the size of the file and its difference from PyTorch.
+
+    Raises:
+        ValueError: if ``out`` has another ending, or ONNX Runtime differs from PyTorch by more than the tolerance.
+    """
     out = Path(out)
     if out.suffix != ".onnx":
         raise ValueError(f"{out}: give a name that ends in .onnx")
+
     model, info = denoisers.load(find_denoiser(denoiser))
-    names = ["noisy", "variance"][: 1 + model.reads_variance]
-    inputs = dict(zip(names, _comparison_frame(), strict=False))
+    noisy, variance = _comparison_frame()
     example = torch.rand(2, model.channels, 70, 90)
-    examples = dict(zip(names, (example, 1e-3 * example + 1e-5), strict=False))
-    stated = {"stride": str(model.stride), "upscale": str(model.upscale), "info": json.dumps(info)}
+    inputs, examples = {"noisy": noisy}, {"noisy": example}
+    if model.reads_variance:
+        inputs["variance"] = variance
+        examples["variance"] = 1e-3 * example + 1e-5
+
+    metadata = {"stride": str(model.stride), "upscale": str(model.upscale), "info": json.dumps(info)}
     steps = progress((), label=f"export {out.name}", unit="step", total=2)
     with steps, replacing(out) as partial, torch.inference_mode():
-        session = write_onnx(model, examples, "denoised", partial, stated)
+        session = write_onnx(model, examples, "denoised", partial, metadata)
         steps.update()
         difference = difference_from(model(*inputs.values()), session, inputs, out)
         steps.update()
-    size = f"{out.stat().st_size / 1e6:.1f} MB, of any batch, height and width"
+
+    megabytes = out.stat().st_size / 1e6
+    size = f"{megabytes:.1f} MB, for any batch, height and width"
     return f"{out}: {size}; largest difference from PyTorch {difference:.1e}"
 
 
 def _comparison_frame() -> tuple[Tensor, Tensor]:
-    """Noisy packed RAW ``(1, 4, h, w)`` of a generated scene, and its variance."""
+    """Make noisy packed RAW ``(1, 4, h, w)`` of a generated scene, and its variance."""
     trial = trial_of(demo_pairs("test", count=1)[0], noise_model("cycleisp_sidd"))
     assert trial.variance is not None
     return trial.noisy, trial.variance

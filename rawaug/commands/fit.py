@@ -13,7 +13,7 @@ from rawaug.data.pair_folder import MosaicSettings
 from rawaug.errors import escape
 from rawaug.files import locked, require_writable
 from rawaug.isp.fit import FitConfig
-from rawaug.noise import camera_law
+from rawaug.noise import MeasuredLevels, camera_law
 
 
 def run(
@@ -46,6 +46,7 @@ def run(
     if Path(out).suffix != ".safetensors":
         raise ValueError(f"--out {out}: the file must end in .safetensors")
     require_writable(out)
+
     figure = Path(out).with_name(f"{Path(out).stem}-noise.png")
     figure.parent.mkdir(parents=True, exist_ok=True)
     with locked(Path(f"{out}.lock")):
@@ -63,16 +64,24 @@ def run(
         )
         isp.info["data"] = data
         isp.save(out)
+
     for line in isp.info.get("unreadable", []):
         print(escape(line))
-    print(f"fitted {len(isp.info['frames'])} frames in {isp.info['seconds']} s: {out}")
-    for score in isp.info.get("held_out", [])[-1:]:
-        print(f"held out: {score['blind']:.2f} dB blind, {score['as_shot']:.2f} dB with the as-shot white balance")
+    print(f"{out}: fitted to {len(isp.info['frames'])} frames in {isp.info['seconds']} s")
+    scores = isp.info.get("held_out", [])
+    if scores:
+        blind, as_shot = scores[-1]["blind"], scores[-1]["as_shot"]
+        print(f"PSNR of the held-out frames: {blind:.2f} dB blind, {as_shot:.2f} dB with the as-shot white balance")
     if "noise_not_measured" in isp.info:
-        print(f"noise not measured: {isp.info['noise_not_measured']}")
+        print(f"The noise was not measured: {isp.info['noise_not_measured']}")
     if "noise" in isp.info:
-        law = camera_law(isp.info["noise"])
-        for level in law.levels:
-            at = "" if level.iso is None else f" at ISO {level.iso:g}"
-            print(f"noise{at}: shot_var {level.shot_var:.3g}, read_var {level.read_var:.3g}, R^2 {level.r2:.3f}")
-        print(f"points and lines: {', '.join(map(str, noise_figures(figure, law)))}")
+        _print_noise(camera_law(isp.info["noise"]), figure)
+
+
+def _print_noise(law: MeasuredLevels, figure: Path) -> None:
+    for level in law.levels:
+        condition = "" if level.iso is None else f" at ISO {level.iso:g}"
+        print(f"Noise{condition}: shot_var {level.shot_var:.3g}, read_var {level.read_var:.3g}, R^2 {level.r2:.3f}")
+
+    figures = ", ".join(map(str, noise_figures(figure, law)))
+    print(f"Measured points and fitted lines: {figures}")

@@ -18,7 +18,7 @@ from rawaug.noise.cameras import SPREAD, load_profiles, measured_ranges, profile
 from rawaug.version import __version__
 
 _WITH_LEVELS = 3
-"""So few cameras are listed with their levels."""
+"""Maximum number of cameras that are listed with the levels of their noise."""
 
 
 def run(weights: str, /, *part: str, json: bool = False) -> None:
@@ -32,99 +32,137 @@ def run(weights: str, /, *part: str, json: bool = False) -> None:
             matrices.
     """
     if weights == "cameras":
-        found = cameras(" ".join(part))
-        print(dumps({"cameras": found}) if json else _listed(found))
-        return
-    if part:
-        raise ValueError(f"{' '.join(part)}: too many arguments; a part of a name goes with the word cameras")
-    print(dumps(as_json(weights)) if json else describe(weights))
+        rows = cameras(" ".join(part))
+        text = dumps({"cameras": rows}) if json else _table(rows)
+    elif part:
+        raise ValueError(f"{' '.join(part)}: too many arguments; use rawaug info cameras to look for a camera")
+    else:
+        text = dumps(as_json(weights)) if json else describe(weights)
+    print(text)
 
 
 def cameras(part: str = "") -> list[dict[str, Any]]:
-    """The cameras with ``part`` in their names: ``name``, ``xyz_to_camera`` (3 x 3) and ``iso`` of the noise, or None.
+    """List the cameras that have ``part`` in their names, in alphabetical order.
 
-    One with a noise profile has ``noise``, the least and the greatest levels that are likely by ISO.
+    Returns:
+        For each camera ``name``, ``xyz_to_camera`` (3 x 3, or None) and ``iso``, the range of its measured noise (or
+        None). If a part is given, cameras with a noise profile have ``noise``: by ISO the limits of likely levels.
 
     Raises:
         ValueError: if there is none.
     """
-    listed, profiles = load_cameras(), load_profiles()
-    found: dict[str, dict[str, Any]] = {}
-    for name, matrix in zip(listed.names, listed.xyz_to_camera.tolist(), strict=True):
-        found.setdefault(camera_key(name), {"name": name, "xyz_to_camera": matrix, "iso": None})
-    limits = dict(zip(profiles.names, profiles.limits().exp().round().tolist(), strict=True))
-    for name, iso in {**limits, **measured_ranges()}.items():
-        found.setdefault(camera_key(name), {"name": name, "xyz_to_camera": None, "iso": None})["iso"] = iso
-    named = {camera["name"]: camera for camera in found.values()}
-    wanted = sorted(similar_cameras(part, named), key=str.casefold)
-    if not wanted:
+    published, profiles = load_cameras(), load_profiles()
+    by_key: dict[str, dict[str, Any]] = {}
+    for name, matrix in zip(published.names, published.xyz_to_camera.tolist(), strict=True):
+        by_key.setdefault(camera_key(name), {"name": name, "xyz_to_camera": matrix, "iso": None})
+
+    ranges = dict(zip(profiles.names, profiles.limits().exp().round().tolist(), strict=True))
+    for name, iso in {**ranges, **measured_ranges()}.items():
+        camera = by_key.setdefault(camera_key(name), {"name": name, "xyz_to_camera": None, "iso": None})
+        camera["iso"] = iso
+
+    by_name = {camera["name"]: camera for camera in by_key.values()}
+    names = sorted(similar_cameras(part, by_name), key=str.casefold)
+    if not names:
         raise ValueError(f"no camera has {part!r} in its name; rawaug info cameras lists all")
-    few = {name for name in wanted if part and name in limits}
-    return [named[name] | ({"noise": profile_ends(name)} if name in few else {}) for name in wanted]
+
+    rows = []
+    for name in names:
+        if part and name in ranges:
+            by_name[name]["noise"] = profile_ends(name)
+        rows.append(by_name[name])
+    return rows
 
 
-def _listed(found: Sequence[Mapping[str, Any]]) -> str:
-    width = max(len(camera["name"]) for camera in found)
-    shot, read = ("{:.2f} to {:.2f}".format(*ends) for ends in SPREAD)
-    known = f"a profile's shot_var within {shot}, read_var {read}"
-    lines = [f"{'camera':<{width}}  matrix  noise measured at ISO ({known})"]
-    for camera in found:
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Write the cameras as a table, a few of them with the levels of their noise."""
+    width = max(len(camera["name"]) for camera in rows)
+    shot_spread, read_spread = "{:.2f} to {:.2f}".format(*SPREAD[0]), "{:.2f} to {:.2f}".format(*SPREAD[1])
+    uncertainty = f"a profile's shot_var within {shot_spread}, read_var {read_spread}"
+
+    lines = [f"{'camera':<{width}}  matrix  noise measured at ISO ({uncertainty})"]
+    for camera in rows:
+        matrix = "-" if camera["xyz_to_camera"] is None else "yes"
         iso = "-" if camera["iso"] is None else "{:g} to {:g}".format(*camera["iso"])
-        lines.append(f"{camera['name']:<{width}}  {'-' if camera['xyz_to_camera'] is None else 'yes':<6}  {iso}")
-        lines += [_level_row(*ends) for ends in camera.get("noise", ()) if len(found) <= _WITH_LEVELS]
+        lines.append(f"{camera['name']:<{width}}  {matrix:<6}  {iso}")
+        if len(rows) <= _WITH_LEVELS:
+            for level, shot_var, read_var in camera.get("noise", ()):
+                lines.append(_level_row(level, shot_var, read_var))
     return "\n".join(lines)
 
 
 def _level_row(iso: float, shot_var: tuple[float, float], read_var: tuple[float, float]) -> str:
-    shot, read = ("{:.2e} to {:.2e}".format(*ends) for ends in (shot_var, read_var))
-    return f"  ISO {iso:<7g} shot_var {shot}   read_var {read}"
+    shot_range = "{:.2e} to {:.2e}".format(*shot_var)
+    read_range = "{:.2e} to {:.2e}".format(*read_var)
+    return f"  ISO {iso:<7g} shot_var {shot_range}   read_var {read_range}"
 
 
 def as_json(weights: str | Path) -> dict[str, Any]:
-    """What ``rawaug info --json`` prints: of an ISP see :func:`rawaug.isp.model.DictionaryISP.description`."""
+    """Collect what ``rawaug info --json`` prints.
+
+    The keys of an ISP are those of :meth:`rawaug.isp.model.DictionaryISP.description`.
+    """
     if is_camera_file(weights):
         return camera_as_json(Camera.load(weights)) | {"file": str(weights), "version": __version__}
+
     path = find_weights(weights, FOLDER)
     content: dict[str, Any] = {"file": str(path), "sha256": sha256(path), "version": __version__}
     if read_header(path)["kind"] == "isp":
         return content | DictionaryISP.from_pretrained(path).description()
+
     model, info = denoisers.load(path)
-    parameters = sum(p.numel() for p in model.parameters())
-    name = {"kind": "denoiser", "name": type(model).__name__, "parameters": parameters}
-    return content | name | {"config": model.config, "info": info}
+    return content | {
+        "kind": "denoiser",
+        "name": type(model).__name__,
+        "parameters": sum(p.numel() for p in model.parameters()),
+        "config": model.config,
+        "info": info,
+    }
 
 
 def describe(weights: str | Path) -> str:
-    """Kind, size, settings and, for an ISP, its atoms as numbers; the figures of a camera's YAML file."""
+    """Describe a file in lines: kind, size, settings and atoms of weights, or the figures of a camera's YAML file."""
     if is_camera_file(weights):
         return describe_camera(Camera.load(weights))
     path = find_weights(weights, FOLDER)
     if read_header(path)["kind"] == "isp":
         return _describe_isp(path)
+
     content = as_json(path)
     lines = [f"{path}: denoiser {content['name']}, {content['parameters'] / 1e6:.3f} M parameters"]
-    lines += [f"  {key}: {dumps(value)}" for key, value in {**content["config"], **content["info"]}.items()]
+    for key, value in {**content["config"], **content["info"]}.items():
+        lines.append(f"  {key}: {dumps(value)}")
     return "\n".join(lines)
 
 
 def _describe_isp(path: Path) -> str:
     isp = DictionaryISP.from_pretrained(path)
-    config, parameters = isp.config, sum(p.numel() for p in isp.parameters())
+    config = isp.config
+    parameters = sum(p.numel() for p in isp.parameters())
+
     lines = [f"{path}: dictionary ISP, {parameters / 1e6:.3f} M parameters, {isp.cfa} output"]
     lines.append(f"  stages: {' '.join(config.stages)} mosaic; encoders {'on' if config.encoders else 'off'}")
+
     weights = isp.reverse_encoders.gain.prior.softmax(0)
     lines.append("  gain atoms (digital, red, blue; constant weight):")
     for atom, weight in zip(isp.gain.atoms().tolist(), weights.tolist(), strict=True):
-        lines.append("    " + "  ".join(f"{value:6.3f}" for value in atom) + f"   {weight:.3f}")
+        digital, red, blue = atom
+        lines.append(f"    {digital:6.3f}  {red:6.3f}  {blue:6.3f}   {weight:.3f}")
+
     rows = "sum 1" if config.cameras else "l1 norm 1"
     lines.append(f"  colour atoms (sRGB to camera, rows of {rows}):")
     for matrix in isp.colour.atoms().tolist():
-        lines.append("    " + " | ".join(" ".join(f"{value:6.3f}" for value in row) for row in matrix))
+        lines.append("    " + " | ".join("{:6.3f} {:6.3f} {:6.3f}".format(*row) for row in matrix))
+
     curve = isp.tone_curve().mean(dim=1)
     codes = ", ".join(f"{code} {curve[code].item():.4f}" for code in (16, 32, 64, 128, 192, 255))
     lines.append(f"  tone and gamma, grey code to linear: {codes}")
-    lines += [f"  {text}" for stage in isp.ordered_stages if (text := stage.describe())]
-    lines += [f"  {key}: {dumps(value)}" for key, value in isp.info.items()]
+    for stage in isp.ordered_stages:
+        text = stage.describe()
+        if text:
+            lines.append(f"  {text}")
+    for key, value in isp.info.items():
+        lines.append(f"  {key}: {dumps(value)}")
     return "\n".join(lines)
 
 
@@ -138,8 +176,8 @@ def describe_camera(camera: Camera) -> str:
 
     lines.append("  matrix from linear sRGB to white-balanced camera RGB, and gains, by light:")
     for anchor in camera.anchors():
-        rows = [" ".join(f"{value:7.4f}" for value in row) for row in anchor.matrix.tolist()]
-        gains = " ".join(f"{value:.4f}" for value in anchor.gains.tolist())
+        rows = ["{:7.4f} {:7.4f} {:7.4f}".format(*row) for row in anchor.matrix.tolist()]
+        gains = "{:.4f} {:.4f} {:.4f}".format(*anchor.gains.tolist())
         lines.append(f"    {anchor.light:<5} ({1e6 / anchor.mired:.0f} K)  {' | '.join(rows)}   gains {gains}")
 
     lines.append("  noise, variances with white = 1:" if camera.levels else "  noise: not stated")

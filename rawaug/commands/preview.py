@@ -7,6 +7,7 @@ chooses for the picture: what differs between them is camera, light, tone and ex
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -53,24 +54,29 @@ def run(
     """
     if count < 0:
         raise ValueError(f"count must be at least 0, got {count}")
-    stages = Path(out) if Path(out).suffix else Path(f"{out}.png")
-    require_writable(stages)
+    path = Path(out)
+    if not path.suffix:
+        path = Path(f"{out}.png")
+    require_writable(path)
+
     augment = RawAugment.from_pretrained(isp, cfa=cfa)
     whole = trim_to_even(read_shot(picture, max_pixels))
-    stages.parent.mkdir(parents=True, exist_ok=True)
-    _draw_stages(augment, whole, count, seed).savefig(stages, dpi=130)
-    print(stages)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _draw_stages(augment, whole, count, seed).savefig(path, dpi=130)
+    print(path)
 
 
 @torch.no_grad()
 def _draw_stages(augment: RawAugment, whole: Tensor, count: int, seed: int) -> Any:
-    isp, sensor, frame = augment.isp, pattern(augment.cfa), (whole.shape[-2], whole.shape[-1])
-    height, width = (min(side, _MAXIMUM) for side in frame)
+    isp, sensor = augment.isp, pattern(augment.cfa)
+    frame = whole.shape[-2], whole.shape[-1]
+    height, width = min(frame[0], _MAXIMUM), min(frame[1], _MAXIMUM)
     top, left = (frame[0] - height) // 4 * 2, (frame[1] - width) // 4 * 2
     srgb = bayer.crop(whole, top, left, height, width)
     place = frame_coordinates(height, width, (top, left), frame)
     setting = isp.reverse(srgb[None], coordinates=place).params
     panels = stage_pictures(augment, srgb, setting, place)
+
     generator = keyed_generator(seed, "preview")
     for k in range(count):
         params = augment.sample(srgb[None], generator, torch.tensor([[top, left, *frame, 0]]))
@@ -78,8 +84,9 @@ def _draw_stages(augment: RawAugment, whole: Tensor, count: int, seed: int) -> A
         gains = " ".join(f"{gain:.2f}" for gain in pair.params.isp.gains[0].tolist())
         developed = isp.forward_pixels(sensor.demosaic(augment.mosaic(pair.clean)), setting).clamp(0, 1)
         panels[f"draw {k + 1}: gains {gains}\nmean {pair.clean.mean().item():.3f}"] = developed[0]
+
     columns = max(len(panels) - count, 4)
-    rows = -(-len(panels) // columns)
+    rows = math.ceil(len(panels) / columns)
     figure = new_figure(2.6 * columns, 2.6 * rows)
     axes = figure.subplots(rows, columns, squeeze=False).flatten()
     for axis in axes:

@@ -24,6 +24,7 @@ from rawaug.progress import progress
 from rawaug.registry import Spec
 
 _UNUSED = (0.0, 0.0)
+"""The levels for a denoiser that reads none."""
 
 
 def run(
@@ -49,32 +50,36 @@ def run(
     """
     kind, _, path = benchmark.partition(":")
     if kind != "sidd" or not path:
-        raise ValueError(f"{benchmark}: no benchmark; use sidd:PATH")
+        raise ValueError(f"{benchmark}: not a benchmark; use sidd:PATH")
     require_writable(out)
+
     spec = DEFAULT if denoiser is None and classical is None else denoiser
-    made = choose_denoiser(spec, classical, self_ensemble, device)
-    assert made is not None
-    submit(path, out, made.require_mosaic())
+    model = choose_denoiser(spec, classical, self_ensemble, device)
+    assert model is not None
+    submit(path, out, model.require_mosaic())
     print(f"submission: {out}")
 
 
 def submit(path: str, out: str, denoiser: RawDenoiser) -> None:
     """Denoise the blocks below the folder ``path``, and write the submission ``out``."""
     blocks = SiddBenchmark(path)
-    write_submission(out, _denoised(blocks, denoiser), blocks[0].mosaic.shape[-1])
+    write_submission(out, _denoise(blocks, denoiser), blocks[0].mosaic.shape[-1])
 
 
-def _denoised(benchmark: SiddBenchmark, denoiser: RawDenoiser) -> Iterator[Tensor]:
+def _denoise(benchmark: SiddBenchmark, denoiser: RawDenoiser) -> Iterator[Tensor]:
     for first in progress(range(0, len(benchmark), BLOCKS), label="benchmark", unit="frame"):
         blocks = benchmark[first : first + BLOCKS]
-        levels = blocks[0].noise_profile or (_estimated(blocks) if denoiser.reads_levels else _UNUSED)
+        levels = blocks[0].noise_profile or _UNUSED
+        if levels is _UNUSED and denoiser.reads_levels:
+            levels = _estimate_levels(blocks)
         for block in blocks:
             yield denoiser.frame(block, levels).clamp(0.0, 1.0)
 
 
-def _estimated(blocks: list[RawFrame]) -> tuple[float, float]:
+def _estimate_levels(blocks: list[RawFrame]) -> tuple[float, float]:
+    mosaics = torch.cat([block.mosaic for block in blocks], dim=-1)
     try:
-        estimate = estimate_noise(torch.cat([block.mosaic for block in blocks], dim=-1), blocks[0].cfa)
+        estimate = estimate_noise(mosaics, blocks[0].cfa)
     except ValueError as error:
         scene = blocks[0].name.rpartition("_")[0]
         raise ValueError(

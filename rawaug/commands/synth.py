@@ -18,6 +18,8 @@ from rawaug.synthesis.shards import PER_SHARD
 
 @dataclass(frozen=True)
 class Options(AugmentConfig):
+    """The settings of an augmentation, each an option of its own."""
+
     draw: Annotated[Draw, OPTIONS] = Draw()
 
 
@@ -43,23 +45,37 @@ def run(
         format: 16-bit DNG of RAW, float32 NPZ, TIFF (float32, sRGB 16 bits), 8-bit PNG of sRGB, or tar shards for
             WebDataset and Hugging Face.
         per_image: pairs per picture.
-        config: what is drawn.
+        config: camera, noise and target of the pairs.
         seed: random seed.
         workers: number of processes; by default one per core.
         max_pixels: larger pictures are refused before they are decoded.
         shard: K/N makes part K of N, K from 1 to N, for job arrays; all N write to the same folder.
         per_shard: pictures per tar file, with --format webdataset.
     """
-    noise = value_of(config.noise) if isinstance(config.noise, str) else config.noise  # [shot_var, read_var]
-    rest: dict[str, Any] = {"workers": workers, "max_pixels": max_pixels, "shard": shard, "per_shard": per_shard}
-    print_synthesis(synth(pictures, out, format, per_image, seed=seed, **rest, **vars(config) | {"noise": noise}))
+    settings: dict[str, Any] = dict(vars(config))
+    if isinstance(config.noise, str):
+        settings["noise"] = value_of(config.noise)  # it may be [shot_var, read_var]
+    result = synth(
+        pictures,
+        out,
+        format,
+        per_image,
+        seed=seed,
+        workers=workers,
+        max_pixels=max_pixels,
+        shard=shard,
+        per_shard=per_shard,
+        **settings,
+    )
+    print_synthesis(result)
 
 
 def print_synthesis(result: Synthesis) -> None:
+    """Print the counts of a run as a table, and a line for each picture that cannot be read."""
     head = ("pictures", "pairs made", "existing", "unreadable", "time (s)")
     numbers = (result.pictures, result.made, result.existing, len(result.broken))
     print_rows(str(result.out), head, [[*map(str, numbers), f"{result.seconds:.1f}"]])
     for reason in result.broken.values():
-        print(f"unreadable: {escape(reason)}")
+        print(f"Unreadable: {escape(reason)}")
     for line in result.left_out:
         print(line)

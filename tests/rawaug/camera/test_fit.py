@@ -60,7 +60,7 @@ def test_files_and_folders_are_fitted_together(
     isp = fit(out, one, tmp_path / "more", two)
     assert isp.info["frames"] == ["one", "b", "a", "two"]
     assert isp.info["data"] == [str(one), str(tmp_path / "more"), str(two)]
-    assert f"fitted 4 frames in {isp.info['seconds']} s: {out}" in capsys.readouterr().out
+    assert f"{out}: fitted to 4 frames in {isp.info['seconds']} s" in capsys.readouterr().out
     by_hand = rawaug.fit([one, tmp_path / "more", two], progress=False, noise="off", **SETTINGS)
     assert same(isp, by_hand)
     assert not same(isp, fit(out, one, two))
@@ -94,7 +94,7 @@ def test_held_out_frames_are_scored_and_leave_no_trace_in_the_fit(
     assert len(scores) == 2 and scores[0].keys() == scores[1].keys() == {"blind", "as_shot"}
     assert all(5.0 < value < 70.0 for value in scores[-1].values())
     said = capsys.readouterr().out
-    assert f"held out: {scores[-1]['blind']:.2f} dB blind, {scores[-1]['as_shot']:.2f} dB with" in said
+    assert f"{scores[-1]['blind']:.2f} dB blind, {scores[-1]['as_shot']:.2f} dB with" in said
     pair, isp = rawaug.data.RawFolder(unseen)[0], DictionaryISP.from_pretrained(tmp_path / "watched.safetensors")
     for known, key in enumerate(scores[-1]):  # the last score is that of the file
         assert scores[-1][key] == pytest.approx(psnr_r(isp, pair, white_balance=bool(known)), abs=0.006)
@@ -171,7 +171,7 @@ def test_pairs_that_do_not_state_their_cfa_and_levels_are_fitted_by_given_ones(
     given = ["--cfa", "GRBG", "--black", "64", "--white", "1023"]
     out, (fitted, held) = tmp_path / "mine.safetensors", (f"pairs:{folder}" for folder in folders)
     isp = fit(out, fitted, "--held-out", held, *given)
-    assert isp.cfa == "GRBG" and isp.info["frames"] == ["fitted"] and "held out:" in capsys.readouterr().out
+    assert isp.cfa == "GRBG" and isp.info["frames"] == ["fitted"] and "held-out" in capsys.readouterr().out
     assert "does not state its CFA" in refused("fit", fitted, "--out", out, *QUICK, *given[2:])
     line = refused("fit", "demo:train", "--out", out, *QUICK, "--cfa", "GRBG")
     assert "cfa" in line and "demo:" in line

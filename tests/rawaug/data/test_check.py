@@ -122,7 +122,7 @@ def test_the_command_prints_the_report(tmp_path: Path, capsys: pytest.CaptureFix
     (tmp_path / "1.png").write_bytes(b"")
     assert main(["data", "check", str(tmp_path), "--first", "2"]) == 2
     printed = capsys.readouterr()
-    assert "1.png" in printed.out and printed.err.strip().endswith("1 damaged, listed above")
+    assert "1.png" in printed.out and "damaged" in printed.err
     assert main(["data", "check", str(tmp_path / "none")]) == 2
     assert "none: no such file or folder" in capsys.readouterr().err
 
