@@ -27,9 +27,6 @@ from denoisers.network import DENOISERS
 from rawaug.data import demo_pairs, demo_pictures
 from rawaug.data.pairs import DATASETS, PICTURES, Pair
 from rawaug.experiment.recipe import EXPERIMENTS
-from rawaug.files import digest
-from rawaug.isp import fast
-from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import STAGES
 from rawaug.noise.models import NOISE
 from rawaug.paper.baselines.base import BASELINES
@@ -76,27 +73,6 @@ def no_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         homes = dict.fromkeys(("HOME", "USERPROFILE", "TRITON_HOME"), home)  # Triton has read HOME when it was imported
         for name, value in {**homes, "TZ": "UTC", "LC_ALL": "C.UTF-8"}.items():
             patch.setenv(name, value)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def baked_once() -> Iterator[None]:
-    """Equal ISPs share their tables, which take 0.3 s, on one number of threads: hundreds of tests make one."""
-    known: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
-    bake = fast._tables
-
-    def baked(isp: DictionaryISP, nodes: int, forward: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
-        tensors = [tensor.detach().cpu().reshape(-1) for tensor in (*isp.parameters(), *isp.buffers())]
-        given = isp.config, isp.ordered_stages, isp.gain.log_gains.device, nodes, forward, torch.get_num_threads()
-        key = digest(repr(given).encode(), *(tensor.view(torch.uint8).numpy().tobytes() for tensor in tensors))
-        if key not in known:
-            if len(known) == 8:
-                known.clear()
-            known[key] = bake(isp, nodes, forward)
-        return known[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fast, "_tables", baked)
         yield
 
 
