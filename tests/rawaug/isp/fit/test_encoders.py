@@ -163,8 +163,10 @@ def test_as_shot_gains_know_the_atoms_that_training_has_moved(
 def test_lights_of_atoms_are_measured(isp: DictionaryISP, frames: list[Pair]) -> None:
     drawn = sample_pixels(frames, CONFIG.pixels, CONFIG.seed)
     before = mean_psnr(isp, drawn, as_shot=True)
+    gamma = isp.stages["gamma"].reverse_gamma
+    assert isinstance(gamma, torch.Tensor)
     with torch.no_grad():
-        isp.stages["gamma"].reverse_gamma.add_(0.1)
+        gamma.add_(0.1)
         isp.colour.matrices.mul_(torch.tensor([1.0, 1.2, 0.9])[:, None])
         isp.colour.neutral.add_(0.3)
     spoilt = mean_psnr(isp, drawn, as_shot=True)
