@@ -137,7 +137,7 @@ class MosaicDRUNet(DRUNet):
         seed: int = 0,
     ) -> None:
         if domain == "linear":
-            raise ValueError("domain linear is for networks of packed RAW; choose ksigma or anscombe")
+            raise ValueError("domain linear supports packed RAW only; choose ksigma or anscombe")
         super().__init__(
             width, scales, blocks, limits, mend, pyramid=pyramid, variance_map=False, domain=domain, seed=seed
         )

@@ -39,11 +39,11 @@ PACKED = 4
 """Channels of packed RAW: R, Gr, Gb, B."""
 
 MOST_FEATURES, MOST_LAYERS, MOST_SCALES = 2**16, 1000, 12
-"""Larger networks are refused before they are built: a few bytes of a file or a recipe can ask for any size."""
+"""Limits of a network's size, as a few bytes of a file or a recipe can ask for any."""
 
 MOST_HALVINGS = 4
 BLIND = 0.25
-"""Share of clipped values from which on the picture at half the sides is ignored."""
+"""Minimum share of clipped values for ignoring the picture at half the sides."""
 
 NEAR = 8.0
 """A network that is told its limits sees them up to this distance, in deviations of the noise."""

@@ -29,10 +29,10 @@ from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_dark_
 from rawaug.noise.estimate import WORST_FIT
 
 MOST_FRAMES = 32
-"""Largest number of frames measured, since all are in memory."""
+"""Maximum number of frames that are measured, as all of them are in memory."""
 _UNKNOWN = "unknown"
 WATCHED_PATCHES = 4
-"""Of each held-out frame, scored while the fit goes on."""
+"""Number of patches of a held-out frame that are scored during the fit."""
 
 
 def fit(
@@ -83,7 +83,7 @@ def fit(
     if noise not in ("auto", "on", "off"):
         raise ValueError(f"noise must be auto, on or off, got {noise!r}")
     if noise == "off" and dark is not None:
-        raise ValueError(f"dark {dark}: is for measuring the noise, and noise is off; leave one of them out")
+        raise ValueError(f"dark {dark}: has no use with noise: off; leave one of them out")
     start = time.perf_counter()
     mosaics = {key: value for key, value in (("cfa", cfa), ("black", black), ("white", white)) if value is not None}
     pairs = _pairs(source, camera_jpeg, mosaics)

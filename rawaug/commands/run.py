@@ -25,7 +25,7 @@ from rawaug.registry import suggest
 from rawaug.tasks.settings import Recipe
 
 SHARED = ("channels", "variance_map", "deviation", "domain")
-"""Settings that all networks have: they say what a recipe's network is for."""
+"""Settings that all networks share."""
 
 Options = list[tuple[str, Any]]
 """The dotted keys of the command line with their values, in their order."""
@@ -146,7 +146,7 @@ def keep_arms(arms: Mapping[str, Any], names: str | Sequence[str]) -> dict[str, 
     wanted = [names] if isinstance(names, str) else list(names)
     for name in wanted:
         if name not in arms:
-            raise ValueError(f"arms: {name} is none of {', '.join(arms)}{suggest(name, arms)}")
+            raise ValueError(f"arms: {name} is not an arm; use one of {', '.join(arms)}{suggest(name, arms)}")
 
     return {name: arm for name, arm in arms.items() if name in wanted}
 

@@ -40,14 +40,14 @@ NOISE_LEVELS = {
     1600: (1.2e-2, 6.1e-4),
     2500: (1.9e-2, 1.2e-3),
 }
-"""ISO: (shot_var, read_var)."""
+"""The levels (shot_var, read_var) by ISO."""
 
 _COLOR_MATRIX = ((1.66, -0.53, -0.13), (-0.21, 1.55, -0.34), (0.02, -0.47, 1.45))
 _ILLUMINANTS = ((2.25, 1.32), (2.10, 1.41), (1.98, 1.52), (1.85, 1.66), (1.72, 1.84), (1.55, 2.15))
 """Gains of red and blue from open shade over daylight to tungsten."""
 _EXPOSURE = (0.75, 1.0)
 _BLUR = 0.7
-"""Standard deviation in pixels of the point spread: no lens is as sharp as a picture that was scaled down."""
+"""Standard deviation of the lens's point spread, in pixels."""
 _SHADING_CENTRE = (0.06, -0.04)
 _SHADING_FOCAL_LENGTH = 1.85
 _SHOULDER, _CONTRAST = 1.2, 0.4

@@ -26,7 +26,7 @@ from rawaug.io import encode_srgb
 from rawaug.io.raw import XYZ_FROM_SRGB
 
 UNKNOWN_COLOUR = (1.0, 1.0, 1.0), torch.eye(3, device="cpu")
-"""Gains and matrix where a dataset states none."""
+"""The gains and the matrix of frames whose dataset states none."""
 
 
 def srgb_from_camera(xyz_to_camera: np.ndarray) -> Tensor:

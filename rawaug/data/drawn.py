@@ -132,11 +132,11 @@ SIDE = 640
 _SMALLEST = (4.0, 8.0, 16.0)
 _LARGEST = (80.0, 160.0, 300.0)
 _COVER = (1.5, 3.0, 6.0)
-"""Area of all shapes relative to the picture's; few of the first are hidden."""
+"""Total area of the shapes, relative to the picture's area."""
 _BLUR = (0.0, 0.0, 0.5, 0.8, 1.2)
-"""Deviation in pixels: lenses differ."""
+"""Limits of the blur's standard deviation, in pixels."""
 _FONT = (16.0, 160.0)
-"""Least and greatest size of letters, in pixels of the oversampled picture."""
+"""Smallest and largest size of letters, in pixels of the oversampled picture."""
 _LETTERS = string.ascii_letters + string.digits + "   .,-"
 
 Colour = tuple[int, int, int]
@@ -270,4 +270,4 @@ KINDS: dict[str, Callable[[Any, np.ndarray, float, Rng], None]] = {
     ),
     "lettering": _lettering,
 }
-"""How each kind of shape is drawn: ``(PIL picture, centre, radius, rng)``, in pixels of the oversampled picture."""
+"""The functions that draw each kind of shape: ``draw(PIL picture, centre, radius, rng)``, in oversampled pixels."""

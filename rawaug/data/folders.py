@@ -34,7 +34,7 @@ from rawaug.io.raw import RAW_EXTENSIONS
 
 _JPEG_SUFFIXES = (".jpg", ".JPG", ".jpeg", ".JPEG")
 _JPEG_MARGIN = 0.03
-"""Cameras cut a few lines off their JPEGs that LibRaw keeps, or the other way round."""
+"""Maximum number of lines by which the sizes of a JPEG and of LibRaw's RAW may differ."""
 _NAMED = 20
 _log = logging.getLogger(__name__)
 T = TypeVar("T")

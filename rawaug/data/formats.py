@@ -53,7 +53,7 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 _TEXT = b"MATLAB 5.0"
 _UNREADABLE = "cannot be read as a MATLAB file"
 MAX_BYTES = 2**30
-"""Larger variables are refused before they are read: those of the published datasets have at most 0.5 GiB."""
+"""Maximum size of a variable in a file; those of the published datasets have at most 0.5 GiB."""
 
 
 def mat_version(path: str | Path) -> str:
@@ -246,7 +246,7 @@ KINDS: dict[str, Callable[[Any], Any]] = {
     "shot_var": _variance,
     "read_var": _variance,
 }
-"""The keys that a file may state, each with the function that reads its value."""
+"""The keys of the metadata, each with the function that parses its value."""
 
 
 def _shown(value: Any) -> str:
@@ -256,7 +256,7 @@ def _shown(value: Any) -> str:
 # -- files, by extension ----------------------------------------------------------------------------------------------
 
 Found = tuple[np.ndarray, Mapping[str, Any]]
-"""The numbers of a file, and what it states."""
+"""The numbers of a file, and its metadata."""
 
 
 class _Unclear(ValueError):
@@ -354,7 +354,7 @@ READERS: dict[str, Callable[[Path, str, bool, int], Found]] = {
 }
 READABLE = (*RAW_EXTENSIONS, *READERS)
 TWO_IN_ONE = (".npz", ".mat")
-"""Files that may hold both mosaics of a pair."""
+"""Extensions of files that can hold both mosaics of a pair."""
 
 
 # -- one mosaic -------------------------------------------------------------------------------------------------------

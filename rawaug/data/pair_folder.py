@@ -23,7 +23,7 @@ from rawaug.data.pairs import DATASETS, LazyPairs, Pair
 from rawaug.files import files_below
 
 NOISY, CLEAN = "*_noisy.*", "*_clean.*"
-"""The naming of ``rawaug synth``."""
+"""The file names of ``rawaug synth``."""
 
 _WILD = re.compile(r"[*?]")
 

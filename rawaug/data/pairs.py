@@ -253,9 +253,9 @@ class LazyPairs(Lazy[Pair]):
     """Pairs, read when they are asked for."""
 
     max_pixels: int = MAX_PIXELS
-    """sRGB pictures, and mosaics in PNG files, with more are refused before they are decoded."""
+    """Maximum number of pixels of sRGB pictures and of mosaics in PNG files."""
     labels: Sequence[FrameLabel] = ()
-    """One a frame, where the dataset knows them without reading any."""
+    """The labels of the frames, if the dataset knows them without reading a frame."""
 
     def files_of(self, index: int) -> Sequence[Path]:
         """The files that identify a pair; none where its name does."""
@@ -365,7 +365,7 @@ class Binned(SomePairs):
 
 
 OWN_PICTURES = "pairs"
-"""``data.pictures`` of a recipe that augments the pictures of its own pairs."""
+"""The value of ``data.pictures`` for augmenting the pictures of a recipe's own pairs."""
 
 
 class PairPictures(Lazy[Tensor]):
@@ -426,7 +426,8 @@ def _named(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
     for name in wanted:
         found = [k for k, known in enumerate(names) if known == name or known.rpartition("_")[0] == name]
         if not found:
-            raise ValueError(f"data.select: {name} is none of the {len(names)} frames, such as {', '.join(names[:3])}")
+            examples = ", ".join(names[:3])
+            raise ValueError(f"data.select: {name} is not among the {len(names)} frames, such as {examples}")
         indices += [k for k in found if k not in indices]
     return indices
 

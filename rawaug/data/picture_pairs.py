@@ -30,7 +30,7 @@ EXTENSIONS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 _NAMES = {"cc15": ("*_real.*", "*_mean.*"), "polyu": ("*_real.*", "*_mean.*"), "pictures": ("*_noisy.*", "*_clean.*")}
 _BLOCKS = "sidd-srgb"
 KINDS = (*_NAMES, _BLOCKS)
-"""Datasets that :func:`open_picture_pairs` knows."""
+"""The datasets of :func:`open_picture_pairs`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -197,7 +197,7 @@ class Zurich(LazyPairs):
         numbers = read_plane(file, self.max_pixels)
         scale = 1.0 if numbers.dtype == np.uint16 else 0.25
         if numbers.max() >= scale * 2**_BITS:
-            raise ValueError(f"{file}: has value {numbers.max()}, more than {_BITS} bits; it is of another dataset")
+            raise ValueError(f"{file}: has value {numbers.max()}, more than {_BITS} bits; give a file of this dataset")
         light = (numbers.astype(np.float32) - scale * BLACK) / (scale * (ZURICH_WHITE - BLACK))
         return Pair(
             name=self.names[index],
@@ -252,7 +252,7 @@ class RawBench(LazyPairs):
 
 REAL_FRAMES = Path(__file__).with_name("real_frames")
 REAL_BLACK, REAL_WHITE = 512, 16383
-"""Black and white level of the PNGs; below black lies what is left of the noise."""
+"""Black and white level of the PNGs, with room for noise below black."""
 
 
 @DATASETS.register("real")

@@ -49,7 +49,7 @@ PHONES = {
     "N6": ("Motorola Nexus 6", CFA.BGGR),
     "G4": ("LG G4", CFA.BGGR),
 }
-"""Code in the folder's name: the phone, and the pattern of its frames."""
+"""The phone and the pattern of its frames, by the code in the folder's name."""
 
 _NAME = re.compile(r"\d{4}_(\d{3})_([A-Z0-9]{2})_(\d{5})_\d{5}_\d{4}_[LNH]")
 
@@ -185,7 +185,7 @@ def _even(image: Tensor) -> Tensor:
 
 
 LEAST_LIKENESS = 0.8
-"""Correlation of the greens below which pictures do not show the blocks of the mosaics."""
+"""Minimum correlation of the greens for pictures that show the blocks of the mosaics."""
 
 
 def turn_like(pictures: Tensor, mosaics: Tensor, cfa: CFA, what: str) -> Tensor:
@@ -209,7 +209,7 @@ def _correlation(a: Tensor, b: Tensor) -> Tensor:
 
 
 BLOCKS = 32
-"""Blocks of a frame."""
+"""Number of blocks of a frame."""
 
 _NO_COLOUR = Colour(*UNKNOWN_COLOUR, 0)
 

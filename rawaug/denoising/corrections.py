@@ -13,7 +13,7 @@ from rawaug.bayer import CFA, GreenDifference
 from rawaug.io.raw import RawFrame
 
 Correction = Literal["auto", "keep"]
-"""Take an error out where it is significant, or keep it."""
+"""When to correct an error: always, never, or if it is significant."""
 
 
 @dataclass(frozen=True)

@@ -37,12 +37,12 @@ from rawaug.progress import progress
 from rawaug.registry import Spec, spec_label, split_spec, suggest
 
 Levels = tuple[float, float]
-"""(shot_var, read_var)."""
+"""The levels of noise: (shot_var, read_var)."""
 Model = Callable[[Tensor, Tensor | None], Tensor]
 """``model(noisy, variance) -> denoised``, each ``(B, 4, h, w)``; it may have a ``stride`` and an ``upscale``."""
 CPU = torch.device("cpu")
 FILTER_TILES = (512, 32)
-"""Side and overlap of a filter's tiles, in packed pixels; the filters look 8 pixels around, and BM3D 20."""
+"""Side and overlap of a filter's tiles, in packed pixels; the filters have a reach of 8 pixels, and BM3D of 20."""
 
 
 class Noisy(NamedTuple):
@@ -110,9 +110,7 @@ class RawDenoiser:
         if not 0.0 <= self.strength <= 1.0:
             raise ValueError(f"strength must be between 0 and 1, got {self.strength}; --noise takes higher levels")
         if self.upscale > 1 and self.strength != 1.0:
-            raise ValueError(
-                f"--strength {self.strength}: of a linear DNG it is 1; there is no noisy full colour to mix in"
-            )
+            raise ValueError("--strength does not support --linear: the noisy frame has no full colour to mix in")
 
     @classmethod
     def of(

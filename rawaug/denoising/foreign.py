@@ -20,7 +20,7 @@ from rawaug.files import parse_object, read_tensors
 from rawaug.noise import anscombe
 
 STRIDE = 32
-"""The stride of a network that states none."""
+"""The default stride of a network."""
 
 
 class OnnxNetwork(nn.Module):
@@ -57,7 +57,7 @@ class OnnxNetwork(nn.Module):
         sides = [self.upscale * side for side in noisy.shape[-2:]]
         if denoised.ndim != 4 or list(denoised.shape[-2:]) != sides:
             got = f"{tuple(denoised.shape)} for {tuple(noisy.shape)}"
-            raise ValueError(f"{self.path}: the result is of another shape: {got}")
+            raise ValueError(f"{self.path}: the result has another shape: {got}")
         return denoised
 
 

@@ -34,15 +34,15 @@ from rawaug.kernels.runtime import find_device, has_fast_bfloat16
 from rawaug.registry import Spec, spec_label, suggest
 
 PICTURES = "rawaug-srgb"
-"""What denoises pictures where no denoiser is named."""
+"""The default picture denoiser."""
 USUAL, CLEAN = 20.0 / 255.0, 1.0 / 255.0
-"""K, as found on CC15, and D, on clean photographs."""
+"""K, measured on CC15, and D, measured on clean photographs."""
 _SAMPLED, _SIDE, _SQUARE = 3, 256, 16
-"""The level is estimated on this many parts of this side in both directions, in squares of the last side."""
+"""For estimating the level: the number of parts in both directions, their side, and the side of the squares in them."""
 _TILE = 1280
-"""Side of a tile: of the default's, 12 megapixels take more than 2 GB."""
+"""Side of a tile; the default denoiser needs more than 2 GB for 12 megapixels at once."""
 TURNS = {1: (0,), 2: (0, 5), 4: range(4), 8: range(bayer.N_VIEWS)}
-"""The turns whose mean is taken, by their number: flips are the first four, 5 is a quarter turn."""
+"""The views that are averaged, by the number of views."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def _level(spec: str, told: str) -> float:
     except ValueError:
         level = -1.0
     if not 0.0 <= level <= 1.0:
-        raise ValueError(f"{spec}: behind @ stands a level from 0 to 255, got {told}")
+        raise ValueError(f"{spec}: the level after @ must be from 0 to 255, got {told}")
     return level
 
 

@@ -33,7 +33,7 @@ CROP = 192
 """Side of a crop at 100 %, in pixels."""
 
 ACROSS = 4
-"""Largest number of panels side by side: more make captions too small to read on a page."""
+"""Maximum number of panels side by side; more would make the captions too small."""
 
 CURVES = {"loss": "loss", "psnr": "validation PSNR (dB)", "psnr_srgb": "validation PSNR, sRGB (dB)"}
 """Columns of a log that are plotted, with the titles of their plots."""

@@ -30,7 +30,7 @@ from rawaug.version import __version__
 
 PUBLISHED, REGISTERED = "as published", "registered"
 BORDER = 4
-"""Pixels on every side, which a shift may reach."""
+"""Width of the border that is left out of the scores, in pixels."""
 
 
 def picture_trials(pairs: Sequence[Any], registered: bool = False) -> Sequence[Trial]:

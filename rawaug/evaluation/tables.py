@@ -14,7 +14,7 @@ from rawaug.errors import escape
 from rawaug.evaluation.scores import METRICS
 
 WIDTH = 140
-"""Columns of a printed table where stdout is no terminal."""
+"""Width of a printed table in columns, if stdout is not a terminal."""
 
 FIGURES = {
     "psnr": "PSNR (dB)",

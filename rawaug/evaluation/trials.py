@@ -153,9 +153,9 @@ def make_trials(cases: Sequence[Case], make: Callable[[Case], Trial]) -> Sequenc
 # -- the references' own noise -----------------------------------------------------------------------------------------
 
 MUCH = 0.1
-"""Share of the squared error above which a line warns of the references' own noise."""
+"""Threshold for warning of the references' own noise, as a share of the squared error."""
 MOST_MEASURED = 12
-"""Frames whose own noise is measured, evenly spaced; one of 12 megapixels takes seconds."""
+"""Maximum number of frames whose own noise is measured; a frame of 12 megapixels takes seconds."""
 MOST_TARGETS = 3
 """The number of training frames whose own noise is measured."""
 SHOWN = 4

@@ -19,13 +19,13 @@ from statistics import fmean, stdev
 from typing import Any, NamedTuple
 
 MATTERS = 0.05
-"""The smallest gain in dB for which a trained arm is preferred to a method that needs no training."""
+"""Minimum gain in dB for preferring a trained arm to a method without training."""
 
 INPUT = "the noisy input"
 """The name of the noisy input where no other method was scored."""
 
 CLEANER_TEST = "bin the references (bin 4), or add the noise of a higher ISO"
-"""What makes a test less sensitive to the noise of its references."""
+"""Advice for making a test less sensitive to the noise of its references."""
 
 Summary = Mapping[str, Any]
 """The scores of one method, see :func:`rawaug.evaluation.scores.summary`."""

@@ -19,10 +19,10 @@ STAMP = "run.json"
 """The file with the settings of a run."""
 
 FREE = frozenset({"name", "out", "device", "devices", "seeds", "self_ensemble", "views"})
-"""Keys of a run that may change when it is resumed: they say where it runs, or only add to its results."""
+"""Keys that may change when a run is resumed, as they do not change its results."""
 
 FREE_ANYWHERE = SAME_WEIGHTS | {"memory_mb"}
-"""Such keys in parts of the recipe."""
+"""Keys in parts of the recipe that may change when a run is resumed."""
 
 SHOWN = 3
 """Maximum number of changed keys that an error names."""

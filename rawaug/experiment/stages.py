@@ -35,7 +35,7 @@ from rawaug.training.loop import train
 from rawaug.training.state import Start
 
 PLAIN, ENSEMBLE = "plain", "self_ensemble"
-"""How a denoiser is scored, in this order."""
+"""The kinds of scores of a denoiser, in the order of tables."""
 
 Summaries = dict[str, dict[str, Any]]
 """By :data:`PLAIN` and :data:`ENSEMBLE`, a summary of scores."""

@@ -44,7 +44,7 @@ _DROPPED = frozenset((*_LAYOUT, *_OF_PREVIEWS, *_LEVELS, *_DIGESTS, *_REPLACED))
 _CROP = (50718, 50719, 50720, 51125)
 
 _PREVIEW_TAGS = frozenset((*_LAYOUT, *_OF_PREVIEWS, 34675)) - {320, 330}
-"""What is copied of a preview's directory: its layout, the program that made it, its colour profile."""
+"""Tags of a preview's directory that are copied: its layout, the program that made it, its colour profile."""
 _SEGMENTS = ((273, 279), (324, 325), (513, 514))
 """Tags of the places and the lengths of strips, of tiles, and of a JPEG."""
 _PREVIEW_PHOTOMETRICS = (1, 2, 6)

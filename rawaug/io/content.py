@@ -30,7 +30,7 @@ PICTURE_EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", "
 HEIF_EXTENSIONS, AVIF_EXTENSIONS = (".heic", ".heif", ".hif"), (".avif",)
 ALL_PICTURE_EXTENSIONS = (*PICTURE_EXTENSIONS, *HEIF_EXTENSIONS, *AVIF_EXTENSIONS)
 _UNKNOWN_RAW = (".x3f", ".cap", ".eip", ".braw", ".r3d", ".ari", ".gpr")
-"""RAW that nothing here reads, which is counted as RAW all the same."""
+"""Extensions of RAW files that cannot be read; they are counted as RAW."""
 
 Kind = Literal["raw", "picture", "other"]
 

@@ -27,7 +27,7 @@ from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.profiles import profile_of_code_points
 
 MAX_PIXELS = 2**26
-"""Larger pictures (8192 x 8192) are refused by default, since a few header bytes can claim any size."""
+"""The default maximum number of pixels of a picture: 8192 x 8192."""
 
 MAX_CHANNELS = 4
 

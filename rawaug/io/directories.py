@@ -19,7 +19,7 @@ POINTERS = (EXIF, GPS, INTEROPERABILITY)
 """Tags whose value is the place of another directory."""
 
 MOST_ENTRIES, MOST_BYTES = 4096, 2**26
-"""Larger directories, and larger values of one, are taken for damage."""
+"""Limits of a directory and of its values; larger ones count as damaged."""
 
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 """Bytes of a value, by type."""

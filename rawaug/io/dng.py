@@ -70,7 +70,7 @@ _LARGEST_ISO = 65535
 _D65 = 21
 _GREY = 1
 _EXIF_ORIENTATIONS = {0: 1, 1: 2, 3: 3, 2: 4, 4: 5, 6: 6, 7: 7, 5: 8}
-"""By LibRaw's flip."""
+"""EXIF orientations by LibRaw's flip."""
 
 _SUBFILE_TYPE, _ORIENTATION, _PHOTOMETRIC, _SUB_IFDS = 254, 274, 262, 330
 _UNIQUE_CAMERA_MODEL = 50708

@@ -27,21 +27,21 @@ from rawaug.io.pictures import require_utf8
 from rawaug.io.tiff import TiffTags, read_tiff_tags
 
 MAX_PIXELS = 200_000_000
-"""Larger mosaics are refused before they are decoded; the largest sensors have 150 million sites."""
+"""Maximum number of sites of a mosaic; the largest sensors have 150 million."""
 
 FILL = 0xFEFE
 """The number that every site of a mosaic holds before it is decoded."""
 
 SMALLEST_GAP = 64
-"""Fewer sites of this number may be defects of the sensor."""
+"""Minimum number of sites without a value for a gap; fewer may be defects of the sensor."""
 
 KNOWN_PATTERNS = "Bayer, X-Trans and Quad-Bayer RAW is supported"
 
 _DEVELOPED = (b"\xff\xd8\xff", b"\x89PNG", b"RIFF", b"GIF8", b"\x00\x00\x00\x0cJXL", b"\xff\x0a")
-"""How files begin that hold a picture and never RAW: JPEG, PNG, WebP, GIF, JPEG XL."""
+"""First bytes of files that cannot hold RAW: JPEG, PNG, WebP, GIF, JPEG XL."""
 
 _UNREAD_COMPRESSIONS = {52546: "JPEG XL (DNG 1.7)", 34892: "lossy JPEG", 8: "deflate", 32946: "deflate"}
-"""What LibRaw may fail to decode, by TIFF's number."""
+"""Compressions that LibRaw may fail to decode, by TIFF's number."""
 
 _COMPLAINT = re.compile(r": (Unexpected end of file|data corrupted at -?\d+)$")
 _M_PERTURB = -6

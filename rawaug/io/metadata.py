@@ -94,7 +94,7 @@ class Metadata(NamedTuple):
 
 
 Thumbnail = Callable[[int, int], np.ndarray]
-"""Renders the new picture, as it is stored, in a height and width, uint8 ``(h, w, 3)``."""
+"""A function that renders the new picture, as it is stored, in a height and a width: uint8 ``(h, w, 3)``."""
 
 
 def read_exif(path: Path, name: str) -> bytes | None:

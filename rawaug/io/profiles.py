@@ -24,7 +24,7 @@ _PRIMARIES = {
     11: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
     12: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
 }
-"""Of BT.2020, and of P3, in which 11 has another white that no phone writes."""
+"""Chromaticities of the primaries of BT.2020 and of P3."""
 _HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
 
 

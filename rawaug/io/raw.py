@@ -44,7 +44,7 @@ XYZ_FROM_SRGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0
 _TYPICAL_COLOR_MATRIX = np.array([[1.60, -0.45, -0.15], [-0.25, 1.60, -0.35], [0.00, -0.50, 1.50]])
 
 _LARGEST_NUMBER = 1e6
-"""Exposure times, f-numbers and focal lengths above it are absurd."""
+"""Upper limit of plausible exposure times, f-numbers and focal lengths."""
 
 _RENDERING = {"use_camera_wb": True, "no_auto_bright": True, "output_bps": 8, "user_flip": 0}
 

@@ -34,14 +34,14 @@ from rawaug.io.metadata import (
 from rawaug.io.pictures import require_unit_range
 
 QUALITY = 97
-"""Of a JPEG or WebP that is written, of a JPEG with chroma at full size."""
+"""Quality of the JPEG and WebP files that are written; a JPEG has chroma at full size."""
 PICTURE_FORMATS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
-"""Extensions of the files that are written here."""
+"""Extensions of the files that can be written."""
 
 _TURNED_BY_DECODER = ("HEIC", "JPEG XL", "JPEG 2000")
 _LARGEST_WEBP = 16383
 _TIFF_COMPRESSIONS = {1: None, 5: "lzw"}
-"""How a TIFF is packed again, by the number of its tag; anything else becomes Deflate."""
+"""Compression of a TIFF that is written, by that of its source; any other becomes Deflate."""
 
 
 class StoredPicture(NamedTuple):

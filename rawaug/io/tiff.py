@@ -22,7 +22,7 @@ from rawaug.io.gain_map import GainMap, parse_gain_maps
 from rawaug.io.isolated import damage_as_os_error
 
 MOST_PAGES = 64
-"""More than any RAW file has. Damaged offsets make circles of directories, in which a reader never ends."""
+"""Maximum number of directories of a TIFF, as damaged offsets can make circles of them."""
 
 MAKE, MODEL, ORIENTATION, DNG_VERSION, NOISE_PROFILE = 271, 272, 274, 50706, 51041
 _LINEARIZATION, _RAW_DIGEST, _NEW_RAW_DIGEST = 50712, 50972, 51111

@@ -114,7 +114,7 @@ D65 = (0.31271, 0.32902)
 COLDEST, WARMEST = 10_000.0, 2_000.0
 """Limits of the colour temperature, in kelvin."""
 DAYLIGHT_FROM = 4_000.0
-"""Below it the daylight locus is not defined."""
+"""The lowest colour temperature of the daylight locus, in kelvin."""
 DAYLIGHT_SHARE = 0.9
 DAYLIGHT_MIRED = (190.0, 25.0)
 """Mean and standard deviation; as-shot balances of photographs lie between 4,000 and 6,500 K mostly."""

@@ -11,7 +11,7 @@ from rawaug.bayer import CFA
 from rawaug.registry import require_between
 
 HIGHLIGHT_KNEE = 0.9
-"""Mean linear value above which Brooks' inverse gains bend towards 1."""
+"""The mean linear value above which Brooks' inverse gains bend towards 1."""
 
 # More are refused before anything is built: a few bytes of a file can ask for any amount of memory.
 MOST_ATOMS, MOST_CAMERAS, MOST_FEATURES = 1024, 2**14, 256

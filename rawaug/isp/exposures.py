@@ -28,14 +28,14 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import WhiteBalance, as_display_referred, inverse_gains
 
 MIDDLE_GREY = 0.18
-"""Linear light up to which highlights are not compressed."""
+"""The linear light above which highlights are compressed."""
 
 _CLIPPED, _RAMP = 0.95, 0.1
 _LAST_RESORT = 1e-4
-"""Least weight of the shortest exposure, which decides where no other does."""
+"""Minimum weight of the shortest exposure, which decides if no other does."""
 
 _SCENE_WHITE = 0.999
-"""Share of the pixels that must not be clipped."""
+"""Minimum share of pixels that are not clipped."""
 
 
 def confidence(srgb: Tensor) -> Tensor:

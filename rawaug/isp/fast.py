@@ -34,11 +34,11 @@ from rawaug.kernels.reference import Camera, Display, fall_off, look_up, mask_fr
 from rawaug.kernels.runtime import one_thread
 
 NODES = 65
-"""Nodes of the table along each axis of the sRGB cube."""
+"""Number of nodes of the table along each axis of the sRGB cube."""
 CURVE_NODES = 1025
-"""Nodes of an inverted tone curve, over the root of linear light."""
+"""Number of nodes of an inverted tone curve, over the root of linear light."""
 PLACE_NODES = 33
-"""Nodes along each side of a picture at which gains by place are computed, to be interpolated between them."""
+"""Number of nodes along each side of a picture between which gains by place are interpolated."""
 
 
 class BakedISP(nn.Module):

@@ -31,7 +31,7 @@ from rawaug.registry import suggest
 
 _ADVICE = "fit or copy it again"
 _INFINITE = ("colour.spread",)
-"""Tensors that may hold infinity: this width is infinite where the light says nothing of the colour."""
+"""Tensors that may hold infinity: the width is infinite if the light does not limit the colour."""
 
 
 class DictionaryISP(StagedISP):
@@ -284,7 +284,7 @@ class DictionaryISP(StagedISP):
         path = find_weights(name)
         header, state = read_tensors(path, _ADVICE, _INFINITE)
         if header.get("kind") != "isp":
-            raise ValueError(f"{path}: holds {header.get('kind', 'no rawaug weights')}, not an ISP")
+            raise ValueError(f"{path}: contains {header.get('kind', 'no rawaug weights')}, not an ISP")
         try:
             isp = cls(ISPConfig(**parse_object(header["config"])))
             shapes, needed = ({k: v.shape for k, v in tensors.items()} for tensors in (state, isp.state_dict()))
@@ -316,7 +316,7 @@ def restrict_to_cameras(
         ValueError: if the atoms of ``isp`` are not published cameras, or a name is unknown.
     """
     if not isinstance(isp.colour, CameraDictionary):
-        raise ValueError("a camera by name needs an ISP of published cameras, such as universal")
+        raise ValueError("camera: needs an ISP with published cameras, such as universal")
     cameras = [names] if isinstance(names, (str, Path, Camera)) else list(names)
     own = [as_camera(camera) for camera in cameras if isinstance(camera, Camera) or is_camera_file(camera)]
     if own:

@@ -53,7 +53,7 @@ from rawaug.isp.cameras import (
 from rawaug.registry import suggest
 
 YAML_EXTENSIONS = (".yaml", ".yml")
-"""How the name of a camera's file ends."""
+"""Extensions of a camera's file."""
 
 ILLUMINANTS = {
     "A": (0.44758, 0.40745),

@@ -33,13 +33,13 @@ S = TypeVar("S", bound=Stage)
 
 
 THUMBNAIL = 48
-"""Longest side of the picture that an encoder looks at."""
+"""Longest side of an encoder's input, in pixels."""
 CLIPPED = 0.98
 SHADOW = 0.01
-"""Added to a reading used as a variance: the share of read noise."""
+"""The share of read noise that is added to a reading used as a variance."""
 ROUNDS = 4
 PULL = 1e-4
-"""How strongly weights are drawn to the typical ones, as a share of the readings' mean square."""
+"""Strength of the pull of weights to the typical ones, as a share of the readings' mean square."""
 
 
 class Encoder(nn.Module):

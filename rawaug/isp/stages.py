@@ -46,9 +46,9 @@ EPS = 1e-6
 """Floor under a power: keeps the gradient of x ** (1 / gamma) finite at black."""
 
 WIDTH = 32
-"""Features of the networks."""
+"""Number of features of the networks."""
 LEAST_FACTOR = 0.02
-"""Entries of L of a Gaussian mask that is not fitted yet."""
+"""Initial entries of L of a Gaussian mask."""
 _HALF_LEVEL = 0.5 / 255
 
 

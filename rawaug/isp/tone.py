@@ -30,7 +30,7 @@ STEPS = 4
 """Entries of a table for each 8-bit level."""
 NODES = 255 * STEPS + 1
 PIECES = 51
-"""Pieces of a curve whose slopes a fit scales."""
+"""Number of pieces of a curve whose slopes a fit scales."""
 
 
 def srgb_to_linear(code: Tensor) -> Tensor:

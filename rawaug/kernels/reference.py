@@ -32,7 +32,7 @@ ROUNDS = 10
 _LOW = 0xFFFFFFFF
 
 BAND = 2**19
-"""Pixels that a CPU works on at a time, which bounds its memory."""
+"""Number of pixels that a CPU works on at a time, which bounds its memory."""
 
 
 class Camera(NamedTuple):

@@ -82,7 +82,7 @@ ANY_CAMERA = "any camera"
 SHOT_ON_MOSAIC = 8.6
 READ_ON_MOSAIC = 6.2
 SPREAD = ((7.2 / SHOT_ON_MOSAIC, 11.4 / SHOT_ON_MOSAIC), (2.2 / READ_ON_MOSAIC, 16.0 / READ_ON_MOSAIC))
-"""Factors between which a camera's shot_var, and its read_var, may really lie, relative to its profile's."""
+"""Limits of a camera's shot_var and read_var, relative to those of its profile."""
 _ROUNDING = 1e-9  # of logarithms that are the same ISO
 _LEAST = 1e-12  # stands for a variance of 0 in the logarithms
 
@@ -558,7 +558,7 @@ def _named_model(spec: Spec, iso: Iso, poisson: bool) -> NoiseModel:
     if iso is not None and name in ("MeasuredNoise", "EldNoise"):
         spec, iso = {"name": name, "settings": {**settings, "iso": iso}}, None
     if iso is not None or poisson:
-        raise ValueError(f"iso and poisson are for levels of a camera, not for {name}")
+        raise ValueError(f"iso and poisson apply to the levels of a camera, not to {name}")
     model: NoiseModel = NOISE.make(spec)
     return model
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WORST_FIT = 0.5
-"""R^2 below which the points follow no line."""
+"""Minimum R^2 of a fit."""
 BLOCK = 8
 _order = np.add.outer(np.arange(BLOCK), np.arange(BLOCK))
 _inner = np.logical_and.outer(np.arange(BLOCK) > 0, np.arange(BLOCK) > 0)

@@ -40,9 +40,9 @@ Params = dict[str, Tensor]
 _NO_SHOT = 1e-30
 """Replaces a shot_var of 0 to avoid division by zero; too small to affect the picture."""
 _GROUP = 2**18
-"""Values whose photons are counted at a time: many small pictures, or one large one."""
+"""Number of values whose photons are drawn at a time: many small pictures, or one large one."""
 INVERSION_LIMIT = 10.0
-"""Rates below it are drawn by a sum; from it on the expansion is used, whose distribution function errs by 5e-5."""
+"""The rate from which counts are drawn by the expansion, whose distribution function errs by 5e-5."""
 _CACHED = 2**15  # counts that are drawn together on a CPU, to stay in its cache
 
 

@@ -40,7 +40,7 @@ TITLES = ("x", "x1 tone", "x2 gamma", "x3 colour", "x4 gains", "x5 shading")
 SPACES = ("RGB", "Y", "UV")
 LEFT_OUT = ("tone", "colour", "gains", "shading")
 STRIDE = 4
-"""Every fourth pixel of a registered frame is compared, in both directions."""
+"""Step between the pixels of a registered frame that are compared, in both directions."""
 
 
 @dataclass

@@ -36,7 +36,7 @@ from rawaug.training.loop import train
 from rawaug.training.stream import PictureCrops, Source, TrainingStream, add_noise, freeze_samples
 
 SHORTEST_CROP = 256
-"""Side in pixels of what a dry run scores of a test frame."""
+"""Side of the part of a test frame that a dry run scores, in pixels."""
 
 
 @dataclass

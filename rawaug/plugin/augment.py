@@ -114,7 +114,7 @@ class RawAugment(nn.Module):
         self.settings = SettingSampler(draw, self.isp, self.baked)
         self.noise, self.noise_name = noise_for(self.isp, noise), _noise_name(noise)
         if self.pattern is not None and self.noise.by_plane:
-            raise ValueError(f"this noise is one of planes R, Gr, Gb, B, which {self.pattern.name} does not have")
+            raise ValueError(f"this noise needs the planes R, Gr, Gb, B, which {self.pattern.name} does not have")
         self._calls = 0
 
     def with_draws(self, noise: NoiseSpec | NoiseLevels | NoiseModel, draw: Draw = Draw()) -> RawAugment:

@@ -33,7 +33,7 @@ from rawaug.kernels import fastest
 from rawaug.kernels.runtime import one_thread
 
 _REACH = 2.5
-"""Half the width of a Gaussian in deviations."""
+"""Half-width of a Gaussian filter, in standard deviations."""
 
 
 @dataclass(frozen=True)

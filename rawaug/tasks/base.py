@@ -260,4 +260,4 @@ class Task(ABC):
 
 
 SHOWN = 3
-"""Test frames in ``picture.png``."""
+"""Maximum number of test frames in ``picture.png``."""

@@ -37,7 +37,7 @@ LIBRAW = ("VNG", "PPG", "AHD", "DCB", "DHT", "AAHD")
 """LibRaw's demosaicings by its names."""
 
 LEAST = 512
-"""The smallest side that LibRaw's interpolation of X-Trans takes."""
+"""Minimum side of a frame for LibRaw's interpolation of X-Trans."""
 
 BLACK, WHITE = 1024, 65535
 """Black and white level of the DNGs that LibRaw demosaics."""

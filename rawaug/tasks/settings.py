@@ -27,7 +27,7 @@ HELD_OUT = "auto"
 USUAL = "usual"
 """The value of ``data.validation`` that :class:`DataConfig` replaces by the one that suits ``data.pairs``."""
 DEMO = "demo:"
-"""What the names of the built-in, simulated frames begin with."""
+"""The beginning of the names of the built-in, simulated frames."""
 _PAIRS = "pairs:"
 _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("count", "validation_count", "test_count"), (1, MOST)),
@@ -263,7 +263,7 @@ class Recipe:
 
         for key in ("srgb", "srgb_noise", "told"):
             if getattr(arm, key) is not None and self.target != "srgb":
-                raise ValueError(f"{key} is for target 'srgb', not {self.target!r}; omit it")
+                raise ValueError(f"{key} applies to target 'srgb', not {self.target!r}; leave it out")
 
         name, _ = split_spec(arm.estimator)
         weigh = self.loop_of(label).weigh

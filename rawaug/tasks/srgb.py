@@ -93,12 +93,12 @@ class SrgbRecipe(Recipe):
             settings = network.settings.get("channels"), network.settings.get("variance_map", True)
             if network.start is None and settings != (3, reads_level):
                 wanted = f"channels: 3, variance_map: {str(reads_level).lower()}"
-                raise ValueError(f"denoiser.settings: the network of arms.{label} has {wanted}, as told says")
+                raise ValueError(f"denoiser.settings: set {wanted} for the network of arms.{label}, as told requires")
 
         for spec in self.classical:
             name, _ = split_spec(spec)
             if name not in _WITHOUT_PLANES:
-                raise ValueError(f"classical: {name} is for RAW; on sRGB use one of {', '.join(_WITHOUT_PLANES)}")
+                raise ValueError(f"classical: {name} filters RAW; for sRGB use one of {', '.join(_WITHOUT_PLANES)}")
 
 
 @TASKS.register("srgb")

@@ -146,7 +146,7 @@ def test_a_dataset_of_x_trans_pairs_begins_every_crop_at_the_cell(isp: Dictionar
 def test_noise_of_four_planes_is_refused_without_them_and_another_bayer_pattern_is_one_of_its_own(
     isp: DictionaryISP,
 ) -> None:
-    with pytest.raises(ValueError, match="is one of planes R, Gr, Gb, B, which XTRANS does not have"):
+    with pytest.raises(ValueError, match="planes R, Gr, Gb, B"):
         RawAugment(isp, noise=ColourBias(1e-3), cfa="XTRANS")
     augment = RawAugment(isp, cfa="BGGR")
     assert (str(augment.isp.cfa), str(isp.cfa)) == ("BGGR", "RGGB"), "the caller's ISP stays as it is"

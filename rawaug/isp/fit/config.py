@@ -10,7 +10,7 @@ from rawaug.isp.stages import STAGES
 from rawaug.registry import require_between
 
 MOST = 2**31
-"""The most steps or pixels that a setting may ask for."""
+"""Upper limit of settings that count steps or pixels."""
 
 _SWITCH = ("auto", "on", "off")
 

@@ -225,12 +225,12 @@ class Descent:
 FRAMES_A_STEP = 4
 ENCODER_PIXELS, ENCODER_RATE = 1024, 1e-3
 FEWEST_FRAMES, FOLDS = 12, 4
-"""With "auto", encoders are trained from so many frames on, and judged on so many parts left out in turn."""
+"""For encoders with "auto": the minimum number of frames, and the number of folds of the cross-validation."""
 MANY_FRAMES, STEPS, LEARNING_RATE, CONSISTENCY = 50, 1000, 2e-4, 0.01
 """End-to-end training: frames from which on it is the default, its steps, its rate, and the weight of consistency."""
 
 Refit = Callable[[FitFrames, str, FitConfig], DictionaryISP]
-"""Fits an ISP without encoders to some frames alone; the text tells its stages from those of other fits."""
+"""A function that fits an ISP without encoders to some frames; the text names the fit in its progress."""
 
 
 def gain_left_out(frames: FitFrames, folds: int, gain: Callable[[FitFrames, FitFrames, str], float]) -> float:

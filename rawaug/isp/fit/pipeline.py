@@ -51,7 +51,7 @@ CURVE_STEPS = 150
 CURVE_RATE = 2e-2
 DIMMEST = 0.01
 SHADING_PAYS = 0.5
-"""A mask is kept if it halves the squared error; one that the frames' content feigns takes away a few percent."""
+"""Maximum ratio of the squared errors with and without a mask for keeping the mask."""
 FRAMES_A_STEP = 16
 
 

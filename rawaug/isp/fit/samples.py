@@ -25,7 +25,7 @@ from rawaug.seeding import keyed_generator
 CLIPPED_SRGB = 0.98
 CLIPPED_RAW = 0.98
 LEAST_LIKENESS = 0.8
-"""Correlation of the greens of an unregistered pair, shift taken out, below which it is refused."""
+"""Minimum correlation of the greens of an unregistered pair, after the shift is removed."""
 BLOCK = 16
 """Side in pixels of the blocks over which unregistered pairs are averaged."""
 

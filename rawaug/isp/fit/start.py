@@ -28,7 +28,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.seeding import derive_seed
 
 TIE = 1e-1
-"""Weight of the deviations; the squared errors of a good fit are near 1e-6."""
+"""Weight of the deviations; the squared errors of a good fit are about 1e-6."""
 TIE_RANGE = 0.05
 """tau: deviations of frames that belong together are a few hundredths at most."""
 FEWEST_PIXELS = 32
@@ -144,7 +144,7 @@ def fit_fall_off(linear: Tensor, samples: PixelSamples, product: Tensor) -> tupl
 
 SPREADS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, torch.inf)
 SPREAD_EPS = 1e-6
-"""Under the logarithm, as for the MSE: a frame that nothing predicts must not decide alone."""
+"""Constant under the logarithm, so that a frame that nothing predicts does not decide alone."""
 KNEES = (0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
 REACH_ATOMS = 8
 
@@ -247,7 +247,7 @@ def set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) -> 
 LIGHT_PIXELS, LIGHT_FRAMES = 1024, 16
 """Pixels of a frame, and frames at a time, by which the lights of trained atoms are measured."""
 LIGHT_RIDGE = 1e-2
-"""How strongly the neutrals of atoms that few frames use are drawn to the mean."""
+"""Ridge that pulls the neutrals of rarely used atoms to the mean."""
 
 
 @torch.no_grad()

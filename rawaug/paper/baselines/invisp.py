@@ -35,7 +35,7 @@ SCALE_CLAMP = 0.8
 GAMMA = 2.2
 """The power by which RAW is compressed before the network."""
 SLOPE = 0.2
-"""Of the leaky ReLUs for negative values."""
+"""Slope of the leaky ReLUs for negative values."""
 JPEG_QUALITY = 90
 """The quality at which pictures are stored between the two passes, as published."""
 Balance = Tensor | tuple[float, ...] | None

@@ -112,7 +112,7 @@ class UPI(SmoothstepISP):
 
 
 LOG_MSE_EPS = 1e-5
-"""Added to a frame's MSE under the logarithm: frames beyond 50 dB count no more."""
+"""Constant added to a frame's MSE under the logarithm, so that frames beyond 50 dB do not count."""
 ROUNDS = 100
 PIXELS = 32768
 """Number of pixels drawn from each frame."""

@@ -118,11 +118,11 @@ def test_scenes_are_whole() -> None:
 
 def test_names_are_of_frames_or_of_their_folders_and_what_is_held_out_is_not_chosen() -> None:
     assert select_pairs(Shots(), 18, None, ["0004_001_IP_010", "0017_002_S6"]) == [4, 17]
-    with pytest.raises(ValueError, match=r"data\.select: 0099 is none of the 18 frames, such as 0000_001_GP_010"):
+    with pytest.raises(ValueError, match=r"data\.select: 0099"):
         select_pairs(Shots(), 18, None, ["0099"])
     assert select_pairs(Shots(), 4, None) == [0, 1, 2, 3]
     assert max(select_pairs(Shots(), 9, 3, "phones")) < 9 and select_pairs(Shots(), 9, 9, "scenes") == list(range(9))
-    with pytest.raises(ValueError, match="0017_002_S6 is none of the 9 frames"):
+    with pytest.raises(ValueError, match="0017_002_S6"):
         select_pairs(Shots(), 9, None, ["0017_002_S6"])
 
 

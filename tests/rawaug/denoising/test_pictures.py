@@ -54,7 +54,7 @@ def test_a_level_that_is_told_and_the_strength_say_how_much_is_removed() -> None
 
     assert removed("rawaug-srgb@2") < removed("rawaug-srgb@10") < removed("rawaug-srgb@30")
     assert removed("rawaug-srgb", 0.0) == 0.0 < removed("rawaug-srgb", 0.3) < removed("rawaug-srgb", 1.0)
-    with pytest.raises(ValueError, match="behind @ stands a level from 0 to 255, got x"):
+    with pytest.raises(ValueError, match="level after @"):
         PictureDenoiser.of("rawaug-srgb@x")
 
 
@@ -119,7 +119,7 @@ def test_files_and_folders_of_pictures(tmp_path: Path, capsys: pytest.CaptureFix
     assert list(result.broken) == [str(tmp_path / "in" / "b.jpg")]
     with pytest.raises(ValueError, match="exists; give another name"):
         denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "a.png"))
-    with pytest.raises(ValueError, match="is a developed picture; --linear is for RAW"):
+    with pytest.raises(ValueError, match="developed picture.*--linear"):
         denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "c.png"), linear=True)
 
 

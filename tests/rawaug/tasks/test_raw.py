@@ -39,7 +39,7 @@ def test_a_target_that_an_arm_cannot_have_is_refused() -> None:
         target: Target = "srgb"  # type: ignore[misc]
         from_pictures = True
 
-    with pytest.raises(ValueError, match=r"arms\.one: srgb is for target 'srgb', not 'raw'"):
+    with pytest.raises(ValueError, match=r"arms\.one: srgb"):
         Recipe(arms={"one": ArmConfig(1.0, srgb=Srgb(jpeg=(40, 95)))})
     content = {"arms": {"one": {"augmented": 1.0, "srgb": {"jpeg": [40, 101]}}}}
     with pytest.raises(ValueError, match=r"arms\.one\.srgb: jpeg must be .* within 1 to 100"):
