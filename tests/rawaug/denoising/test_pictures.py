@@ -119,7 +119,7 @@ def test_files_and_folders_of_pictures(tmp_path: Path, capsys: pytest.CaptureFix
     assert list(result.broken) == [str(tmp_path / "in" / "b.jpg")]
     with pytest.raises(ValueError, match="exists; give another name"):
         denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "a.png"))
-    with pytest.raises(ValueError, match="developed picture.*--linear"):
+    with pytest.raises(ValueError, match=r"developed picture.*--linear"):
         denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "c.png"), linear=True)
 
 

@@ -177,7 +177,7 @@ def test_what_has_no_meaning_is_refused() -> None:
         ({"levels": []}, "at least one level"),
         ({"denoiser": DenoiserConfig()}, "channels: 3, variance_map: false"),
         ({"arms": {"a": ArmConfig(1.0, told=Told())}}, "channels: 3, variance_map: true, as told"),
-        ({"classical": ["BM3D"]}, "BM3D is for RAW"),
+        ({"classical": ["BM3D"]}, "BM3D"),
         ({"data": DataConfig(pairs=None, validation=None)}, r"data\.validation"),
         ({"arms": {"a": ArmConfig(1.0, srgb_noise="Gausian")}}, "Gaussian"),
     ):
