@@ -26,6 +26,7 @@ from denoisers.classical import FILTERS
 from denoisers.network import DENOISERS
 from rawaug.data import demo_pairs, demo_pictures
 from rawaug.data.pairs import DATASETS, PICTURES, Pair
+from rawaug.data.picture_pairs import PICTURE_PAIRS
 from rawaug.experiment.recipe import EXPERIMENTS
 from rawaug.isp.stages import STAGES
 from rawaug.noise.models import NOISE
@@ -95,7 +96,20 @@ def camera_files() -> Path:
 @pytest.fixture
 def registries(monkeypatch: pytest.MonkeyPatch) -> list[Registry]:
     """All registries, with the built-in things in them; what a test registers is forgotten after it."""
-    kinds = [BASELINES, DATASETS, DENOISERS, ESTIMATORS, EXPERIMENTS, FILTERS, LOSSES, NOISE, PICTURES, STAGES, TASKS]
+    kinds = [
+        BASELINES,
+        DATASETS,
+        DENOISERS,
+        ESTIMATORS,
+        EXPERIMENTS,
+        FILTERS,
+        LOSSES,
+        NOISE,
+        PICTURES,
+        PICTURE_PAIRS,
+        STAGES,
+        TASKS,
+    ]
     for kind in kinds:
         monkeypatch.setattr(kind, "_things", {name: kind[name] for name in kind})
     return kinds

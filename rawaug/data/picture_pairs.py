@@ -24,13 +24,13 @@ from rawaug.data.pairs import LazyPairs, centre
 from rawaug.data.sidd import find_file
 from rawaug.files import files_below
 from rawaug.io.pictures import read_picture
-from rawaug.registry import suggest
+from rawaug.registry import Registry
+
+PICTURE_PAIRS = Registry("kind of picture pairs", "rawaug.picture_pairs", "rawaug.data")
+"""The readers of pairs of developed pictures by name: ``reader(folder) -> PicturePairs``, for ``kind:DIR``."""
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-_NAMES = {"cc15": ("*_real.*", "*_mean.*"), "polyu": ("*_real.*", "*_mean.*"), "pictures": ("*_noisy.*", "*_clean.*")}
-_BLOCKS = "sidd-srgb"
-KINDS = (*_NAMES, _BLOCKS)
-"""The datasets of :func:`open_picture_pairs`."""
+"""Extensions of the pictures of a pair."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +47,20 @@ class PicturePair:
 
 
 class PicturePairs(LazyPairs):
-    """Pairs that are read when they are asked for."""
+    """Pairs of developed pictures, each read when it is asked for.
+
+    Args:
+        names: a name for each pair.
+        files: the files of each pair, for reports.
+        read: a function of a pair's index that returns the noisy and the clean picture, uint8 ``(3, H, W)`` each.
+    """
 
     def __init__(
         self, names: Sequence[str], files: Sequence[Sequence[Path]], read: Callable[[int], tuple[Tensor, Tensor]]
     ) -> None:
         super().__init__(names)
-        self._files, self._read = files, read
+        self._files = files
+        self._read = read
 
     def __iter__(self) -> Iterator[PicturePair]:  # type: ignore[override]
         return map(self.read, range(len(self)))
@@ -71,14 +78,15 @@ class PicturePairs(LazyPairs):
 
 def is_picture_pairs(spec: str) -> bool:
     """Whether ``spec`` names pairs of developed pictures, as ``cc15:DIR`` does."""
-    return spec.partition(":")[0] in KINDS and ":" in spec
+    kind, colon, _ = spec.partition(":")
+    return bool(colon) and kind in PICTURE_PAIRS
 
 
 def open_picture_pairs(spec: str, noisy: str | None = None, clean: str | None = None) -> PicturePairs:
     """Open pairs of developed pictures.
 
     Args:
-        spec: ``kind:DIR``, of one of :data:`KINDS`.
+        spec: ``kind:DIR``, of one of :data:`PICTURE_PAIRS`.
         noisy, clean: patterns of the files of ``pictures:DIR``, such as ``"*_iso6400.jpg"`` and ``"*_iso100.jpg"``.
 
     Raises:
@@ -86,26 +94,49 @@ def open_picture_pairs(spec: str, noisy: str | None = None, clean: str | None = 
         ValueError: if the kind is unknown, or the folder has no pair.
     """
     kind, _, path = spec.partition(":")
-    if kind not in KINDS:
-        raise ValueError(f"{spec}: no such pairs of pictures; use one of {', '.join(KINDS)}{suggest(kind, KINDS)}")
-    if (noisy or clean) and kind != "pictures":
-        raise ValueError(f"{spec}: noisy and clean are patterns of pictures:DIR; omit them")
+    reader = PICTURE_PAIRS[kind]
+    patterns = {}
+    if noisy is not None or clean is not None:
+        patterns = {"noisy": noisy, "clean": clean}
+        if kind != "pictures":
+            raise ValueError(f"{spec}: noisy and clean are patterns of pictures:DIR; leave them out")
+
     folder = Path(path)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of noisy and clean pictures")
-    if kind == _BLOCKS:
-        return _blocks(folder)
-    first, second = _NAMES[kind] if noisy is None else (noisy, clean or clean_pattern(noisy))
-    found = pairs_by_pattern(folder, sorted(files_below(folder, EXTENSIONS)), first, second)
-    if not found:
-        raise ValueError(f"{folder}: has no pictures named {first} and {second}")
-    found.sort(key=lambda pair: pair.noisy)
-    files = [(pair.noisy, pair.clean) for pair in found]
-    return PicturePairs(
-        [pair.name for pair in found], files, lambda k: (read_picture(files[k][0]), read_picture(files[k][1]))
-    )
+    pairs: PicturePairs = reader(folder, **patterns)
+    return pairs
 
 
+@PICTURE_PAIRS.register("pictures")
+def _by_pattern(folder: Path, noisy: str | None = None, clean: str | None = None) -> PicturePairs:
+    if noisy is None:
+        noisy, clean = "*_noisy.*", "*_clean.*"
+    elif clean is None:
+        clean = clean_pattern(noisy)
+    return _matched(folder, noisy, str(clean))
+
+
+@PICTURE_PAIRS.register("cc15")
+@PICTURE_PAIRS.register("polyu")
+def _of_means(folder: Path) -> PicturePairs:
+    return _matched(folder, "*_real.*", "*_mean.*")
+
+
+def _matched(folder: Path, noisy: str, clean: str) -> PicturePairs:
+    """Pair the files of a folder by their names."""
+    pairs = pairs_by_pattern(folder, sorted(files_below(folder, EXTENSIONS)), noisy, clean)
+    if not pairs:
+        raise ValueError(f"{folder}: has no pictures named {noisy} and {clean}")
+    pairs.sort(key=lambda pair: pair.noisy)
+
+    def read(index: int) -> tuple[Tensor, Tensor]:
+        return read_picture(pairs[index].noisy), read_picture(pairs[index].clean)
+
+    return PicturePairs([pair.name for pair in pairs], [(pair.noisy, pair.clean) for pair in pairs], read)
+
+
+@PICTURE_PAIRS.register("sidd-srgb")
 def _blocks(folder: Path) -> PicturePairs:
     arrays = []
     for kind in ("Noisy", "Gt"):

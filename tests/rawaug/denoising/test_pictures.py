@@ -134,7 +134,7 @@ def test_pairs_of_pictures_are_scored_as_published_and_registered(tmp_path: Path
     assert found[REGISTERED]["psnr"] > found[PUBLISHED]["psnr"] + 1.0
     inner = (..., slice(8, -8), slice(8, -8))
     assert (register(noisy(), moved)[inner] - smooth()[inner]).abs().mean() < 0.01
-    with pytest.raises(ValueError, match="no such pairs of pictures"):
+    with pytest.raises(ValueError, match="picture pairs"):
         open_picture_pairs("cc16:x")
     with pytest.raises(FileNotFoundError, match="no such folder"):
         open_picture_pairs("polyu:nowhere")
