@@ -31,7 +31,7 @@ Noise = str | Sequence[float] | MeasuredLevels | Shots
 variances, or the levels of other files."""
 
 LOOSE = 0.9
-"""R^2 below which an estimate is called uncertain."""
+"""Minimum R^2 for a reliable estimate."""
 DISAGREE = 1.75
 """Ratio of the variances at the mean signal, by the tag and by the estimate, from which ``auto`` takes the estimate.
 
