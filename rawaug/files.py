@@ -277,7 +277,7 @@ def read_tensors(
 
 def read_metadata(path: str | Path) -> dict[str, str]:
     """The metadata of any safetensors file, without its tensors; ValueError if it is damaged."""
-    header, _ = _opened(path, "copy or download it again", tensors=False)
+    header, _ = _read_safetensors(path, "copy or download it again", with_tensors=False)
     return header
 
 
