@@ -229,12 +229,6 @@ def _repeat(data: bytearray, rng: np.random.Generator) -> None:
 # -- damage that knows the structure -----------------------------------------------------------------------------------
 
 
-def said_one_line(text: str) -> str | None:
-    """The only line with which a command that prints this refuses; None if it has none, several or a traceback."""
-    lines = [line for line in text.splitlines() if line.startswith("rawaug: ")]
-    return lines[0] if len(lines) == 1 and "Traceback" not in text else None
-
-
 Mutation = Callable[[bytes, np.random.Generator], bytes]
 
 
@@ -315,68 +309,23 @@ def _changed_text(text: str, rng: np.random.Generator) -> str:
     return json.dumps(value).replace('"@"', new if new in _NO_NUMBERS else json.dumps(new))
 
 
-# -- pairs -------------------------------------------------------------------------------------------------------------
-
-
-def tiff_pair(whole: bytes, rng: np.random.Generator) -> bytes:
-    """A description nested without end, a value of it exchanged, or damage to the directory."""
-    import tifffile
-
-    if rng.random() < 0.5:
-        return tiff(whole, rng)
-    with tifffile.TiffFile(io.BytesIO(whole)) as file:
-        text, numbers = _changed_text(file.pages[0].description, rng), file.pages[0].asarray()
-    made = io.BytesIO()
-    tifffile.imwrite(made, numbers, description=text.encode("ascii", "replace"), metadata=None)
-    return made.getvalue()
-
-
-def npz(whole: bytes, rng: np.random.Generator) -> bytes:
-    """An array that is empty, has another type, or is missing."""
-    with np.load(io.BytesIO(whole)) as file:
-        arrays = dict(file)
-    name, made = _pick(rng, sorted(arrays)), io.BytesIO()
-    values = [np.zeros(0), np.zeros(0, "U4"), np.full(3, np.nan), np.array("x"), np.array([["RGGB"] * 2]), None]
-    changed = _pick(rng, values)
-    arrays |= {} if changed is None else {name: changed}
-    np.savez(made, **{key: value for key, value in arrays.items() if changed is not None or key != name})
-    return made.getvalue()
-
-
 # -- recipes -----------------------------------------------------------------------------------------------------------
-
-_LAUGHS = "laugh0: &l0 [ha, ha]\n" + "".join(f"laugh{k}: &l{k} [*l{k - 1}, *l{k - 1}]\n" for k in range(1, 60))
 
 
 def recipe(whole: bytes, rng: np.random.Generator) -> bytes:
-    """A value of a recipe exchanged, at any depth; aliases of aliases; or ``module:function`` in every text."""
+    """A value of a recipe exchanged, or ``module:function`` in the place of one."""
     content = yaml.safe_load(whole)
-    if rng.random() < 0.15:
-        return yaml.safe_dump(_with_texts(content, f"{IMPORTED}:s")).encode()
-    node, depth = content, 0
+    section = content
     while True:
-        key = _pick(rng, sorted(node) if isinstance(node, dict) else list(range(len(node))))
-        inner = node[key]
-        if not isinstance(inner, (dict, list)) or not inner or rng.random() < 0.2 or depth > 20:
+        key = _pick(rng, sorted(section))
+        if not isinstance(section[key], dict) or not section[key]:
             break
-        node, depth = inner, depth + 1
-    node[key] = _pick(rng, [*_VALUES, 1e25, float("nan"), float("inf"), "@"])
-    text = yaml.safe_dump(content)
-    if rng.random() < 0.15:
-        return (text + _LAUGHS).encode()
-    return text.replace("'@'", "[" * 3000 + "]" * 3000).encode()
-
-
-def _with_texts(content: Any, text: str) -> Any:
-    """The content of a recipe with ``text`` in the place of every text but the experiment's name."""
-    if isinstance(content, dict):
-        return {key: value if key == "experiment" else _with_texts(value, text) for key, value in content.items()}
-    if isinstance(content, list):
-        return [_with_texts(value, text) for value in content]
-    return text if isinstance(content, str) else content
+        section = section[key]
+    section[key] = _pick(rng, [*_VALUES, 1e25, float("nan"), float("inf"), f"{IMPORTED}:s"])
+    return yaml.safe_dump(content).encode()
 
 
 MUTATIONS: dict[str, Mutation] = {
-    ".pair.tif": tiff_pair, ".npz": npz, ".dng": tiff, ".tif": tiff, ".safetensors": safetensors, ".yaml": recipe,
+    ".dng": tiff, ".tif": tiff, ".safetensors": safetensors, ".yaml": recipe,
 }  # fmt: skip
 """By the end of a file's name; what other packages alone decode is damaged byte by byte."""

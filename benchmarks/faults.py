@@ -1,34 +1,30 @@
-"""Kills, full disks and strange files: what was there stays whole, and a run goes on as if nothing had been.
+"""Kills: what was there stays whole, and a run goes on as if nothing had been.
 
     python -m benchmarks.faults [--kills 20] [--seed 0] [--commands fit run synth denoise] [--quick]
 
 Every command runs in a forked child on small generated files. First it runs to its end; then it is killed ``--kills``
 times at moments drawn uniformly over that time, by SIGKILL, SIGTERM and SIGINT in turn, and after each kill the same
 command is run again to its end in the same folder. Its files must then equal those of the run that was not killed, bit
-for bit (tensors of safetensors; of JSON all but times), and nothing else may be left. Then come a full disk, which is
-skipped where no small file system can be mounted, and files that never end. Exit status 1 if anything differs or ends
-in more than one line. Two runs at once and folders that vanish or cannot be written are in tests/test_faults.py.
+for bit (tensors of safetensors), and nothing else may be left. Exit status 1 if anything differs. Full disks, two runs
+at once and folders that vanish or cannot be written are in tests/test_faults.py.
 """
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
 import os
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from benchmarks.damage import IRREGULAR, said_one_line, small_frame
+from benchmarks.damage import small_frame
 from benchmarks.measure import parser, write_pictures
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
@@ -191,67 +187,6 @@ def kills(folder: Path, name: str, count: int, seed: int, whole: Files, seconds:
     return [outcome for outcome in outcomes if outcome]
 
 
-# -- small file systems ------------------------------------------------------------------------------------------------
-
-
-class Skipped(Exception):
-    """The fault cannot be made here, or does not concern the command; the text says which."""
-
-
-@contextlib.contextmanager
-def small_file_system(place: Path, kilobytes: int) -> Iterator[None]:
-    """Mount a tmpfs of this size over a folder; Skipped where that is not allowed."""
-    place.mkdir(exist_ok=True)
-    command = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(place)]
-    if shutil.which("mount") is None or subprocess.run(command, capture_output=True).returncode:
-        raise Skipped("needs the right to mount file systems")
-    try:
-        yield
-    finally:
-        subprocess.run(["umount", "--lazy", str(place)], check=True)
-
-
-# -- other faults ------------------------------------------------------------------------------------------------------
-
-
-def one_line(child: Child, *said: str) -> str | None:
-    """What is wrong with how a command ended that had to fail in one line with these words; None if nothing is."""
-    status, text = child.wait(), child.said()
-    line = said_one_line(text) if status == 2 else None
-    return None if line and all(word in line for word in said) else f"status {status}: {text}"
-
-
-def full_disk(folder: Path, name: str, whole: Files) -> str | None:
-    """A disk with room for a part: one line, and the files that are there are whole."""
-    Child(fresh(folder), COMMANDS[name]).wait()
-    size = sum(file.stat().st_size for file in (folder / OUT).rglob("*") if file.is_file())
-    with small_file_system(fresh(folder) / OUT, max(16, size // 2048)):
-        if wrong := one_line(Child(folder, COMMANDS[name]), "No space left on device"):
-            return wrong
-        parts = contents(folder / OUT)
-        half = [file for file in parts if file in whole and parts[file] != whole[file]]
-        return f"incomplete: {', '.join(half)}" if half and name != "run" else None
-
-
-def strange_files(folder: Path, name: str, whole: Files) -> str | None:
-    """A pipe, a link to itself and an endless device among the files: they are left out, and the rest is as before."""
-    place = next((folder / word for word in COMMANDS[name] if word != OUT and (folder / word).is_dir()), None)
-    if place is None:
-        raise Skipped("reads no folder")
-    strange = [place / f"{make.__name__}{next(place.iterdir()).suffix}" for make in IRREGULAR]
-    for file, make in zip(strange, IRREGULAR, strict=True):
-        make(file)
-    child = Child(fresh(folder), COMMANDS[name])
-    status = child.wait()
-    for file in strange:
-        file.unlink()
-    sound = status in (0, 2) and "Traceback" not in child.said() and contents(folder / OUT) == whole
-    return None if sound else f"status {status}: {child.said()}"
-
-
-FAULTS = {"full disk": full_disk, "strange files": strange_files}
-
-
 def main(arguments: list[str] | None = None) -> int:
     cli = parser(__doc__)
     cli.add_argument("--kills", type=int, default=20, help="of each command")
@@ -268,13 +203,6 @@ def main(arguments: list[str] | None = None) -> int:
             whole, seconds = uninterrupted(folder, command)
             wrong = kills(folder, command, count, args.seed, whole, seconds)
             print(f"{command:8} {seconds:5.1f} s  {count} kills, {len(wrong)} wrong", flush=True)
-            for fault, make in FAULTS.items():
-                try:
-                    found = make(folder, command, whole)
-                    print(f"{command:8} {fault}: {found or 'as it should be'}", flush=True)
-                    wrong += [found] if found else []
-                except Skipped as why:
-                    print(f"{command:8} {fault}: skipped: {why}", flush=True)
             failures += wrong
     print(*failures, sep="\n", end="")
     return int(bool(failures))

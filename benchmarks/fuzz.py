@@ -4,17 +4,15 @@
 
 Small files of every kind are made and damaged (benchmarks/damage.py), half of some as their structure suggests, keyed
 by (seed, kind, number); real camera files take part where RAWAUG_SHARED, or shared/data beside the repository, has
-them. The helper process of :mod:`rawaug.io.isolated` reads one after the other, every eighth by the commands too.
-Counted are files that were read; that were refused as documented (ValueError or OSError of one line with the file's
-name); that crashed a decoder, which the package contains; and what must not be: other exceptions and numbers that are
-not finite, more than 10 s of a processor (60 with commands), more than 2 GiB. Exit status 1 if there is any of the last
-three. ``--keep`` keeps all files but those of the first two columns. Linux only.
+them. The helper process of :mod:`rawaug.io.isolated` reads one after the other. Counted are files that were read; that
+were refused as documented (ValueError or OSError of one line with the file's name); that crashed a decoder, which the
+package contains; and what must not be: other exceptions and numbers that are not finite, more than 10 s of a processor,
+more than 2 GiB. Exit status 1 if there is any of the last three. ``--keep`` keeps all files but those of the first two
+columns. Linux only.
 """
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import os
 import re
@@ -27,7 +25,7 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -36,10 +34,9 @@ import numpy as np
 import torch
 
 import denoisers
-from benchmarks.damage import IMPORTED, IRREGULAR, MUTATIONS, make_originals, mutated, said_one_line
+from benchmarks.damage import IMPORTED, IRREGULAR, MUTATIONS, make_originals, mutated
 from benchmarks.measure import parser
 from rawaug import DictionaryISP
-from rawaug.cli import main as rawaug
 from rawaug.commands.info import describe
 from rawaug.commands.run import with_values
 from rawaug.data.formats import read_mosaic, read_value
@@ -64,14 +61,10 @@ DECODERS = {
 
 IRREGULAR_SHARE = 0.05
 """Of the files, those in whose place a pipe, a link to itself or an endless device lies."""
-BY_COMMANDS = 8
-"""Of so many files one is read by the commands as well."""
 OUTCOMES = ("read", "refused", "crashed", "fault", "hung", "memory")
 FORBIDDEN = OUTCOMES[3:]
 SECONDS, MEBIBYTES = 10, 2048
 """Of a processor, and of memory, that a file may take."""
-COMMANDS_COST = 6
-"""So many times the seconds where commands read it too."""
 
 
 def readers(kind: str, path: Path) -> list[Callable[[], object]]:
@@ -148,74 +141,25 @@ def _described(error: Exception) -> str:
     return f"{type(error).__name__} in {Path(last.filename).name}:{last.lineno}: {error}"
 
 
-# -- commands ----------------------------------------------------------------------------------------------------------
-
-NOT_A_NUMBER = re.compile(r"(?<![\w.])[-+]?(nan|inf)(?![\w.])", re.IGNORECASE)
-COMMANDS = {
-    "dng": ["fit {file} --out {out}/camera.safetensors --steps 2 --curve-steps 2 --pixels 1024 --batch 64",
-            "evaluate {whole}/isp.safetensors --data {file}",
-            "denoise {file} {out}/denoised.dng --denoiser {whole}/denoiser.safetensors"],
-    "picture": ["synth {folder} {out}/pairs --workers 0 --noise [0.001,1e-5]"],
-    "npy": ["data check {folder}", "evaluate {whole}/isp.safetensors --data rawir:{folder}"],
-    "denoiser": ["info {file} --json", "evaluate {file} --data {whole}/own.dng --noise [0.001,1e-5]",
-                 "denoise {whole}/own.dng {out}/d.dng --denoiser {file}"],
-    "isp": ["info {file} --json", "evaluate {file} --data {whole}/own.dng"],
-}  # fmt: skip
-"""By the kind of file, of weights by what is in them."""
-
-
-def commands(kind: str, path: Path) -> list[list[str]]:
-    """The command lines that read a file of this kind; the whole files that they need too are two folders above."""
-    kept = path.stem.split("-")[0] if kind == "safetensors" else kind
-    here = {"file": path, "folder": path.parent, "whole": path.parents[1], "out": _out(path)}
-    return [[word.format(**here) for word in line.split()] for line in COMMANDS.get(kept, ())]
-
-
-def run(argv: Sequence[str]) -> tuple[str, str]:
-    """Likewise, of one command line: status 0, or status 2 and one line on stderr."""
-    said, wrong = io.StringIO(), io.StringIO()
-    command = " ".join(argv[:2])
-    try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(wrong):
-            status = rawaug([*argv, "--quiet"])
-    except SystemExit as end:
-        return "fault", f"{command}: exits with {end.code}: {wrong.getvalue()[-200:]!r}"
-    except Exception as error:
-        return "fault", f"{command}: {_described(error)}"
-    if status == 2 and (line := said_one_line(wrong.getvalue())):
-        return "refused", line
-    if status:
-        return "fault", f"{command}: status {status}: {wrong.getvalue()[-200:]!r}"
-    if number := NOT_A_NUMBER.search(said.getvalue()):
-        return "fault", f"{command}: {number.group()} in a result, and status 0"
-    return "read", ""
-
-
-def _out(path: Path) -> Path:
-    return path.parents[1] / f"{path.stem}-out"
-
-
 # -- in the helper process ---------------------------------------------------------------------------------------------
 
 
-def attempt(path: Path, kind: str, by_commands: bool) -> tuple[str, str]:
-    """The worst of what became of a file: :func:`read`, :func:`run`, or too much of a processor or of memory."""
+def attempt(path: Path, kind: str) -> tuple[str, str]:
+    """Read a file, and judge what became of it, and what it took of a processor and of memory."""
     _silence()
-    seconds, before = SECONDS * (COMMANDS_COST if by_commands else 1), time.process_time()
-    resource.setrlimit(resource.RLIMIT_CPU, (int(before) + 2 * seconds, resource.RLIM_INFINITY))  # SIGXCPU ends a hang
+    before = time.process_time()
+    resource.setrlimit(resource.RLIMIT_CPU, (int(before) + 2 * SECONDS, resource.RLIM_INFINITY))  # SIGXCPU ends a hang
     Path("/proc/self/clear_refs").write_text("5")  # forget the peak
-    found = [read(kind, path)]
-    for argv in commands(kind, path) if by_commands and found[0][0] != "fault" else ():
-        _out(path).mkdir()
-        found.append(run(argv))
-        shutil.rmtree(_out(path))
+
+    outcome = read(kind, path)
+
     status = Path("/proc/self/status").read_text()
     peak = int(re.findall(r"VmHWM:\s*(\d+)", status)[0]) / 1024
     if peak > MEBIBYTES:
         return "memory", f"{peak:.0f} MiB"
-    if time.process_time() - before > seconds:
-        return "hung", f"more than {seconds} s of a processor"
-    return min(found, key=lambda one: ("fault", "refused", "read").index(one[0]))
+    if time.process_time() - before > SECONDS:
+        return "hung", f"more than {SECONDS} s of a processor"
+    return outcome
 
 
 @cache
@@ -231,10 +175,10 @@ def _silence() -> None:
 # -- all of them -------------------------------------------------------------------------------------------------------
 
 
-def judged(kind: str, path: Path, by_commands: bool) -> tuple[str, str]:
+def judged(kind: str, path: Path) -> tuple[str, str]:
     """What became of a file: one of :data:`OUTCOMES`, and why."""
     try:
-        return isolated(attempt, path, kind, by_commands)
+        return isolated(attempt, path, kind)
     except OSError as error:  # of the helper
         text = str(error)
         hung = "SIGXCPU" in text or "cannot be read within" in text
@@ -261,7 +205,7 @@ def _fuzz_kind(
 ) -> dict[str, Any]:
     for original in originals:
         copy = _placed(original, folder, "whole", original.read_bytes())
-        if (result := judged(kind, copy, by_commands=original is originals[0]))[0] != "read":
+        if (result := judged(kind, copy))[0] != "read":
             raise ValueError(f"{original}: intact, but was {result[0]} ({result[1]})")
     outcomes, reasons, slowest = Counter[str](), [], 0.0
     for number in range(count):
@@ -272,7 +216,7 @@ def _fuzz_kind(
             path.unlink()
             IRREGULAR[int(rng.integers(len(IRREGULAR)))](path)
         start = time.perf_counter()
-        outcome, why = judged(kind, path, by_commands=number % BY_COMMANDS == 0)
+        outcome, why = judged(kind, path)
         slowest = max(slowest, time.perf_counter() - start)
         outcomes[outcome] += 1
         if outcome not in OUTCOMES[:2]:

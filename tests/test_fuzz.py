@@ -39,12 +39,12 @@ def test_a_crash_and_a_hang_of_a_reader_are_told_apart(
     fuzz: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     missing = tmp_path / "missing.jpg"
-    assert fuzz.judged("picture", missing, False) == ("refused", f"{missing}: no such picture file")
+    assert fuzz.judged("picture", missing) == ("refused", f"{missing}: no such picture file")
     for name, outcome in (("SIGSEGV", "crashed"), ("SIGXCPU", "hung")):
         monkeypatch.setattr(fuzz, "attempt", partial(killed, getattr(signal, name)))
-        found = fuzz.judged("picture", missing, False)
+        found = fuzz.judged("picture", missing)
         assert found[0] == outcome and name in found[1] and "missing.jpg" in found[1]
 
 
-def killed(number: int, path: Path, kind: str, by_commands: bool) -> None:
+def killed(number: int, path: Path, kind: str) -> None:
     os.kill(os.getpid(), number)
