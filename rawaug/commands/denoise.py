@@ -169,6 +169,6 @@ def print_denoised(result: DenoisedFolder[Any]) -> None:
     for done in result.files:
         print(done)
     if result.existing or result.broken:
-        print(f"{len(result.files)} denoised, {result.existing} already existed, {len(result.broken)} failed")
+        print(f"Denoised {len(result.files)} files; {result.existing} already existed, {len(result.broken)} failed.")
     for line in (*result.broken.values(), *result.left_out):
         print(escape(line))

@@ -57,7 +57,7 @@ def run(
     model = choose_denoiser(spec, classical, self_ensemble, device)
     assert model is not None
     submit(path, out, model.require_mosaic())
-    print(f"submission: {out}")
+    print(f"The submission is in {out}.")
 
 
 def submit(path: str, out: str, denoiser: RawDenoiser) -> None:

@@ -112,11 +112,11 @@ def notes_of(result: dict[str, Any]) -> list[str]:
         for strength, scores in row["scores"][TOLD].items():
             summaries[f"{name} ({strength})"] = scores
 
-    notes = ["GMAC and s: a megapixel of the mosaic. sRGB: after one fixed development."]
+    notes = ["GMAC and seconds are per megapixel of the mosaic; sRGB scores are after one fixed development."]
     note = own_noise_note(summaries)
     if note:
         notes.append(note)
-    notes.append(f"noisy input: {result['hash']} (equal hashes, comparable figures)")
+    notes.append(f"Hash of the noisy input: {result['hash']}. Figures with equal hashes can be compared.")
     return notes
 
 
