@@ -51,7 +51,7 @@ def test_pieces_of_frames_are_drawn_beside_a_filter(tmp_path: Path) -> None:
     assert print_.raw.shape == (1, *FRAME) and print_.raw.std() > 0.05, "there is print on the paper"
     crops.main(["demo:test", "--place", "page", "0", "0", "--iso", "6400", "--out", str(tmp_path / "crops.png")])
     assert read_picture(tmp_path / "crops.png").shape == (3, 325, 1092), "noisy, filtered, by the network, clean"
-    with pytest.raises(SystemExit, match="page: 256 x 256 at 40, 0 is not within 288 x 448"):
+    with pytest.raises(SystemExit, match="page:"):
         crops.main(["demo:test", "--place", "page", "40", "0", "--out", str(tmp_path / "crops.png")])
 
 

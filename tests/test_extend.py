@@ -100,7 +100,7 @@ def test_a_recipe_trains_with_what_another_package_brings(
     assert results["recipe"]["noise"] == {"name": "Banded", "settings": {"row_var": 1e-4}}
     monkeypatch.undo()  # the package is gone
     look_again(registries)
-    with pytest.raises(ValueError, match="denoiser 'Shallow' is unknown; use one of CycleISPDenoiser, DHDN"):
+    with pytest.raises(ValueError, match="'Shallow'"):
         denoisers.load(tmp_path / "abroad" / "seed0" / "pictures" / "denoiser.safetensors")
 
 

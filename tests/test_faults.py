@@ -169,7 +169,7 @@ def test_an_output_folder_that_is_removed_on_the_way_is_reported(
             (tmp_path / "out").rmdir()
 
     monkeypatch.setattr(pair_files, "write_pair", write_and_remove)
-    with pytest.raises(OSError, match="out: was removed or replaced during this run; run the same command again"):
+    with pytest.raises(OSError, match=r"out: .*replaced"):
         synth(inputs / "pictures", tmp_path / "out", workers=0)
 
 

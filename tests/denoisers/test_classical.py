@@ -62,7 +62,7 @@ def test_small_and_wrong_inputs(method: type[Classical]) -> None:
     if method is not BM3D:
         noisy = torch.rand(1, 4, least, least + 1, generator=torch.Generator().manual_seed(0))
         assert method()(noisy, torch.full_like(noisy, 1e-3)).isfinite().all()
-    with pytest.raises(ValueError, match=r"takes packed RAW \(B, 4, h >="):
+    with pytest.raises(ValueError, match="packed"):
         method()(torch.zeros(1, 4, least - 1, 32), torch.zeros(1))
     with pytest.raises(ValueError, match="needs the noise variance"):
         method()(torch.zeros(1, 4, 32, 32))

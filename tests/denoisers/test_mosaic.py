@@ -68,7 +68,7 @@ def test_a_recipe_starts_it_from_shipped_weights_and_goes_on_from_its_own(tmp_pa
     save(started, tmp_path / "own.safetensors", {})
     again = first_network(DenoiserConfig(start=str(tmp_path / "own.safetensors")), seed=0)
     assert isinstance(again, MosaicDRUNet) and torch.equal(again.tail.weight, started.tail.weight)
-    with pytest.raises(ValueError, match="rawaug-base is a DRUNet with"):
+    with pytest.raises(ValueError, match="rawaug"):
         first_network(DenoiserConfig("MosaicDRUNet", {"width": 16}, "rawaug-base"), seed=0)
 
 
@@ -129,7 +129,7 @@ def test_a_pyramid_finds_wide_noise_of_every_pattern() -> None:
 def test_what_it_cannot_take_is_refused() -> None:
     net = MosaicDRUNet(**SMALL)
     noisy, variance = noisy_mosaic("XTRANS")
-    with pytest.raises(ValueError, match=r"takes a mosaic and its planes, \(B, 4, H >= 4, W >= 4\), got \(1, 1, 48"):
+    with pytest.raises(ValueError, match="mosaic"):
         net(noisy, variance)
     given = with_planes(noisy, pattern("XTRANS"))
     with pytest.raises(ValueError, match="pass the noise variance"):

@@ -161,7 +161,7 @@ def test_every_network_works_in_every_domain(make: Make, domain: str) -> None:
         model(noisy)
     # The same picture at twice the gain is the same problem, whose solution is twice as bright.
     torch.testing.assert_close(model(2 * noisy, 4 * variance), 2 * model(noisy, variance), rtol=1e-4, atol=1e-4)
-    with pytest.raises(ValueError, match="domain 'log' is unknown; use one of linear, ksigma, anscombe"):
+    with pytest.raises(ValueError, match="'log'"):
         make(domain="log")
 
 
@@ -205,7 +205,7 @@ def test_limits_tell_a_network_where_the_sensor_clips() -> None:
     black, white = (maps[0, 0, 0, ::16].tolist() for maps in (seen[0][:, 4:8], seen[0][:, 8:]))
     assert black == pytest.approx([2 * 0.375**0.5, 8, 8, 8], abs=0.01)
     assert white == pytest.approx([8, 8, 2 * (1000.375**0.5 - 970.375**0.5), 0], abs=0.01)
-    with pytest.raises(ValueError, match="limits and mend need a transformed signal"):
+    with pytest.raises(ValueError, match="transformed"):
         DRUNet(limits=True)
 
 
@@ -233,7 +233,7 @@ def test_a_network_that_mends_is_not_moved_by_hot_pixels() -> None:
     changed = net(hot, 1e-3 * hot + 1e-5) - net(noisy, variance)
     assert changed.abs().max() < 0.1
     assert denoisers.build("DRUNet", **net.config).config == net.config
-    with pytest.raises(ValueError, match="mend compares the planes of packed RAW"):
+    with pytest.raises(ValueError, match="compares"):
         DRUNet(domain="anscombe", mend=True, channels=3)
 
 
@@ -366,12 +366,12 @@ class Payload:
 
 def test_other_checkpoints_are_refused(tmp_path: Path) -> None:
     torch.save({"state_dict": {"head": Payload()}}, tmp_path / "code.pth")
-    with pytest.raises(ValueError, match="not a checkpoint of plain weights"):
+    with pytest.raises(ValueError, match="checkpoint"):
         CycleISPDenoiser.from_published(tmp_path / "code.pth")
     torch.save({"state_dict": {"head.0.bias": torch.zeros(64)}}, tmp_path / "part.pth")
-    with pytest.raises(ValueError, match=r"part\.pth: layer \S+ is missing, the denoiser needs"):
+    with pytest.raises(ValueError, match=r"part\.pth: .*denoiser"):
         CycleISPDenoiser.from_published(tmp_path / "part.pth")
-    with pytest.raises(ValueError, match="groups, blocks and reduction must be at least 1"):
+    with pytest.raises(ValueError, match="reduction"):
         CycleISPDenoiser(groups=0)
 
 

@@ -119,12 +119,12 @@ def test_what_would_move_the_pattern_is_refused() -> None:
         bayer.crop(mosaic, 6, 0, 4, 4)
     with pytest.raises(ValueError, match="even"):
         bayer.RandomCrop(5)
-    with pytest.raises(ValueError, match="6 x 8 is smaller than the crop 8 x 8"):
+    with pytest.raises(ValueError, match="crop"):
         bayer.RandomCrop(8).sample(6, 8, torch.Generator())
     for shape in ((1, 5, 4), (1, 4, 5)):
         with pytest.raises(ValueError, match="even sides"):
             bayer.pack(torch.zeros(shape), "RGGB")
-    with pytest.raises(ValueError, match="demosaicing 'lmmse' is unknown; use one of bilinear, malvar, adams, ahd"):
+    with pytest.raises(ValueError, match="'lmmse'"):
         bayer.demosaic(mosaic[None], "RGGB", "lmmse")
 
 

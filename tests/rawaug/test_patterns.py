@@ -84,15 +84,15 @@ def test_turns_and_crops_keep_the_pattern_and_the_picture(cfa: Pattern, view: in
 
 def test_what_would_move_the_pattern_is_refused() -> None:
     mosaic = torch.zeros(1, 12, 18)
-    with pytest.raises(ValueError, match=r"offset \(2, 6\) must be a multiple of 6 to keep XTRANS"):
+    with pytest.raises(ValueError, match="XTRANS"):
         XTRANS.crop(mosaic, 2, 6, 6, 6)
     with pytest.raises(ValueError, match="extends beyond the mosaic"):
         XTRANS.crop(mosaic, 6, 6, 7, 6)
-    with pytest.raises(ValueError, match="10 x 18 must be multiples of 6 to turn XTRANS"):
+    with pytest.raises(ValueError, match="XTRANS"):
         XTRANS.turn_keeping(mosaic[:, 2:], 1)
     with pytest.raises(ValueError, match="too small"):
         XTRANS.turn_keeping(torch.zeros(1, 6, 6), 1)
-    with pytest.raises(ValueError, match=r"CFA 'X-TRANS' is unknown; use one of RGGB, .*QUAD-RGGB.*, XTRANS"):
+    with pytest.raises(ValueError, match="'X-TRANS'"):
         pattern("X-TRANS")
 
 
@@ -146,7 +146,7 @@ def test_a_dataset_of_x_trans_pairs_begins_every_crop_at_the_cell(isp: Dictionar
 def test_noise_of_four_planes_is_refused_without_them_and_another_bayer_pattern_is_one_of_its_own(
     isp: DictionaryISP,
 ) -> None:
-    with pytest.raises(ValueError, match="planes R, Gr, Gb, B"):
+    with pytest.raises(ValueError, match="planes"):
         RawAugment(isp, noise=ColourBias(1e-3), cfa="XTRANS")
     augment = RawAugment(isp, cfa="BGGR")
     assert (str(augment.isp.cfa), str(isp.cfa)) == ("BGGR", "RGGB"), "the caller's ISP stays as it is"

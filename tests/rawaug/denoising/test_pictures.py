@@ -42,7 +42,7 @@ def test_the_shipped_denoiser_of_pictures_removes_noise() -> None:
     denoised = PictureDenoiser.of("rawaug-srgb")(Noisy(noisy()[None]))[0]
     assert error(denoised) < 0.5 * error(noisy())
     assert "rawaug-srgb" not in shipped_of_mosaics()
-    with pytest.raises(ValueError, match="denoises developed pictures, not RAW"):
+    with pytest.raises(ValueError, match="developed"):
         RawDenoiser.of("rawaug-srgb")
     with pytest.raises(ValueError, match="denoises RAW, not pictures"):
         PictureDenoiser.of("rawaug-small")
@@ -143,6 +143,6 @@ def test_pairs_of_pictures_are_scored_as_published_and_registered(tmp_path: Path
 def test_a_cmyk_picture_is_refused_in_one_line(tmp_path: Path) -> None:
     image = pytest.importorskip("PIL.Image")
     image.new("CMYK", (32, 32), (10, 20, 30, 0)).save(tmp_path / "print.jpg")
-    with pytest.raises(ValueError, match=r"print.jpg: is CMYK; convert it to sRGB first"):
+    with pytest.raises(ValueError, match=r"print.jpg: .*CMYK"):
         denoise(str(tmp_path / "print.jpg"), str(tmp_path / "out.jpg"))
     assert not (tmp_path / "out.jpg").exists()

@@ -83,5 +83,5 @@ def test_noise_of_the_callers_is_that_of_evaluate() -> None:
     evaluated = trial_of(frame, noise_model("SonyA7S2", iso=6400))
     assert told.variance is not None and evaluated.variance is not None
     assert torch.equal(told.noisy, evaluated.noisy) and torch.allclose(told.variance, evaluated.variance)
-    with pytest.raises(ValueError, match="iso: needs the name of a camera as noise"):
+    with pytest.raises(ValueError, match=r"iso: .*camera"):
         strengths_of(isos=[100])

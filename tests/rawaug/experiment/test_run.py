@@ -47,5 +47,5 @@ def test_it_is_found_before_any_work(
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     require_trainable("cpu", 1, "bf16-mixed")
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(MissingExtra, match=r"matplotlib is not installed; run: pip install '.*\[train\]'"):
+    with pytest.raises(MissingExtra, match="matplotlib"):
         require_trainable("cpu", 1, "32-true")

@@ -136,5 +136,5 @@ def test_black_levels_of_another_number_of_rows_are_refused(tmp_path: Path, baye
     assert read_raw(path).black == (BLACK + 1,) * 4, "equal for all rows: one level"
     extra = [(50716, SRATIONAL, 5, (1, 1, 2, 1) + (1, 1) * 3, True)]
     path = bayer_dng(tmp_path / "b.dng", numbers_of(CFA.RGGB, 32, 48), black=(BLACK,), white=WHITE, extra=extra)
-    with pytest.raises(OSError, match=r"b\.dng: its TIFF tags are damaged \(black levels of"):
+    with pytest.raises(OSError, match=r"b\.dng: .*TIFF"):
         read_raw(path)

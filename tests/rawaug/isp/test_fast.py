@@ -96,18 +96,18 @@ def test_later_changes_of_the_isp_do_not_reach_it() -> None:
 def test_pictures_and_parameters_that_do_not_fit_are_refused() -> None:
     isp = full_isp()
     baked, params = BakedISP(isp), isp.choose(torch.zeros(2, 3, 8, 8))
-    with pytest.raises(ValueError, match=r"even sides, got \(2, 3, 8, 7\)"):
+    with pytest.raises(ValueError, match="sides"):
         baked(torch.zeros(2, 3, 8, 7), params)
-    with pytest.raises(ValueError, match="matrix is for 2 pictures, but the batch has 3"):
+    with pytest.raises(ValueError, match="matrix"):
         baked(torch.zeros(3, 3, 8, 8), params)
-    with pytest.raises(ValueError, match="place is for 1 pictures"):
+    with pytest.raises(ValueError, match="place"):
         baked(torch.zeros(2, 3, 8, 8), params, torch.tensor([[0, 0, 8, 8]]))
 
 
 def test_stages_in_another_order_are_refused() -> None:
-    with pytest.raises(ValueError, match="usual order, got gamma gains colour; fit it anew"):
+    with pytest.raises(ValueError, match="colour"):
         BakedISP(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))
-    with pytest.raises(ValueError, match="usual order, got gamma gains colour; fit it anew"):
+    with pytest.raises(ValueError, match="colour"):
         FastForward(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))
 
 

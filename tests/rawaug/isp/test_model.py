@@ -67,7 +67,7 @@ def test_stages_can_be_left_out(srgb: torch.Tensor) -> None:
     kept = tuple(stage for stage in POINTWISE_STAGES if stage != "gains")
     result = DictionaryISP(ISPConfig(stages=kept)).reverse(srgb, intermediates=True)
     assert list(result.intermediates) == ["x1", "x2", "x3", "x5"]
-    with pytest.raises(ValueError, match="'bogus' is unknown; use one of colour, curve, gains, gamma, shading, tone"):
+    with pytest.raises(ValueError, match="'bogus'"):
         DictionaryISP(ISPConfig(stages=("tone", "bogus")))
 
 
@@ -200,5 +200,5 @@ def test_atoms_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
     with torch.no_grad():
         isp.gain.log_gains.fill_(1000.0)  # finite, but their exponentials are not
     isp.save(tmp_path / "a.safetensors")
-    with pytest.raises(ValueError, match=r"a\.safetensors: .*its gain atoms are not finite"):
+    with pytest.raises(ValueError, match=r"a\.safetensors: .*finite"):
         DictionaryISP.from_pretrained(tmp_path / "a.safetensors")

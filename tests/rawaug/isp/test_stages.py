@@ -171,7 +171,7 @@ def test_configure_removes_stages_and_sets_the_knee(srgb: Tensor) -> None:
     isp.configure(stages=("gamma", "gains"))
     assert list(isp.reverse(srgb, intermediates=True).intermediates) == ["x2", "x4"]
     assert not any("tone" in name or "shading" in name for name in isp.state_dict())
-    with pytest.raises(ValueError, match="'tone' is not in this ISP, which has gamma gains"):
+    with pytest.raises(ValueError, match="'tone'"):
         isp.configure(stages=("tone", "gamma"))
 
 

@@ -64,7 +64,7 @@ def test_a_kernel_that_fails_is_reported_once_and_pytorch_goes_on(monkeypatch: p
     def fails() -> int:
         raise RuntimeError("no ptxas\nfor this target")
 
-    with pytest.warns(UserWarning, match="unavailable, using PyTorch instead: RuntimeError: for this target"):
+    with pytest.warns(UserWarning, match="RuntimeError"):
         assert kernels.try_kernel(fails, lambda: 2) == 2
     assert not kernels.can_use_triton(torch.zeros(1, device="meta"))
 

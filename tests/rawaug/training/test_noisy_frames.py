@@ -112,7 +112,7 @@ def test_a_self_supervised_recipe_never_meets_a_clean_frame(pictures: list[torch
 def test_frames_as_shot_need_measured_levels() -> None:
     pair = replace(demo_pairs("train", count=1)[0], noisy=None, shot_var=None, read_var=None)
     assert drop_clean(pair) is pair
-    with pytest.raises(ValueError, match="train_00_astronaut: has no noise levels"):
+    with pytest.raises(ValueError, match=r"train_00_astronaut: .*levels"):
         noisy_frame(pair, None)
     assert noisy_frame(pair, {"shot_var": 1e-3, "read_var": 1e-5, "r2": 1.0}).read_var == 1e-5
 
@@ -161,9 +161,9 @@ def test_real_frames_are_estimated_once_and_only_for_estimators_that_add_noise(m
 
 def test_what_an_estimator_lacks_is_named() -> None:
     frame = NoisyFrame("small", torch.zeros(1, 32, 32), 1e-3, 1e-5, CFA.RGGB)
-    with pytest.raises(ValueError, match="small: Noise2Noise needs 2 shots"):
+    with pytest.raises(ValueError, match=r"small: .*Noise2Noise"):
         NoisyCrops([frame], Noise2Noise(), 16, CFA.RGGB).draw(torch.Generator())
-    with pytest.raises(ValueError, match="small: a frame of 32 x 32 is too small"):
+    with pytest.raises(ValueError, match=r"small: .*small"):
         NoisyCrops([frame], R2R(), 32, CFA.RGGB).draw(torch.Generator())
 
 

@@ -104,7 +104,7 @@ def test_settings_that_cannot_be_are_refused(exact_pairs: list[Pair]) -> None:
     for settings in ({"atoms": 0}, {"pixels": 0}, {"steps": -1}, {"reach": 0.9}):
         with pytest.raises(ValueError, match=next(iter(settings))):
             FitConfig(**settings)
-    with pytest.raises(ValueError, match="gain_atoms is 20, but these frames need 1 to 9"):
+    with pytest.raises(ValueError, match="gain_atoms"):
         fit_isp(exact_pairs[:1], replace(TINY, isp={"gain_atoms": 20}), progress=False)
 
 

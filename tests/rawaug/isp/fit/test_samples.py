@@ -65,7 +65,7 @@ def test_noisy_readings_are_taken_only_where_they_are(exact_pair: Callable[..., 
     clean, _ = sample_pixels([pair], 100, seed=0)
     noisy, _ = sample_pixels([pair], 100, seed=0, noisy=True)
     assert torch.equal(clean.srgb, noisy.srgb) and not torch.allclose(clean.target, noisy.target)
-    with pytest.raises(ValueError, match="shot: has no noisy RAW"):
+    with pytest.raises(ValueError, match=r"shot: .*noisy"):
         sample_pixels([exact_pair("shot", WB, 0)], 100, seed=0, noisy=True)
 
 

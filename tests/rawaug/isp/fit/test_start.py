@@ -237,5 +237,5 @@ def test_a_frame_without_unclipped_pixels_is_named() -> None:
         white_balance=(2.0, 1.0, 1.5),
         color_matrix=torch.eye(3),
     )
-    with pytest.raises(ValueError, match="IMG_1: too few unclipped pixels"):
+    with pytest.raises(ValueError, match=r"IMG_1: .*unclipped"):
         fit_isp([blown], FitConfig(pixels=256), progress=False)

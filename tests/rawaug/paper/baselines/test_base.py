@@ -135,7 +135,7 @@ def test_methods_that_cannot_render_say_so(exact_pairs: list[Pair]) -> None:
             picture = model(raw, exact_pairs[0].srgb[None] if name == "cycleisp" else None)
             assert picture.shape == (1, 3, 96, 128) and picture.min() >= 0.0 and picture.max() <= 1.0
         else:
-            with pytest.raises(ValueError, match="only converts sRGB to RAW"):
+            with pytest.raises(ValueError, match="converts"):
                 model(raw)
 
 
