@@ -10,6 +10,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.data.pairs import Pair
 from rawaug.isp import staged
+from rawaug.isp.config import ISPParams
 from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, frame_coordinates
@@ -18,23 +19,41 @@ from rawaug.seeding import keyed_generator
 
 
 @torch.no_grad()
-def psnr_r(isp: DictionaryISP, pair: Pair, white_balance: bool = False, patches: int | None = None) -> float:
-    """PSNR_r of one frame, with its as-shot ``white_balance`` if asked; of an unregistered pair that of block averages.
+def psnr_r(
+    isp: DictionaryISP,
+    pair: Pair,
+    white_balance: bool = False,
+    patches: int | None = None,
+    tone: staged.Tone | None = None,
+) -> float:
+    """Measure PSNR_r of one frame; of an unregistered pair that of block averages.
 
-    Of a registered frame ``patches`` are scored, all by default. ValueError if the picture is not in the camera's
-    colours, as SIDD's blocks without their sRGB files.
+    Args:
+        isp: reconstructs the RAW.
+        pair: the frame.
+        white_balance: whether the ISP is given the frame's as-shot gains.
+        patches: how many patches of a registered frame are scored, all by default.
+        tone: the tone curve that the ISP is given, as in :meth:`DictionaryISP.reverse`.
+
+    Raises:
+        ValueError: if the picture is not in the camera's colours, as SIDD's blocks without their sRGB files.
     """
     pair.require_rendered()
     given = pair.white_balance if white_balance else None
+
+    def choose(srgb: Tensor) -> ISPParams:
+        params = staged.with_white_balance(isp, isp.choose(srgb), given, None)
+        return staged.with_tone(isp, params, tone)
+
     if pair.registered:
-        params = staged.with_white_balance(isp, isp.choose(pair.srgb[None]), given, None)
+        params = choose(pair.srgb[None])
 
         def made(patch: Tensor, place: Tensor) -> Tensor:
             return bayer.mosaic(isp.reverse_pixels(as_float(patch), params, place), pair.cfa)
 
         return windows_psnr(made, pair, patches)
     blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
-    params = staged.with_white_balance(isp, isp.choose(blocks.srgb[None]), given, None)
+    params = choose(blocks.srgb[None])
     return block_psnr(isp.reverse_pixels(blocks.srgb[None], params, blocks.coordinates)[0], blocks.raw, blocks.clipped)
 
 

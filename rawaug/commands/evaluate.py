@@ -34,6 +34,8 @@ def run(
     seed: int = 0,
     bin: int = 1,
     classical: Annotated[list[Spec] | None, YAML] = None,
+    as_shot: bool = False,
+    tone: str | None = None,
     device: str = "cpu",
     report: str | None = None,
     json: str | None = None,
@@ -53,6 +55,8 @@ def run(
         seed: seed of that noise.
         bin: K bins the frames K x K by colour site first: clean references of real photographs (denoisers).
         classical: classical filters to score on the same noise: NonLocalMeans, Wavelet, TotalVariation, BM3D.
+        as_shot: give an ISP the as-shot gains of each frame.
+        tone: give an ISP with tone curves the one of the pictures, such as linear for LibRaw's rendering.
         device: device for a denoiser: cpu, cuda, ...
         report: write an HTML page with a denoiser's scores and crops to this file.
         json: write the result as JSON to this file.
@@ -79,7 +83,12 @@ def run(
         report=report,
         settings=settings or PairSettings(),
     )
-    result = evaluate_isp(asked) if is_isp(weights) else task_of(data).evaluate(asked)
+    if is_isp(weights):
+        result = evaluate_isp(asked, as_shot, tone)
+    elif as_shot or tone is not None:
+        raise ValueError(f"{weights}: is a denoiser; --as-shot and --tone are for ISPs")
+    else:
+        result = task_of(data).evaluate(asked)
     require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
     return result
 
@@ -97,8 +106,11 @@ def is_isp(weights: str) -> bool:
     return read_metadata(file).get("kind") == "isp"
 
 
-def evaluate_isp(asked: Evaluation) -> dict[str, Any]:
-    """PSNR_r of an ISP on the frames of a test set, printed and written; the result, as in the JSON."""
+def evaluate_isp(asked: Evaluation, as_shot: bool = False, tone: str | None = None) -> dict[str, Any]:
+    """PSNR_r of an ISP on the frames of a test set, printed and written; the result, as in the JSON.
+
+    ``as_shot`` gives the ISP the gains of each frame, and ``tone`` the tone curve of all.
+    """
     for_denoisers = asked.views > 1 or asked.noise is not None or asked.bin != 1 or asked.classical or asked.report
     if for_denoisers:
         options = "--self-ensemble, --views, --noise, --bin, --classical and --report"
@@ -110,10 +122,12 @@ def evaluate_isp(asked: Evaluation) -> dict[str, Any]:
 
     rows = []
     for pair in progress(pairs, label="evaluate", unit="image"):
-        psnr = require_finite(pair.name, psnr_r(isp, pair))
+        psnr = require_finite(pair.name, psnr_r(isp, pair, as_shot, tone=tone))
         rows.append(Row("ISP", pair.name, "", "", "raw", psnr))
 
     result = {**asked.facts("isp", file), **summary(rows)}
+    if as_shot or tone is not None:
+        result |= {"as_shot": as_shot, "tone": tone}
     if pairs.broken:
         result["broken"] = pairs.reasons()
     print_scores(result)

@@ -148,7 +148,7 @@ _PHONES = [
         },
         (50, 100, 200, 400, 800, 1600, 3200),
         Shading(0.03, -0.05, 0.55, 0.35),
-        Rendering(0.85, 6.0, 0.015, 0.70, 0.16, 0.10, 1.0, 1.05, 0.30, 0.40),
+        Rendering(0.85, 6.0, 0.015, 0.55, 0.16, 0.08, 1.0, 1.05, 0.25, 0.35),
     ),
     _phone(
         "IP",
@@ -157,7 +157,7 @@ _PHONES = [
         {100: (0.000702, 3e-6), 400: (0.000735, 3e-6), 800: (0.000723, 3e-6), 1600: (0.000687, 2e-6)},
         (50, 100, 200, 400, 800, 1600),
         Shading(-0.02, 0.02, 0.40, 0.20),
-        Rendering(0.65, 5.0, 0.010, 0.50, 0.14, 0.08, 0.9, 1.00, 0.20, 0.25),
+        Rendering(0.65, 5.0, 0.010, 0.50, 0.15, 0.06, 0.9, 1.00, 0.20, 0.25),
     ),
     _phone(
         "S6",
@@ -172,7 +172,7 @@ _PHONES = [
         },
         (50, 100, 200, 400, 800, 1600, 3200),
         Shading(0.05, 0.04, 0.70, 0.30),
-        Rendering(0.80, 8.0, 0.020, 0.65, 0.20, 0.14, 0.95, 1.20, 0.35, 0.50),
+        Rendering(0.80, 8.0, 0.020, 0.60, 0.17, 0.10, 0.95, 1.20, 0.30, 0.45),
     ),
     _phone(
         "N6",
@@ -187,7 +187,7 @@ _PHONES = [
         },
         (50, 100, 200, 400, 800, 1600, 3200),
         Shading(-0.06, -0.03, 0.80, 0.45),
-        Rendering(0.55, 9.0, 0.020, 0.45, 0.11, 0.15, 0.8, 0.95, 0.10, 0.20),
+        Rendering(0.55, 9.0, 0.020, 0.45, 0.15, 0.10, 0.8, 0.95, 0.15, 0.20),
     ),
     _phone(
         "G4",
@@ -196,7 +196,7 @@ _PHONES = [
         {100: (0.000739, 2e-6), 400: (0.00186, 2e-6), 800: (0.003356, 6.3e-5)},
         (50, 100, 200, 400, 800),
         Shading(0.02, 0.06, 0.50, 0.50),
-        Rendering(0.75, 7.0, 0.015, 0.60, 0.15, 0.12, 1.0, 1.10, 0.25, 0.35),
+        Rendering(0.75, 7.0, 0.015, 0.55, 0.16, 0.08, 1.0, 1.10, 0.22, 0.35),
     ),
 ]
 CAMERAS: dict[str, Phone] = {phone.code: phone for phone in _PHONES}
@@ -253,6 +253,7 @@ class PhoneFrames(LazyPairs):
         path: a folder of photographs (:func:`rawaug.data.scenes.scene_files`), or empty for the package's own.
         split: ``"train"``, ``"validation"`` or ``"test"``.
         seed: of all that is drawn.
+        size: height and width of the frames, even.
 
     Example:
         >>> frames = PhoneFrames("", "train")
@@ -260,8 +261,10 @@ class PhoneFrames(LazyPairs):
         (320, '0001_001_G4_00100_00033_5500_L_010', 'G4')
     """
 
-    def __init__(self, path: str | Path = "", split: str = "test", seed: int = 0) -> None:
-        self.path, self.split, self.seed = str(path), split, seed
+    def __init__(
+        self, path: str | Path = "", split: str = "test", seed: int = 0, size: tuple[int, int] = FRAME
+    ) -> None:
+        self.path, self.split, self.seed, self.size = str(path), split, seed, size
         self.files = scene_files(path, split)
         self.instances = self._draw_instances()
         if split == "train":
@@ -290,14 +293,15 @@ class PhoneFrames(LazyPairs):
     def stamp(self, index: int) -> str:
         instance, _ = self.shots[index]
         size = instance.file.stat().st_size
-        return f"{self.names[index]} seed {self.seed} of {instance.file.name} {size}"
+        height, width = self.size
+        return f"{self.names[index]} seed {self.seed}, {height} x {width} of {instance.file.name} {size}"
 
     def read(self, index: int) -> Pair:
         instance, _ = self.shots[index]
         code = label_of(instance.name).phone
         phone = CAMERAS[code]
         generator = keyed_generator(self.seed, "phones window", self.split, instance.name)
-        scene = draw_window(instance.file, FRAME, generator, self.max_pixels)
+        scene = draw_window(instance.file, self.size, generator, self.max_pixels)
         noise = keyed_generator(self.seed, "phones noise", self.split, self.names[index])
         return take(phone, scene, instance.shot, noise, self.names[index])
 

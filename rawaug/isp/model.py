@@ -26,7 +26,7 @@ from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
 from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weights, log_light
 from rawaug.isp.own_cameras import Camera, as_camera, is_camera_file, mired_of, weights_in_light
 from rawaug.isp.own_sampler import OwnCameraSampler, own_cameras
-from rawaug.isp.staged import StagedISP, thumbnail
+from rawaug.isp.staged import StagedISP, Tone, thumbnail
 from rawaug.registry import suggest
 
 _ADVICE = "fit or copy it again"
@@ -128,6 +128,7 @@ class DictionaryISP(StagedISP):
         *,
         white_balance: Tensor | tuple[float, ...] | None = None,
         digital_gain: Tensor | float | None = None,
+        tone: Tone | None = None,
         raw_samples: Tensor | None = None,
         coordinates: Tensor | None = None,
         intermediates: bool = False,
@@ -140,6 +141,9 @@ class DictionaryISP(StagedISP):
             white_balance: the camera's as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``; green is made 1. They
                 choose the colour atoms of such light as well.
             digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
+            tone: the tone curve that the picture was rendered with, where the ISP has a dictionary of them
+                (``isp.info["tones"]``): a name such as ``"linear"``, which is LibRaw's rendering, or a mixture
+                (:func:`rawaug.isp.staged.with_tone`); what the ISP chooses by default.
             raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are solved for from these few readings
                 (:func:`rawaug.isp.staged.with_raw_samples`).
             coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame
@@ -158,6 +162,7 @@ class DictionaryISP(StagedISP):
         with self._float32(srgb):
             x = stages.as_display_referred(srgb)
             params = staged.with_white_balance(self, params or self.choose(x), white_balance, digital_gain)
+            params = staged.with_tone(self, params, tone)
             if len(params.gains) != len(x):
                 raise ValueError(f"the parameters are for {len(params.gains)} pictures, but the batch has {len(x)}")
             if raw_samples is not None:
@@ -183,6 +188,7 @@ class DictionaryISP(StagedISP):
         params: ISPParams | None = None,
         *,
         white_balance: Tensor | tuple[float, ...] | None = None,
+        tone: Tone | None = None,
         coordinates: Tensor | None = None,
         intermediates: bool = False,
     ) -> ISPResult:
@@ -192,6 +198,7 @@ class DictionaryISP(StagedISP):
             raw: ``(B, 1, H, W)`` with the ISP's CFA, floating point, white = 1.
             params: the settings of the pictures; by default the forward encoders, or their constants, choose them.
             white_balance: the camera's as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``.
+            tone: the tone curve to render with, as in :meth:`reverse`.
             coordinates: as in :meth:`reverse`.
             intermediates: also return x5 ... x1.
 
@@ -206,6 +213,7 @@ class DictionaryISP(StagedISP):
             if params is None:
                 params = self.choose_forward(self.remove_shading(x5, coordinates))
             params = staged.with_white_balance(self, params, white_balance, None)
+            params = staged.with_tone(self, params, tone)
             seen: dict[str, Tensor] = {"x5": x5}
             srgb = self.forward_pixels(x5, params, coordinates, seen if intermediates else None)
         return ISPResult(srgb.clamp(0.0, 1.0), params, seen if intermediates else {})

@@ -14,6 +14,7 @@ weights v, and ``sum_n w_n (C_n T(x))_c`` in w.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeVar, cast
 
@@ -27,6 +28,7 @@ from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, GainDictio
 from rawaug.isp.stages import STAGES, Stage
 from rawaug.isp.tone import ToneCurve, ToneDictionary
 from rawaug.kernels.reference import apply_curves
+from rawaug.registry import suggest
 from rawaug.seeding import derive_seed, initialise_from
 
 S = TypeVar("S", bound=Stage)
@@ -253,6 +255,46 @@ def with_white_balance(
         own = params.gains[:, 1:2] / params.matrix[:, 1:2].sum(2)
         params = params._replace(gains=params.gains / own * digital)
     return params
+
+
+Tone = str | Mapping[str, float] | Tensor
+"""A tone curve by name, a mixture of them (shares by name), or weights ``(K,)`` or ``(B, K)`` of all of them."""
+
+
+def with_tone(isp: StagedISP, params: ISPParams, tone: Tone | None) -> ISPParams:
+    """Replace the tone curves of a setting by a known one, or by a mixture.
+
+    Args:
+        isp: whose dictionary of tone curves is used; ``isp.info["tones"]`` has their names.
+        params: the settings of B pictures.
+        tone: a name such as ``"linear"``, shares by name such as ``{"linear": 0.5, "upi": 0.5}``, or weights ``(K,)``
+            or ``(B, K)``. Shares and weights are divided by their sum. None keeps the setting's own.
+
+    Raises:
+        ValueError: if the ISP has no such curve, or a share is negative.
+    """
+    if tone is None:
+        return params
+    if isp.tone is None:
+        raise ValueError("tone: this ISP has learned a curve of its own; only one with a dictionary of curves takes it")
+    names = list(isp.info.get("tones", ()))
+    count = len(isp.tone.curves)
+    if isinstance(tone, Tensor):
+        weights = tone.to(params.gains)
+    else:
+        shares = {tone: 1.0} if isinstance(tone, str) else tone
+        weights = params.gains.new_zeros(count)
+        for name, share in shares.items():
+            if name not in names:
+                raise ValueError(f"tone {name!r} is unknown; use one of {', '.join(names)}{suggest(name, names)}")
+            weights[names.index(name)] = share
+    batch = len(params.gains)
+    if weights.shape not in ((count,), (1, count), (batch, count)):
+        raise ValueError(f"tone must be ({count},) or ({batch}, {count}), got {tuple(weights.shape)}")
+    total = weights.sum(dim=-1, keepdim=True)
+    if not (weights >= 0).all() or not ((total > 0) & total.isfinite()).all():
+        raise ValueError("tone: shares must not be negative, and one must be positive")
+    return params._replace(tone_weights=(weights / total).expand(batch, count))
 
 
 def _require_factor(name: str, value: Tensor) -> None:

@@ -9,6 +9,8 @@ from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.stages import STAGES
 from rawaug.registry import require_between
 
+PUBLISHED_STEPS = 3000
+"""Steps end to end of the published fit."""
 MOST = 2**31
 """Upper limit of settings that count steps or pixels."""
 
@@ -20,6 +22,11 @@ class FitConfig:
     """How an ISP is fitted.
 
     Args:
+        method: "staged" fits stage by stage and keeps encoders and masks where held-out frames gain, for a handful of
+            frames. "published" is the fit of the paper: encoders and both masks, learned end to end after a short
+            start, by l2 losses on RAW and on every image between the stages of both passes and by the consistency of
+            the weights (``joint_steps``, 3,000 by default). It sets ``shading``, ``attention`` and ``encoders`` to on
+            and ``tone`` to learned, and needs two frames or more; the paper has 5 to 320.
         size: "small" has at most 8 atoms a dictionary and narrow encoders: with encoders 0.12 M parameters instead
             of 0.52 M, without them about 5,000 in either case.
         atoms: largest number of atoms in each dictionary; more frames than that are clustered.
@@ -38,6 +45,8 @@ class FitConfig:
         attention: fit the attention mask as well.
         encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them with a dozen frames or more
             and keeps them if they beat the constants on held-out frames.
+        raw_loss: of end-to-end training on RAW: "l2" as published, or "log", the logarithm of each frame's mean squared
+            error, which weighs frames as the mean of decibels does.
         encoder_steps: steps of the encoders' training.
         joint_steps: steps of a last end-to-end training of everything at once; by default 1000 with 50 frames or more,
             else 0. Kept only if held-out frames improve.
@@ -52,6 +61,7 @@ class FitConfig:
         isp: further keys of :class:`rawaug.isp.config.ISPConfig`, such as ``encoder_widths``.
     """
 
+    method: Literal["staged", "published"] = "staged"
     size: Literal["default", "small"] = "default"
     atoms: int = 16
     reach: float = 1.6
@@ -68,6 +78,7 @@ class FitConfig:
     curve_steps: int | None = None
     prior_steps: int = 400
     mse_floor: float = 1e-5
+    raw_loss: Literal["l2", "log"] = "l2"
     intermediate: float = 0.1
     consistency: float = 1.0
     noisy: bool = False
@@ -79,9 +90,19 @@ class FitConfig:
         """``atoms``, as far as the size allows."""
         return min(self.atoms, SMALL.colour_atoms) if self.size == "small" else self.atoms
 
+    def settled(self) -> FitConfig:
+        """The same configuration, with what its method sets."""
+        if self.method == "staged":
+            return self
+        steps = PUBLISHED_STEPS if self.joint_steps is None else self.joint_steps
+        return replace(
+            self, shading="on", attention=True, encoders="on", tone="learned", encoder_steps=0, joint_steps=steps
+        )
+
     def shortest(self) -> FitConfig:
         """The same configuration, reduced to a fit of a second."""
-        return replace(self, steps=2, curve_steps=10, pixels=512, batch=128, prior_steps=20, encoder_steps=4)
+        short = replace(self, steps=2, curve_steps=10, pixels=512, batch=128, prior_steps=20, encoder_steps=4)
+        return replace(short, joint_steps=4) if self.method == "published" else short
 
     def __post_init__(self) -> None:
         steps = ("steps", "joint_steps", "curve_steps", "prior_steps", "encoder_steps")
@@ -92,7 +113,14 @@ class FitConfig:
         require_between("reach", self.reach, 1.0, float(MOST))
         for key in ("learning_rate", "mse_floor", "intermediate", "consistency"):
             require_between(key, getattr(self, key), 0.0, float(MOST))
-        for key, values in {"size": ("default", "small"), **dict.fromkeys(("shading", "encoders"), _SWITCH)}.items():
+        choices = {
+            "raw_loss": ("l2", "log"),
+            "method": ("staged", "published"),
+            "size": ("default", "small"),
+            "shading": _SWITCH,
+            "encoders": _SWITCH,
+        }
+        for key, values in choices.items():
             if getattr(self, key) not in values:
                 raise ValueError(f"{key} must be {' or '.join(values)}, got {getattr(self, key)!r}")
         if unknown := set(self.isp) - {key.name for key in fields(ISPConfig)}:

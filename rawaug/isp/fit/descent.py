@@ -228,6 +228,12 @@ FEWEST_FRAMES, FOLDS = 12, 4
 """For encoders with "auto": the minimum number of frames, and the number of folds of the cross-validation."""
 MANY_FRAMES, STEPS, LEARNING_RATE, CONSISTENCY = 50, 1000, 2e-4, 0.01
 """End-to-end training: frames from which on it is the default, its steps, its rate, and the weight of consistency."""
+PUBLISHED_RATE, PUBLISHED_FRAMES, PUBLISHED_PIXELS = 2e-3, 8, 256
+"""The published fit learns nearly all of it end to end: its rate, and frames and pixels of a step."""
+LOG_WEIGHT = 0.02
+"""Of the logarithm of an error beside the squared errors of the other pass."""
+LOSS_SCALE = 1e4
+"""Squared errors are near 1e-4, and what encoders get of them would vanish beside the epsilon of Adam, 1e-8."""
 
 Refit = Callable[[FitFrames, str, FitConfig], DictionaryISP]
 """A function that fits an ISP without encoders to some frames; the text names the fit in its progress."""
@@ -359,21 +365,54 @@ def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, desc
     held_out = range(0, count, 10)[: max(1, count // 2)]
     watched, trained = frames.some(held_out), frames.some([k for k in range(count) if k not in held_out])
 
+    published = config.method == "published"
+    chosen = PUBLISHED_FRAMES if published else FRAMES_A_STEP
+    pixels = min(config.batch, PUBLISHED_PIXELS) if published else config.batch
+
     def loss(generator: torch.Generator) -> Tensor:
-        drawn = _draw_frames(trained, FRAMES_A_STEP, config.batch, generator)
-        return torch.stack([_joint_frame_loss(isp, part, shot, config) for part, shot in drawn]).mean()
+        losses = []
+        for part, srgb, raw in _draw_batches(trained, chosen, pixels, generator):
+            raw = isp.remove_shading(raw, None)
+            if published:
+                srgb, raw = _same_piece(srgb, raw, generator)
+            losses.append(len(srgb) * _joint_loss(isp, part, srgb, raw, config))
+        return LOSS_SCALE * torch.stack(losses).sum() / chosen
 
     tensors = dict(isp.named_parameters())
-    descent.run("end to end", loss, tensors, steps, LEARNING_RATE, watch=lambda: mean_psnr(isp, watched))
+    rate = PUBLISHED_RATE if published else LEARNING_RATE
+    descent.run("end to end", loss, tensors, steps, rate, watch=lambda: mean_psnr(isp, watched))
     seen = descent.watched["end to end"]
     if seen.step > 0:
         measure_lights(isp, trained)
     isp.info["joint"] = {"steps": steps, "kept_step": seen.step, "gain_db": round(seen.best - seen.start, 2)}
 
 
-def _joint_frame_loss(isp: DictionaryISP, part: PixelSamples, shot: FrameSummary, config: FitConfig) -> Tensor:
-    ours, theirs = isp.choose(shot.srgb), isp.choose_forward(isp.remove_shading(shot.raw, None))
+def _draw_batches(
+    frames: FitFrames, count: int, pixels: int, generator: torch.Generator
+) -> list[tuple[PixelSamples, Tensor, Tensor]]:
+    """Draw ``count`` frames, with replacement, in batches of one size: pixels, thumbnails of sRGB and of RAW."""
+    chosen = torch.randint(len(frames.shots), (count,), generator=generator).tolist()
+    index = torch.randint(frames.pixels.srgb.shape[-1], (pixels,), generator=generator)
+    groups: dict[tuple[torch.Size, torch.Size], list[int]] = {}
+    for k in chosen:
+        shot = frames.shots[k]
+        groups.setdefault((shot.srgb.shape, shot.raw.shape), []).append(k)
+    batches = []
+    for members in groups.values():
+        srgb = torch.cat([frames.shots[k].srgb for k in members])
+        raw = torch.cat([frames.shots[k].raw for k in members])
+        batches.append((frames.pixels.pick(index, torch.tensor(members)), srgb, raw))
+    return batches
+
+
+def _joint_loss(isp: DictionaryISP, part: PixelSamples, srgb: Tensor, raw: Tensor, config: FitConfig) -> Tensor:
+    """Compute the loss of B frames: ``srgb`` ``(B, 3, h, w)`` and ``raw`` ``(B, 3, h', w')``, without shading."""
+    ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
     back: dict[str, Tensor] = {}
     back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.coordinates, back)
     cycle = cycle_error(isp, part, theirs, back, config)
-    return mean_square(isp, part, ours)[0] + cycle + CONSISTENCY * config.consistency * weight_distance(ours, theirs)
+    distance = weight_distance(ours, theirs) / len(srgb)
+    error = mean_square(isp, part, ours)
+    if config.raw_loss == "log":
+        error = LOG_WEIGHT * (error + config.mse_floor).log()
+    return error.mean() + cycle + CONSISTENCY * config.consistency * distance

@@ -76,7 +76,7 @@ def fit_isp(
     Raises:
         ValueError: if there is no pair, a frame has too few unclipped pixels, or ``state`` cannot be read.
     """
-    config = config or FitConfig()
+    config = (config or FitConfig()).settled()
     reading = progress_of(pairs, label="read", unit="frame", shown=progress)
     frames = sample_pixels(reading, config.pixels, config.seed, config.noisy)
     _require_pixels(frames)

@@ -241,3 +241,12 @@ def test_whatever_is_benchmarked_can_be_evaluated(middles: list[Pair], tmp_path:
         evaluate("nowhere.onnx", data="given:")
     with pytest.raises(ValueError, match="no such denoiser"):
         evaluate("rawaug-smal", data="given:")
+
+
+def test_an_isp_may_be_told_what_a_file_states() -> None:
+    blind = evaluate("universal", data="real:validation")
+    given = evaluate("universal", data="real:validation", as_shot=True, tone="linear")
+    assert given["psnr"] > blind["psnr"] + 2.0
+    assert (given["as_shot"], given["tone"]) == (True, "linear") and "tone" not in blind
+    with pytest.raises(ValueError, match="--tone"):
+        evaluate("rawaug-small", data="real:validation", tone="linear")

@@ -11,6 +11,7 @@ from rawaug.data.pairs import Pair
 from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.staged import THUMBNAIL, Encoder, thumbnail
+from rawaug.isp.tone import srgb_to_linear
 from rawaug.metrics import psnr
 
 
@@ -146,3 +147,40 @@ def test_a_digital_gain_is_that_of_grey(fitted: DictionaryISP, exact_pairs: list
 def test_other_shapes_and_places_are_refused(given: dict[str, torch.Tensor], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         DictionaryISP().reverse(picture(), **given)  # type: ignore[arg-type]
+
+
+# -- a known tone curve ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["universal", "universal-small"])
+def test_a_tone_by_name_is_that_curve_in_both_passes(name: str) -> None:
+    isp = DictionaryISP.from_pretrained(name)
+    x = picture()
+    result = isp.reverse(x, tone="linear", intermediates=True)
+    torch.testing.assert_close(result.intermediates["x2"], srgb_to_linear(x), atol=2e-4, rtol=0)
+    back = isp.forward(result.raw, result.params._replace(tone_weights=isp.choose(x).tone_weights), tone="linear")
+    assert torch.equal(back.params.tone_weights, result.params.tone_weights)
+    assert not torch.allclose(isp.reverse(x).raw, result.raw)
+
+
+def test_a_mixture_of_tones_is_the_mean_of_their_light() -> None:
+    isp = DictionaryISP.from_pretrained("universal")
+    x = picture()
+    names = isp.info["tones"]
+    one, two = (isp.reverse(x, tone=name, intermediates=True).intermediates["x2"] for name in names[:2])
+    mixed = isp.reverse(x, tone={names[0]: 1.0, names[1]: 3.0}, intermediates=True)
+    torch.testing.assert_close(mixed.intermediates["x2"], 0.25 * one + 0.75 * two, atol=1e-5, rtol=0)
+    replayed = isp.reverse(x, tone=mixed.params.tone_weights[0])
+    assert torch.equal(replayed.raw, mixed.raw)
+
+
+def test_tones_that_there_are_not_are_refused() -> None:
+    isp = DictionaryISP.from_pretrained("universal")
+    with pytest.raises(ValueError, match="linear"):
+        isp.reverse(picture(), tone="liner")
+    with pytest.raises(ValueError, match="negative"):
+        isp.reverse(picture(), tone={"linear": -1.0})
+    with pytest.raises(ValueError, match="tone must be"):
+        isp.reverse(picture(), tone=torch.ones(3))
+    with pytest.raises(ValueError, match="learned"):
+        DictionaryISP.from_pretrained("canon-powershot").reverse(picture(), tone="linear")

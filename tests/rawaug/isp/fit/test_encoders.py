@@ -15,6 +15,7 @@ from rawaug.isp.fit.descent import Descent, joint_steps, mean_psnr, train_jointl
 from rawaug.isp.fit.samples import FitFrames, sample_pixels
 from rawaug.isp.fit.start import measure_lights
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.stages import LensShading
 
 LIGHTS = [(1.6, 1.0, 1.9), (1.9, 1.0, 1.6)]
 SETTINGS = {"encoder_widths": (8, 8, 16)}
@@ -22,7 +23,14 @@ SETTINGS = {"encoder_widths": (8, 8, 16)}
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    quick = {"FRAMES_A_STEP": 2, "ENCODER_PIXELS": 64, "ENCODER_RATE": 1.5e-2, "FOLDS": 2}
+    quick = {
+        "FRAMES_A_STEP": 2,
+        "ENCODER_PIXELS": 64,
+        "ENCODER_RATE": 1.5e-2,
+        "FOLDS": 2,
+        "PUBLISHED_RATE": 1e-2,
+        "PUBLISHED_FRAMES": 4,
+    }
     for name, value in quick.items():
         monkeypatch.setattr(descent, name, value)
 
@@ -185,3 +193,25 @@ def test_it_ends_a_fit_that_asks_for_it_and_one_of_many_frames(frames: list[Pair
 def test_a_single_frame_leaves_none_to_watch(frames: list[Pair]) -> None:
     with pytest.raises(ValueError, match="two frames or more"):
         fit_isp(frames[:1], replace(CONFIG, joint_steps=5), progress=False)
+
+
+def test_the_published_fit_learns_encoders_and_both_masks_end_to_end(exact_pair: Callable[..., Pair]) -> None:
+    pairs = lit_frames(exact_pair, 8, informative=True)
+    settings: dict[str, Any] = {"pixels": 512, "batch": 64, "atoms": 2, "reach": 1.0, "isp": SETTINGS}
+    short = FitConfig(method="published", steps=0, curve_steps=20, prior_steps=40, joint_steps=40, **settings)
+    isp = fit_isp(pairs, short, progress=False)
+    assert isp.config.encoders and isp.config.attention and isp.config.stages[-1] == "shading"
+    assert isp.info["joint"]["steps"] == 40 and isp.info["joint"]["kept_step"] > 0
+    chosen = [isp.choose(pairs[k].srgb[None]) for k in (0, 2)]
+    assert not torch.allclose(chosen[0].colour_weights, chosen[1].colour_weights)
+    lens = isp.find(LensShading)
+    assert lens is not None and lens.reverse_attention is not None
+    assert lens.reverse_attention.place_layers[-1].weight.abs().max() > 0
+
+
+def test_the_method_settles_what_belongs_to_it() -> None:
+    settled = FitConfig(method="published").settled()
+    assert (settled.encoders, settled.shading, settled.attention, settled.tone) == ("on", "on", True, "learned")
+    assert settled.joint_steps == 3000 and FitConfig().settled() == FitConfig()
+    with pytest.raises(ValueError, match="method"):
+        FitConfig(method="other")  # type: ignore[arg-type]
