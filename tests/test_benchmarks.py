@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import augment, binning, crops, denoise, measure, patterns, sensors, synth
+from benchmarks import augment, binning, crops, denoise, measure, patterns, pictures, sensors, synth
 from rawaug.data.demo import FRAME
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import NOISY
@@ -83,3 +83,15 @@ def test_patterns_are_compared_in_full_colour(tmp_path: Path) -> None:
     assert "NonLocalMeans" in figures["GRBG"] and "NonLocalMeans" not in figures["XTRANS"], "filters are for Bayer"
     for rows in (figures["GRBG"], figures["XTRANS"]):
         assert rows["NonLocalMeans of the picture, 1"][0] > rows["noisy"][0] + 2
+
+
+def test_files_are_compared_with_other_readers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = measure.write_pictures(tmp_path / "in", 2, (32, 48))
+    (tmp_path / "in" / "cut.jpg").write_bytes((source / "000000.jpg").read_bytes()[:300])
+    (tmp_path / "in" / "notes.txt").write_text("words")
+    assert pictures.main([str(tmp_path / "in"), "--json", str(tmp_path / "out.json")]) == 0
+    rows = json.loads((tmp_path / "out.json").read_text())
+    outcomes = {Path(row["path"]).name: row["outcome"] for row in rows}
+    assert outcomes["000000.jpg"] == outcomes["000001.jpg"] == "equal"
+    assert outcomes["notes.txt"] == "neither picture nor RAW" and "refused" in outcomes["cut.jpg"]
+    assert "4 files" in capsys.readouterr().out

@@ -228,7 +228,7 @@ def _require_grey_or_rgb(spec: Any, path: Path) -> bool:
     if names == ("R", "G"):  # grey with alpha in JPEG XL
         return True
     more = names[1:] if len(names) < 3 else names[3:]
-    if more not in ((), ("A",)):
+    if more not in ((), ("A",)) or "A" in names[:-1]:  # a palette with alpha comes as R, A, B
         raise ValueError(f"{path}: has channels {', '.join(names)}; expected grey or R, G, B, with optional alpha")
     return bool(more)
 

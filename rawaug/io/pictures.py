@@ -76,9 +76,10 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
     path = Path(path)
     picture = decode(path, max_pixels, coarse=True)
     pixels = _as_srgb(_over_black(picture), picture, path)
-    upright = turn(torch.from_numpy(pixels).permute(2, 0, 1), view_of_orientation(picture.orientation))
     # NumPy puts the planes apart several times faster than PyTorch
-    return torch.from_numpy(np.ascontiguousarray(upright.numpy()))
+    planes = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
+    view = view_of_orientation(picture.orientation)
+    return turn(planes, view).contiguous() if view else planes
 
 
 def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:

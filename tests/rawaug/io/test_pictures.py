@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageCms, ImageOps, features
 
 from rawaug.io import decode_srgb, encode_srgb, read_picture, write_picture
+from rawaug.io.directories import Tag, pack_directory
 from rawaug.io.pictures import read_plane, recode_jpeg
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (24, 37, 3), np.uint8)
@@ -426,3 +427,17 @@ def test_a_damaged_png_is_one_line_and_libpng_is_silent(
     with pytest.raises(OSError, match=r"a\.png: .*read"):
         read_picture(tmp_path / "a.png")
     assert capfd.readouterr().err == ""
+
+
+def test_a_palette_with_alpha_in_a_tiff_is_refused(tmp_path: Path) -> None:
+    """OpenImageIO gives its numbers as R, A and B."""
+    pixels = np.random.default_rng(0).integers(0, 256, (16, 20, 2), np.uint8).tobytes()
+    shorts = {256: [20], 257: [16], 258: [8, 8], 259: [1], 262: [3], 277: [2], 278: [16], 338: [2]}
+    shorts[320] = np.random.default_rng(1).integers(0, 65536, 768).tolist()
+    tags = [Tag(code, 3, len(values), struct.pack(f"<{len(values)}H", *values)) for code, values in shorts.items()]
+    tags += [Tag(273, 4, 1, struct.pack("<I", 8)), Tag(279, 4, 1, struct.pack("<I", len(pixels)))]
+    place = 8 + len(pixels)
+    data = b"II*\0" + struct.pack("<I", place) + pixels + pack_directory("<", tags, place)
+    (tmp_path / "a.tif").write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.tif: has channels R, A, B"):
+        read_picture(tmp_path / "a.tif")
