@@ -27,6 +27,8 @@ class FitConfig:
             start, by l2 losses on RAW and on every image between the stages of both passes and by the consistency of
             the weights (``joint_steps``, 3,000 by default). It sets ``shading``, ``attention`` and ``encoders`` to on
             and ``tone`` to learned, and needs two frames or more; the paper has 5 to 320.
+        start: an ISP, by the name of a shipped one or its file, from whose tone the fit starts wherever that makes the
+            frames better than the curves of the standards.
         size: "small" has at most 8 atoms a dictionary and narrow encoders: with encoders 0.12 M parameters instead
             of 0.52 M, without them about 5,000 in either case.
         atoms: largest number of atoms in each dictionary; more frames than that are clustered.
@@ -62,6 +64,7 @@ class FitConfig:
     """
 
     method: Literal["staged", "published"] = "staged"
+    start: str | None = None
     size: Literal["default", "small"] = "default"
     atoms: int = 16
     reach: float = 1.6

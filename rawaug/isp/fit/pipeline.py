@@ -26,7 +26,15 @@ from rawaug.files import digest
 from rawaug.isp import stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.descent import Descent, cycle_error, reading_error, train_encoders, train_jointly, with_better_tone
+from rawaug.isp.fit.descent import (
+    Descent,
+    adam,
+    cycle_error,
+    reading_error,
+    train_encoders,
+    train_jointly,
+    with_better_tone,
+)
 from rawaug.isp.fit.samples import FitFrames, FramePair, FrameSummary, PixelSamples, sample_pixels
 from rawaug.isp.fit.start import (
     FEWEST_PIXELS,
@@ -40,6 +48,7 @@ from rawaug.isp.fit.start import (
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.own_cameras import Camera
 from rawaug.isp.stages import LensShading, Stage
+from rawaug.isp.tone import to_linear
 from rawaug.kernels.runtime import one_thread
 from rawaug.progress import progress as progress_of
 from rawaug.seeding import derive_seed
@@ -53,6 +62,8 @@ DIMMEST = 0.01
 SHADING_PAYS = 0.5
 """Maximum ratio of the squared errors with and without a mask for keeping the mask."""
 FRAMES_A_STEP = 16
+START_STEPS, START_RATE = 1000, 3e-3
+"""Of the descent that brings the tone near that of the ISP that a fit starts from."""
 
 
 def fit_isp(
@@ -233,9 +244,12 @@ class _Fit:
 
     def tone(self, report: Callable[[DictionaryISP], str] | None) -> None:
         """Run stage 2, the tone and each frame's colour; ``report`` is called with the ISP as it would be."""
-        tensors: dict[str, Tensor] = self._colours()
         for stage in self.isp.ordered_stages:
             stage.start_fine()
+        if self.config.start is not None:
+            self._start_from(DictionaryISP.from_pretrained(self.config.start))
+        tensors: dict[str, Tensor] = self._colours()
+        for stage in self.isp.ordered_stages:
             tensors |= stage.parameters_of(forward=False)
 
         def loss(generator: torch.Generator) -> Tensor:
@@ -252,6 +266,54 @@ class _Fit:
 
         name = f"sRGB to RAW{self.part}"
         self.descent.run(name, loss, tensors, self.config.steps, self.config.learning_rate, status)
+
+    def _start_from(self, other: DictionaryISP) -> None:
+        """Start the tone from that of another ISP, or the best of its curves, if it makes the frames better."""
+        greys = torch.linspace(0.0, 1.0, 256).expand(1, 3, 1, -1)
+        colours = torch.cat([greys, stages.node_colours(9).flatten(2)[:, :, None]], dim=3)
+        tensors: list[Tensor] = []
+        for stage in self.isp.ordered_stages:
+            if stage.makes <= 2:
+                tensors += stage.parameters_of(forward=False).values()
+        before = [tensor.detach().clone() for tensor in tensors]
+        colour, error = self.colour, self._tone_error(self.isp.linear)[0]
+        best: tuple[float, Tensor] | None = None
+        with torch.no_grad():
+            curves = [other.linear] if other.tone is None else [_curve_of(table) for table in other.tone.curves]
+            for curve in curves:
+                value, _ = self._tone_error(curve)
+                if best is None or value < best[0]:
+                    best = value, curve(colours)
+        if best is None or best[0] >= error:
+            return
+        wanted = best[1]
+        for tensor in tensors:
+            tensor.requires_grad_()
+        descent = adam(
+            tensors,
+            START_RATE,
+            lambda step: ((self.isp.linear(colours) - wanted) ** 2 / (wanted + 0.01)).mean(),
+            lambda step: step / START_STEPS,
+        )
+        for _ in descent:
+            pass
+        for tensor in tensors:
+            tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
+        started, self.colour = self._tone_error(self.isp.linear)
+        if started >= error:
+            self.colour = colour
+            for tensor, old in zip(tensors, before, strict=True):
+                tensor.data.copy_(old)
+
+    @torch.no_grad()
+    def _tone_error(self, linear: Callable[[Tensor], Tensor]) -> tuple[float, FrameColour]:
+        """Compute the error under a tone with each frame's best colour, and that colour."""
+        shading = self.isp.find(LensShading)
+        x = linear(self.samples.srgb)
+        if shading is not None:
+            x = x * shading.mask(self.samples.coordinates)
+        colour = FrameColour.from_product(least_squares(x, self.samples, self.known_matrix))
+        return float(reading_error(stages.correct_colour(x, colour.product()), self.samples)), colour
 
     def _few_numbers(self, without: Stage | None = None) -> dict[str, Tensor]:
         used = [stage for stage in self.isp.ordered_stages if stage is not without]
@@ -294,6 +356,11 @@ class _Fit:
 
         if tensors:
             self.descent.run("RAW to sRGB", loss, tensors, self.config.steps, self.config.learning_rate)
+
+
+def _curve_of(table: Tensor) -> Callable[[Tensor], Tensor]:
+    """Make the function of pictures ``(B, 3, H, W)`` that a table ``(1021,)`` stands for."""
+    return lambda x: to_linear(x, table.expand(len(x), -1))
 
 
 def darkens_corners(mean: Tensor, precision: Tensor) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -131,6 +132,28 @@ def test_a_curve_that_no_standard_has_is_found_and_serves_every_pass(exact_pair:
     )
     ahead = isp.forward(unseen.raw[None], white_balance=unseen.white_balance).srgb
     assert psnr(ahead, unseen.srgb[None] / 255.0).item() > 38.0
+
+
+@pytest.mark.parametrize("start", ["another camera", "universal"])
+def test_a_fit_starts_from_the_tone_of_another_isp(start: str, exact_pair: Callable[..., Pair], tmp_path: Path) -> None:
+    balances = [(1.5, 1.0, 2.0), (2.0, 1.0, 1.5)]
+    pairs = [exact_pair(f"shot{k}", balance, k, curve=bent) for k, balance in enumerate(balances)]
+    other = fit_isp(pairs, CURVE, progress=False)
+    if start == "another camera":
+        start = str(tmp_path / "other.safetensors")
+        other.save(start)
+    short = replace(CURVE, tone="learned", steps=2)
+    alone = fit_isp(pairs, short, progress=False)
+    started = fit_isp(pairs, replace(short, start=start), progress=False)
+
+    def distance(isp: DictionaryISP) -> float:
+        curve, wanted = (one.tone_curve()[:, 1] / one.tone_curve()[200, 1] for one in (isp, other))
+        return float((curve - wanted)[:220].square().mean().sqrt())
+
+    if start == "universal":
+        assert distance(started) < 1.1 * distance(alone)
+    else:
+        assert distance(started) < 0.7 * distance(alone)
 
 
 def refitted(gains: dict[str, float]) -> Callable[..., DictionaryISP]:
