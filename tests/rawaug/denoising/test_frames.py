@@ -328,7 +328,7 @@ def test_wrong_wishes_are_refused_before_anything_is_written(
         (["--denoiser", identity, "--strength", "1.5"], "strength must be between 0 and 1, got 1.5"),
         (["--denoiser", identity, "--linear"], "does not demosaic; use rawaug-joint"),
         (["--denoiser", joint], "demosaics too, to a linear DNG; add --linear"),
-        (["--denoiser", joint, "--linear", "--strength", "0.5"], "--strength 0.5: of a linear DNG it is 1"),
+        (["--denoiser", joint, "--linear", "--strength", "0.5"], "--strength does not support --linear"),
         (["--denoiser", joint, "--linear", "--preview", "p.png"], "--preview p.png: --linear does not support it"),
     ):
         assert message in refused("denoise", source, out, *wish)

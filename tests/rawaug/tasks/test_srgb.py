@@ -176,7 +176,7 @@ def test_what_has_no_meaning_is_refused() -> None:
     for given, said in (
         ({"levels": []}, "at least one level"),
         ({"denoiser": DenoiserConfig()}, "channels: 3, variance_map: false"),
-        ({"arms": {"a": ArmConfig(1.0, told=Told())}}, "channels: 3, variance_map: true, as told"),
+        ({"arms": {"a": ArmConfig(1.0, told=Told())}}, "channels: 3, variance_map: true"),
         ({"classical": ["BM3D"]}, "BM3D"),
         ({"data": DataConfig(pairs=None, validation=None)}, r"data\.validation"),
         ({"arms": {"a": ArmConfig(1.0, srgb_noise="Gausian")}}, "Gaussian"),
