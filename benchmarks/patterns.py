@@ -45,7 +45,8 @@ class _Colours(NonLocalMeans):
 def without_network(trial: Trial, pair: Pair) -> Iterator[tuple[str, Callable[[], Tensor]]]:
     """Names and results, linear camera RGB ``(1, 3, H, W)``."""
     mosaic, cfa = mosaic_of(trial.noisy, trial.cfa), trial.condition
-    noisy = trial.ways["demosaiced"](trial.noisy)
+    (demosaic,) = trial.ways.values()
+    noisy = demosaic(trial.noisy)
     yield "noisy", lambda: noisy
     if cfa in CFA.__members__:
         from rawpy import FBDDNoiseReductionMode
