@@ -167,6 +167,7 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]], isp: str) -> dict[str
     with gr.Group():
         controls["picture"] = gr.Dropdown(choices, value=choices[0][1] if choices else None, label="Picture", **whole)
         upload = gr.UploadButton("Open your own", size="sm", elem_id="upload")
+
     with gr.Group():
         controls["isp"] = gr.Dropdown(isps, value=isp, label="ISP")
         controls["camera"] = gr.Dropdown([ANY, *cameras], value=ANY, label="Camera", **whole)
@@ -174,6 +175,7 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]], isp: str) -> dict[str
         controls["tone"] = gr.Dropdown([ANY, *views.tone_names(isp)], value=ANY, label="Tone curve", **whole)
         controls["draw_exposure"] = gr.Checkbox(True, label="Draw the exposure at random")
         controls["exposure"] = gr.Slider(-4, 1, value=0, step=0.25, label="Exposure (stops)", interactive=False)
+
     with gr.Group():
         controls["noise"] = gr.Dropdown(views.noise_choices(isp), value=noise, label="Noise", **whole)
         controls["iso"] = gr.Number(0, label="ISO", info=_about_iso(noise), interactive=False)
@@ -217,6 +219,7 @@ def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, An
     # One after the other: the late answer to a tab's opening must not replace that to a newer setting.
     quiet = {"show_progress": "hidden", "api_visibility": "private", "concurrency_id": "draw"}
     inputs, results = list(controls.values()), list(outputs.values())
+
     triggers = [page.load, *(control.change for control in inputs)]
     gr.on(triggers, redraw, [opened, *inputs], results, trigger_mode="always_last", **quiet)
     for name, tab in tabs.items():
@@ -267,6 +270,7 @@ def make_server(page: Any) -> Any:
 
     theme = gr.themes.Base(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
     form = {"theme": theme, "css_paths": Path(__file__).with_name("page.css"), "footer_links": []}
+
     app = gr.mount_gradio_app(fastapi.FastAPI(), page, "/", ssr_mode=False, **form)
     return uvicorn.Server(uvicorn.Config(app, log_level="error"))
 

@@ -227,6 +227,7 @@ def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, o
         origin: what the pair was made from.
     """
     _WRITERS[format](stem, pair, augment)
+
     header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(asdict(origin))}
     write_tensors(pair.params.tensors(), header, f"{stem}.safetensors")
 
@@ -373,6 +374,7 @@ def _shading_maps(augment: RawAugment, pair: RawPair) -> tuple[GainMap, ...]:
         return ()
 
     height, width = augment.mosaic(pair.clean).shape[-2:]
+
     rows, columns = _SHADING_NODES
     y = torch.linspace(0, height, rows) - height / 2
     x = torch.linspace(0, width, columns) - width / 2
