@@ -42,7 +42,7 @@ class Classical(ABC):
     extra: ClassVar[str] = "train"
     """The extra of rawaug that brings them."""
     licence: ClassVar[str] = ""
-    """What to know before they are installed."""
+    """A note on the licences of the libraries that it needs."""
 
     @classmethod
     def missing(cls) -> str | None:

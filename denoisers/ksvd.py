@@ -31,7 +31,7 @@ GAIN = 1.15
 ROUNDS = 5
 TRAINING_PATCHES = 4000
 MOST_ATOMS = SIDE**2 // 2
-"""A patch that needs more atoms is taken for noise, with these."""
+"""Maximum number of atoms of a patch."""
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 

@@ -46,10 +46,10 @@ BLIND = 0.25
 """Minimum share of clipped values for ignoring the picture at half the sides."""
 
 NEAR = 8.0
-"""A network that is told its limits sees them up to this distance, in deviations of the noise."""
+"""The distance up to which a network sees its limits, in standard deviations of the noise."""
 
 DEFECT = (5.0, 0.15)
-"""A defect is beyond its neighbours by so many deviations of the noise and by this share of their value."""
+"""Thresholds of a defect beyond its neighbours: in deviations of the noise, and as a share of their value."""
 
 LEAK = 0.2
 """Negative slope of the leaky ReLUs."""

@@ -340,7 +340,7 @@ def _blocks(width: int, number: int) -> nn.Sequential:
 
 
 CONTEXT = 4
-"""DRUNet's last scale sees its signal less the mean over squares of so many of its cells a side."""
+"""Side of the squares, in cells, whose mean is subtracted from the signal of DRUNet's last scale."""
 
 
 class ResidualBlock(nn.Module):

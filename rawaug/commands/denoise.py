@@ -88,7 +88,7 @@ def run(
         write_json({"files": [asdict(done) for done in result.files], "broken": result.broken}, json)
     print_denoised(result)
     if result.broken:
-        raise ValueError(f"{source}: {len(result.broken)} of its files could not be denoised, listed above")
+        raise ValueError(f"{source}: {len(result.broken)} of its files could not be denoised; they are listed above")
 
 
 def is_picture(source: str) -> bool:

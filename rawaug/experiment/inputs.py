@@ -17,7 +17,7 @@ from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.noisy_frames import noise_of
 
 MOST_HELD_OUT = 16
-"""Largest number of frames that are held out for validation: a fifth of them, but at least one."""
+"""Maximum number of frames that are held out for validation; it is a fifth of them, and at least one."""
 
 GIVEN = "given pairs"
 """The value of ``data.pairs``, ``data.validation`` or ``data.test`` in the results of pairs given from Python."""

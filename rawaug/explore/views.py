@@ -57,7 +57,7 @@ _ZOOM = (24, 36)
 """Height and width of the part of the mosaic that is magnified."""
 
 _SCALE = 8
-"""By how much it is magnified."""
+"""Magnification of that part."""
 
 
 @dataclass(frozen=True)

@@ -269,7 +269,7 @@ def _without_application_segments(plain: bytes) -> bytes:
 
 
 _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]", re.DOTALL)
-"""A marker within or behind a scan, which is neither a stuffed byte nor a restart."""
+"""A marker within or behind a scan other than a stuffed byte or a restart."""
 
 
 def _end_of_picture(source: bytes) -> int:

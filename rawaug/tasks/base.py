@@ -61,7 +61,7 @@ class Task(ABC):
     """Whether frames are binned so that the four sites of a cell make a pixel of full colour."""
 
     compared_in: ClassVar[str] = ""
-    """What scores compare, if it is not RAW; it ends the titles of tables."""
+    """The end of the titles of tables: the domain of the scores, if it is not RAW."""
 
     input: ClassVar[Any] = NOISY
     """The denoiser that stands for the noisy input in tables."""

@@ -200,7 +200,7 @@ class Recipe:
     """The name of the task that reads these settings."""
 
     target: ClassVar[Target] = "raw"
-    """What the augmentation makes of pictures."""
+    """The target of the augmentation."""
 
     from_pictures: ClassVar[bool] = False
     """Whether arms can train on nothing but pictures, with clean targets."""

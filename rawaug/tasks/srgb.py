@@ -54,7 +54,7 @@ BLACK, WHITE = 8192.0, 65535.0
 """Black and white level of the DNG: room for noise below black."""
 
 DEVIATIONS = (0.01, 0.015, 0.022, 0.033, 0.05, 0.075, 0.11, 0.16)
-"""The deviations of white noise that a filter can be told, of which validation chooses one."""
+"""Standard deviations of white noise from which validation chooses a filter's strength."""
 
 REAL = "real"
 """The name of the table of real pairs, whose level is not known."""

@@ -14,7 +14,7 @@ MOST = 2**31
 """The largest number of steps, samples or processes that a setting may have."""
 
 VALIDATIONS = 5
-"""Validations of a short training, which are the points of its curves."""
+"""Number of validations of a short training, which are the points of its curves."""
 
 Weighing = Literal["linear", "normalised", "stabilised", "mixed", "relative"]
 """How the loss weighs light and shade; :mod:`rawaug.training.estimators` has the formulas."""
@@ -111,7 +111,7 @@ class TrainConfig:
 
 
 SAME_WEIGHTS = frozenset({"workers", "compile", "checkpoint_every", "logger"})
-"""Keys of :class:`TrainConfig` that change how fast the weights are found, not which."""
+"""Keys of :class:`TrainConfig` that change the speed of a training, and not its weights."""
 
 
 def weights_key(network: DenoiserConfig, config: TrainConfig, samples: Any, validation: Any) -> str:

@@ -127,7 +127,7 @@ def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
 
 
 FAINT = 45.0
-"""PSNR in dB of noisy frames above which there is next to nothing to remove."""
+"""PSNR of noisy frames, in dB, above which there is hardly any noise to remove."""
 
 
 def faintness_note(frames: Sequence[NoisyFrame]) -> str:

@@ -25,7 +25,7 @@ from rawaug.plugin.dataset import RawPairs
 from rawaug.seeding import keyed_generator
 
 WATCHED = 16
-"""Samples made from pictures on which a training without validation pairs is watched."""
+"""Number of samples made from pictures for watching a training without validation pairs."""
 
 
 class Source(Protocol):

@@ -231,7 +231,7 @@ MANY_FRAMES, STEPS, LEARNING_RATE, CONSISTENCY = 50, 1000, 2e-4, 0.01
 PUBLISHED_RATE, PUBLISHED_FRAMES, PUBLISHED_PIXELS = 2e-3, 8, 256
 """The published fit learns nearly all of it end to end: its rate, and frames and pixels of a step."""
 LOG_WEIGHT = 0.02
-"""Of the logarithm of an error beside the squared errors of the other pass."""
+"""Weight of the logarithm of an error beside the squared errors of the other pass."""
 LOSS_SCALE = 1e4
 """Squared errors are near 1e-4, and what encoders get of them would vanish beside the epsilon of Adam, 1e-8."""
 

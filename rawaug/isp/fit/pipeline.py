@@ -63,7 +63,7 @@ SHADING_PAYS = 0.5
 """Maximum ratio of the squared errors with and without a mask for keeping the mask."""
 FRAMES_A_STEP = 16
 START_STEPS, START_RATE = 1000, 3e-3
-"""Of the descent that brings the tone near that of the ISP that a fit starts from."""
+"""Steps and rate of the descent that brings the tone near that of the ISP that a fit starts from."""
 
 
 def fit_isp(

@@ -271,7 +271,7 @@ def test_folders_are_resumed_and_fail_where_a_file_is_broken(
     assert main(command) == 2
     said = capsys.readouterr()
     assert (out / "a.dng").is_file() and (out / "sub" / "a.dng").is_file() and "broken.nef" in said.out
-    assert said.err.strip().splitlines()[-1].endswith("1 of its files could not be denoised, listed above")
+    assert said.err.strip().splitlines()[-1].endswith("1 of its files could not be denoised; they are listed above")
     (out / "sub" / "a.dng").unlink()
     again = denoise_folder(source, out, RawFiles(identity))
     assert (len(again.files), again.existing, len(again.broken)) == (1, 1, 1)
