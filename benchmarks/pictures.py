@@ -208,7 +208,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if one.outcome not in ("equal", "neither picture nor RAW"):
             print(f"{one.outcome}: {one.path}: {one.reason}")
     if args.json:
-        rows = [one._replace(path=str(one.path))._asdict() for one in comparisons]
+        rows = [one._asdict() | {"path": str(one.path)} for one in comparisons]
         args.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     return 0
 

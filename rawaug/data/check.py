@@ -54,12 +54,17 @@ class PartReport:
             lines.append(line)
 
     def __str__(self) -> str:
-        examined = "" if self.examined == self.items else f", {self.examined} examined"
-        lines = [f"{self.what}: {self.items}{examined}"]
+        head = f"{self.what}: {self.items}"
+        if self.examined != self.items:
+            head += f", {self.examined} examined"
+
+        lines = [head]
         for what, counts in self.counts.items():
-            more = f", {len(counts) - _SHOWN} more" if len(counts) > _SHOWN else ""
-            shown = ", ".join(f"{escape(value)} ({count})" for value, count in counts.most_common(_SHOWN))
-            lines.append(f"  {what}: {shown}{more}")
+            shown = [f"{escape(value)} ({count})" for value, count in counts.most_common(_SHOWN)]
+            if len(counts) > _SHOWN:
+                shown.append(f"{len(counts) - _SHOWN} more")
+            lines.append(f"  {what}: {', '.join(shown)}")
+
         lines.append(f"  damaged: {len(self.broken) or 'none'}")
         lines += [f"    {escape(line)}" for line in self.broken]
         if self.unfit:
@@ -131,13 +136,14 @@ def _left_out(folder: Path) -> list[str]:
 
 def _of_kind(kind: str, spec: str) -> list[tuple[str, Callable[[], Any]]]:
     """What ``kind:path`` may open everywhere else: pairs, pictures, or both."""
-    openers = ((DATASETS, "pairs", open_pairs), (PICTURES, "pictures", open_pictures))
-    found: list[tuple[str, Callable[[], Any]]] = [
-        (f"{what} of {spec}", partial(opener, spec)) for kinds, what, opener in openers if kind in kinds
-    ]
-    if not found:
+    openers: list[tuple[str, Callable[[], Any]]] = []
+    if kind in DATASETS:
+        openers.append((f"pairs of {spec}", partial(open_pairs, spec)))
+    if kind in PICTURES:
+        openers.append((f"pictures of {spec}", partial(open_pictures, spec)))
+    if not openers:
         open_pairs(spec)  # raises for an unknown kind
-    return found
+    return openers
 
 
 def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
@@ -201,15 +207,20 @@ def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartRep
     except (OSError, ValueError) as error:
         part.broken.append(" ".join(str(error).split()))
         return part
+
     part.items = len(items)
     part.examined = part.items if first is None else min(first, part.items)
-    opening, names = pickle.dumps(open_part), getattr(items, "names", range(part.items))
+    opening = pickle.dumps(open_part)
+    names = getattr(items, "names", range(part.items))
+
     for index in range(part.examined):
         try:
-            for kind, value in isolated(_facts, opening, index, name=names[index]).items():
-                part.counts[kind][value] += 1
+            facts = isolated(_facts, opening, index, name=names[index])
         except (OSError, ValueError) as error:
             part.add_broken(error)
+            continue
+        for kind, value in facts.items():
+            part.counts[kind][value] += 1
     return part
 
 

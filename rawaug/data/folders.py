@@ -79,15 +79,20 @@ class PictureFolder(Dataset[Tensor]):
     def __getitem__(self, index: int) -> Tensor:
         first = range(len(self))[index]
         for candidate in chain(range(first, len(self)), range(first)):
-            if not self._bad[candidate] and (picture := self._attempt(candidate)) is not None:
+            if self._bad[candidate]:
+                continue
+            picture = self._attempt(candidate)
+            if picture is not None:
                 return picture
         raise AssertionError("the share of skipped files is checked before the last one is")
 
     @property
     def names(self) -> list[str]:
+        """The paths of all files."""
         return [str(self.file(index)) for index in range(len(self))]
 
     def file(self, index: int) -> Path:
+        """The path of one file."""
         return self.path / os.fsdecode(self._names[index])
 
     def read(self, index: int) -> Tensor:
@@ -101,15 +106,24 @@ class PictureFolder(Dataset[Tensor]):
     @property
     def skipped(self) -> dict[Path, str]:
         """The files that could not be used, with the reason, as far as any worker has met them."""
-        bad = self._bad.nonzero()[:, 0].tolist()
-        for index in bad:
-            if index not in self._reasons:  # met by a worker: ask the file again
-                try:
-                    self.read(index)
-                    self._reasons[index] = f"{self.file(index)}: was damaged, but is readable now"
-                except (OSError, ValueError) as error:
-                    self._reasons[index] = str(error)
-        return {self.file(index): self._reasons[index] for index in bad}
+        reasons: dict[Path, str] = {}
+        for index in self._bad_indices():
+            if index not in self._reasons:  # met by a worker
+                self._reasons[index] = self._ask_again(index)
+            reasons[self.file(index)] = self._reasons[index]
+        return reasons
+
+    def _bad_indices(self) -> list[int]:
+        indices: list[int] = self._bad.nonzero()[:, 0].tolist()
+        return indices
+
+    def _ask_again(self, index: int) -> str:
+        """The reason why a file cannot be used."""
+        try:
+            self.read(index)
+        except (OSError, ValueError) as error:
+            return str(error)
+        return f"{self.file(index)}: was damaged, but is readable now"
 
     def report(self) -> str:
         """Name the files that were skipped so far, with the reasons, and the kinds of files that are left out."""
@@ -126,21 +140,37 @@ class PictureFolder(Dataset[Tensor]):
         except (OSError, ValueError) as error:
             self._reasons[index] = str(error)
             _log.warning("skipped: %s", escape(error))
+
         self._bad[index] = 1
-        bad = self._bad.nonzero()[:, 0].tolist()
-        if len(bad) > self.allowed_share * len(self):
-            count = f"{len(bad)} of {len(self)} pictures are unusable, more than allowed_share {self.allowed_share:.0%}"
-            names = ", ".join([*(str(self.file(i)) for i in bad[:_NAMED]), *(["..."] if len(bad) > _NAMED else [])])
-            raise ValueError(f"{self.path}: {count}: {names}; last: {self._reasons[index]}")
+        self._require_few_bad(last=index)
         return None
+
+    def _require_few_bad(self, last: int) -> None:
+        """Raise ValueError if more than the allowed share of the files had to be skipped."""
+        bad = self._bad_indices()
+        if len(bad) <= self.allowed_share * len(self):
+            return
+
+        names = [str(self.file(index)) for index in bad[:_NAMED]]
+        if len(bad) > _NAMED:
+            names.append("...")
+        count = f"{len(bad)} of {len(self)} pictures are unusable, more than allowed_share {self.allowed_share:.0%}"
+        raise ValueError(f"{self.path}: {count}: {', '.join(names)}; last: {self._reasons[last]}")
 
 
 def reports(pictures: Any) -> list[str]:
     """The report of each folder in ``pictures`` that leaves files out, including cached and concatenated ones."""
     if isinstance(pictures, PictureFolder):
         return [pictures.report()] if pictures.skipped or pictures.left_out else []
-    inside = pictures.datasets if isinstance(pictures, ConcatDataset) else [getattr(pictures, "pictures", None)]
-    return [report for each in inside if each is not None for report in reports(each)]
+
+    inside = [getattr(pictures, "pictures", None)]
+    if isinstance(pictures, ConcatDataset):
+        inside = list(pictures.datasets)
+    lines: list[str] = []
+    for dataset in inside:
+        if dataset is not None:
+            lines += reports(dataset)
+    return lines
 
 
 class Cached(Dataset[T]):
@@ -160,16 +190,24 @@ class Cached(Dataset[T]):
         return len(self.pictures)
 
     def __getitem__(self, index: int) -> T:
-        if index not in self._kept:
-            found = self.pictures[index]
-            item: T = found if self.make is None else self.make(found)
-            parts = [item] if isinstance(item, Tensor) else vars(item).values()
-            size = sum(part.nbytes for part in parts if isinstance(part, Tensor))
-            if size > self._left:
-                return item
+        if index in self._kept:
+            return self._kept[index]
+
+        item = self.pictures[index]
+        if self.make is not None:
+            item = self.make(item)
+        size = _bytes_of(item)
+        if size <= self._left:
             self._left -= size
             self._kept[index] = item
-        return self._kept[index]
+        kept_or_not: T = item
+        return kept_or_not
+
+
+def _bytes_of(item: Any) -> int:
+    """The memory of a tensor, or of the tensors that are attributes of an object."""
+    parts = [item] if isinstance(item, Tensor) else vars(item).values()
+    return sum(part.nbytes for part in parts if isinstance(part, Tensor))
 
 
 class Kept(SomePairs):
@@ -198,7 +236,8 @@ class Readable(Sequence[Pair]):
 
     def __iter__(self) -> Iterator[Pair]:
         for index in range(len(self.pairs)):
-            if (pair := self.attempt(index, self.pairs.__getitem__)) is not None:
+            pair = self.attempt(index, self.pairs.__getitem__)
+            if pair is not None:
                 yield pair
         if self.broken and len(self.broken) == len(self.pairs):
             raise ValueError(f"none of the {len(self.pairs)} frames can be read; {self.reasons()[0]}")
@@ -214,13 +253,15 @@ class Readable(Sequence[Pair]):
             return None
 
     def reasons(self) -> list[str]:
+        """Why pairs cannot be read, in their order."""
         return [self.broken[index] for index in sorted(self.broken)]
 
     def kept(self) -> Sequence[Pair]:
         """The pairs without those found broken so far; the original sequence if none was."""
         if not self.broken:
             return self.pairs
-        return SomePairs(self.pairs, [k for k in range(len(self.pairs)) if k not in self.broken])
+        whole = [index for index in range(len(self.pairs)) if index not in self.broken]
+        return SomePairs(self.pairs, whole)
 
 
 def left_out(pairs: Readable, of: str) -> list[str]:
@@ -235,7 +276,9 @@ def skip_broken(pairs: Sequence[Pair], of: str) -> Iterator[Pair]:
     """Iterate over the readable pairs; afterwards, print the skipped ones."""
     readable = pairs if isinstance(pairs, Readable) else Readable(pairs)
     yield from readable
-    if lines := left_out(readable, of):
+
+    lines = left_out(readable, of)
+    if lines:
         print("\n".join(lines))
 
 
@@ -264,8 +307,10 @@ class RawFolder(LazyPairs):
         jpeg_quality: int | None = None,
         max_pixels: int = MAX_PIXELS,
     ) -> None:
-        given = [path] if isinstance(path, (str, Path)) else path
-        self.files = [file for one in given for file in files_in(one, "RAW", RAW_EXTENSIONS)]
+        paths = [path] if isinstance(path, (str, Path)) else path
+        self.files: list[Path] = []
+        for one in paths:
+            self.files += files_in(one, "RAW", RAW_EXTENSIONS)
         self.camera_jpeg = camera_jpeg
         self.adjust_maximum_thr, self.jpeg_quality, self.max_pixels = adjust_maximum_thr, jpeg_quality, max_pixels
         super().__init__(_names(self.files))

@@ -51,15 +51,18 @@ def open_pairs(
     """
     if bin != 1:
         return Binned(open_pairs(spec, split, as_clean, max_pixels, **settings), bin)
+
     settings = {key: value for key, value in settings.items() if value is not None}
     if not isinstance(spec, (str, Path)):
         return _as_they_are(spec, settings)
+
     kind, path = _kind_and_path(str(spec))
     if kind is None:
         _require_none(settings, spec)
         folder = RawFolder(path, max_pixels=max_pixels or MAX_PIXELS)
         require_no_pairs(folder, str(spec), as_clean)
         return folder
+
     reader = _reader(DATASETS, str(spec), kind, path, "a RAW file or folder")
     path, named = _path_and_split(path)
     chosen = check_settings(f"{kind}:", reader, settings, given=("path", "split")) if settings else {}
@@ -101,6 +104,7 @@ def open_pictures(spec: str | Path | Sequence[str | Path], min_side: int = 2, ma
     """
     if not isinstance(spec, (str, Path)):
         return ConcatDataset([open_pictures(one, min_side, max_pixels) for one in spec])
+
     spec = str(spec)
     kind, path = _kind_and_path(spec)
     if kind is None:
@@ -112,6 +116,7 @@ def _reader(kinds: Registry, spec: str, kind: str, path: str, other: str) -> Cal
     if kind not in kinds:
         known = ", ".join(f"{name}:" for name in kinds)
         raise ValueError(f"{spec}: unknown {kinds.kind}; use {known} or the path of {other}{suggest(kind, kinds)}")
+
     reader: Callable[[str, Any], Any] = kinds[kind]
     if not path and inspect.signature(reader).parameters["path"].default is inspect.Parameter.empty:
         raise ValueError(f"{spec}: has no path; write {kind}:PATH")
@@ -121,10 +126,14 @@ def _reader(kinds: Registry, spec: str, kind: str, path: str, other: str) -> Cal
 def _kind_and_path(spec: str) -> tuple[str | None, str]:
     """Split ``"kind:path"``; the kind is None for a plain path, including ``C:\\shots``."""
     kind, colon, path = spec.partition(":")
-    return (kind, path) if colon and len(kind) > 1 and kind.replace("-", "").isidentifier() else (None, spec)
+    if colon and len(kind) > 1 and kind.replace("-", "").isidentifier():
+        return kind, path
+    return None, spec
 
 
 def _path_and_split(path: str) -> tuple[str, str | None]:
     """Split ``"path:split"``; the split is None if not given."""
     folder, colon, split = path.rpartition(":")
-    return (folder, split) if colon and split in _SPLITS else (path, None)
+    if colon and split in _SPLITS:
+        return folder, split
+    return path, None

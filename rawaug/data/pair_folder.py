@@ -101,10 +101,8 @@ class PairFolder(LazyPairs):
     def read(self, index: int) -> Pair:
         name, *files = self.pairs[index]
         alone = files[0] == files[1]
-        noisy, clean = (
-            read_mosaic(file, which, self.given, alone, self.max_pixels)
-            for file, which in zip(files, ("noisy", "clean"), strict=True)
-        )
+        noisy = read_mosaic(files[0], "noisy", self.given, alone, self.max_pixels)
+        clean = read_mosaic(files[1], "clean", self.given, alone, self.max_pixels)
         for what, one, other in (
             ("size", tuple(noisy.mosaic.shape[1:]), tuple(clean.mosaic.shape[1:])),
             ("CFA", noisy.cfa, clean.cfa),
@@ -139,8 +137,11 @@ def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:
 def looks_like_pairs(files: Sequence[Path]) -> bool:
     """Whether there are files as ``rawaug synth`` writes them: a noisy frame beside its clean one, or NPZ."""
     names = {str(file).casefold() for file in files if file.suffix.lower() in READABLE}
-    partners = {re.sub(r"_noisy(\.\w+)$", r"_clean\1", name) for name in names if re.search(r"_noisy\.\w+$", name)}
-    return bool(names & partners) or any(name.endswith(".npz") for name in names)
+    for name in names:
+        partner = re.sub(r"_noisy(\.\w+)$", r"_clean\1", name)
+        if name.endswith(".npz") or (partner != name and partner in names):
+            return True
+    return False
 
 
 def _pairs_below(path: Path, noisy: str | None, clean: str | None) -> list[PairFiles]:
@@ -200,16 +201,23 @@ def pairs_by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -
 def _by_wild_parts(top: Path, files: Sequence[Path], pattern: str) -> dict[tuple[str, ...], Path]:
     """The files that match a pattern, by their folder and what its ``*`` and ``?`` stand for there."""
     wild = {"*": "([^/]*)", "?": "([^/])"}
-    parts = (wild.get(part, re.escape(part)) for part in re.split(r"([*?])", pattern))
-    regex = re.compile("((?:.*/)?)" + "".join(parts), re.IGNORECASE)
-    found = ((regex.fullmatch(file.relative_to(top).as_posix()), file) for file in files)
-    return {tuple(map(str.casefold, match.groups())): file for match, file in found if match}
+    expression = "((?:.*/)?)"
+    for part in re.split(r"([*?])", pattern):
+        expression += wild.get(part, re.escape(part))
+    regex = re.compile(expression, re.IGNORECASE)
+
+    by_parts: dict[tuple[str, ...], Path] = {}
+    for file in files:
+        match = regex.fullmatch(file.relative_to(top).as_posix())
+        if match:
+            by_parts[tuple(map(str.casefold, match.groups()))] = file
+    return by_parts
 
 
 def clean_pattern(noisy: str) -> str:
     """Replace the word noisy by clean, keeping its case."""
     words = {"noisy": "clean", "Noisy": "Clean", "NOISY": "CLEAN"}
-    clean, count = re.subn("|".join(words), lambda found: words[found[0]], noisy)
+    clean, count = re.subn("|".join(words), lambda match: words[match[0]], noisy)
     if not count:
         raise ValueError(f"the pattern {noisy} does not contain the word noisy; give that of the clean files too")
     return clean
