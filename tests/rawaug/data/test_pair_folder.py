@@ -211,7 +211,7 @@ def test_data_check_finds_pairs_and_takes_their_settings(tmp_path: Path, capsys:
     said = capsys.readouterr().out
     assert "noisy/clean pairs: 1" in said and "cfas: GRBG (1)" in said and "damaged: none" in said
     (part,) = check(tmp_path).parts  # found by the names; what they lack is listed
-    assert part.what == "noisy/clean pairs" and "does not state its CFA" in part.broken[0]
+    assert part.what == "noisy/clean pairs" and "does not state its CFA" in part.unfit[0]
     assert main(["data", "check", str(tmp_path), "--cfa", "GRBG"]) == 2
 
 
@@ -230,7 +230,7 @@ def test_damage_by_others_is_a_line_and_the_rest_is_read(tmp_path: Path, monkeyp
         "empty.npz: cfa is not valid",
         "loop_noisy.tif",
     ):
-        assert sum(said in line for line in part.broken) == 1
+        assert sum(said in line for line in part.broken + part.unfit) == 1
 
 
 @pytest.mark.parametrize("kind", ["npy", "npz"])
