@@ -114,13 +114,18 @@ def _keep_memory() -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit status."""
+    """Entry point; returns the exit status.
+
+    Threads of OpenMP sleep where they wait for each other, unless ``OMP_WAIT_POLICY`` says otherwise. By default they
+    spin, and where other programs want the cores, a thread that spins keeps them from the one that it waits for.
+    """
     words = list(sys.argv[1:] if arguments is None else arguments)
     words.sort(key=lambda word: word != "--quiet")  # comes first, so that run takes it for no key of a recipe
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # names of files need not fit the terminal's encoding
             stream.reconfigure(errors="backslashreplace")
 
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before PyTorch loads OpenMP
     if words[:1] and words[0] in NETWORKS:
         _keep_memory()
     if not words or words[0] in ("-h", "--help"):

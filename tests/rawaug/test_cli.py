@@ -240,3 +240,13 @@ def test_what_a_file_of_ones_own_registers_is_used_by_name(tmp_path: Path, refus
     assert "no such file" in refused("--import", tmp_path / "own.py", *evaluate)
     assert "gone" in refused("--import", tmp_path / "own_filter.py", *evaluate)
     FILTERS._things.pop("Nothing")
+
+
+def test_threads_sleep_where_they_wait_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Threads that spin stop a training where other programs want the cores."""
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    main([])
+    assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    main([])
+    assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"
