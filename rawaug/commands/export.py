@@ -110,7 +110,7 @@ def export_cube(isp: DictionaryISP, out: str | Path, white_balance: Sequence[flo
         )
 
     setting = isp.typical_setting(white_balance)
-    gains = " ".join(f"{gain:.4f}" for gain in setting.gains[0].tolist())
+    gains = "{:.4f} {:.4f} {:.4f}".format(*setting.gains[0].tolist())
     lines = [
         f'TITLE "rawaug {path.stem}: sRGB to linear camera RGB"',
         f"# gains R G B {gains}, included; lens shading and mosaic are not",

@@ -149,14 +149,18 @@ def _describe_isp(path: Path) -> str:
         digital, red, blue = atom
         lines.append(f"    {digital:6.3f}  {red:6.3f}  {blue:6.3f}   {weight:.3f}")
 
-    rows = "sum 1" if config.cameras else "l1 norm 1"
+    rows = "l1 norm 1"
+    if config.cameras:
+        rows = "sum 1"
     lines.append(f"  colour atoms (sRGB to camera, rows of {rows}):")
     for matrix in isp.colour.atoms().tolist():
         lines.append("    " + " | ".join("{:6.3f} {:6.3f} {:6.3f}".format(*row) for row in matrix))
 
     curve = isp.tone_curve().mean(dim=1)
-    codes = ", ".join(f"{code} {curve[code].item():.4f}" for code in (16, 32, 64, 128, 192, 255))
-    lines.append(f"  tone and gamma, grey code to linear: {codes}")
+    points = []
+    for code in (16, 32, 64, 128, 192, 255):
+        points.append(f"{code} {curve[code].item():.4f}")
+    lines.append(f"  tone and gamma, grey code to linear: {', '.join(points)}")
     for stage in isp.ordered_stages:
         text = stage.describe()
         if text:
@@ -172,7 +176,9 @@ def describe_camera(camera: Camera) -> str:
     grid = f"black {camera.black_level:g}, white {camera.white:g} DN"
     if camera.bits is not None:
         grid += f", rounded to {camera.bits} bits"
-    lines.append(f"  {grid}" if camera.white != 1.0 else "  no digital numbers")
+    if camera.white == 1.0:
+        grid = "no digital numbers"
+    lines.append(f"  {grid}")
 
     lines.append("  matrix from linear sRGB to white-balanced camera RGB, and gains, by light:")
     for anchor in camera.anchors():
@@ -180,12 +186,17 @@ def describe_camera(camera: Camera) -> str:
         gains = "{:.4f} {:.4f} {:.4f}".format(*anchor.gains.tolist())
         lines.append(f"    {anchor.light:<5} ({1e6 / anchor.mired:.0f} K)  {' | '.join(rows)}   gains {gains}")
 
-    lines.append("  noise, variances with white = 1:" if camera.levels else "  noise: not stated")
+    if camera.levels:
+        lines.append("  noise, variances with white = 1:")
+    else:
+        lines.append("  noise: not stated")
     for level in camera.levels:
         at = "any ISO" if level.iso is None else f"ISO {level.iso:g}"
         lines.append(f"    {at:<10}  shot_var {level.shot_var:.4g}   read_var {level.read_var:.4g}")
 
-    tone = "any of the ISP's" if camera.tone is None else dumps(camera.tone)
+    tone = "any of the ISP's"
+    if camera.tone is not None:
+        tone = dumps(camera.tone)
     lines.append(f"  tone: {tone}")
     return "\n".join(lines)
 

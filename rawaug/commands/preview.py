@@ -81,7 +81,7 @@ def _draw_stages(augment: RawAugment, whole: Tensor, count: int, seed: int) -> A
     for k in range(count):
         params = augment.sample(srgb[None], generator, torch.tensor([[top, left, *frame, 0]]))
         pair = augment.apply(srgb[None], params)
-        gains = " ".join(f"{gain:.2f}" for gain in pair.params.isp.gains[0].tolist())
+        gains = "{:.2f} {:.2f} {:.2f}".format(*pair.params.isp.gains[0].tolist())
         developed = isp.forward_pixels(sensor.demosaic(augment.mosaic(pair.clean)), setting).clamp(0, 1)
         panels[f"draw {k + 1}: gains {gains}\nmean {pair.clean.mean().item():.3f}"] = developed[0]
 
