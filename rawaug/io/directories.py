@@ -18,7 +18,7 @@ THUMBNAIL, THUMBNAIL_BYTES = 513, 514
 POINTERS = (EXIF, GPS, INTEROPERABILITY)
 """Tags whose value is the place of another directory."""
 
-MOST_ENTRIES, MOST_BYTES = 4096, 2**26
+MOST_ENTRIES, MOST_BYTES, MOST_NUMBERS = 4096, 2**26, 2**20
 """Limits of a directory and of its values; larger ones count as damaged."""
 
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
@@ -112,11 +112,21 @@ class TiffFile:
             raise DamagedTags(f"tag {entry.code} of {entry.size} bytes")
         return Tag(entry.code, entry.dtype, entry.values, self.read(entry.place, entry.size))
 
+    def tags(self, entries: Iterable[Entry]) -> list[Tag]:
+        """Tags with their values, which may overlap in a hostile file, and have a limit together."""
+        chosen = list(entries)
+        size = sum(entry.size for entry in chosen)
+        if size > MOST_BYTES:
+            raise DamagedTags(f"tags of {size} bytes")
+        return [self.tag(entry) for entry in chosen]
+
     def numbers(self, entry: Entry | None) -> tuple[int, ...]:
         """The whole numbers of a tag; none where it is missing or holds others."""
         letters = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}
         if entry is None or entry.dtype not in letters:
             return ()
+        if entry.values > MOST_NUMBERS:
+            raise DamagedTags(f"tag {entry.code} of {entry.values} numbers")
         return struct.unpack(f"{self.order}{entry.values}{letters[entry.dtype]}", self.tag(entry).data)
 
     def number(self, directory: Directory, code: int, default: int = 0) -> int:

@@ -14,7 +14,7 @@ import re
 import struct
 import warnings
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
@@ -31,6 +31,7 @@ from rawaug.io.directories import (
     THUMBNAIL_BYTES,
     DamagedTags,
     Directory,
+    Entry,
     Tag,
     TiffFile,
     pack_directory,
@@ -56,6 +57,8 @@ _JFXX_PREFIX = b"JFXX\0"
 _APP0, _APP1, _APP2, _APP14, _APP15, _COMMENT = 0xE0, 0xE1, 0xE2, 0xEE, 0xEF, 0xFE
 _MOST_IN_SEGMENT = 65533
 _MP_ENTRIES = 45058
+_LARGEST_THUMBNAIL = 2**20
+"""Pixels of a thumbnail; a larger one is left as it is."""
 
 _LAYOUT = frozenset(
     (
@@ -115,12 +118,12 @@ def _exif_of_tiff(path: Path) -> bytes:
     with path.open("rb") as file:
         tiff = TiffFile(file)
         first = tiff.directory(tiff.first)
-        tags = [tiff.tag(entry) for code, entry in first.entries.items() if code not in _NOT_IN_EXIF]
-        return _pack_block(tiff, _without_layout(tags), first)
+        entries = [entry for code, entry in first.entries.items() if code not in _NOT_IN_EXIF]
+        return _pack_block(tiff, tiff.tags(_without_layout(entries)), first)
 
 
-def _without_layout(tags: list[Tag]) -> list[Tag]:
-    return [tag for tag in tags if tag.code not in _LAYOUT and tag.code not in POINTERS]
+def _without_layout(entries: Iterable[Entry]) -> list[Entry]:
+    return [entry for entry in entries if entry.code not in _LAYOUT and entry.code not in POINTERS]
 
 
 def _pack_block(tiff: TiffFile, tags: list[Tag], first: Directory) -> bytes:
@@ -140,13 +143,13 @@ def _pack_block(tiff: TiffFile, tags: list[Tag], first: Directory) -> bytes:
 def _pack_pointed(tiff: TiffFile, source: int, place: int) -> bytes:
     """The directory at ``source`` of a file for ``place`` of a block, with that of interoperability behind it."""
     directory = tiff.directory(source)
-    tags = [tiff.tag(entry) for code, entry in directory.entries.items() if code not in POINTERS]
+    tags = tiff.tags(entry for code, entry in directory.entries.items() if code not in POINTERS)
     if INTEROPERABILITY not in directory.entries:
         return pack_directory(tiff.order, tags, place)
 
     size = len(pack_directory(tiff.order, [*tags, pointer_tag(tiff.order, INTEROPERABILITY, 0)], place))
     inner = tiff.directory(tiff.number(directory, INTEROPERABILITY))
-    inner_tags = [tiff.tag(entry) for entry in inner.entries.values()]
+    inner_tags = tiff.tags(inner.entries.values())
     own = [*tags, pointer_tag(tiff.order, INTEROPERABILITY, place + size)]
     return pack_directory(tiff.order, own, place) + pack_directory(tiff.order, inner_tags, place + size)
 
@@ -165,7 +168,7 @@ def mend_exif(exif: bytes, thumbnail: Thumbnail | None, upright: bool) -> bytes:
             block[entry.place : entry.place + 2] = struct.pack(tiff.order + "H", 1)
         if thumbnail is not None and first.following:
             _mend_thumbnail(block, tiff, tiff.directory(first.following), thumbnail)
-    except DamagedTags:
+    except (DamagedTags, struct.error):
         return exif
     return bytes(block)
 
@@ -181,6 +184,8 @@ def _mend_thumbnail(block: bytearray, tiff: TiffFile, second: Directory, render:
         with Image.open(BytesIO(block[start : start + size]), formats=("JPEG",)) as old:
             width, height = old.size
     except (OSError, SyntaxError, ValueError):
+        return
+    if width * height > _LARGEST_THUMBNAIL:
         return
 
     picture = Image.fromarray(render(height, width))
@@ -387,11 +392,7 @@ def dress_tiff(plain: bytes, metadata: Metadata, upright: bool) -> bytes:
     order = written.order
 
     block = _block_of(metadata, order, upright)
-    source = TiffFile(BytesIO(block))
-    kept = source.directory(source.first)
-    pointers = [source.tag(entry) for code, entry in kept.entries.items() if code in (EXIF, GPS)]
-    tags = _without_layout([source.tag(entry) for entry in kept.entries.values()]) + pointers
-    tags += _tags_of_parts(metadata, order)
+    tags = _tags_of_block(block) + _tags_of_parts(metadata, order)
 
     start = len(block) + len(block) % 2
     place = start
@@ -416,9 +417,22 @@ def byte_order(metadata: Metadata) -> str:
     return ">" if metadata.exif is not None and metadata.exif.startswith(b"MM") else "<"
 
 
+def _tags_of_block(block: bytes) -> list[Tag]:
+    """The tags of a block's first directory that a picture's can have, with the pointers to EXIF and GPS."""
+    tiff = TiffFile(BytesIO(block))
+    entries = tiff.directory(tiff.first).entries
+    pointers = [entries[code] for code in (EXIF, GPS) if code in entries]
+    return tiff.tags(_without_layout(entries.values()) + pointers)
+
+
 def _block_of(metadata: Metadata, order: str, upright: bool) -> bytes:
+    """The EXIF block, or an empty one where there is none, or a damaged one."""
     if metadata.exif is not None:
-        return mend_exif(metadata.exif, None, upright)
+        try:
+            _tags_of_block(metadata.exif)
+            return mend_exif(metadata.exif, None, upright)
+        except DamagedTags as error:
+            warnings.warn(f"{metadata.source}: its EXIF is damaged ({error}) and left out", stacklevel=2)
     head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8)
     return head + pack_directory(order, [], 8)
 
@@ -430,7 +444,7 @@ def _tags_of_parts(metadata: Metadata, order: str) -> list[Tag]:
         with metadata.source.open("rb") as file:
             tiff = TiffFile(file)
             entries = tiff.directory(tiff.first).entries
-            return [tiff.tag(entries[code]) for code in _NOT_IN_EXIF if code in entries]
+            return tiff.tags(entries[code] for code in _NOT_IN_EXIF if code in entries)
     if metadata.xmp is not None:
         tags.append(Tag(XMP_TAG, 1, len(metadata.xmp), metadata.xmp))
     if metadata.profile is not None:

@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from rawaug.io import read_picture
-from rawaug.io.directories import Tag, TiffFile, pack_directory, pointer_tag
+from rawaug.io.directories import DamagedTags, Tag, TiffFile, pack_directory, pointer_tag
 from rawaug.io.headers import XMP_PREFIX, jpeg_segments
 from rawaug.io.metadata import pack_chunk
 from rawaug.io.stored import StoredPicture, read_stored, write_stored
@@ -295,3 +295,16 @@ def test_damaged_metadata_is_no_reason_to_refuse_a_picture(tmp_path: Path) -> No
     again(tmp_path / "in.jpg", tmp_path / "out.jpg")
     assert damaged in (tmp_path / "out.jpg").read_bytes()
     assert read_picture(tmp_path / "out.jpg").shape == (3, 40, 60)
+
+    with pytest.warns(UserWarning, match="EXIF is damaged"):
+        again(tmp_path / "in.jpg", tmp_path / "out.tif")
+    assert read_picture(tmp_path / "out.tif").shape == (3, 40, 60)
+
+
+def test_tags_that_overlap_do_not_fill_the_memory() -> None:
+    shared = [Tag(code, 7, 2**16, b"") for code in range(60000, 62000)]
+    block = bytearray(b"II*\0" + struct.pack("<I", 8) + pack_directory("<", shared, 8))
+    block += bytes(2**17)
+    tiff = TiffFile(BytesIO(bytes(block)))
+    with pytest.raises(DamagedTags, match="bytes"):
+        tiff.tags(tiff.directory(8).entries.values())
