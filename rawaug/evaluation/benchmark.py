@@ -22,7 +22,7 @@ from rawaug import bayer
 from rawaug.data.pairs import Pair, centre
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.evaluation.figures import Panels, panels_of
-from rawaug.evaluation.scores import METRICS, NOISY, group_rows, score, summary
+from rawaug.evaluation.scores import METRICS, NOISY, Row, group_rows, score, summary
 from rawaug.evaluation.tables import join_figures
 from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise, raw_trial
 from rawaug.files import digest
@@ -80,21 +80,25 @@ def trials(
         strengths: noise levels by name, see :func:`strengths_of`.
     """
     strengths = strengths or strengths_of()
-    of_sensors = [name for name in strengths if name in OF_SENSORS] or strengths
-    found: list[Trial] = []
+    with_faults = [name for name in strengths if name in OF_SENSORS] or list(strengths)
+
+    cases: list[Trial] = []
     for frame in progress(frames, label="noise", unit="frame"):
         middle = frame.middle(crop)
         for name, levels in strengths.items():
-            told = noisy_frame(frame, name, levels, seed)
-            found.append(_middle(told, middle, crop, TOLD, name))
+            exact = noisy_frame(frame, name, levels, seed)
+            cases.append(_middle(exact, middle, crop, TOLD, name))
+
             with suppress(ValueError):  # too little of the frame is flat
-                estimate = estimate_noise(bayer.unpack(told.image, frame.cfa)[0], frame.cfa)
-                known = Noisy.of(told.image, (estimate.shot_var, estimate.read_var), frame.cfa)
-                found.append(_middle(known, middle, crop, ESTIMATED, name))
-            if name in of_sensors:
-                real = noisy_frame(frame, name, levels, seed, real=True)
-                found.append(_middle(real, middle, crop, REAL, name))
-    return found
+                estimate = estimate_noise(bayer.unpack(exact.image, frame.cfa)[0], frame.cfa)
+                estimated = Noisy.of(exact.image, (estimate.shot_var, estimate.read_var), frame.cfa)
+                cases.append(_middle(estimated, middle, crop, ESTIMATED, name))
+
+            if name in with_faults:
+                faulty = noisy_frame(frame, name, levels, seed, real=True)
+                cases.append(_middle(faulty, middle, crop, REAL, name))
+
+    return cases
 
 
 def noisy_frame(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real: bool = False) -> Noisy:
@@ -110,64 +114,92 @@ def noisy_frame(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real
     """
     noise = SensorNoise(levels, **SENSOR) if real else ShotReadNoise(levels)
     key = ("benchmark", strength) if strength in STRENGTHS else (TEST_NOISE,)
-    noisy, _, told = freeze_noise(bayer.pack(frame.raw[None], frame.cfa), noise, seed, *key, frame.name)
-    assert told is not None
-    return Noisy.of(noisy, told, frame.cfa)
+    packed = bayer.pack(frame.raw[None], frame.cfa)
+    noisy, _, exact = freeze_noise(packed, noise, seed, *key, frame.name)
+    assert exact is not None
+    return Noisy.of(noisy, exact, frame.cfa)
 
 
-def _middle(given: Noisy, frame: Pair, crop: int, condition: str, strength: str) -> Trial:
+def _middle(noisy: Noisy, frame: Pair, crop: int, condition: str, strength: str) -> Trial:
     """The middle of a noisy frame beside that of the clean one, ``crop`` pixels of the mosaic."""
-    assert given.variance is not None
-    noisy, variance = (centre(image, crop // 2, crop // 2, step=1) for image in (given.image, given.variance))
-    clean, about = bayer.pack(frame.raw[None], frame.cfa), {"condition": condition, "strength": strength}
-    return raw_trial(frame, noisy, clean, variance, given.levels, frame.cfa, **about)
+    assert noisy.variance is not None
+    side = crop // 2
+    image = centre(noisy.image, side, side, step=1)
+    variance = centre(noisy.variance, side, side, step=1)
+    clean = bayer.pack(frame.raw[None], frame.cfa)
+    return raw_trial(frame, image, clean, variance, noisy.levels, frame.cfa, condition=condition, strength=strength)
 
 
 def hash_of(trials: Iterable[Trial]) -> str:
     """Eight digits of the SHA-256 of all noisy inputs, rounded to steps of 2^-12, on which all processors agree."""
-    found = list(trials)
-    strengths = list(dict.fromkeys(trial.strength for trial in found))
-    found.sort(key=lambda trial: (CONDITIONS.index(trial.condition), strengths.index(trial.strength)))
-    return digest(*((trial.noisy * 4096).round().to(torch.int32).numpy().tobytes() for trial in found))[:8]
+    cases = list(trials)
+    strengths = list(dict.fromkeys(trial.strength for trial in cases))
+    cases.sort(key=lambda trial: (CONDITIONS.index(trial.condition), strengths.index(trial.strength)))
+
+    images = []
+    for trial in cases:
+        steps = (trial.noisy * 4096).round().to(torch.int32)
+        images.append(steps.numpy().tobytes())
+
+    return digest(*images)[:8]
 
 
-def benchmark(denoisers: Sequence[RawDenoiser], found: Sequence[Trial]) -> dict[str, Any]:
+def benchmark(denoisers: Sequence[RawDenoiser], cases: Sequence[Trial]) -> dict[str, Any]:
     """Scores of every denoiser, by its name, on these :func:`trials`, beside those of the noisy input.
 
     Returns:
         ``frames``, ``hash``, and ``rows`` by name: ``gmac`` and ``seconds`` a mosaic megapixel, and ``scores`` by
         condition and strength, means of :data:`rawaug.evaluation.scores.METRICS`.
     """
-    gmacs = {one.name: _gmac(one, found[0]) for one in denoisers}
-    scored = group_rows(score([NOISY, *denoisers], found, "benchmark"))
-    places = list(dict.fromkeys((condition, trial.strength) for condition in CONDITIONS for trial in found))
+    gmacs = {one.name: _gmac(one, cases[0]) for one in denoisers}
+    strengths = list(dict.fromkeys(trial.strength for trial in cases))
+
     rows: dict[str, dict[str, Any]] = {}
-    for name, of_one in scored.items():
-        scores: dict[str, dict[str, Any]] = {}
-        for condition, strength in places:
-            at = [row for row in of_one if (row.condition, row.strength) == (condition, strength)]
-            if at or condition != REAL:
-                means = summary(at)
-                scores.setdefault(condition, {})[strength] = {
-                    **{key: means[key] for key in (*METRICS, "own_noise") if key in means},
-                    "frames": len(at),
-                }
-        seconds = round(fmean(row.seconds for row in of_one), 3)
-        rows[name] = {"gmac": gmacs.get(name), "seconds": seconds if name in gmacs else None, "scores": scores}
-    names = list(dict.fromkeys(trial.frame for trial in found))
-    return {"frames": names, "hash": hash_of(found), "rows": rows}
+    for name, of_one in group_rows(score([NOISY, *denoisers], cases, "benchmark")).items():
+        seconds = None
+        if name in gmacs:
+            seconds = round(fmean(row.seconds for row in of_one), 3)
+        rows[name] = {"gmac": gmacs.get(name), "seconds": seconds, "scores": _by_condition(of_one, strengths)}
+
+    frames = list(dict.fromkeys(trial.frame for trial in cases))
+    return {"frames": frames, "hash": hash_of(cases), "rows": rows}
 
 
-def noise_note(found: Sequence[Trial], strengths: Iterable[str], seed: int) -> str:
+def _by_condition(rows: Sequence[Row], strengths: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Mean scores of one denoiser by condition and strength; sensors have some of the strengths alone."""
+    scores: dict[str, dict[str, Any]] = {}
+    for condition in CONDITIONS:
+        for strength in strengths:
+            of_place = [row for row in rows if (row.condition, row.strength) == (condition, strength)]
+            if condition == REAL and not of_place:
+                continue
+
+            means = summary(of_place)
+            figures: dict[str, Any] = {key: means[key] for key in (*METRICS, "own_noise") if key in means}
+            figures["frames"] = len(of_place)
+            scores.setdefault(condition, {})[strength] = figures
+
+    return scores
+
+
+def noise_note(cases: Sequence[Trial], strengths: Iterable[str], seed: int) -> str:
     """A sentence that says what the noise of these :func:`trials` is, by strength and levels, and that it is drawn."""
-    said = []
+    parts = []
     for name in strengths:
-        levels = [trial.levels for trial in found if trial.levels and (trial.condition, trial.strength) == (TOLD, name)]
-        columns = [[f"{bound:.2g}" for bound in (min(column), max(column))] for column in zip(*levels, strict=True)]
-        said.append(f"{name} ({', '.join(' to '.join(dict.fromkeys(bounds)) for bounds in columns)})")
+        levels = []
+        for trial in cases:
+            if trial.levels is not None and (trial.condition, trial.strength) == (TOLD, name):
+                levels.append(trial.levels)
+
+        ranges = []
+        for column in zip(*levels, strict=True):
+            bounds = dict.fromkeys([f"{min(column):.2g}", f"{max(column):.2g}"])
+            ranges.append(" to ".join(bounds))
+        parts.append(f"{name} ({', '.join(ranges)})")
+
     return (
         "The noise is synthetic: Gaussian of variance shot_var y + read_var, drawn on clean frames with seed "
-        f"{seed}, not a camera's own. Strengths, with shot_var and read_var: {'; '.join(said)}."
+        f"{seed}, not a camera's own. Strengths, with shot_var and read_var: {'; '.join(parts)}."
     )
 
 
@@ -175,33 +207,52 @@ def _gmac(denoiser: RawDenoiser, trial: Trial) -> float | None:
     """Multiplications that PyTorch computes, in 10^9 a megapixel of the mosaic; None if there are none."""
     with FlopCounterMode(display=False) as counter:
         denoiser(trial.input)
+
     return round(counter.get_total_flops() / 2e3 / trial.noisy.numel(), 2) or None
 
 
 def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str, list[str]]]]:
     """Title, columns and cells by denoiser of each condition's table; heads say how many frames could be estimated."""
-    for condition in (TOLD, ESTIMATED, REAL):
-        scored = {name: at["frames"] for name, at in result["rows"]["noisy input"]["scores"][condition].items()}
-        count = len(result["frames"])
-        head = [name if n == count else f"{name} ({n} of {count} frames)" for name, n in scored.items()]
-        shown = display_strength(scored)
-        head += [f"SSIM, {shown}", "GMAC", "s"] if condition == TOLD else []
+    count = len(result["frames"])
+    frames = f"{count} frame{'s' * (count != 1)}"
+
+    for condition in CONDITIONS:
+        of_input = result["rows"]["noisy input"]["scores"][condition]
+        shown = display_strength(of_input)
+
+        head = []
+        for strength, scores in of_input.items():
+            part = "" if scores["frames"] == count else f" ({scores['frames']} of {count} frames)"
+            head.append(strength + part)
+        if condition == TOLD:
+            head += [f"SSIM, {shown}", "GMAC", "s"]
+
         cells = {}
         for name, row in result["rows"].items():
             scores = row["scores"][condition]
-            cells[name] = [join_figures(scores[strength], "psnr", "psnr_srgb") for strength in scored]
+            cells[name] = [join_figures(scores[strength], "psnr", "psnr_srgb") for strength in of_input]
             if condition == TOLD:
-                costs = ["" if row[key] is None else f"{row[key]:.2f}" for key in ("gmac", "seconds")]
+                costs = [_format_cost(row[key]) for key in ("gmac", "seconds")]
                 cells[name] += [join_figures(scores[shown], "ssim", "ssim_srgb"), *costs]
-        yield f"{condition}: PSNR of RAW / sRGB in dB, {count} frame{'s' * (count != 1)}", head, cells
+
+        yield f"{condition}: PSNR of RAW / sRGB in dB, {frames}", head, cells
+
+
+def _format_cost(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
 
 
 def costs_of(result: Mapping[str, Any]) -> dict[str, tuple[float | None, float, float]]:
     """By denoiser its GMAC a megapixel and its PSNR of RAW and sRGB, at the strength that is shown."""
     shown = display_strength(result["rows"]["noisy input"]["scores"][TOLD])
-    rows = {name: row for name, row in result["rows"].items() if name != "noisy input"}
-    scored = {name: row["scores"][TOLD][shown] for name, row in rows.items()}
-    return {name: (rows[name]["gmac"], scores["psnr"], scores["psnr_srgb"]) for name, scores in scored.items()}
+    costs = {}
+    for name, row in result["rows"].items():
+        if name == "noisy input":
+            continue
+        scores = row["scores"][TOLD][shown]
+        costs[name] = row["gmac"], scores["psnr"], scores["psnr_srgb"]
+
+    return costs
 
 
 def display_strength(strengths: Collection[str]) -> str:
@@ -210,8 +261,10 @@ def display_strength(strengths: Collection[str]) -> str:
     return "strong" if "strong" in strengths else last
 
 
-def crops(denoisers: Sequence[RawDenoiser], found: Iterable[Trial], most: int) -> Iterator[Panels]:
+def crops(denoisers: Sequence[RawDenoiser], cases: Iterable[Trial], most: int) -> Iterator[Panels]:
     """Pictures for the page: the first ``most`` frames with noise of :func:`display_strength`, by every denoiser."""
-    told = [trial for trial in found if trial.condition == TOLD]
-    shown = display_strength(dict.fromkeys(trial.strength for trial in told))
-    return (panels_of(denoisers, trial) for trial in [t for t in told if t.strength == shown][:most])
+    exact = [trial for trial in cases if trial.condition == TOLD]
+    shown = display_strength(dict.fromkeys(trial.strength for trial in exact))
+    of_strength = [trial for trial in exact if trial.strength == shown]
+    for trial in of_strength[:most]:
+        yield panels_of(denoisers, trial)
