@@ -183,24 +183,36 @@ class Measured(SomePairs):
 
 def own_noise_note(summaries: Mapping[str, Mapping[str, Any]]) -> str:
     """A line on scores of which the references' own noise is a large part; empty if there are none."""
-    shares = {name: scores.get("own_noise", 0.0) for name, scores in summaries.items()}
-    much = sorted((name for name, share in shares.items() if share > MUCH), key=lambda name: -shares[name])
-    named = ", ".join(f"{name} {shares[name]:.0%}" for name in much[:SHOWN])
-    kept = " (more than 100%: it keeps that noise)" if any(shares[name] > 1.0 for name in much) else ""
-    return f"own noise of the references as a share of the squared error: {named}{kept}; {ADVICE}" if much else ""
+    shares = {}
+    for name, scores in summaries.items():
+        share = scores.get("own_noise", 0.0)
+        if share > MUCH:
+            shares[name] = share
+
+    if not shares:
+        return ""
+
+    names = sorted(shares, key=lambda name: -shares[name])[:SHOWN]
+    listed = ", ".join(f"{name} {shares[name]:.0%}" for name in names)
+    kept = " (more than 100%: it keeps that noise)" if max(shares.values()) > 1.0 else ""
+    return f"own noise of the references as a share of the squared error: {listed}{kept}; {ADVICE}"
 
 
 def added_noise_note(trials: Iterable[Trial]) -> str:
     """A line that warns of noise hardly stronger than that of the references; empty if it is much stronger."""
-    known = [
-        (one.own, one.variance.mean().item()) for one in trials if one.own is not None and one.variance is not None
-    ]
-    own, added = (fmean(values) for values in zip(*known, strict=True)) if known else (0.0, 1.0)
-    if own <= MUCH * added:
+    own = []
+    added = []
+    for trial in trials:
+        if trial.own is not None and trial.variance is not None:
+            own.append(trial.own)
+            added.append(trial.variance.mean().item())
+
+    if not own or fmean(own) <= MUCH * fmean(added):
         return ""
+
     return (
-        f"the test frames' own noise has {own / added:.0%} of the variance of the noise added to them: a perfect "
-        f"denoiser would score {-10.0 * math.log10(own):.1f} dB; {ADVICE}"
+        f"the test frames' own noise has {fmean(own) / fmean(added):.0%} of the variance of the noise added to them: "
+        f"a perfect denoiser would score {-10.0 * math.log10(fmean(own)):.1f} dB; {ADVICE}"
     )
 
 
