@@ -147,6 +147,8 @@ SPREAD_EPS = 1e-6
 """Constant under the logarithm, so that a frame that nothing predicts does not decide alone."""
 KNEES = (0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
 REACH_ATOMS = 8
+LEAST_DETERMINANT = 0.05
+"""Of a matrix with rows of l1 norm 1; published cameras have 0.1 and more."""
 
 
 def set_dictionaries(
@@ -180,7 +182,13 @@ def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSumm
     params = colour.params()
     light, neutral = log_light(balance), -colour.neutral(balance)[1]
     count = isp.config.colour_atoms
-    groups = _groups(torch.cat([params.matrix.flatten(1), params.gains.log()], dim=1), count, config.seed)
+    points = torch.cat([params.matrix.flatten(1), params.gains.log()], dim=1)
+    kept = torch.arange(len(points))
+    if len(points) > count:
+        plausible = plausible_matrices(params.matrix).nonzero()[:, 0]
+        kept = plausible if len(plausible) >= count else kept
+    groups = points.new_zeros(count, len(points))
+    groups[:, kept] = _groups(points[kept], count, config.seed)
     isp.colour.matrices.copy_((groups @ params.matrix.flatten(1)).unflatten(1, (3, 3)))
     isp.colour.light.copy_(groups @ light)
     isp.colour.neutral.copy_(groups @ neutral)
@@ -189,6 +197,17 @@ def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSumm
     frames = torch.stack([green, red - green, blue - green], dim=1)
     more = reach_atoms(isp.config.gain_atoms - count, config.reach)
     isp.gain.log_gains.copy_(torch.cat([frames, frames.mean(0) + more]))
+
+
+def plausible_matrices(matrices: Tensor) -> Tensor:
+    """Say which matrices ``(F, 3, 3)`` from sRGB may be a camera's: booleans ``(F,)``.
+
+    Each channel sees its own primary most, and the matrix is far from singular. Frames of few colours leave their
+    matrices open, and must not become atoms.
+    """
+    own = matrices.diagonal(dim1=1, dim2=2)
+    others = matrices.abs() - torch.diag_embed(matrices.diagonal(dim1=1, dim2=2).abs())
+    return (own > others.amax(dim=2)).all(dim=1) & (torch.linalg.det(matrices) > LEAST_DETERMINANT)
 
 
 def reach_atoms(count: int, reach: float) -> Tensor:
