@@ -202,7 +202,7 @@ def test_bad_input_is_one_line(tmp_path: Path, refused: Callable[..., str], baye
         (("run", "fewshot", *QUICK_RUN, "--out", tmp_path, "--data.pictures", tmp_path / "empty"), "no picture"),
         (("evaluate", tmp_path / "bad.safetensors", "--data", "demo:test"), "bad.safetensors"),
         (("info", tmp_path / "gone.safetensors"), "gone.safetensors"),
-        (("fit", "demo:train", "--out", "x.safetensors", "--noise", "off", "--dark", "gone"), "dark gone: is for"),
+        (("fit", "demo:train", "--out", "x.safetensors", "--noise", "off", "--dark", "gone"), "dark gone: has no use"),
         *((("denoise", file, f"out{file.suffix}", "--denoiser", ""), "no such denoiser") for file in (whole, picture)),
         *((("synth", picture, "out", "--noise", noise), "noise") for noise in ("null", "true", "[[1,2],[3,4]]")),
         (("denoise", sound, "b.dng", "--noise", "[nan,1]"), "must be a name or a pair"),
