@@ -69,7 +69,9 @@ def run(
         options |= {"greens": greens != "auto", "noise": noise != "auto"}
         _require_none(source, options)
         views = 8 if self_ensemble else None
-        kind = PictureFiles(PictureDenoiser.of(denoiser or PICTURES, device, strength, views, "auto"))
+        kind = PictureFiles(
+            PictureDenoiser.of(PICTURES if denoiser is None else denoiser, device, strength, views, "auto")
+        )
     else:
         if json:
             require_writable(Path(json))
