@@ -78,7 +78,9 @@ def test_an_isp_behind_another_pattern_has_the_same_colours() -> None:
     assert (str(isp.cfa), str(other.cfa)) == ("GRBG", "RGGB") and change_cfa(isp, CFA.GRBG) is isp
     grey = torch.full((1, 3, 8, 8), 128, dtype=torch.uint8)
     ours, theirs = (x.reverse(grey).raw for x in (isp, other))
-    torch.testing.assert_close(ours[..., 0::2, 1::2], theirs[..., 0::2, 0::2], rtol=0.0, atol=1e-6)  # red
+    torch.testing.assert_close(
+        ours[..., 0::2, 1::2], theirs[..., 0::2, 0::2], rtol=0.0, atol=2e-5
+    )  # red, but for shading
 
 
 def test_a_mosaic_of_another_pattern_is_denoised_in_the_network_s_own() -> None:
