@@ -78,8 +78,11 @@ class BakedISP(nn.Module):
         gain = _place_gain(self.isp.ordered_stages, place, size, self.table, forward=False)
         if gain is None:
             return _pass(srgb, camera, white)
-        sites = torch.cat([gain[..., i::2, j::2] for i, j in CFA(self.config.cfa).sites], dim=1)
-        return (_pass(srgb, camera, math.inf) * sites).clamp_max(white)
+
+        raw = _pass(srgb, camera, math.inf)
+        with one_thread():  # PyTorch's threads do not survive the fork of a worker
+            sites = torch.cat([gain[..., i::2, j::2] for i, j in CFA(self.config.cfa).sites], dim=1)
+            return (raw * sites).clamp_max(white)
 
     @torch.no_grad()
     def colours(
@@ -263,6 +266,7 @@ def _batch_params(
 
 
 @torch.no_grad()
+@one_thread()  # as above, and the same gains in every process
 def _place_gain(
     stages: Sequence[Stage],
     place: Tensor | None,
