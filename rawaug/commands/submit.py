@@ -1,4 +1,4 @@
-"""``rawaug submit``: the noisy blocks of SIDD's benchmark, denoised and written as its server takes them.
+"""``rawaug submit``: the noisy blocks of a benchmark whose clean ones are kept, denoised and written as it takes them.
 
 Noise levels are those that the dataset publishes for a frame, else estimated from all of its noisy blocks together.
 Results are cut to [0, 1].
@@ -7,6 +7,7 @@ Results are cut to [0, 1].
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 from denoisers.files import DEFAULT
 from rawaug.commands import YAML
 from rawaug.commands.denoise import choose_denoiser
+from rawaug.data.dnd import Dnd, write_dnd_submission
 from rawaug.data.sidd import BLOCKS, SiddBenchmark, write_submission
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.files import require_writable
@@ -37,11 +39,11 @@ def run(
     self_ensemble: bool = False,
     device: str = "auto",
 ) -> None:
-    """Denoise the noisy blocks of SIDD's benchmark, in the form that its server takes.
+    """Denoise the noisy blocks of a benchmark, in the form that its server takes.
 
     Args:
-        benchmark: sidd:PATH with BenchmarkNoisyBlocksRaw.mat.
-        out: the file to submit, SubmitRaw.csv.
+        benchmark: sidd:PATH with BenchmarkNoisyBlocksRaw.mat, or dnd:PATH with info.mat.
+        out: what to submit: SubmitRaw.csv for SIDD, a folder for DND.
         denoiser: .safetensors file written by rawaug run, or the name of a shipped denoiser; by default rawaug-small.
         classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, WNNM, KSVD, GLIDE,
             or {name, settings}.
@@ -49,19 +51,23 @@ def run(
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
     """
     kind, _, path = benchmark.partition(":")
-    if kind != "sidd" or not path:
-        raise ValueError(f"{benchmark}: not a benchmark; use sidd:PATH")
-    require_writable(out)
+    if kind not in ("sidd", "dnd") or not path:
+        raise ValueError(f"{benchmark}: not a benchmark; use sidd:PATH or dnd:PATH")
+    require_writable(Path(out), folder=kind == "dnd")
 
     spec = DEFAULT if denoiser is None and classical is None else denoiser
     model = choose_denoiser(spec, classical, self_ensemble, device)
     assert model is not None
-    submit(path, out, model.require_mosaic())
+    method = model.require_mosaic()
+    if kind == "dnd":
+        submit_dnd(path, out, method)
+    else:
+        submit(path, out, method)
     print(f"The submission is in {out}.")
 
 
 def submit(path: str, out: str, denoiser: RawDenoiser) -> None:
-    """Denoise the blocks below the folder ``path``, and write the submission ``out``."""
+    """Denoise SIDD's blocks below the folder ``path``, and write the submission ``out``."""
     blocks = SiddBenchmark(path)
     write_submission(out, _denoise(blocks, denoiser), blocks[0].mosaic.shape[-1])
 
@@ -86,3 +92,15 @@ def _estimate_levels(blocks: list[RawFrame]) -> tuple[float, float]:
             f"{scene}: its noise cannot be estimated ({error}); put noise_level_functions.csv beside the blocks"
         ) from error
     return estimate.shot_var, estimate.read_var
+
+
+def submit_dnd(path: str, out: str, denoiser: RawDenoiser) -> None:
+    """Denoise DND's boxes below the folder ``path``, and write the 50 files of the submission into ``out``."""
+    boxes = Dnd(path)
+    write_dnd_submission(out, _denoised_boxes(boxes, denoiser))
+
+
+def _denoised_boxes(boxes: Dnd, denoiser: RawDenoiser) -> Iterator[Tensor]:
+    for box in progress(boxes, label="benchmark", unit="box"):
+        levels = box.noise_profile or _UNUSED
+        yield denoiser.frame(box, levels).clamp(0.0, 1.0)

@@ -1,13 +1,14 @@
 """What is read: pictures, RAW files, published datasets and the built-in demo data.
 
 They come as datasets of sRGB pictures (:func:`open_pictures`) or as RAW-sRGB pairs (:func:`open_pairs`); what has no
-clean version, the benchmark of SIDD, comes as noisy blocks with a writer for submissions.
+clean version, the benchmarks of SIDD and DND, comes as noisy blocks with a writer for submissions.
 """
 
 from __future__ import annotations
 
 from rawaug.data.check import check
 from rawaug.data.demo import DemoCamera, demo_pairs, demo_photographs, demo_pictures
+from rawaug.data.dnd import Dnd, write_dnd_submission
 from rawaug.data.drawn import Shapes, dead_leaves
 from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.opening import open_pairs, open_pictures
@@ -16,7 +17,7 @@ from rawaug.data.pairs import DATASETS, PICTURES, Binned, Pair
 from rawaug.data.sidd import SiddBenchmark, write_submission
 
 __all__ = [
-    "DATASETS", "PICTURES", "Binned", "DemoCamera", "Pair", "PairFolder", "PictureFolder", "RawFolder", "Shapes",
+    "DATASETS", "PICTURES", "Binned", "DemoCamera", "Dnd", "Pair", "PairFolder", "PictureFolder", "RawFolder", "Shapes",
     "SiddBenchmark", "check", "dead_leaves", "demo_pairs", "demo_photographs", "demo_pictures", "open_pairs",
-    "open_pictures", "write_submission",
+    "open_pictures", "write_dnd_submission", "write_submission",
 ]  # fmt: skip

@@ -18,6 +18,7 @@ from typing import Any
 
 from torch import Tensor
 
+from rawaug.data.dnd import Dnd
 from rawaug.data.folders import PictureFolder
 from rawaug.data.formats import READABLE
 from rawaug.data.opening import open_pairs, open_pictures
@@ -158,6 +159,8 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
         yield "SIDD, benchmark blocks (noisy only)", partial(SiddBenchmark, path)
     if any(re.fullmatch(r"siddplus_valid_\w+_raw\.mat", name) for name in files):
         yield "SIDD+, validation blocks", partial(SiddPlusBlocks, path)
+    if (path / "info.mat").is_file():
+        yield "DND, boxes (noisy only)", partial(Dnd, path)
     if any((path / split / "huawei_raw").is_dir() for split in ("train", "test")):
         for split in ("train", "test"):
             yield f"Zurich RAW to RGB, {split}", partial(Zurich, path, split)

@@ -81,8 +81,10 @@ def read_array(path: str | Path, name: str) -> np.ndarray:
 
 
 def read_value(path: str | Path, name: str) -> Any:
-    """The variable ``name`` as plain values: structs are dicts, cells lists (row by row), characters strings, numbers
-    arrays without axes of length 1.
+    """The variable ``name`` as plain values.
+
+    Structs are dicts, struct arrays lists of dicts, cells lists (row by row), characters strings, and numbers arrays
+    without axes of length 1.
     """
     return isolated(_read, Path(path), name, True)
 
@@ -157,7 +159,8 @@ def _plain(node: Any, file: Any) -> Any:
     import h5py
 
     if isinstance(node, h5py.Group):
-        return {key: _plain(_member(node, key), file) for key in node}
+        fields = {key: _plain(_member(node, key), file) for key in node}
+        return _struct_array(fields) if _is_struct_array(node) else fields
     value = _values(node)
     if h5py.check_ref_dtype(node.dtype) is not None:
         return [_plain(file[reference], file) for reference in np.ravel(value, order="F")]
@@ -166,6 +169,25 @@ def _plain(node: Any, file: Any) -> Any:
     if node.attrs.get("MATLAB_empty", 0):
         return np.zeros(0)
     return np.array(np.asarray(value).T.squeeze(), order="C")
+
+
+def _is_struct_array(group: Any) -> bool:
+    """Whether the fields of a struct refer to values of several elements; unlike cells they have no class."""
+    import h5py
+
+    for field in group.values():
+        refers = isinstance(field, h5py.Dataset) and h5py.check_ref_dtype(field.dtype) is not None
+        if not refers or "MATLAB_class" in field.attrs:
+            return False
+    return len(group) > 0
+
+
+def _struct_array(fields: Mapping[str, list[Any]]) -> list[dict[str, Any]]:
+    """The elements of a struct array, by the values of each field."""
+    elements = []
+    for values in zip(*fields.values(), strict=True):
+        elements.append(dict(zip(fields, values, strict=True)))
+    return elements
 
 
 # -- metadata ---------------------------------------------------------------------------------------------------------

@@ -13,9 +13,9 @@ import pytest
 
 
 def write_mat73(path: Path, variables: dict[str, Any]) -> Path:
-    """Version 7.3: HDF5 behind 512 bytes, axes reversed, structs as groups, cells as references.
+    """Version 7.3: HDF5 behind 512 bytes, axes reversed, structs as groups, struct arrays and cells as references.
 
-    Arrays are numeric, strings are char, dicts structs, lists cells.
+    Arrays are numeric, strings are char, dicts structs, lists of dicts struct arrays, other lists cells.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w", userblock_size=512) as file:
@@ -33,6 +33,11 @@ def _put(file: h5py.File, group: h5py.Group, name: str, value: Any) -> None:
         node.attrs["MATLAB_class"] = np.bytes_("struct")
         for key, inner in value.items():
             _put(file, node, key, inner)
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        node = group.create_group(name)
+        node.attrs["MATLAB_class"] = np.bytes_("struct")
+        for key in value[0]:
+            node.create_dataset(key, data=_references(file, [element[key] for element in value]))
     elif isinstance(value, list):
         cell = group.create_dataset(name, data=_references(file, value))
         cell.attrs["MATLAB_class"] = np.bytes_("cell")

@@ -58,9 +58,15 @@ def test_arrays_keep_matlabs_axes_and_type_through_the_helper(
 
 
 def test_structs_cells_and_text_become_plain(written: Callable[[dict[str, Any]], Path]) -> None:
-    path = written({"s": {"Make": "LGE", "wb": np.array([[0.5, 1.0, 0.6]])}, "c": [ARRAY[0], ARRAY[1]]})
+    shots: list[dict[str, Any]] = [
+        {"box": np.arange(8.0).reshape(2, 4) + k, "nlf": {"a": 0.1 * k, "b": 2.0}} for k in range(3)
+    ]
+    path = written({"s": {"Make": "LGE", "wb": np.array([[0.5, 1.0, 0.6]])}, "shots": shots, "c": [ARRAY[0], ARRAY[1]]})
     plain = read_value(path, "s")
     assert plain["Make"] == "LGE" and np.allclose(plain["wb"], [0.5, 1, 0.6])
+    elements = read_value(path, "shots")
+    assert [float(shot["nlf"]["a"]) for shot in elements] == pytest.approx([0, 0.1, 0.2])
+    assert np.array_equal(elements[2]["box"], shots[2]["box"])
     assert all(np.array_equal(a, b) for a, b in zip(read_value(path, "c"), ARRAY[:2], strict=True))
 
 

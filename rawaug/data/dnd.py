@@ -1,0 +1,162 @@
+"""The Darmstadt Noise Dataset: noisy boxes whose clean versions are kept, and the files that its server takes.
+
+Fifty frames of four cameras are to be denoised in twenty boxes each. ``info.mat`` (version 7.3) holds the struct array
+``info`` with, for each frame, ``boundingboxes`` (top, left, bottom, right, counted from 1, both ends inside), ``nlf``
+(var(y) = a y + b) and ``camera`` (``pattern`` with R, G, B as 1, 2, 3, ``AsShotNeutral``, ``ColorMatrix2``);
+``images_raw/0001.mat`` holds the frame ``Inoisy`` in [0, 1]. As every matrix of such files the pattern is transposed
+for those who do not exchange its axes: GBRG then looks like GRBG. Source: T. Plötz, S. Roth, "Benchmarking denoising
+algorithms with real photographs", CVPR 2017, and its submission kit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from rawaug.bayer import CFA
+from rawaug.data.development import gains_from_neutral, srgb_from_camera
+from rawaug.data.formats import read_array, read_value, to_raw
+from rawaug.data.pairs import DATASETS, Lazy, Pair
+from rawaug.io import RawFrame
+
+FRAMES, BOXES = 50, 20
+"""Number of frames of the published dataset, and of boxes of a frame."""
+
+
+class Box(NamedTuple):
+    """A box in its frame, counted from 0; the ends lie outside."""
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+
+class FrameInfo(NamedTuple):
+    """A frame as ``info`` describes it; ``stated`` has the arguments of a :class:`RawFrame` that it states."""
+
+    boxes: list[Box]
+    cfa: CFA
+    stated: dict[str, Any]
+
+
+class Dnd(Lazy[RawFrame]):
+    """The boxes, frame by frame: 1,000 of 512 x 512; one frame at a time is in memory.
+
+    Results go to :func:`write_dnd_submission`, in the same order.
+
+    Raises:
+        FileNotFoundError: if ``info.mat`` or a frame is missing below ``path``.
+        ValueError: if ``info.mat`` is not as published.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        info = self.path / "info.mat"
+        entries = read_value(info, "info")
+        if not isinstance(entries, list):
+            raise ValueError(f"{info}: info is not a struct array over the frames")
+        self.frames = [parse_frame(entry, info, number) for number, entry in enumerate(entries)]
+
+        missing = [self.file(number) for number in range(len(self.frames)) if not self.file(number).is_file()]
+        if missing:
+            raise FileNotFoundError(
+                f"{missing[0]}: no such frame of DND; {len(missing)} of {len(self.frames)} are missing"
+            )
+
+        self.places: list[tuple[int, int]] = []
+        names = []
+        for number, frame in enumerate(self.frames):
+            for box in range(len(frame.boxes)):
+                self.places.append((number, box))
+                names.append(f"{number + 1:04d}_{box + 1:02d}")
+        self._open_frame: tuple[int, Tensor] | None = None
+        super().__init__(names)
+
+    def file(self, number: int) -> Path:
+        """The file of a frame, counted from 0."""
+        return self.path / "images_raw" / f"{number + 1:04d}.mat"
+
+    def read(self, index: int) -> RawFrame:
+        number, box_number = self.places[index]
+        if self._open_frame is None or self._open_frame[0] != number:
+            mosaic = to_raw(read_array(self.file(number), "Inoisy"), 2, self.file(number))
+            self._open_frame = (number, mosaic)
+
+        noisy = self._open_frame[1]
+        frame = self.frames[number]
+        box = frame.boxes[box_number]
+        height, width = noisy.shape[-2:]
+        inside = 0 <= box.top < box.bottom <= height and 0 <= box.left < box.right <= width
+        if not inside:
+            raise ValueError(
+                f"{self.file(number)}: box {box_number + 1} of info.mat extends beyond the frame of {height} x {width}"
+            )
+
+        cut = noisy[:, box.top : box.bottom, box.left : box.right].contiguous()
+        cfa = frame.cfa.shift(box.top, box.left)
+        return RawFrame(cut, cfa, name=self.names[index], **frame.stated)
+
+
+def parse_frame(entry: Any, file: Path, number: int) -> FrameInfo:
+    """A frame of the struct array ``info``; ValueError, which names the file, if it is not as published."""
+    try:
+        boxes = []
+        for top, left, bottom, right in np.asarray(entry["boundingboxes"]).reshape(-1, 4).astype(int).tolist():
+            boxes.append(Box(top - 1, left - 1, bottom, right))
+
+        camera, noise = entry["camera"], entry["nlf"]
+        colours = ["RGB"[int(colour) - 1] for colour in np.ravel(camera["pattern"])]
+        stated = {
+            "noise_profile": (float(noise["a"]), float(noise["b"])),
+            "white_balance": gains_from_neutral(camera["AsShotNeutral"]),
+            "color_matrix": srgb_from_camera(camera["ColorMatrix2"]),
+        }
+        return FrameInfo(boxes, CFA("".join(colours)), stated)
+    except (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError) as error:
+        raise ValueError(f"{file}: frame {number + 1} of info is not as published ({error})") from error
+
+
+@DATASETS.register("dnd")
+def no_clean_frames(path: str, split: str) -> Sequence[Pair]:
+    """Nothing: DND has no pairs."""
+    raise ValueError(
+        f"dnd:{path}: the clean frames of DND are not public; denoise it with rawaug submit dnd:{path}, and submit "
+        "the result"
+    )
+
+
+def write_dnd_submission(folder: str | Path, denoised: Iterable[Tensor]) -> None:
+    """Write 1,000 denoised boxes ``(1, H, W)`` in [0, 1], in the order and patterns of :class:`Dnd`, as its 50 files.
+
+    Raises:
+        ValueError: if a box has another shape or values outside [0, 1], or there are not 1,000 of them.
+    """
+    from scipy.io import savemat
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    cells = np.empty(BOXES, object)
+    count = 0
+
+    for mosaic in denoised:
+        cells[count % BOXES] = checked_box(mosaic, f"box {count}")
+        count += 1
+        if count % BOXES == 0 and count <= FRAMES * BOXES:
+            file = folder / f"{count // BOXES:04d}.mat"
+            savemat(file, {"Idenoised": cells, "israw": True, "eval_version": "1.0"})
+
+    if count != FRAMES * BOXES:
+        raise ValueError(f"{folder}: a submission must have {FRAMES * BOXES} boxes, got {count}")
+
+
+def checked_box(mosaic: Tensor, name: str) -> np.ndarray:
+    """The array that is written for a denoised mosaic, float32 ``(H, W)``."""
+    in_range = bool((mosaic >= 0.0).all() and (mosaic <= 1.0).all())  # NaN is not
+    if mosaic.ndim != 3 or mosaic.shape[0] != 1 or not in_range:
+        raise ValueError(f"{name}: must have values in [0, 1] and shape (1, H, W), got {tuple(mosaic.shape)}")
+    return mosaic[0].detach().cpu().float().numpy()

@@ -1,0 +1,380 @@
+"""``rawaug run paper``: the paper's tables, its ablation and its cycle in one run, with its figures beside ours.
+
+Each part is a recipe of its own, which runs in a folder below that of the whole and resumes by itself. Then one page,
+``report.html``, and one file, ``paper.json``, have all of them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from itertools import combinations
+from pathlib import Path
+from statistics import fmean
+from typing import Any, NamedTuple
+
+from rawaug.evaluation.page import Figure, Page, command_line
+from rawaug.evaluation.tables import mean_and_spread, print_rows
+from rawaug.experiment.folder import claim, require_free
+from rawaug.experiment.recipe import EXPERIMENTS
+from rawaug.experiment.run import run
+from rawaug.files import write_json
+from rawaug.paper import published
+from rawaug.paper.ablation import Ablation, ablate
+from rawaug.paper.reconstruction import Comparison, compare
+from rawaug.tasks.settings import Recipe
+
+PARTS = ("table1", "table2_nikon", "table2_canon", "table3", "few", "unsupervised", "ablation")
+TITLES = {
+    "table1": "Table 1: RAW reconstruction",
+    "table2": "Table 2: RAW reconstruction, two DSLRs",
+    "table3": "Table 3: RAW denoising",
+    "ablation": "Ablation: PSNR against RAW after each stage",
+}
+SHORTEST_CROP = 64
+"""Side in pixels of what a dry run scores of a test frame."""
+Table = dict[str, dict[str, Any]]
+"""By row and column a figure, or None."""
+
+
+@dataclass
+class Paper:
+    """The settings of the paper's tables; a part that is null is left out.
+
+    Args:
+        name: of the output folder within ``out``.
+        data: the pairs of all parts but table 2, in place of those that the parts name; null leaves them.
+        test: the test pairs of these parts; null leaves those that they name.
+        pictures: their sRGB pictures; null leaves those that they name.
+        parts: those to run now, in this order; the page has every part that was run before.
+        table1: RAW reconstruction, PSNR_d and the cycle.
+        table2_nikon: RAW reconstruction of one DSLR.
+        table2_canon: of the other one.
+        table3: denoising with all pairs; its arms are named tnrd, dncnn, dhdn, cycleisp and ours.
+        few: the arm ours_f, with few pairs.
+        unsupervised: the arm ours_u, from noisy frames alone.
+        ablation: after each stage.
+        out: folder of all runs.
+    """
+
+    name: str = "paper"
+    data: str | None = None
+    test: str | None = None
+    pictures: str | None = None
+    parts: list[str] = field(default_factory=lambda: list(PARTS))
+    table1: Comparison | None = None
+    table2_nikon: Comparison | None = None
+    table2_canon: Comparison | None = None
+    table3: Recipe | None = None
+    few: Recipe | None = None
+    unsupervised: Recipe | None = None
+    ablation: Ablation | None = None
+    out: str = "runs"
+
+    def __post_init__(self) -> None:
+        for part in self.parts:
+            if part not in PARTS:
+                raise ValueError(f"parts: {part} is none; choose from {', '.join(PARTS)}")
+
+    def shortest(self) -> Paper:
+        """All parts in their shortest form, on small test frames, since some filters take minutes for a whole one."""
+        parts: dict[str, Any] = {}
+        for name in PARTS:
+            settings = getattr(self, name)
+            if settings is None:
+                continue
+            short = settings.shortest()
+            if isinstance(short, Recipe):
+                short = replace(short, data=replace(short.data, test_crop=SHORTEST_CROP))
+            parts[name] = short
+        return replace(self, **parts)
+
+    def part(self, name: str) -> Any:
+        """The settings of a part with the data of the whole, in a folder below that of the whole; None without it."""
+        settings = getattr(self, name)
+        if settings is None:
+            return None
+
+        settings = replace(settings, name=f"{self.name}/{name}", out=self.out)
+        if isinstance(settings, Recipe):
+            return replace(settings, data=replace(settings.data, **self._own(pairs=self.data)))
+        if isinstance(settings, Ablation):
+            return settings if self.data is None else replace(settings, data=self.data)
+        if name != "table1":
+            return settings
+
+        settings = replace(settings, **self._own(data=self.data))
+        if settings.downstream is not None and self.test is not None:
+            settings = replace(settings, downstream=replace(settings.downstream, test=[self.test]))
+        return settings
+
+    def _own(self, **data: str | None) -> dict[str, Any]:
+        keys = {**data, "test": self.test, "pictures": self.pictures}
+        return {key: value for key, value in keys.items() if value is not None}
+
+
+@EXPERIMENTS.register("paper")
+def run_paper(paper: Paper, overwrite: bool = False) -> dict[str, Any]:
+    """Run the parts and write the page; ``overwrite`` replaces another run of its name.
+
+    Returns:
+        By table (``table1``, ``table2``, ``table3``, ``ablation``) its rows, as ``paper.json`` has them.
+    """
+    require_free(paper, overwrite)
+    folder = claim(paper, overwrite)
+
+    for name in paper.parts:
+        settings = paper.part(name)
+        if isinstance(settings, Comparison):
+            compare(settings, overwrite)
+        elif isinstance(settings, Ablation):
+            ablate(settings, overwrite)
+        elif settings is not None:
+            run(settings, overwrite)
+
+    tables = read_tables(folder)
+    write_json({"settings": asdict(paper), "tables": tables}, folder / "paper.json")
+    page = write_page(folder, tables, asdict(paper))
+    for name, table in tables.items():
+        print_table(TITLES[name], table)
+    print(f"page: {page}")
+    return tables
+
+
+# -- the figures of the parts ------------------------------------------------------------------------------------------
+
+
+def read_tables(folder: Path) -> dict[str, Table]:
+    """The tables of the parts that were run in a folder, ours and the paper's figures side by side."""
+    tables = {}
+
+    first = read_part(folder, "table1", "table")
+    if first is not None:
+        tables["table1"] = reconstruction_table(first["rows"])
+
+    nikon = read_part(folder, "table2_nikon", "table")
+    canon = read_part(folder, "table2_canon", "table")
+    if nikon is not None or canon is not None:
+        tables["table2"] = dslr_table((nikon or {}).get("rows", {}), (canon or {}).get("rows", {}))
+
+    runs = [read_part(folder, part, "results") for part in ("table3", "few", "unsupervised")]
+    if any(runs):
+        tables["table3"] = denoising_table([one for one in runs if one is not None])
+
+    stages = read_part(folder, "ablation", "ablation")
+    if stages is not None:
+        tables["ablation"] = ablation_table(stages["stages"])
+    return tables
+
+
+def read_part(folder: Path, part: str, stem: str) -> Any:
+    """The figures that a part left in its folder; None if it was not run to its end."""
+    path = folder / part / f"{stem}.json"
+    return json.loads(path.read_text()) if path.is_file() else None
+
+
+def reconstruction_table(rows: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Table 1 from the rows of a comparison."""
+    columns = ("PSNR_r", "worst 25%", "best 25%", "PSNR_d", "M parameters")
+    keys = ("psnr_r", "worst25", "best25", "psnr_d")
+    table: Table = {}
+
+    for name, row in rows.items():
+        paper = published.TABLE_1.get(published.ISP_NAMES.get(name, ""))
+        figures = [*(row.get(key) for key in keys), row["parameters"] / 1e6]
+        cells: dict[str, Any] = {}
+        for k, column in enumerate(columns):
+            cells[column] = figures[k]
+            cells[f"{column}, paper"] = None if paper is None else paper[k]
+
+        cells["cycle"] = row.get("cycle")
+        cells["cycle, paper"] = published.CYCLE if name == "dictionary-encoders" else None
+        cells["steps"] = row.get("steps")
+        cells["loss still falling"] = still_falling(row.get("curve"))
+        table[row_name(name)] = cells
+    return table
+
+
+def dslr_table(nikon: Mapping[str, Mapping[str, Any]], canon: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Table 2 from the rows of two comparisons, of which one may be empty."""
+    table: Table = {}
+    for name in {**nikon, **canon}:
+        paper = published.TABLE_2.get(published.ISP_NAMES.get(name, ""), (None, None))
+        cells: dict[str, Any] = {}
+        for camera, rows, figure in (("Nikon", nikon, paper[0]), ("Canon", canon, paper[1])):
+            row = rows.get(name, {})
+            cells[f"{camera} PSNR_r"] = row.get("psnr_r")
+            cells[f"{camera} PSNR_r, paper"] = figure
+            cells[f"{camera} balanced"] = row.get("balanced")
+        table[row_name(name)] = cells
+    return table
+
+
+def denoising_table(runs: Sequence[Mapping[str, Any]]) -> Table:
+    """Table 3 from the results of the recipes that train, with the self-ensemble where there is one."""
+    table: Table = {}
+    for results in runs:
+        for arm, seeds in results["results"].items():
+            kind = "self_ensemble" if "self_ensemble" in seeds[0] else "plain"
+            scores = [one[kind] for one in seeds]
+            add_denoiser(table, arm, [one.get("psnr") for one in scores], [one.get("ssim") for one in scores])
+            noisy = seeds[0]["plain"]
+            if "Noisy" not in table:
+                add_denoiser(table, "noisy", [noisy.get("psnr_noisy")], [noisy.get("ssim_noisy")])
+
+        for name, scores in results["others"].items():
+            add_denoiser(table, name, [scores.get("psnr")], [scores.get("ssim")])
+
+    order = list(published.TABLE_3)
+    ranked = sorted(table, key=lambda name: order.index(name) if name in order else len(order))
+    return {name: table[name] for name in ranked}
+
+
+def add_denoiser(table: Table, name: str, psnr: Sequence[float], ssim: Sequence[float]) -> None:
+    """Add a row of table 3 under the paper's name, if it has one; the first figures of a name stay."""
+    known = {**published.DENOISER_NAMES, "noisy": "Noisy"}
+    label = known.get(name, name)
+    paper = published.TABLE_3.get(label, (None, None))
+    figures = {"PSNR": list(psnr), "PSNR, paper": paper[0], "SSIM": list(ssim), "SSIM, paper": paper[1]}
+    table.setdefault(label, figures)
+
+
+def ablation_table(stages: Mapping[str, Sequence[Sequence[float]]]) -> Table:
+    """The ablation's curves by what is known of a frame and space, blind and with as-shot gains."""
+    from rawaug.paper.ablation import SPACES
+    from rawaug.paper.ablation import TITLES as STAGES
+
+    table: Table = {}
+    for setting, rows in stages.items():
+        for k, space in enumerate(SPACES):
+            curve = {stage: row[k] for stage, row in zip(STAGES, rows, strict=True)}
+            table[f"{space}, {setting}"] = curve
+
+    for space, figures in published.ABLATION.items():
+        table[f"{space}, paper"] = {stage: figures.get(stage) for stage in STAGES}
+    return table
+
+
+def row_name(name: str) -> str:
+    """A row's own name, with the paper's behind it."""
+    paper = published.ISP_NAMES.get(name)
+    return name if paper is None else f"{name} ({paper})"
+
+
+def still_falling(curve: Sequence[float] | None) -> float | None:
+    """By how many percent the loss of the last tenth of a training is below that of the tenth before."""
+    if curve is None or len(curve) < 2:
+        return None
+    return 100.0 * (curve[-2] - curve[-1]) / curve[-2]
+
+
+# -- the page ----------------------------------------------------------------------------------------------------------
+
+
+class Order(NamedTuple):
+    """How the rows of a table are ordered in the paper and here: pairs of rows that are alike, and that are not."""
+
+    same: int
+    reversed: list[str]
+
+    def sentence(self) -> str:
+        """Say in a sentence whether the paper's order is found again."""
+        if not self.same and not self.reversed:
+            return ""
+        if not self.reversed:
+            return f"The paper's order is found again in all {self.same} pairs of rows."
+        total = self.same + len(self.reversed)
+        wrong = "; ".join(self.reversed)
+        return f"The paper's order is found again in {self.same} of {total} pairs of rows; refuted: {wrong}."
+
+
+def compare_order(table: Table, column: str) -> Order:
+    """Compare the order of the rows by a column with that of the paper's figures."""
+    figures = {}
+    for name, cells in table.items():
+        ours, paper = mean_of(cells.get(column)), cells.get(f"{column}, paper")
+        if ours is not None and paper is not None:
+            figures[name] = (ours, paper)
+
+    same, wrong = 0, []
+    for (first, (a, b)), (second, (c, d)) in combinations(figures.items(), 2):
+        if (a - c) * (b - d) > 0:
+            same += 1
+        else:
+            better, worse = (first, second) if b > d else (second, first)
+            wrong.append(f"{better} above {worse}")
+    return Order(same, wrong)
+
+
+def mean_of(value: Any) -> float | None:
+    """The mean of a figure, which may be one a seed; None without it."""
+    if isinstance(value, list):
+        numbers = [one for one in value if one is not None]
+        return fmean(numbers) if numbers else None
+    return value
+
+
+def cell(column: str, value: Any) -> str:
+    """A figure as text."""
+    digits = 3 if "SSIM" in column else 2
+    if value is None or value == [None]:
+        return ""
+    if column == "steps":
+        return str(value)
+    if column == "loss still falling":
+        return f"{value:.1f} %"
+    return mean_and_spread(value if isinstance(value, list) else [value], digits)
+
+
+def columns_of(table: Table) -> list[str]:
+    """The columns that have a figure in any row."""
+    columns: list[str] = []
+    for cells in table.values():
+        for column, value in cells.items():
+            if value not in (None, [None]) and column not in columns:
+                columns.append(column)
+    return columns
+
+
+def text_rows(table: Table) -> dict[str, list[str]]:
+    """The cells of a table as text, by row."""
+    columns = columns_of(table)
+    return {name: [cell(column, cells.get(column)) for column in columns] for name, cells in table.items()}
+
+
+def print_table(title: str, table: Table) -> None:
+    """Print a table with the paper's figures."""
+    rows = [[name, *cells] for name, cells in text_rows(table).items()]
+    print_rows(title, ["", *columns_of(table)], rows)
+
+
+NOTES = {
+    "table1": "Figures without a paper's row stand beside its own. A loss that is still falling by more than a few "
+    "percent says that the training was too short.",
+    "table2": "Rows 'own rendering' are InvISP's protocol: RAW from the picture that the network itself rendered, "
+    "stored as a JPEG. 'Balanced' is InvISP's figure, of demosaiced, white-balanced, gamma-compressed RAW.",
+    "table3": "Networks are averaged over the views of the self-ensemble, as in the paper.",
+    "ablation": "Images between the stages of the way from sRGB to RAW, each frame by a fit to the others.",
+}
+ORDERED_BY = {"table1": ["PSNR_r", "PSNR_d"], "table2": ["Nikon PSNR_r", "Canon PSNR_r"], "table3": ["PSNR"]}
+
+
+def write_page(folder: Path, tables: Mapping[str, Table], settings: Mapping[str, Any]) -> Path:
+    """Write ``report.html``; its path."""
+    page = Page("The paper's tables", "The figures of Conde et al., AAAI 2022, beside those of this run.")
+    page.add(terms={"Command": command_line()} if command_line() else {})
+
+    for name, table in tables.items():
+        texts = [NOTES[name]]
+        for column in ORDERED_BY.get(name, []):
+            sentence = compare_order(table, column).sentence()
+            if sentence:
+                texts.append(f"{column}: {sentence}")
+
+        content: dict[str, Any] = {"texts": texts, "head": ["", *columns_of(table)], "rows": text_rows(table)}
+        picture = folder / "ablation" / "ablation.png"
+        if name == "ablation" and picture.is_file():
+            content["figures"] = [Figure(picture.read_bytes(), "the ablation's curves")]
+        page.add(TITLES[name], **content)
+    return page.write(folder / "report.html", settings)
