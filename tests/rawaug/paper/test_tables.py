@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 
 from rawaug.commands.run import with_values
 from rawaug.experiment.recipe import find_recipe, read_recipe
-from rawaug.paper import published, tables
+from rawaug.paper import published
 from rawaug.paper.tables import PARTS, Paper, compare_order, read_tables, run_paper, still_falling
 
 ROW = {"parameters": 590_000, "seconds": 1.0, "mpix_s": 1.0}
@@ -70,7 +71,7 @@ def test_the_order_of_the_rows_is_compared_pair_by_pair(folder: Path) -> None:
 
 def test_one_page_and_one_file_have_all_of_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paper = Paper(out=str(folder.parent), parts=[])
-    (folder / "run.json").write_text(json.dumps(tables.asdict(paper)))
+    (folder / "run.json").write_text(json.dumps(asdict(paper)))
     result = run_paper(paper)
     page = (folder / "report.html").read_text()
     for text in ("Table 1", "Table 2", "Table 3", "Ablation", "45.21", "WNNM", "42.00"):

@@ -206,7 +206,7 @@ def test_the_published_fit_learns_encoders_and_both_masks_end_to_end(exact_pair:
     assert not torch.allclose(chosen[0].colour_weights, chosen[1].colour_weights)
     lens = isp.find(LensShading)
     assert lens is not None and lens.reverse_attention is not None
-    assert lens.reverse_attention.place_layers[-1].weight.abs().max() > 0
+    assert lens.reverse_attention.place_layers[-1].weight.abs().max() > 0  # type: ignore[operator]
 
 
 def test_the_method_settles_what_belongs_to_it() -> None:
