@@ -43,7 +43,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "tasks": PRODUCT,
     "commands": PRODUCT | {"explore", "tasks", "experiment"},
     "experiment": PRODUCT | {"tasks"},
-    "paper": PRODUCT | {"experiment"},
+    "paper": PRODUCT | {"experiment", "tasks"},
     "cli": BASE | {"commands", "experiment", "paper"},
     "__main__": {"cli"},
 }
