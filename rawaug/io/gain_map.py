@@ -50,10 +50,15 @@ class GainMap:
 
 
 def parse_gain_maps(opcodes: bytes, on_mosaic: bool) -> tuple[GainMap, ...]:
-    """The gain maps of an opcode list; its other opcodes are skipped."""
+    """The gain maps of an opcode list; its other opcodes are skipped.
+
+    Raises:
+        ValueError: if the list is truncated, or a map is incomplete or has spacings or gains that are not positive.
+    """
     maps = []
     try:
-        (count,), place = struct.unpack_from(">I", opcodes), 4
+        (count,) = struct.unpack_from(">I", opcodes)
+        place = 4
         for _ in range(count):
             code, _, _, size = _OPCODE.unpack_from(opcodes, place)
             place += _OPCODE.size
@@ -67,20 +72,24 @@ def parse_gain_maps(opcodes: bytes, on_mosaic: bool) -> tuple[GainMap, ...]:
 
 def _parse(body: bytes, on_mosaic: bool) -> GainMap:
     top, left, bottom, right, plane, planes, *rest = _GRID.unpack_from(body)
-    rows, columns, points_v, points_h, *grid, map_planes = rest
+    rows, columns, points_v, points_h, spacing_v, spacing_h, origin_v, origin_h, map_planes = rest
     size = points_v * points_h * map_planes
     if size == 0 or min(rows, columns) == 0 or len(body) < _GRID.size + 4 * size:
         raise ValueError(f"a gain map of {points_v} x {points_h} points and pitch {rows} x {columns} is incomplete")
+
     gains = np.frombuffer(body, ">f4", size, _GRID.size).reshape(points_v, points_h, map_planes)
-    spaced = all(spacing > 0 for spacing, points in zip(grid[:2], (points_v, points_h), strict=True) if points > 1)
-    if not (spaced and np.isfinite(grid).all() and np.isfinite(gains).all() and gains.min() > 0):
-        raise ValueError(f"a gain map of spacing {grid[0]:g} x {grid[1]:g} and least gain {gains.min():g} is invalid")
+    is_spaced = (spacing_v > 0 or points_v == 1) and (spacing_h > 0 or points_h == 1)
+    is_finite = np.isfinite([spacing_v, spacing_h, origin_v, origin_h]).all() and np.isfinite(gains).all()
+    if not (is_spaced and is_finite and gains.min() > 0):
+        spacing = f"{spacing_v:g} x {spacing_h:g}"
+        raise ValueError(f"a gain map of spacing {spacing} and least gain {gains.min():g} is invalid")
+
     return GainMap(
         area=(top, left, bottom, right),
         pitch=(rows, columns),
         planes=(plane, planes),
-        spacing=(grid[0], grid[1]),
-        origin=(grid[2], grid[3]),
+        spacing=(spacing_v, spacing_h),
+        origin=(origin_v, origin_h),
         gains=torch.from_numpy(gains.astype(np.float32)).permute(2, 0, 1).contiguous(),
         on_mosaic=on_mosaic,
     )
@@ -89,18 +98,23 @@ def _parse(body: bytes, on_mosaic: bool) -> GainMap:
 def opcode_list(maps: Iterable[GainMap]) -> bytes:
     """The inverse of :func:`parse_gain_maps`, of maps for one list."""
     opcodes = []
-    for m in maps:
-        planes, points_v, points_h = m.gains.shape
-        grid = (*m.pitch, points_v, points_h, *m.spacing, *m.origin, planes)
-        body = _GRID.pack(*m.area, *m.planes, *grid) + m.gains.permute(1, 2, 0).numpy().astype(">f4").tobytes()
+    for gain_map in maps:
+        planes, points_v, points_h = gain_map.gains.shape
+        grid = (*gain_map.pitch, points_v, points_h, *gain_map.spacing, *gain_map.origin, planes)
+        gains = gain_map.gains.permute(1, 2, 0).numpy().astype(">f4")
+        body = _GRID.pack(*gain_map.area, *gain_map.planes, *grid) + gains.tobytes()
         opcodes.append(_OPCODE.pack(_GAIN_MAP, _DNG_1_3, _MAY_BE_SKIPPED, len(body)) + body)
     return struct.pack(">I", len(opcodes)) + b"".join(opcodes)
 
 
-def of_planes(m: GainMap, cfa: CFA | str) -> list[GainMap]:
+def of_planes(gain_map: GainMap, cfa: CFA | str) -> list[GainMap]:
     """A map of a mosaic's sites as maps of the planes R, G, B of the demosaiced picture."""
-    if m.pitch != (2, 2):
-        return [replace(m, planes=(0, 3))]
-    colour = CFA(cfa).channels[m.area[0] % 2][m.area[1] % 2]
-    gains = m.gains.sqrt() if colour == 1 else m.gains  # both greens have a map, and the plane is multiplied by both
-    return [replace(m, area=(0, 0, *m.area[2:]), pitch=(1, 1), planes=(colour, 1), gains=gains)]
+    if gain_map.pitch != (2, 2):
+        return [replace(gain_map, planes=(0, 3))]
+
+    top, left, bottom, right = gain_map.area
+    colour = CFA(cfa).channels[top % 2][left % 2]
+    gains = gain_map.gains
+    if colour == 1:  # both greens have a map, and the plane is multiplied by both
+        gains = gains.sqrt()
+    return [replace(gain_map, area=(0, 0, bottom, right), pitch=(1, 1), planes=(colour, 1), gains=gains)]
