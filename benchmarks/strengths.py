@@ -1,0 +1,111 @@
+"""Denoisers at four strengths of drawn noise on several sets of frames, set by set: RAW and developed PSNR.
+
+    python -m benchmarks.strengths TABLE.json rawaug-base NonLocalMeans PMRID.safetensors \\
+        --sets real:test real:validation demo:test RAW_DIR@4
+
+Denoisers are named as for ``rawaug benchmark``; noise and middles are those of its first table. ``@8`` behind a name is
+a self-ensemble of eight views, ``@4`` behind a set bins it 4 x 4 around the sites. Scores go to the file as they come,
+and what stands there is not scored again, so slow denoisers can be added to a table later.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import torch
+
+from benchmarks.measure import parser
+from rawaug.data import Binned, open_pairs
+from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.evaluation.benchmark import REAL, TOLD, strengths_of, trials
+from rawaug.evaluation.scores import NOISY, score
+from rawaug.evaluation.tables import print_rows
+from rawaug.evaluation.trials import Measured, Trial
+from rawaug.progress import progress
+
+Scores = dict[str, Any]
+
+
+def main(command: Sequence[str] | None = None) -> None:
+    """Score what is missing in the table, and print it."""
+    options = parser(__doc__)
+    options.add_argument("table", type=Path, help="JSON file of all scores")
+    options.add_argument("denoisers", nargs="*")
+    options.add_argument("--sets", nargs="+", default=["real:test", "real:validation"])
+    options.add_argument("--crop", type=int, default=256, help="side of the middles, in pixels of the mosaic")
+    options.add_argument("--sensors", action="store_true", help="score sensors as they are, too")
+    options.add_argument("--threads", type=int, default=torch.get_num_threads())
+    args = options.parse_args(command)
+    torch.set_num_threads(args.threads)
+
+    table: Scores = json.loads(args.table.read_text()) if args.table.is_file() else {}
+    conditions = [TOLD, REAL] if args.sensors else [TOLD]
+
+    for name in args.sets:
+        everything = [trial for trial in frozen_trials(name, args.crop) if trial.condition in conditions]
+        for spec in ["noisy", *args.denoisers]:
+            add_scores(table, name, spec, everything, args.table)
+    print_table(table)
+
+
+def frozen_trials(spec: str, crop: int) -> list[Trial]:
+    """The middles of all frames of a set, such as ``FOLDER@4``, under every condition and strength."""
+    data, _, factor = spec.partition("@")
+    pairs = open_pairs(data, split="test")
+    frames = Binned(Measured(pairs, len(pairs)), int(factor or 1))
+    return trials(frames, crop, strengths=strengths_of())
+
+
+def add_scores(table: Scores, name: str, spec: str, everything: Sequence[Trial], path: Path) -> None:
+    """Score a denoiser on those trials of a set that the table lacks, and write the table after each."""
+    denoiser: Any = None
+    for trial in progress(everything, label=f"{name}, {Path(spec).stem}", unit="image"):
+        key = " | ".join((name, trial.condition, trial.strength, trial.frame))
+        cells = table.setdefault(key, {})
+        if Path(spec).stem in cells:
+            continue
+        if denoiser is None:
+            denoiser = open_denoiser(spec)
+
+        row = next(score([denoiser], [trial]))
+        cells[Path(spec).stem] = [row.psnr, row.psnr_srgb, row.own_noise]
+        path.write_text(json.dumps(table, indent=0))
+
+
+def open_denoiser(spec: str) -> Any:
+    """The noisy input, or a denoiser by its name, with as many views as stand behind its ``@``."""
+    if spec == "noisy":
+        return NOISY
+    name, _, views = spec.partition("@")
+    return RawDenoiser.of(name, views=int(views or 1))
+
+
+def print_table(table: Scores) -> None:
+    """A row for each set, condition and strength; a cell is the mean over frames, RAW / developed."""
+    groups: dict[tuple[str, ...], list[Scores]] = {}
+    for key, cells in table.items():
+        name, condition, strength, _ = key.split(" | ")
+        groups.setdefault((name, condition, strength), []).append(cells)
+
+    columns = list(dict.fromkeys(column for cells in table.values() for column in cells))
+    rows = []
+    for group, frames in groups.items():
+        row = [*group, str(len(frames))]
+        for column in columns:
+            scores = [cells[column] for cells in frames if column in cells]
+            if len(scores) < len(frames):
+                row.append("")
+                continue
+            row.append("{:.2f} / {:.2f}".format(*(fmean(values) for values in list(zip(*scores, strict=True))[:2])))
+        own = [cells[columns[-1]][2] for cells in frames if columns[-1] in cells]
+        row.append(", ".join(f"{100 * fmean(own):.0f} %" for _ in own[:1] if None not in own))
+        rows.append(row)
+    print_rows("PSNR of RAW / sRGB in dB", ["set", "condition", "strength", "frames", *columns, "own noise"], rows)
+
+
+if __name__ == "__main__":
+    main()
