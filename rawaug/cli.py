@@ -38,7 +38,7 @@ COMMANDS = {
     "info": "Describe a weights file, or list the known cameras: rawaug info cameras [PART].",
     "preview": "Draw a picture at every stage of an ISP, and as augmented RAW.",
     "run": "Run a recipe: rawaug run RECIPE [--key value ...]; resumable, writes runs/NAME.",
-    "submit": "Denoise the noisy blocks of SIDD's benchmark, in the form that its server takes.",
+    "submit": "Denoise the noisy blocks of a benchmark, in the form that its server takes.",
     "synth": "Write noisy and clean RAW pairs made from sRGB pictures.",
 }
 """Modules of :mod:`rawaug.commands`, each with a function ``run`` whose docstring opens with this line."""

@@ -258,7 +258,7 @@ class PhoneFrames(LazyPairs):
     Example:
         >>> frames = PhoneFrames("", "train")
         >>> len(frames), frames.names[0], frames.labels[0].phone
-        (320, '0001_001_G4_00100_00033_5500_L_010', 'G4')
+        (320, '0001_001_N6_00100_00100_5500_N_010', 'N6')
     """
 
     def __init__(

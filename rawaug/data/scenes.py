@@ -151,7 +151,7 @@ def camera_in_light(xyz_to_camera: Sequence[Sequence[float]], kelvin: float) -> 
     Example:
         >>> identity = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
         >>> camera_in_light(identity, 3200).sum(dim=1)  # the white point of the light
-        tensor([1.0594, 1.0000, 0.4439], dtype=torch.float64)
+        tensor([1.0604, 1.0000, 0.4454], dtype=torch.float64)
     """
     neutral = _SRGB_TO_XYZ.sum(dim=1)
     cones = (_BRADFORD @ white_point(kelvin)) / (_BRADFORD @ neutral)

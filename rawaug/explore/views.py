@@ -147,7 +147,7 @@ def command(look: Look, out: str = "pairs") -> str:
 
     Example:
         >>> command(Look("cat.png", AugmentConfig(draw=Draw(light=5500, exposure=-0.5)), seed=3))
-        'rawaug synth cat.png pairs --format npz --exposure=-0.5 --light 5500 --seed 3'
+        'rawaug synth cat.png pairs --format npz --noise cycleisp_sidd --exposure=-0.5 --light 5500 --seed 3'
     """
     options: dict[str, Any] = {}
     for name, value in changes(look.config).items():

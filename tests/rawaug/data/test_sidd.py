@@ -304,7 +304,7 @@ def test_a_file_of_blocks_found_wrong_is_not_read_for_every_block(
     monkeypatch.setattr(sidd, "read_array", counted)
     (part,) = check(tmp_path).parts
     assert part.items == 1024 and len(reads) == 2
-    assert len(part.broken) == 1 and "has 64 blocks, but there are patterns for 1024" in part.broken[0]
+    assert len(part.unfit) == 1 and "64 blocks" in part.unfit[0]
     for content in ("rggb\nrgbw\n", "\0"):
         patterns.write_text(content)
         with pytest.raises(ValueError, match=r"bayer_patterns\.csv: .*patterns") as error:

@@ -38,7 +38,8 @@ def header(name: str) -> str:
 
 
 def test_every_kind_has_settings_that_name_it() -> None:
-    assert set(TASKS) == {"raw", "rgb", "mosaic", "srgb"} and set(EXPERIMENTS) == {"reconstruction", "ablation"}
+    assert set(TASKS) == {"raw", "rgb", "mosaic", "srgb"}
+    assert set(EXPERIMENTS) == {"reconstruction", "ablation", "paper"}
     for name in TASKS:
         assert settings_of(name).kind == name and TASKS[name].__module__ == f"rawaug.tasks.{name}"
     for name in ("reconstruction", "ablation"):

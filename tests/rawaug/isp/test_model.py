@@ -98,8 +98,10 @@ def test_files_that_are_not_isps_are_refused(tmp_path: Path) -> None:
 
 def test_the_shipped_isps_are_small_and_hold_only_what_is_on() -> None:
     files = sorted(WEIGHTS.glob("*.safetensors"))
-    assert len(files) == 4 and sum(file.stat().st_size for file in files) < 400_000
+    assert len(files) == 5
     for file in files:
+        has_encoders = file.stem == "phones"
+        assert file.stat().st_size < (2_500_000 if has_encoders else 200_000)
         assert set(read_tensors(file, "", infinite=["colour.spread"])[1]) == set(
             DictionaryISP.from_pretrained(file).state_dict()
         )

@@ -11,7 +11,7 @@ from rawaug.training.config import SAME_WEIGHTS, DenoiserConfig, TrainConfig, we
 
 OTHER: dict[str, Any] = {
     "schedule": "step", "loss": "l2", "weigh": "mixed", "precision": "bf16-mixed", "channels_last": False,
-    "compile": True, "ema": 0.5, "learning_rate": 1e-3, "clip_norm": 1.0,
+    "compile": True, "ema": 0.5, "learning_rate": 1e-3, "clip_norm": 1.0, "logger": "csv",
 }  # fmt: skip
 
 
@@ -21,7 +21,7 @@ def test_a_key_counts_unless_it_leaves_the_weights_as_they_are(key: str) -> None
     other: dict[str, Any] = {key: OTHER.get(key, getattr(config, key) + 2 if key not in OTHER else None)}
     changed = replace(config, **other)
     before, after = (weights_key(DenoiserConfig(), c, "samples", "validation") for c in (config, changed))
-    assert (before == after) == (key in {"workers", "compile", "checkpoint_every"}) == (key in SAME_WEIGHTS)
+    assert (before == after) == (key in {"workers", "compile", "checkpoint_every", "logger"}) == (key in SAME_WEIGHTS)
 
 
 def test_looks_count_where_they_choose_the_weights() -> None:
