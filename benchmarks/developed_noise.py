@@ -30,7 +30,7 @@ from rawaug.io.raw import develop
 from rawaug.metrics import psnr
 from rawaug.noise import noise_model
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import enlarge
+from rawaug.plugin.crops import enlarge
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.pictures import trim_to_even
 from rawaug.plugin.targets import Srgb

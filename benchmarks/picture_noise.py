@@ -25,7 +25,8 @@ from rawaug.data import open_pictures
 from rawaug.data.pairs import centre
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import RawPairs, enlarge
+from rawaug.plugin.crops import enlarge
+from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.pictures import trim_to_even
 from rawaug.plugin.targets import Srgb
 

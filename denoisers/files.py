@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from denoisers.network import DENOISERS, Denoiser
+from rawaug.bayer import canonical_cfa
 from rawaug.files import parse_object, read_tensors, write_tensors
 
 FORMAT, KIND = "rawaug", "denoiser"
@@ -69,6 +70,8 @@ def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) ->
         raise ValueError(f"{path}: cannot save a {type(model).__name__}; only {', '.join(DENOISERS)} load again")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: its folder does not exist; create it first")
+    if "cfa" in info:
+        canonical_cfa(str(info["cfa"]))  # raises for an unknown pattern
     try:
         texts = {"config": json.dumps(model.config), "info": json.dumps(info, allow_nan=False)}
     except (TypeError, ValueError) as error:
@@ -101,7 +104,8 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
         raise ValueError(f"{path}: not a denoiser of rawaug (its metadata lack format={FORMAT}, kind={KIND})")
     try:
         config, info = (parse_object(metadata.get(key, "")) for key in ("config", "info"))
-        model = outline(metadata.get("model", ""), config)  # before the file's tensors are known to fit
+        # An outline: the file's tensors are not known to fit. Float32, whatever the default is.
+        model = outline(metadata.get("model", ""), config).float()
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     tensors = {key: x.float() if x.dtype == torch.float16 else x for key, x in tensors.items()}  # half of the bytes
@@ -125,6 +129,10 @@ def find_denoiser(name: str | Path) -> Path:
     path = Path(name) if Path(name).suffix else FOLDER / f"{name}.safetensors"
     if not path.is_file():
         known = ", ".join(list_shipped()) or "none in this installation"
+        if (Path(__file__).parents[1] / "rawaug" / "weights" / f"{name}.safetensors").is_file():
+            raise ValueError(
+                f"{name}: is a camera's ISP, not a denoiser; load it by rawaug.DictionaryISP.from_pretrained"
+            )
         raise FileNotFoundError(f"{name}: no such denoiser; give a .safetensors file or a shipped one ({known})")
     return path
 

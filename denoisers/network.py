@@ -295,6 +295,10 @@ class Denoiser(nn.Module, ABC):
         if variance.shape != noisy.shape:
             raise ValueError(f"variance {tuple(variance.shape)} must have the shape {tuple(noisy.shape)} of noisy")
         self._require_type(variance, "variance")
+        traced = torch.compiler.is_compiling() or torch.onnx.is_in_onnx_export()
+        on_cpu = variance.device.type == "cpu"  # elsewhere reading a value back would stall the device
+        if on_cpu and not traced and variance.numel() and float(variance.detach().min()) < 0.0:
+            raise ValueError(f"variance must not be negative, got {float(variance.min()):.3g}")
         return variance
 
     def _at_one_scale(self, noisy: Tensor, variance: Tensor | None) -> Tensor:

@@ -22,11 +22,14 @@ if TYPE_CHECKING:
     from rawaug.isp.own_cameras import Camera as Camera
     from rawaug.plugin.augment import ISPModel as ISPModel
     from rawaug.plugin.augment import RawAugment as RawAugment
+    from rawaug.plugin.clean_raw import RawNoise as RawNoise
     from rawaug.plugin.dataset import RawPairs as RawPairs
     from rawaug.plugin.dataset import RawPairStream as RawPairStream
     from rawaug.plugin.draw import Draw as Draw
     from rawaug.plugin.finishing import Finish as Finish
+    from rawaug.plugin.loader import ResumableLoader as ResumableLoader
     from rawaug.plugin.loader import WrappedLoader as WrappedLoader
+    from rawaug.plugin.loader import resumable as resumable
     from rawaug.plugin.loader import wrap as wrap
     from rawaug.plugin.params import AugmentParams as AugmentParams
     from rawaug.plugin.params import RawPair as RawPair
@@ -45,10 +48,11 @@ _PUBLIC = {
     "rawaug.isp.model": ("DictionaryISP",),
     "rawaug.isp.own_cameras": ("Camera",),
     "rawaug.plugin.augment": ("ISPModel", "RawAugment"),
+    "rawaug.plugin.clean_raw": ("RawNoise",),
     "rawaug.plugin.dataset": ("RawPairStream", "RawPairs"),
     "rawaug.plugin.draw": ("Draw",),
     "rawaug.plugin.finishing": ("Finish",),
-    "rawaug.plugin.loader": ("WrappedLoader", "wrap"),
+    "rawaug.plugin.loader": ("ResumableLoader", "WrappedLoader", "resumable", "wrap"),
     "rawaug.plugin.params": ("AugmentParams", "RawPair", "load_params", "save_params"),
     "rawaug.plugin.targets": ("Burst", "Srgb"),
     "rawaug.synthesis.folder": ("synth",),

@@ -126,14 +126,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")
 
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before PyTorch loads OpenMP
-    if words[:1] and words[0] in NETWORKS:
+    command = _command_at(words)
+    if words[command : command + 1] and words[command] in NETWORKS:
         _keep_memory()
     if not words or words[0] in ("-h", "--help"):
         for point in _PLUGINS:  # those alone are imported for the first lines of their docstrings
             with suppress(ImportError, AttributeError):
                 app[point.name]
-    if words[:1] == ["run"] and {"-h", "--help"} & set(words[2:]):  # of a recipe: its keys
-        words = [*words[:2], "--keys"]
+    if words[command : command + 1] == ["run"] and {"-h", "--help"} & set(words[command + 2 :]):  # a recipe's keys
+        words = [*words[: command + 2], "--keys"]
 
     try:
         app.meta(words, exit_on_error=False, print_error=False)
@@ -153,6 +154,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     print(f"rawaug: {escape(text)}", file=sys.stderr)
     return BAD_INPUT
+
+
+def _command_at(words: Sequence[str]) -> int:
+    """Where the command is, behind the options that come before it."""
+    place = 0
+    while place < len(words) and words[place].startswith("--"):
+        place += 2 if words[place] == "--import" else 1
+    return place
 
 
 def _one_line(error: Exception) -> str:

@@ -323,6 +323,9 @@ def find_weights(name: str | Path, *more: Path) -> Path:
         if candidate.is_file():
             return candidate
 
+    denoiser = Path(__file__).parents[1] / "denoisers" / "weights" / f"{name}.safetensors"
+    if denoiser.is_file():
+        raise ValueError(f"{name}: is a denoiser, not an ISP; load it by denoisers.from_pretrained")
     names: list[str] = []
     for folder in folders:
         names += [file.stem for file in folder.glob("*.safetensors")]

@@ -33,7 +33,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "isp": BASE | {"kernels"},
     "io": BASE,
     "data": BASE | {"io"},
-    "plugin": CAMERA | {"io"},
+    "plugin": CAMERA | {"data", "io"},
     "synthesis": CAMERA | {"plugin", "data", "io"},
     "camera": CAMERA | {"data", "io"},
     "denoising": CAMERA | {"io"},

@@ -15,13 +15,15 @@ of texture. As in practice, there are few RAW pairs and many sRGB pictures.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import torch
 from torch import Tensor
+from torch.utils.data import Dataset
 
 from rawaug.bayer import CFA, demosaic, mosaic
 from rawaug.data.drawn import dead_leaves
@@ -213,7 +215,26 @@ def demo_pairs(split: str, count: int | None = None) -> list[Pair]:
     return [_pair(split, k) for k in range(count)]
 
 
-def demo_pictures(count: int = 32) -> list[Tensor]:
+class PicturesInMemory(Dataset[Tensor], Sequence[Tensor]):
+    """Pictures in memory: a sequence that a DataLoader takes."""
+
+    def __init__(self, pictures: Sequence[Tensor]) -> None:
+        self.pictures = list(pictures)
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    @overload
+    def __getitem__(self, index: int) -> Tensor: ...
+    @overload
+    def __getitem__(self, index: slice) -> PicturesInMemory: ...
+    def __getitem__(self, index: int | slice) -> Tensor | PicturesInMemory:
+        if isinstance(index, slice):
+            return PicturesInMemory(self.pictures[index])
+        return self.pictures[index]
+
+
+def demo_pictures(count: int = 32) -> PicturesInMemory:
     """The sRGB pictures of a user: photographs whole, then dead leaves of 288 x 448 textured from them.
 
     The photographs are those of the training pairs and five others, none of validation or test.
@@ -222,7 +243,7 @@ def demo_pictures(count: int = 32) -> list[Tensor]:
         raise ValueError(f"demo: count must be at least 1, got {count}")
     photographs = _users_photographs()
     leaves = (_leaves(k) for k in range(count - len(photographs)))
-    return [*photographs[:count], *leaves]
+    return PicturesInMemory([*photographs[:count], *leaves])
 
 
 @DATASETS.register("demo")
@@ -232,7 +253,7 @@ def open_demo(path: str = "", split: str = "test") -> list[Pair]:
 
 
 @PICTURES.register("demo")
-def open_demo_pictures(path: str = "", min_side: int = 2) -> list[Tensor]:
+def open_demo_pictures(path: str = "", min_side: int = 2) -> PicturesInMemory:
     if path:
         raise ValueError(f"demo:{path}: the demo's pictures have no parts; use demo:")
     return demo_pictures()

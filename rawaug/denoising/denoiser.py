@@ -107,6 +107,8 @@ class RawDenoiser:
     takes: ClassVar[str] = "raw"
 
     def __post_init__(self) -> None:
+        if self.views not in (1, 4, 8):
+            raise ValueError(f"views must be 1, 4 or 8, got {self.views!r}")
         if not 0.0 <= self.strength <= 1.0:
             raise ValueError(f"strength must be between 0 and 1, got {self.strength}; --noise takes higher levels")
         if self.upscale > 1 and self.strength != 1.0:

@@ -67,6 +67,10 @@ def as_display_referred(srgb: Tensor) -> Tensor:
     return as_float(srgb)
 
 
+_OVERSHOOT = 0.5
+"""Bicubic interpolation goes beyond [0, 1] by less."""
+
+
 def require_display_range(image: Tensor) -> None:
     """Raise ValueError if floats of an image of any shape leave [0, 1] by more than half an 8-bit level, or are NaN."""
     # Only on the CPU: elsewhere reading a value back would stall the device.
@@ -76,7 +80,9 @@ def require_display_range(image: Tensor) -> None:
     if not (low >= -_HALF_LEVEL and high <= 1 + _HALF_LEVEL):
         if missing := int(image.isnan().sum()):
             raise ValueError(f"a float picture is in [0, 1], got NaN in {missing} of {image.numel()} values")
-        advice = "scale it, and normalise after rawaug"
+        advice = "normalise after rawaug, or divide by the largest value that it can have"
+        if low >= -_OVERSHOOT and high <= 1.0 + _OVERSHOOT:
+            advice = "call clamp(0, 1) if an interpolation has overshot, and normalise after rawaug"
         raise ValueError(f"a float picture must be in [0, 1], got {low:.4g} to {high:.4g}; {advice}")
 
 

@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy, deepcopy
 from pathlib import Path
-from typing import Any, TypeVar, get_args, overload
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, overload
 
 import numpy as np
 import torch
@@ -32,9 +32,19 @@ from rawaug.isp.own_sampler import own_cameras
 from rawaug.kernels.runtime import eager
 from rawaug.noise import Iso, MeasuredLevels, NoiseLevels, NoiseModel, NoiseSpec, noise_model
 from rawaug.noise.cameras import is_law, measured_noise
+from rawaug.plugin.crops import cut_patch, draw_patch
 from rawaug.plugin.draw import Draw, SettingSampler
 from rawaug.plugin.params import AugmentParams, RawPair
-from rawaug.plugin.pictures import find_picture, get_picture, is_picture, replace_picture, to_rgb_batch, trim_to_even
+from rawaug.plugin.pictures import (
+    find_picture,
+    get_picture,
+    is_picture,
+    replace_picture,
+    stack_pictures,
+    to_rgb_batch,
+    to_rgb_tensor,
+    trim_to_even,
+)
 from rawaug.plugin.targets import Burst, Srgb, Target, keep_white
 from rawaug.registry import check_settings, spec_label, split_spec
 from rawaug.seeding import keyed_generator, rank_key
@@ -43,7 +53,8 @@ from rawaug.seeding import keyed_generator, rank_key
 class RawAugment(nn.Module):
     """Make RAW pairs of batches of sRGB pictures.
 
-    The module has no parameters and adds nothing to the ``state_dict`` of a surrounding network. Calling it draws
+    The module has no parameters and adds nothing to the ``state_dict`` of a surrounding network. It stays float32:
+    ``half()``, ``bfloat16()`` and ``double()`` change nothing, and ``to(device)`` moves it. Calling it draws
     parameters (:meth:`sample`) and applies them (:meth:`apply`), on the device of the batch.
 
     Args:
@@ -89,6 +100,7 @@ class RawAugment(nn.Module):
         seed: int = 0,
     ) -> None:
         super().__init__()
+        self._rank: tuple[int, ...] = ()
         isp = of_camera(isp) if isinstance(isp, Camera) else isp
         if noise is None:
             noise = usual_noise(isp)
@@ -220,6 +232,8 @@ class RawAugment(nn.Module):
         """
         if params is None:
             return super().apply(srgb)
+        if not isinstance(params, AugmentParams):
+            raise ValueError(f"apply takes the params of a pair, pair.params, got {type(params).__name__}")
         if is_picture(srgb):
             return self._pair(self._batch(srgb), params.map(lambda t: t[None])).map(lambda t: t[0])
         return self._pair(self._batch(srgb), params)
@@ -270,6 +284,8 @@ class RawAugment(nn.Module):
             >>> augment.develop(pair.noisy, pair.params).shape
             torch.Size([2, 3, 64, 64])
         """
+        if not isinstance(params, AugmentParams):
+            raise ValueError(f"develop takes the params of a pair, pair.params, got {type(params).__name__}")
         if raw.ndim == 3:
             return self.develop(raw[None], params.map(lambda t: t[None]), demosaicing)[0]
         if self.pattern is not None or raw.ndim != 4 or raw.shape[1] != 4 or min(raw.shape[-2:]) < 2:
@@ -365,6 +381,18 @@ class RawAugment(nn.Module):
         pair = self.make_pair(srgb, generator or self._own_generator())
         return replace_picture(batch, where, pair.map(lambda t: t[0]) if is_picture(pictures) else pair)
 
+    if TYPE_CHECKING:  # nn.Module's own call is of any kind
+
+        @overload
+        def __call__(self, batch: Tensor, generator: torch.Generator | None = None, key: None = None) -> RawPair: ...
+        @overload
+        def __call__(
+            self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None
+        ) -> Any: ...
+        def __call__(
+            self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None
+        ) -> Any: ...
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RawAugment:
         """Move with the surrounding network, but stay float32."""
 
@@ -388,6 +416,38 @@ class RawAugment(nn.Module):
         """The device that pairs are made on."""
         return self.isp.gain.log_gains.device
 
+    # -- pictures as a Dataset or a loader hands them over ------------------------------------------------------------
+
+    def open_folder(self, path: str | Path, size: tuple[int, int] | None) -> Any:
+        """The pictures of a folder, or of ``kind:path``, less those that are smaller than a crop of ``size``."""
+        from rawaug.data import open_pictures
+
+        return open_pictures(str(path), min_side=2 if size is None else min(size))
+
+    def as_batch(self, pictures: Any, bgr: bool = False) -> Tensor:
+        """Pictures of one size as ``(B, 3, H, W)`` with even sides."""
+        return trim_to_even(to_rgb_batch(pictures, bgr))
+
+    def stack(self, patches: Sequence[Tensor]) -> Tensor:
+        """Stack patches of one size to ``(B, 3, H, W)``."""
+        return stack_pictures(patches)
+
+    def draw_patch(
+        self,
+        picture: Any,
+        size: tuple[int, int] | None,
+        turns: bool,
+        generator: torch.Generator,
+        zoom: float = 1.0,
+        bgr: bool = False,
+    ) -> tuple[Tensor, Tensor]:
+        """Draw a crop of a picture, and cut it out; see :func:`rawaug.plugin.crops.draw_patch`."""
+        return draw_patch(picture, size, turns, generator, zoom, bgr)
+
+    def cut_patch(self, picture: Any, place: Tensor, size: tuple[int, int] | None, bgr: bool = False) -> Tensor:
+        """Cut the patch of a drawn place out of a picture; see :func:`rawaug.plugin.crops.cut_patch`."""
+        return cut_patch(trim_to_even(to_rgb_tensor(picture, bgr)), place, size)
+
     def _batch(self, pictures: Any) -> Tensor:
         """``(B, 3, H, W)`` with even sides; other input is moved to the module's device."""
         srgb = trim_to_even(to_rgb_batch(pictures))
@@ -404,7 +464,11 @@ class RawAugment(nn.Module):
         """A new generator for each call, worker and process."""
         self._calls += 1
         worker = get_worker_info()
-        return keyed_generator(self.seed, "augment", worker.seed if worker else 0, self._calls, *rank_key())
+        rank = rank_key() or self._rank
+        return keyed_generator(self.seed, "augment", worker.seed if worker else 0, self._calls, *rank)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_rank": rank_key() or self._rank}  # a spawned worker has no process group
 
 
 M = TypeVar("M", bound=nn.Module)

@@ -9,48 +9,64 @@ The epoch advances by itself: it is the number of times that picture i was asked
 
 from __future__ import annotations
 
-import math
 import operator
 from collections.abc import Iterator, Sequence, Sized
 from pathlib import Path
-from typing import Any, SupportsIndex
+from typing import Any, Generic, TypeVar, overload
 
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
-from rawaug import bayer
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels.runtime import one_thread
+from rawaug.isp.own_cameras import Camera
 from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.clean_raw import RawNoise
+from rawaug.plugin.crops import crop_size
 from rawaug.plugin.epochs import Passes, Visits
-from rawaug.plugin.params import AugmentParams, RawPair, require_keys
-from rawaug.plugin.pictures import find_picture, get_picture, replace_picture, to_rgb_tensor, trim_to_even
+from rawaug.plugin.params import AugmentParams, Keys, RawPair, pair_form
+from rawaug.plugin.pictures import find_picture, get_picture, replace_picture
 from rawaug.seeding import keyed_generator
 
+Sample = TypeVar("Sample", covariant=True)
 
-class _Pairs(Dataset[Any]):
+Maker = RawAugment | RawNoise | DictionaryISP | Camera | str | Path
+"""What makes pairs: an augmentation, or a camera for one with the default settings."""
+
+Pictures = Dataset[Tensor] | Sequence[Tensor] | Sequence["np.ndarray[Any, Any]"] | str | Path
+"""Pictures alone, without labels: their samples are pairs."""
+
+
+class _Pairs(Dataset[Sample], Generic[Sample]):
     """What a Dataset of pairs and a stream of them share: the settings, the epochs, and how a sample becomes a pair."""
 
     def __init__(
         self,
         dataset: Any,
-        augment: RawAugment | DictionaryISP | str | Path,
+        augment: Maker,
         crop: int | tuple[int, int] | None = 256,
         *,
         seed: int = 0,
         key: str | int | None = None,
         turns: bool = True,
-        keys: Sequence[str] | None = None,
+        keys: Keys | None = None,
+        fields: Sequence[str] | None = None,
+        order: str | Sequence[str] | None = None,
+        bgr: bool = False,
         zoom: float = 1.0,
     ) -> None:
         if not zoom >= 1.0 or (zoom > 1.0 and crop is None):
             raise ValueError(f"zoom must be at least 1, and 1 without a crop; got {zoom} with crop={crop}")
-        self._epochs = self._make_epochs(dataset)
-        self.dataset, self.augment = dataset, as_augment(augment)
+        self.augment = as_augment(augment)
         self.crop, self.seed, self.turns, self.zoom = crop_size(crop), seed, turns, zoom
-        self.key, self.keys = key, require_keys(keys)
+        self.key, self.form, self.bgr = key, pair_form(keys, fields, order), bgr
+        self.dataset = self._open(dataset)
+        self._epochs = self._make_epochs(self.dataset)
+
+    def _open(self, dataset: Any) -> Any:
+        """The pictures of a folder where its path is given."""
+        return open_dataset(dataset, self.augment, self.crop) if isinstance(dataset, (str, Path)) else dataset
 
     def _make_epochs(self, dataset: Any) -> Visits | Passes:
         raise NotImplementedError
@@ -68,14 +84,23 @@ class _Pairs(Dataset[Any]):
     def state_dict(self) -> dict[str, Any]:
         """The state from which :meth:`load_state_dict` goes on with the draws that follow.
 
-        It is exact between passes, and in the middle of a pass without workers or with a pinned epoch. With workers,
-        pictures that they had fetched ahead go on with their next draw.
+        It is exact between passes, and in the middle of a pass without workers or with a pinned epoch. With workers
+        that have fetched pictures ahead it cannot be, and :meth:`load_state_dict` refuses it;
+        :func:`rawaug.resumable` makes a loader whose state is exact anywhere.
         """
         return self._epochs.state_dict()
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from ``state``; call this while no loader is in the middle of a pass."""
-        self._epochs.load_state_dict(state)
+    def load_state_dict(self, state: dict[str, Any], next_epoch: bool = False) -> None:
+        """Go on from ``state``; call this while no loader is in the middle of a pass.
+
+        Args:
+            state: as :meth:`state_dict` gives it.
+            next_epoch: where the state is of the middle of a pass, begin the next epoch.
+
+        Raises:
+            ValueError: if it is the state of other pictures, or of the middle of a pass that cannot go on exactly.
+        """
+        self._epochs.load_state_dict(state, next_epoch)
         if self._epochs.pinned is not None:
             self.set_epoch(self._epochs.pinned)
 
@@ -95,30 +120,56 @@ class _Pairs(Dataset[Any]):
 
     def _make_pair(self, sample: Any, name: int | str, generator: torch.Generator) -> Any:
         where = find_picture(sample, self.key)
+        picture = get_picture(sample, where)
         try:
-            patch, crop = draw_patch(get_picture(sample, where), self.crop, self.turns, generator, self.zoom)
-            batch = self.augment.make_pair(patch[None], generator, crop[None])
+            patch, place = self.augment.draw_patch(picture, self.crop, self.turns, generator, self.zoom, self.bgr)
+            batch = self.augment.make_pair(patch[None], generator, place[None])
         except ValueError as error:
             raise ValueError(f"picture {name}: {error}") from error
-        pair = batch.map(lambda t: t[0])
-        return replace_picture(sample, where, pair if self.keys is None else pair.as_dict(self.keys))
+        pair = batch.map(lambda tensor: tensor[0])
+        return replace_picture(sample, where, self.form(pair, self._name_of(name)))
+
+    def _name_of(self, number: int | str) -> str:
+        """The name of a picture: that of its file where the dataset knows it, else its number."""
+        if isinstance(number, int) and hasattr(self.dataset, "file"):
+            return str(self.dataset.file(number))
+        names = getattr(self.dataset, "names", None)
+        if isinstance(number, int) and isinstance(names, Sequence):
+            return str(names[number])
+        return str(number)
+
+    def __getattr__(self, name: str) -> Any:
+        """Attributes of the dataset, such as ``classes``."""
+        if name.startswith("_") or "dataset" not in self.__dict__:
+            raise AttributeError(name)
+        return getattr(self.dataset, name)
 
 
-class RawPairs(_Pairs):
+class RawPairs(_Pairs[Sample]):
     """A Dataset of pictures as a Dataset of RAW pairs.
 
     Args:
         dataset: has ``len`` and an index, and yields pictures in any form that :mod:`rawaug.plugin.pictures` lists, or
-            tuples or mappings that have one. All other fields pass through.
-        augment: makes the pair, on the CPU where workers are to run it; or an ISP, its name or its path, for a
-            :class:`RawAugment` of it with the default settings.
-        crop: side of the square crop in pixels, or (height, width), even; None keeps whole pictures (made even by
-            dropping a line).
+            tuples or mappings that have one. All other fields pass through, and its attributes are those of the pairs.
+            Or the path of a folder of pictures, or ``kind:path`` (:func:`rawaug.data.open_pictures`).
+        augment: makes the pair, on the CPU where workers are to run it; or an ISP, its name or its path, or a
+            :class:`rawaug.Camera`, for a :class:`RawAugment` of it with the default settings. A
+            :class:`rawaug.RawNoise` makes pairs of clean RAW: the dataset has frames, or the path of a folder of RAW
+            files.
+        crop: side of the square crop in pixels of the picture, or (height, width), even; None keeps whole pictures
+            (made even by dropping a line). Packed RAW has half as many rows and columns: what BasicSR calls a
+            ``gt_size`` of 128 packed pixels is a crop of 256.
         seed: decides all draws, together with the epoch and the index.
         key: name of the picture in samples that are mappings, its index in tuples (0 by default).
         turns: whether to draw flips and quarter turns; what is not square is only flipped.
         keys: names for the pair's noisy, clean, variance and params, in this order, as many as are wanted: the pair is
-            then a dict of these. In samples that are mappings they stand in place of the picture.
+            then a dict of these. In samples that are mappings they stand in place of the picture. Or a mapping of names
+            to these, to ``name``, that of the picture, or to ``level``, the strength of its noise, as
+            ``{"L": "noisy", "H": "clean", "L_path": "name"}``.
+        fields: of the same, as many as are wanted, as ``("clean", "noisy")``: the pair is then a tuple of these.
+        order: of the planes of packed RAW: a CFA, for the order that ``pixel_unshuffle`` of such a mosaic gives;
+            ``"RGBG"`` or the like, in which the first G is Gr; or four names of R, Gr, Gb, B. By default R, Gr, Gb, B.
+        bgr: whether pictures have their channels in the order B, G, R, as ``cv2.imread`` gives them.
         zoom: half of the crops are enlarged by up to this factor (bicubic), drawn log-uniformly; 1 for none. Pictures
             scaled down for the screen are sharper, pixel by pixel, than RAW of a lens and an optical low-pass filter.
 
@@ -140,6 +191,84 @@ class RawPairs(_Pairs):
 
     _epochs: Visits
 
+    # What a sample is follows from the pictures and from how pairs are handed over.
+    @overload
+    def __init__(
+        self: RawPairs[RawPair],
+        dataset: Pictures,
+        augment: Maker,
+        crop: int | tuple[int, int] | None = 256,
+        *,
+        seed: int = 0,
+        key: None = None,
+        turns: bool = True,
+        keys: None = None,
+        fields: None = None,
+        order: str | Sequence[str] | None = None,
+        bgr: bool = False,
+        zoom: float = 1.0,
+    ) -> None: ...
+    @overload
+    def __init__(
+        self: RawPairs[dict[str, Any]],
+        dataset: Pictures,
+        augment: Maker,
+        crop: int | tuple[int, int] | None = 256,
+        *,
+        seed: int = 0,
+        key: None = None,
+        turns: bool = True,
+        keys: Keys,
+        fields: None = None,
+        order: str | Sequence[str] | None = None,
+        bgr: bool = False,
+        zoom: float = 1.0,
+    ) -> None: ...
+    @overload
+    def __init__(
+        self: RawPairs[Any],
+        dataset: Any,
+        augment: Maker,
+        crop: int | tuple[int, int] | None = 256,
+        *,
+        seed: int = 0,
+        key: str | int | None = None,
+        turns: bool = True,
+        keys: Keys | None = None,
+        fields: Sequence[str] | None = None,
+        order: str | Sequence[str] | None = None,
+        bgr: bool = False,
+        zoom: float = 1.0,
+    ) -> None: ...
+    def __init__(
+        self,
+        dataset: Any,
+        augment: Maker,
+        crop: int | tuple[int, int] | None = 256,
+        *,
+        seed: int = 0,
+        key: str | int | None = None,
+        turns: bool = True,
+        keys: Keys | None = None,
+        fields: Sequence[str] | None = None,
+        order: str | Sequence[str] | None = None,
+        bgr: bool = False,
+        zoom: float = 1.0,
+    ) -> None:
+        super().__init__(
+            dataset,
+            augment,
+            crop,
+            seed=seed,
+            key=key,
+            turns=turns,
+            keys=keys,
+            fields=fields,
+            order=order,
+            bgr=bgr,
+            zoom=zoom,
+        )
+
     def _make_epochs(self, dataset: Any) -> Visits:
         if isinstance(dataset, IterableDataset) or not hasattr(dataset, "__getitem__"):
             raise TypeError(
@@ -147,17 +276,26 @@ class RawPairs(_Pairs):
             )
         return Visits(len(dataset) if isinstance(dataset, Sized) else 0)
 
-    def __getitem__(self, index: int) -> Any:
-        index = range(len(self))[operator.index(index)]  # an IndexError ends iteration
-        return self.draw(index, self._generator(*self._epochs.key(index)))
+    def __getitem__(self, index: int) -> Sample:
+        number, count = operator.index(index), len(self)
+        if not -count <= number < count:
+            raise IndexError(f"there is no pair {number}: the dataset has {count} pictures")  # it ends iteration, too
+        number %= count
+        return self.draw(number, self._generator(*self._epochs.key(number)))
 
-    def draw(self, index: int, generator: torch.Generator) -> Any:
+    def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
+        """The pairs of a batch, as a DataLoader asks for them."""
+        self._epochs.fetch(len(indices))
+        return [self[index] for index in indices]
+
+    def draw(self, index: int, generator: torch.Generator) -> Sample:
         """Draw the pair of picture ``index`` from a generator on the CPU; no epoch is counted.
 
         Returns:
             The sample of the dataset with the pair, without B, in place of the picture.
         """
-        return self._make_pair(self.dataset[index], index, generator)
+        sample: Sample = self._make_pair(self.dataset[index], index, generator)
+        return sample
 
     def draw_batch(self, indices: Sequence[int], generators: Sequence[torch.Generator]) -> RawPair:
         """Draw the pairs of :meth:`draw`, bit for bit, as one batch, which is faster for small crops.
@@ -166,12 +304,13 @@ class RawPairs(_Pairs):
             indices: B indices of a dataset whose samples are pictures alone; ``crop`` must be set.
             generators: one for each.
         """
-        drawn, patches = [], []
+        parameters, patches = [], []
         for index, generator in zip(indices, generators, strict=True):
-            patch, crop = draw_patch(self.dataset[index], self.crop, self.turns, generator, self.zoom)
+            picture = self.dataset[index]
+            patch, place = self.augment.draw_patch(picture, self.crop, self.turns, generator, self.zoom, self.bgr)
             patches.append(patch[None])
-            drawn.append(self.augment.sample(patches[-1], generator, crop[None]))
-        pair: RawPair = self.augment.apply(torch.cat(patches), AugmentParams.concatenate(drawn))
+            parameters.append(self.augment.sample(patches[-1], generator, place[None]))
+        pair: RawPair = self.augment.apply(torch.cat(patches), AugmentParams.concatenate(parameters))
         return pair
 
     def replay(self, index: int, params: AugmentParams) -> RawPair:
@@ -181,12 +320,13 @@ class RawPairs(_Pairs):
             ValueError: if the picture is of another size than the one that they were drawn for.
         """
         sample = self.dataset[index]
-        picture = trim_to_even(to_rgb_tensor(get_picture(sample, find_picture(sample, self.key))))
-        pair: RawPair = self.augment.apply(cut_patch(picture, params.crop, self.crop), params)
+        picture = get_picture(sample, find_picture(sample, self.key))
+        patch = self.augment.cut_patch(picture, params.crop, self.crop, self.bgr)
+        pair: RawPair = self.augment.apply(patch, params)
         return pair
 
 
-class RawPairStream(_Pairs, IterableDataset[Any]):
+class RawPairStream(_Pairs[Any], IterableDataset[Any]):
     """An iterable Dataset of pictures as one of RAW pairs.
 
     A stream has no index. Without ``identity`` the n-th sample that worker w of W meets is number nW + w: no two share
@@ -196,8 +336,8 @@ class RawPairStream(_Pairs, IterableDataset[Any]):
 
     Args:
         dataset: an iterable of samples, which are as for :class:`RawPairs`. It divides itself between workers, as those
-            of WebDataset and Hugging Face do, or ``divide`` does.
-        augment, crop, seed, key, turns, keys, zoom: as for :class:`RawPairs`.
+            of WebDataset and Hugging Face do, or ``divide`` does. Or the path of a folder of pictures.
+        augment, crop, seed, key, turns, keys, fields, order, bgr, zoom: as for :class:`RawPairs`.
         identity: name or index of the field that identifies a sample, such as ``"__key__"``; it keys the draws.
         divide: give sample i to worker i mod W, of a dataset that every worker would go through in full.
 
@@ -213,19 +353,37 @@ class RawPairStream(_Pairs, IterableDataset[Any]):
     def __init__(
         self,
         dataset: Any,
-        augment: RawAugment | DictionaryISP | str | Path,
+        augment: Maker,
         crop: int | tuple[int, int] | None = 256,
         *,
         seed: int = 0,
         key: str | int | None = None,
         turns: bool = True,
-        keys: Sequence[str] | None = None,
+        keys: Keys | None = None,
+        fields: Sequence[str] | None = None,
+        order: str | Sequence[str] | None = None,
+        bgr: bool = False,
         zoom: float = 1.0,
         identity: str | int | None = None,
         divide: bool = False,
     ) -> None:
-        super().__init__(dataset, augment, crop, seed=seed, key=key, turns=turns, keys=keys, zoom=zoom)
-        self.identity, self.divide = identity, divide
+        super().__init__(
+            dataset,
+            augment,
+            crop,
+            seed=seed,
+            key=key,
+            turns=turns,
+            keys=keys,
+            fields=fields,
+            order=order,
+            bgr=bgr,
+            zoom=zoom,
+        )
+        self.identity, self.divide = identity, divide or isinstance(dataset, (str, Path))
+
+    def _open(self, dataset: Any) -> Any:
+        return _InOrder(super()._open(dataset)) if isinstance(dataset, (str, Path)) else dataset
 
     def _make_epochs(self, dataset: Any) -> Passes:
         return Passes()
@@ -254,103 +412,45 @@ class RawPairStream(_Pairs, IterableDataset[Any]):
         return value if isinstance(value, int) else str(value)
 
 
-def as_augment(augment: RawAugment | DictionaryISP | str | Path) -> RawAugment:
-    """An augmentation as it is, or one of an ISP, its name or its path, with the default settings.
+class _InOrder(IterableDataset[Any]):
+    """The pictures of a folder as a stream."""
+
+    def __init__(self, pictures: Any) -> None:
+        self.pictures = pictures
+
+    def __iter__(self) -> Iterator[Any]:
+        for index in range(len(self.pictures)):
+            yield self.pictures[index]
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    def file(self, index: int) -> Path:
+        path: Path = self.pictures.file(index)
+        return path
+
+
+def as_augment(augment: Maker) -> RawAugment | RawNoise:
+    """An augmentation as it is, or one of an ISP, its name or its path, or of a camera, with the default settings.
 
     Raises:
         TypeError: if it is something else.
     """
-    if isinstance(augment, RawAugment):
+    if isinstance(augment, (RawAugment, RawNoise)):
         return augment
-    if isinstance(augment, (DictionaryISP, str, Path)):
+    if isinstance(augment, (DictionaryISP, Camera, str, Path)):
         return RawAugment.from_pretrained(augment)
-    raise TypeError(f"augment must be a RawAugment, or an ISP, its name or path; got {type(augment).__name__}")
+    raise TypeError(
+        f"augment must be a RawAugment, a RawNoise, a Camera, or an ISP, its name or path; got {type(augment).__name__}"
+    )
 
 
-def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
-    """Height and width of a crop that is given as a side or as both; None means whole pictures.
-
-    Raises:
-        ValueError: if a side is odd, or it is neither.
-    """
-    if crop is None:
-        return None
-    sides = (crop, crop) if isinstance(crop, SupportsIndex) else tuple(crop) if isinstance(crop, Sequence) else ()
-    if len(sides) != 2 or not all(isinstance(side, SupportsIndex) for side in sides):
-        raise ValueError(f"crop must be an even side or (height, width), got {crop!r}")
-    height, width = (int(side) for side in sides)
-    return bayer.RandomCrop((height, width)).size
-
-
-def draw_crop(
-    picture: Tensor, size: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
-) -> Tensor:
-    """Draw where a picture is cropped and how the crop is turned, as :class:`AugmentParams` keeps it.
+def open_dataset(path: str | Path, augment: RawAugment | RawNoise, size: tuple[int, int] | None) -> Any:
+    """The pictures, or the clean RAW, of a folder or of ``kind:path``, with an index.
 
     Args:
-        picture: ``(3, H, W)`` with even sides.
-        size: height and width of the crop; None for the whole picture.
-        turns: whether flips are drawn, and, of a square, quarter turns.
-        generator: on the CPU.
-        zoom: half of the crops are enlarged by up to this factor.
-
-    Returns:
-        ``(5,)`` top, left, H, W, view; with a zoom ``(6,)``, where the last is the number of rows that are enlarged.
+        path: of a folder or a file, or ``kind:path``.
+        augment: says which.
+        size: of the crops; pictures that are smaller are left out, and reported by the folder.
     """
-    height, width = picture.shape[-2:]
-    region = size or (height, width)
-    if size and zoom > 1.0:
-        share, drawn = torch.rand(2, generator=generator).tolist()
-        rows = size[0] if share < 0.5 else math.ceil(size[0] / 2 * zoom**-drawn) * 2
-        return torch.cat([draw_crop(picture, _region(size, rows), turns, generator), torch.tensor([rows])])
-    corner = bayer.RandomCrop(region).sample(height, width, generator)
-    turn = bayer.RandomTurn(bayer.CFA.RGGB, quarter=region[0] == region[1])
-    view = turn.sample(generator) if turns else torch.tensor(0)
-    return torch.cat([corner, torch.tensor([height, width]), view[None]])
-
-
-def draw_patch(
-    picture: Any, size: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
-) -> tuple[Tensor, Tensor]:
-    """Draw a crop of a picture in any form, and cut it out.
-
-    Args:
-        picture: in any form that :mod:`rawaug.plugin.pictures` lists.
-        size: height and width of the crop; None for the whole picture.
-        turns, generator, zoom: as for :func:`draw_crop`.
-
-    Returns:
-        The patch ``(3, *size)``, uint8 or float32, and its crop ``(5,)`` or ``(6,)``.
-    """
-    whole = trim_to_even(to_rgb_tensor(picture))
-    crop = draw_crop(whole, size, turns, generator, zoom)
-    return cut_patch(whole, crop, size), crop
-
-
-def cut_patch(picture: Tensor, crop: Tensor, size: tuple[int, int] | None) -> Tensor:
-    """Cut the patch ``(3, *size)`` that a drawn crop ``(5,)`` or ``(6,)`` means out of a whole picture ``(3, H, W)``.
-
-    Raises:
-        ValueError: if the crop was drawn for a picture of another size.
-    """
-    top, left, height, width, view, rows = (*crop.tolist(), 0)[:6]
-    if picture.shape[-2:] != (height, width):
-        raise ValueError(f"the parameters belong to a picture of {height} x {width}, got {tuple(picture.shape[-2:])}")
-    patch = bayer.crop(picture, top, left, *(_region(size, rows) if size else (height, width)))
-    if size and patch.shape[-2:] != size:
-        patch = enlarge(patch, size)
-    return bayer.turn(patch, view).contiguous()
-
-
-def _region(size: tuple[int, int], rows: int) -> tuple[int, int]:
-    """Even height and width of the ``rows`` that are enlarged to the crop; 0 rows for the crop itself."""
-    return (rows, math.ceil(size[1] * rows / size[0] / 2) * 2) if rows else size
-
-
-def enlarge(patch: Tensor, size: tuple[int, int]) -> Tensor:
-    """Enlarge a patch ``(3, h, w)`` to ``(3, *size)`` by bicubic interpolation; it keeps its type, uint8 or float."""
-    with one_thread():  # the same bits everywhere
-        larger = F.interpolate(patch[None].float(), size=size, mode="bicubic", align_corners=False)[0]
-    if patch.dtype == torch.uint8:
-        return larger.round_().clamp_(0, 255).to(torch.uint8)
-    return larger.clamp_(0.0, 1.0).to(patch.dtype)
+    return augment.open_folder(path, size)

@@ -1,4 +1,4 @@
-"""The epoch that a draw belongs to, and a DataLoader's share of a distributed run.
+"""The epoch that a draw belongs to.
 
 A DataLoader does not tell its Dataset that a new pass begins, so draws are counted where they are made:
 
@@ -13,63 +13,26 @@ then a pure function of (seed, epoch, index).
 
 from __future__ import annotations
 
-import copy
 import math
 from operator import index
 from typing import Any, SupportsIndex
 
 import torch
 from torch import Tensor
-from torch.utils.data import BatchSampler, DataLoader, DistributedSampler, RandomSampler, SequentialSampler
+from torch.utils.data import get_worker_info
 
+from rawaug.plugin.order import world_size
 from rawaug.seeding import rank_key
 
-
-def world_size() -> int:
-    """The number of processes of a distributed run, 1 without one."""
-    distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
-    return torch.distributed.get_world_size() if distributed else 1
-
-
-def own_share(loader: Any, seed: int) -> Any:
-    """Divide a DataLoader between the processes of a distributed run.
-
-    Lightning and Fabric divide only a DataLoader, which a wrapped one is not.
-
-    Args:
-        loader: a DataLoader whose order comes from its ``shuffle``.
-        seed: of the order, the same in all processes.
-
-    Returns:
-        A loader over this process's pictures; ``loader`` itself in a single process, where its sampler was chosen by
-        the user, and where it is no DataLoader.
-    """
-    if world_size() == 1 or not isinstance(loader, DataLoader) or not _has_own_order(loader):
-        return loader
-    shuffle = isinstance(loader.sampler, RandomSampler)
-    dataset: Any = loader.dataset
-    sampler: DistributedSampler[Any] = DistributedSampler(
-        dataset, shuffle=shuffle, seed=seed, drop_last=loader.drop_last
-    )
-    share = copy.copy(loader)
-    batches = BatchSampler(sampler, loader.batch_size, loader.drop_last) if loader.batch_size is not None else None
-    # A DataLoader refuses another sampler once it is made; a copy that has no iterator yet may have one.
-    share.__dict__.update(sampler=sampler, batch_sampler=batches, _iterator=None)
-    return share
-
-
-def _has_own_order(loader: DataLoader[Any]) -> bool:
-    """Whether the sampler is the one that the loader made from ``shuffle``."""
-    sampler, batches = loader.sampler, loader.batch_sampler
-    if batches is not None and not (type(batches) is BatchSampler and batches.sampler is sampler):
-        return False
-    if type(sampler) is RandomSampler:
-        return not sampler.replacement and sampler.num_samples == len(sampler.data_source)
-    return type(sampler) is SequentialSampler
-
-
-_COUNTED = -1  # in place of a pinned epoch
+_COUNTED = -1
+"""Stands in place of a pinned epoch."""
 MAX_WORKERS = 512
+
+_BROKEN_OFF = (
+    "the state is of the middle of a pass whose workers had fetched more pictures than were used, so it cannot go on "
+    "exactly; resume by rawaug.resumable(loader), by numbering the epochs with set_epoch, or begin the next epoch "
+    "with load_state_dict(state, next_epoch=True)"
+)
 
 
 def require_epoch(epoch: SupportsIndex) -> int:
@@ -109,10 +72,10 @@ class _Epochs:
         return {**self.__dict__, "_rank": self.rank()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        for value in state.values():
+        for name, value in state.items():
             if isinstance(value, Tensor):
                 value.share_memory_()  # an unpickled copy is not shared with its own workers; in a worker it is already
+            setattr(self, name, value)
 
     def _resume(self, epoch: int | None) -> None:
         self._pinned[0] = _COUNTED if epoch is None else require_epoch(epoch)
@@ -126,30 +89,72 @@ class Visits(_Epochs):
     a counted draw also has the rank.
     """
 
+    def __init__(self, size: int) -> None:
+        super().__init__(size)
+        self._in_workers = torch.zeros(1, dtype=torch.bool).share_memory_()
+        """Whether workers have counted visits."""
+        self._batch = torch.ones(1, dtype=torch.int64).share_memory_()
+        """Pictures that are asked for at a time."""
+
     def key(self, index: int) -> tuple[int, ...]:
         """Count a visit of picture ``index``, and return the key of its draw: epoch, index and rank."""
         if self.pinned is not None:
             return (self.pinned, index)
         if index >= len(self._counts):
             raise ValueError(f"the dataset has grown from {len(self._counts)} pictures; create RawPairs again")
+
+        if get_worker_info() is not None:
+            self._in_workers[0] = True
         visit = int(self._counts[index])
         self._counts[index] = visit + 1
         return (visit, index, *self.rank())
 
+    def fetch(self, batch: int) -> None:
+        """Note how many pictures a loader asks for at a time."""
+        self._batch[0] = batch
+
     def state_dict(self) -> dict[str, Any]:
-        """The pinned epoch and each picture's visits.
+        """The pinned epoch, each picture's visits, and whether the state is exact.
 
         The processes of a distributed run share one state: there each picture's visits are the passes so far.
         """
-        return {"epoch": self.pinned, "visits": self._shared_by_ranks(self._counts.clone())}
+        visits = self._shared_by_ranks(self._counts.clone())
+        exact = self.pinned is not None or not self._runs_ahead(visits)
+        return {"epoch": self.pinned, "visits": visits, "exact": exact}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from ``state``; ValueError if it belongs to another number of pictures."""
+    def load_state_dict(self, state: dict[str, Any], next_epoch: bool = False) -> None:
+        """Go on from ``state``.
+
+        Args:
+            state: as :meth:`state_dict` gives it.
+            next_epoch: where the state is of the middle of a pass, begin the next epoch.
+
+        Raises:
+            ValueError: if it belongs to another number of pictures, or is not exact.
+        """
         visits = torch.as_tensor(state["visits"])
         if visits.shape != self._counts.shape:
             raise ValueError(f"the state is that of {len(visits)} pictures, the dataset has {len(self._counts)}")
+        if next_epoch and len(visits):
+            visits = torch.full_like(visits, int(visits.max()))
+        elif not state.get("exact", True):
+            raise ValueError(_BROKEN_OFF)
         self._resume(state["epoch"])
         self._counts.copy_(visits)
+        self._in_workers[0] = False
+
+    def _runs_ahead(self, visits: Tensor) -> bool:
+        """Whether workers have counted visits of pictures that the training may not have seen yet.
+
+        It cannot be seen where they have fetched all the rest of a pass: such a state is that of the next pass.
+        """
+        worker = get_worker_info()
+        if worker is not None:  # one of torchdata's StatefulDataLoader, whose workers keep a state each
+            return worker.num_workers > 1
+        if not bool(self._in_workers) or not len(visits):
+            return False
+        behind = int((visits < visits.max()).sum())
+        return behind >= int(self._batch)  # fewer are those that drop_last leaves out
 
     @staticmethod
     def _shared_by_ranks(visits: Tensor) -> Tensor:
@@ -163,25 +168,38 @@ class Visits(_Epochs):
 class Passes(_Epochs):
     """Counts of the passes over a stream, and the sample at which a resumed pass goes on.
 
-    Worker w of W counts in row W, column w, and the main process in row 0. Of passes with another number of workers
-    those count that their first worker has begun.
+    Workers of one pass begin it at different times, so each reads only what none of its siblings writes: worker w
+    counts the passes that it has begun, among however many, and the first of W workers those of W workers. The passes
+    before one of worker w are its own and those of at most w workers, which had no worker w.
     """
 
     def __init__(self) -> None:
-        super().__init__(MAX_WORKERS + 1, MAX_WORKERS)
-        self._resumed = torch.tensor([-1, 0]).share_memory_()  # a pass, and the number of its first sample
-        self._running: tuple[int, int] | None = None  # in this process: the pass, and the number of the next sample
+        super().__init__(MAX_WORKERS)
+        self._of_workers = torch.zeros(MAX_WORKERS + 1, dtype=torch.int32).share_memory_()
+        """By W, the passes of W workers that the first of them has begun; 0 for the main process."""
+        self._resumed = torch.tensor([-1, 0]).share_memory_()
+        """A pass, and the number of its first sample."""
+        self._running: tuple[int, int] | None = None
+        """In this process: the pass, and the number of the next sample."""
 
     def begin(self, workers: int, worker: int) -> tuple[int, int]:
         """Count a pass of one of ``workers`` workers, and return its epoch and the number of its first sample."""
-        # Other rows alone: a sibling may be counting the same pass in this one.
-        others = self._counts[:workers, 0].sum() + self._counts[workers + 1 :, 0].sum()
-        started = int(self._counts[workers, worker] + others)
-        self._counts[workers, worker] += 1
+        started = self.passes
+        if workers:
+            started = int(self._counts[worker] + self._of_workers[: worker + 1].sum())
+            self._counts[worker] += 1
+        if worker == 0:
+            self._of_workers[workers] += 1
+
         resumed, first = self._resumed.tolist()
         start = first if started == resumed else 0
         self._running = (started, start)
         return (started if self.pinned is None else self.pinned), start
+
+    @property
+    def passes(self) -> int:
+        """The passes that have begun."""
+        return int(self._of_workers.sum())
 
     def at(self, number: int) -> None:
         """Note that sample ``number`` comes next in this process."""
@@ -198,13 +216,17 @@ class Passes(_Epochs):
         The main process does not know how far its workers have come in a pass: with workers, the state is that of the
         next pass.
         """
-        started, position = self._running or (int(self._counts[:, 0].sum()), 0)
+        started, position = self._running or (self.passes, 0)
         return {"epoch": self.pinned, "passes": started, "position": position}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from ``state`` with the next sample of the next pass."""
+    def load_state_dict(self, state: dict[str, Any], next_epoch: bool = False) -> None:
+        """Go on from ``state`` with the next sample of the next pass, or with ``next_epoch`` at the next epoch."""
+        passes, position = state["passes"], state["position"]
+        if next_epoch and position:
+            passes, position = passes + 1, 0
         self._resume(state["epoch"])
         self._counts.zero_()
-        self._counts[0, 0] = state["passes"]
-        self._resumed.copy_(torch.tensor([state["passes"], state["position"]]))
+        self._of_workers.zero_()
+        self._of_workers[0] = passes
+        self._resumed.copy_(torch.tensor([passes, position]))
         self._running = None

@@ -2,37 +2,37 @@
 
 Batch n of epoch e is drawn from a generator seeded with BLAKE2b(seed, "wrap", e, n), where the seed is the
 augmentation's: whatever the loader's workers do, the same batches make the same pairs. Each pass is a new epoch. In a
-distributed run each process has its share of the pictures (:mod:`rawaug.plugin.epochs`), and the keys of processes but
+distributed run each process has its share of the pictures (:mod:`rawaug.plugin.order`), and the keys of processes but
 the first have their rank as well.
+
+:func:`resumable` does the same for the epochs and the order of a loader of any batches, such as those of RawPairs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence, Sized
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import IterableDataset
+from torch.utils.data import DataLoader, IterableDataset
 
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.own_cameras import Camera
 from rawaug.kernels.runtime import find_device
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import as_augment, crop_size, draw_patch
-from rawaug.plugin.epochs import own_share, require_epoch, world_size
-from rawaug.plugin.params import RawPair, require_keys
-from rawaug.plugin.pictures import (
-    find_picture,
-    get_picture,
-    is_picture,
-    replace_picture,
-    stack_pictures,
-    to_rgb_batch,
-    trim_to_even,
-)
+from rawaug.plugin.clean_raw import RawNoise
+from rawaug.plugin.crops import crop_size
+from rawaug.plugin.dataset import as_augment, open_dataset
+from rawaug.plugin.epochs import require_epoch
+from rawaug.plugin.order import is_drawn, keep_order, own_share, pack_order, unpack_order, world_size
+from rawaug.plugin.params import Keys, PairForm, RawPair, pair_form
+from rawaug.plugin.pictures import find_picture, get_picture, is_picture, replace_picture
 from rawaug.seeding import keyed_generator, rank_key
+
+Batch = TypeVar("Batch", covariant=True)
 
 
 class Position(NamedTuple):
@@ -43,35 +43,29 @@ class Position(NamedTuple):
     passed: int = 0
 
 
-class WrappedLoader:
-    """A loader of RAW pairs, made by :func:`wrap`; its other attributes are the wrapped loader's own.
+class ResumableLoader(Generic[Batch]):
+    """A loader that numbers its passes, and goes on in the middle of one; its other attributes are the loader's own.
 
     Args:
-        loader, augment, crop, key, keys, device: as for :func:`wrap`, which converts and checks them.
+        loader: a DataLoader, or what iterates like one.
+        seed: of the order of a distributed run, where each process has its share.
     """
 
-    def __init__(
-        self,
-        loader: Iterable[Any],
-        augment: RawAugment,
-        crop: tuple[int, int] | None,
-        key: str | int | None,
-        keys: tuple[str, ...] | None,
-        device: torch.device | str | None,
-    ) -> None:
-        self.loader, self.key, self.crop, self.keys = loader, key, crop, keys
-        named = find_device(device) if isinstance(device, str) else device
-        self.device = named if named is not None else augment.device
-        self.augment = augment.to(self.device)
+    def __init__(self, loader: Iterable[Any], seed: int = 0) -> None:
+        self.loader, self.seed = loader, seed
         self._share: Any = None
+        self._kept: Any = None
+        self._order: Any = None
         self._next = self._at = Position(0, 0)
-        self._order: Tensor | None = None
+        self._has_pool = False
+        self._resumed_generator: Tensor | None = None
+        self._loaded: Mapping[str, Any] | None = None
 
     @property
     def share(self) -> Any:
         """The wrapped loader, or in a distributed run this process's part of it."""
         if self._share is None and world_size() > 1:
-            self._share = own_share(self.loader, self.augment.seed)
+            self._share = own_share(self.loader, self.seed)
         return self.loader if self._share is None else self._share
 
     def __len__(self) -> int:
@@ -85,85 +79,165 @@ class WrappedLoader:
         an epoch. It is forwarded to the wrapped loader's own ``set_epoch``, if there is one.
         """
         self._next = self._at = Position(require_epoch(epoch), require_epoch(start))
+        self._loaded = None
+        if self._order is not None:
+            self._order.start_at(0)
         if hasattr(self.loader, "set_epoch"):
             self.loader.set_epoch(epoch)
 
     def state_dict(self) -> dict[str, Any]:
         """The state from which :meth:`load_state_dict` goes on with the next batch.
 
-        It holds the epoch and the number of that batch, and, where the wrapped loader has these, the state of its own
-        ``generator`` at the start of the pass and its ``state_dict``.
+        It holds the epoch and the number of that batch, and, where the loader has these, the state of its own
+        ``generator``, the order of the pass, or its own ``state_dict``.
+
+        In the middle of a pass that is shuffled each process of a distributed run has a state of its own, unless the
+        loader's order comes from ``shuffle`` alone.
         """
+        if self._loaded is not None:  # nothing has been asked for since
+            return dict(self._loaded)
         state: dict[str, Any] = {"epoch": self._at.epoch, "batch": self._at.batch}
         if self._generator is not None:
-            state["order"] = self._generator.get_state() if self._order is None else self._order
+            state["generator"] = self._generator.get_state()
+            state["pool"] = self._has_pool
         if hasattr(self.loader, "state_dict"):
             state["loader"] = self.loader.state_dict()
+        elif self._at.batch and self._order is not None and is_drawn(self._order.sampler):
+            state["order"] = pack_order(self._order.current or [])
+            state["rank"] = rank_key()
         return state
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with the batch after the last one that ``state`` knows of.
 
-        A wrapped loader with a ``load_state_dict`` of its own goes on by itself; of any other the first batches are
-        loaded again and passed over. Their order is the same if it is sequential, drawn from the loader's own
-        ``generator``, or that of a distributed run; what a script shuffles from PyTorch's global state it restores.
+        A wrapped loader with a ``load_state_dict`` of its own goes on by itself. A DataLoader goes on in the order of
+        the pass, and loads nothing twice. Of any other loader the first batches are loaded again and passed over: it
+        must give the same ones.
+
+        Raises:
+            ValueError: if the state is that of another process, or the loader's order cannot be had again.
         """
-        goes_on = "loader" in state and hasattr(self.loader, "load_state_dict")
-        self._next = self._at = Position(state["epoch"], state["batch"], 0 if goes_on else state["batch"])
-        if goes_on:
+        epoch, batch = require_epoch(state["epoch"]), require_epoch(state["batch"])
+        self._loaded = None
+        if "loader" in state and hasattr(self.loader, "load_state_dict"):
+            self._next = self._at = Position(epoch, batch)
+            self._load_loader(state, batch)
+            self._loaded = state
+            return
+
+        _, order = self._prepare()
+        if order is None:
+            self._require_repeatable(batch)
+            self._next = self._at = Position(epoch, batch, passed=batch)
+            return
+        if state.get("rank", rank_key()) != rank_key():
+            raise ValueError("the state is that of another process; save and load one for each process")
+        if batch and is_drawn(order.sampler) and "order" not in state:
+            raise ValueError("the state does not hold the order of the pass; it was saved by another kind of loader")
+        self._next = self._at = Position(epoch, batch)
+        order.start_at(batch, unpack_order(state["order"]) if batch and "order" in state else None)
+        self._restore_generator(state, batch)
+        self._loaded = state
+
+    def _load_loader(self, state: Mapping[str, Any], batch: int) -> None:
+        """Load the state of a loader that has one, and that of its generator."""
+        generator = self._generator
+        if generator is None or "generator" not in state:
             self.loader.load_state_dict(state["loader"])  # type: ignore[attr-defined]
-        if self._generator is not None and "order" in state:
-            self._generator.set_state(state["order"])
+        elif batch or getattr(self.loader, "num_workers", 1):
+            self.loader.load_state_dict(state["loader"])  # type: ignore[attr-defined]
+            self._resumed_generator = state["generator"] if batch else None
+        else:
+            # At the end of a pass without workers torchdata's loader would draw from its generator once too often.
+            generator.set_state(state["generator"])
+
+    def _restore_generator(self, state: Mapping[str, Any], batch: int) -> None:
+        """Let the loader's generator go on, of which a new pool of workers draws once more than one used again."""
+        if self._generator is None or "generator" not in state:
+            return
+        if batch:
+            self._resumed_generator = state["generator"]  # the order of this pass is drawn already
+        elif state.get("pool"):
+            self._order.draw_from(self._generator, state["generator"])
+        else:
+            self._generator.set_state(state["generator"])
+
+    def _require_repeatable(self, batch: int) -> None:
+        """Raise ValueError in the middle of a pass where the order is neither kept nor told by the epoch."""
+        if not batch or not isinstance(self.loader, DataLoader) or isinstance(self.loader.dataset, IterableDataset):
+            return
+        raise ValueError(
+            "the loader's sampler has no length, so its order cannot be kept; resume at the start of an epoch, or use "
+            "torchdata's StatefulDataLoader"
+        )
 
     @property
     def _generator(self) -> torch.Generator | None:
         return getattr(self.loader, "generator", None)
 
-    def __iter__(self) -> Iterator[Any]:
+    def _prepare(self) -> tuple[Any, Any]:
+        """The loader that is iterated, and its order where that is kept."""
+        if self._kept is None:
+            self._kept, self._order = keep_order(self.share)
+        return self._kept, self._order
+
+    def __iter__(self) -> Iterator[Batch]:
+        loader, _ = self._prepare()
+        self._loaded = None
         epoch, start, passed = self._at = self._next
         self._next = Position(epoch + 1, 0)
-        self._order = None if self._generator is None else self._generator.get_state()
         if self.share is not self.loader:
             self.share.sampler.set_epoch(epoch)
+        self._begin(epoch)
+
         first = start - passed
         length = self._length()
-        for number, batch in enumerate(self.share, first):
+        number = first - 1
+        for number, batch in enumerate(loader, first):
+            self._has_pool = bool(getattr(loader, "persistent_workers", False))
+            if self._generator is not None and self._resumed_generator is not None:
+                self._generator.set_state(self._resumed_generator)  # whatever has been drawn to begin again
+                self._resumed_generator = None
             if number < start:
                 continue
-            where = find_picture(batch, self.key, batched=True)
-            generator = keyed_generator(self.augment.seed, "wrap", epoch, number, *rank_key())
-            pair = self._make_pair(self._with_channel(get_picture(batch, where)), generator)
-            last = number - first + 1 == length  # where training loops stop, before the end of the iterator
-            self._advance(Position(epoch + 1, 0) if last else Position(epoch, number + 1))
-            yield replace_picture(batch, where, pair if self.keys is None else pair.as_dict(self.keys))
-        self._advance(Position(epoch + 1, 0))
+            converted = self._convert(batch, epoch, number)
+            is_last = number + 1 == length  # where training loops stop, before the end of the iterator
+            self._at = Position(epoch + 1, 0) if is_last else Position(epoch, number + 1)
+            yield converted
+
+        self._at = Position(epoch + 1, 0)
+        if number < start and not start and hasattr(self.loader, "load_state_dict"):
+            yield from self._again(epoch)  # its state was that of the end of the pass before
+
+    def _again(self, epoch: int) -> Iterator[Batch]:
+        """The pass of a loader that resumes by itself, and has first ended the pass of its state."""
+        length = self._length()
+        for number, batch in enumerate(self.share):
+            converted = self._convert(batch, epoch, number)
+            is_last = number + 1 == length
+            self._at = Position(epoch + 1, 0) if is_last else Position(epoch, number + 1)
+            yield converted
+        self._at = Position(epoch + 1, 0)
+
+    def _begin(self, epoch: int) -> None:
+        """Called before each pass: a dataset that numbers its epochs is told this one."""
+        dataset: Any = getattr(self.loader, "dataset", None)
+        if hasattr(dataset, "set_epoch"):
+            dataset.set_epoch(epoch)
+
+    def _convert(self, batch: Any, epoch: int, number: int) -> Batch:
+        """What becomes of a batch of the loader."""
+        converted: Batch = batch
+        return converted
 
     def _length(self) -> int | None:
         """Batches of a pass, where they can be counted on."""
         if isinstance(getattr(self.loader, "dataset", None), IterableDataset):
             return None
-        return len(self) if isinstance(self.loader, Sized) else None
-
-    def _advance(self, position: Position) -> None:
-        self._at = position
-        if not position.batch:
-            self._order = None
-
-    def _with_channel(self, batch: Any) -> Any:
-        """Batches of grey pictures ``(B, H, W)``, which a DataLoader collates, with an axis for their one channel."""
-        grey = isinstance(batch, (Tensor, np.ndarray)) and batch.ndim == 3
-        return batch[:, None] if grey and getattr(self.loader, "batch_size", None) is not None else batch
-
-    def _make_pair(self, pictures: Any, generator: torch.Generator) -> RawPair:
-        whole = trim_to_even(to_rgb_batch(pictures)) if self.crop is None else None
-        srgb, crop = (whole, None) if whole is not None else self._draw_crops(pictures, generator)
-        return self.augment.make_pair(srgb.to(self.device, non_blocking=True), generator, crop)
-
-    def _draw_crops(self, pictures: Any, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """One crop of each picture ``(B, 3, crop, crop)``, and their places ``(B, 5)``."""
-        listed = [pictures] if is_picture(pictures) else pictures
-        drawn = [draw_patch(picture, self.crop, False, generator) for picture in listed]
-        return stack_pictures([patch for patch, _ in drawn]), torch.stack([crop for _, crop in drawn])
+        try:
+            return len(self) if isinstance(self.loader, Sized) else None
+        except TypeError:  # of a sampler without a length
+            return None
 
     def __getattr__(self, name: str) -> Any:
         if "_share" not in self.__dict__:  # asked for before anything is set, by copy and pickle
@@ -171,29 +245,166 @@ class WrappedLoader:
         return getattr(self.share, name)
 
 
+def resumable(loader: Iterable[Any], seed: int = 0) -> ResumableLoader[Any]:
+    """Make a loader that goes on in the middle of an epoch, exactly.
+
+    It numbers its passes and tells the number to a dataset with ``set_epoch``, such as :class:`rawaug.RawPairs`, so
+    that a pair depends on (seed, epoch, index) alone. It keeps the order of a shuffled pass with its state.
+
+    Args:
+        loader: a DataLoader, or what iterates like one.
+        seed: of the order of a distributed run, in which each process has its share of a loader that is sequential or
+            has ``shuffle=True``.
+
+    Example:
+        >>> from rawaug.isp.model import DictionaryISP
+        >>> from rawaug.plugin.dataset import RawPairs
+        >>> pairs = RawPairs([torch.rand(3, 32, 32) for _ in range(4)], RawAugment(DictionaryISP()), crop=32)
+        >>> loader = resumable(DataLoader(pairs, batch_size=2, shuffle=True))
+        >>> batches = iter(loader)
+        >>> first, state = next(batches), loader.state_dict()
+        >>> second = next(batches)
+        >>> loader.load_state_dict(state)
+        >>> torch.equal(next(iter(loader)).noisy, second.noisy)
+        True
+    """
+    return ResumableLoader(loader, seed)
+
+
+class WrappedLoader(ResumableLoader[Batch]):
+    """A loader of RAW pairs, made by :func:`wrap`; its other attributes are the wrapped loader's own.
+
+    Args:
+        loader, augment, crop, key, bgr, device: as for :func:`wrap`, which converts and checks them.
+        form: how a pair is handed over.
+    """
+
+    def __init__(
+        self,
+        loader: Iterable[Any],
+        augment: RawAugment | RawNoise,
+        crop: tuple[int, int] | None,
+        key: str | int | None,
+        form: PairForm,
+        bgr: bool,
+        device: torch.device | str | None,
+    ) -> None:
+        super().__init__(loader, augment.seed)
+        self.key, self.crop, self.form, self.bgr = key, crop, form, bgr
+        named = find_device(device) if isinstance(device, str) else device
+        self.device = named if named is not None else augment.device
+        self.augment = augment.to(self.device)
+
+    def _begin(self, epoch: int) -> None:
+        """The pairs are drawn here, so that the dataset's epochs are its own."""
+
+    def _convert(self, batch: Any, epoch: int, number: int) -> Batch:
+        where = find_picture(batch, self.key, batched=True)
+        generator = keyed_generator(self.augment.seed, "wrap", epoch, number, *rank_key())
+        pair = self._make_pair(self._with_channel(get_picture(batch, where)), generator)
+        converted: Batch = replace_picture(batch, where, self.form(pair))
+        return converted
+
+    def _with_channel(self, batch: Any) -> Any:
+        """Batches of grey pictures ``(B, H, W)``, which a DataLoader collates, with an axis for their one channel."""
+        grey = isinstance(batch, (Tensor, np.ndarray)) and batch.ndim == 3
+        return batch[:, None] if grey and getattr(self.loader, "batch_size", None) is not None else batch
+
+    def _make_pair(self, pictures: Any, generator: torch.Generator) -> RawPair:
+        if self.crop is None:
+            images, places = self.augment.as_batch(pictures, self.bgr), None
+        else:
+            images, places = self._draw_crops(pictures, generator)
+        return self.augment.make_pair(images.to(self.device, non_blocking=True), generator, places)
+
+    def _draw_crops(self, pictures: Any, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """One crop of each picture ``(B, C, height, width)``, and their places ``(B, 5)``."""
+        listed = [pictures] if is_picture(pictures) else pictures
+        patches, places = [], []
+        for picture in listed:
+            patch, place = self.augment.draw_patch(picture, self.crop, False, generator, bgr=self.bgr)
+            patches.append(patch)
+            places.append(place)
+        return self.augment.stack(patches), torch.stack(places)
+
+
+@overload
 def wrap(
-    loader: Iterable[Any],
-    augment: RawAugment | DictionaryISP | str | Path,
+    loader: DataLoader[Tensor] | str | Path,
+    augment: RawAugment | RawNoise | DictionaryISP | Camera | str | Path,
+    crop: int | tuple[int, int] | None = None,
+    *,
+    key: None = None,
+    keys: None = None,
+    fields: None = None,
+    order: str | Sequence[str] | None = None,
+    bgr: bool = False,
+    device: torch.device | str | None = None,
+    batch_size: int | None = None,
+    shuffle: bool | None = None,
+) -> WrappedLoader[RawPair]: ...
+@overload
+def wrap(
+    loader: DataLoader[Tensor] | str | Path,
+    augment: RawAugment | RawNoise | DictionaryISP | Camera | str | Path,
+    crop: int | tuple[int, int] | None = None,
+    *,
+    key: None = None,
+    keys: Keys,
+    fields: None = None,
+    order: str | Sequence[str] | None = None,
+    bgr: bool = False,
+    device: torch.device | str | None = None,
+    batch_size: int | None = None,
+    shuffle: bool | None = None,
+) -> WrappedLoader[dict[str, Any]]: ...
+@overload
+def wrap(
+    loader: Iterable[Any] | str | Path,
+    augment: RawAugment | RawNoise | DictionaryISP | Camera | str | Path,
     crop: int | tuple[int, int] | None = None,
     *,
     key: str | int | None = None,
-    keys: Sequence[str] | None = None,
+    keys: Keys | None = None,
+    fields: Sequence[str] | None = None,
+    order: str | Sequence[str] | None = None,
+    bgr: bool = False,
     device: torch.device | str | None = None,
-) -> WrappedLoader:
+    batch_size: int | None = None,
+    shuffle: bool | None = None,
+) -> WrappedLoader[Any]: ...
+def wrap(
+    loader: Iterable[Any] | str | Path,
+    augment: RawAugment | RawNoise | DictionaryISP | Camera | str | Path,
+    crop: int | tuple[int, int] | None = None,
+    *,
+    key: str | int | None = None,
+    keys: Keys | None = None,
+    fields: Sequence[str] | None = None,
+    order: str | Sequence[str] | None = None,
+    bgr: bool = False,
+    device: torch.device | str | None = None,
+    batch_size: int | None = None,
+    shuffle: bool | None = None,
+) -> WrappedLoader[Any]:
     """Make a loader of RAW pairs of any loader of sRGB batches; the rest of the training script stays as it is.
 
     Args:
         loader: a DataLoader, or what iterates like one. Its batches are pictures ``(B, 3, H, W)`` in any form that
             :mod:`rawaug.plugin.pictures` accepts, lists of pictures, or tuples or mappings that have these. The
-            :class:`RawPair` takes their place, all else passes through.
-        augment: makes the pairs, and moves to ``device``; or an ISP, its name or its path.
+            :class:`RawPair` takes their place, all else passes through. Or the path of a folder of pictures, which
+            needs ``crop`` where they differ in size.
+        augment: makes the pairs, and moves to ``device``; or an ISP, its name or its path, or a camera. A
+            :class:`rawaug.RawNoise` takes clean RAW in place of pictures.
         crop: even side of a square crop, or (height, width), drawn for each picture: makes a batch of pictures of
             different sizes. By default whole pictures, without their last row or column where a side is odd.
         key: name of the pictures in batches that are mappings, their index in tuples (0 by default).
-        keys: names for noisy, clean, variance and params, as for :class:`rawaug.RawPairs`.
+        keys, fields, order: how pairs are handed over, as for :class:`rawaug.RawPairs`; a batch has no names.
+        bgr: whether pictures have their channels in the order B, G, R, as ``cv2.imread`` gives them.
         device: where the pairs are made, by default where ``augment`` is; a ``torch.device``, or a name that
             :func:`rawaug.kernels.runtime.find_device` knows, ``auto`` among them. uint8 pictures travel
             there as uint8.
+        batch_size, shuffle: of a folder, 1 and false by default; a loader has its own.
 
     Raises:
         TypeError: if ``augment`` is none of these.
@@ -206,4 +417,10 @@ def wrap(
         >>> [(pair.noisy.shape, labels) for pair, labels in loader]
         [(torch.Size([2, 4, 32, 32]), ['cat', 'dog'])]
     """
-    return WrappedLoader(loader, as_augment(augment), crop_size(crop), key, require_keys(keys), device)
+    maker, size = as_augment(augment), crop_size(crop)
+    if isinstance(loader, (str, Path)):
+        pictures = open_dataset(loader, maker, size)
+        loader = DataLoader(pictures, batch_size=batch_size or 1, shuffle=bool(shuffle), collate_fn=list)
+    elif batch_size is not None or shuffle is not None:
+        raise ValueError("batch_size and shuffle are for the path of a folder; a loader has its own")
+    return WrappedLoader(loader, maker, size, key, pair_form(keys, fields, order), bgr, device)

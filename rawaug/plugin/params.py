@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -91,20 +92,124 @@ class RawPair(NamedTuple):
         """Apply a function to every tensor; ``pair.map(lambda t: t[0])`` is the first pair of ``(B, 4, H/2, W/2)``."""
         return RawPair(change(self.noisy), change(self.clean), change(self.variance), self.params.map(change))
 
-    def as_dict(self, keys: Sequence[str]) -> dict[str, Any]:
-        """The first of noisy, clean, variance and params as a dict with these keys, such as ``("lq", "gt")``."""
-        return dict(zip(keys, self, strict=False))
+    @property
+    def level(self) -> Tensor:
+        """The strength of the noise, the root of the mean square of noisy less clean: ``(B,)``, or a scalar.
+
+        It is what networks for developed pictures are told, on the scale white = 1.
+        """
+        single = self.params.crop.ndim == 1
+        difference = self.noisy - self.clean if self.noisy.shape == self.clean.shape else self.noisy[:, :0]
+        if difference.numel() == 0:
+            raise ValueError("level: noisy and clean differ in shape; a level is one of pairs of one kind")
+        square = difference.square()
+        return square.mean().sqrt() if single else square.flatten(1).mean(1).sqrt()
 
 
-def require_keys(keys: Sequence[str] | None) -> tuple[str, ...] | None:
-    """Check the keys of :meth:`RawPair.as_dict`; ValueError if they are not 1 to 4 different names."""
+FIELDS = ("noisy", "clean", "variance", "params", "name", "level")
+"""What a sample of a Dataset can hold: a pair's parts, the name of its picture, and the strength of its noise."""
+
+RAW_PLANES = ("R", "Gr", "Gb", "B")
+_ORDERS = {"RGGB": (0, 1, 2, 3), "BGGR": (3, 2, 1, 0), "GRBG": (1, 0, 3, 2), "GBRG": (2, 3, 0, 1)}
+"""What ``pixel_unshuffle`` of a mosaic of each CFA gives, as numbers of :data:`RAW_PLANES`."""
+
+
+@dataclass(frozen=True)
+class PairForm:
+    """How a pair is handed over: whole, as a tuple or as a dict, and in which order its planes are.
+
+    Args:
+        fields: of :data:`FIELDS`, in the order of the tuple or dict; None for a :class:`RawPair`.
+        keys: a key for each field, for a dict.
+        planes: numbers of R, Gr, Gb and B in the order of the planes; None for this very order.
+    """
+
+    fields: tuple[str, ...] | None = None
+    keys: tuple[str, ...] | None = None
+    planes: tuple[int, ...] | None = None
+
+    def __call__(self, pair: RawPair, name: str | None = None) -> Any:
+        """Hand over a pair, with or without B.
+
+        Args:
+            pair: packed RAW ``(..., 4, h, w)`` in the order R, Gr, Gb, B, or any other target.
+            name: of its picture.
+
+        Raises:
+            ValueError: if the name is asked for and there is none.
+        """
+        if self.planes is not None:
+            pair = self._in_order(pair)
+        if self.fields is None:
+            return pair
+        values = []
+        for field in self.fields:
+            if field == "name" and name is None:
+                raise ValueError("keys: a loader of batches has no names of pictures; let its samples hold them")
+            values.append(name if field == "name" else getattr(pair, field))
+        return tuple(values) if self.keys is None else dict(zip(self.keys, values, strict=True))
+
+    def _in_order(self, pair: RawPair) -> RawPair:
+        planes = list(self.planes or ())
+        parts = []
+        for part in (pair.noisy, pair.clean, pair.variance):
+            is_packed = part.ndim >= 3 and part.shape[-3] == len(RAW_PLANES)
+            parts.append(part[..., planes, :, :] if is_packed else part)
+        noisy, clean, variance = parts
+        return RawPair(noisy, clean, variance, pair.params)
+
+
+Keys = Sequence[str] | Mapping[str, str]
+
+
+def pair_form(
+    keys: Keys | None = None, fields: Sequence[str] | None = None, order: str | Sequence[str] | None = None
+) -> PairForm:
+    """Check how pairs are to be handed over.
+
+    Args:
+        keys: names for noisy, clean, variance and params, in this order, as many as are wanted; or a mapping of names
+            to :data:`FIELDS`. The pair is then a dict.
+        fields: of :data:`FIELDS`, as many as are wanted; the pair is then a tuple of these.
+        order: of the planes of packed RAW: a CFA, for the order that ``pixel_unshuffle`` of such a mosaic gives;
+            ``"RGBG"`` or the like, in which the first G is Gr; or four names of R, Gr, Gb, B.
+
+    Raises:
+        ValueError: if a name, a field or a plane is unknown or there twice.
+    """
+    planes = None if order is None else _planes_of(order)
+    if keys is not None and fields is not None:
+        raise ValueError("give keys for a dict, or fields for a tuple; keys={'lq': 'noisy'} names fields")
+    if fields is not None:
+        wanted = () if isinstance(fields, str) else tuple(fields)
+        if not wanted or not set(wanted) <= set(FIELDS):
+            raise ValueError(f"fields are one or more of {', '.join(FIELDS)}, got {fields!r}")
+        return PairForm(wanted, None, planes)
+    if isinstance(keys, Mapping):
+        if not keys or not set(keys.values()) <= set(FIELDS):
+            raise ValueError(f"keys are a mapping of names to {', '.join(FIELDS)}, got {dict(keys)!r}")
+        return PairForm(tuple(keys.values()), tuple(keys), planes)
     if keys is None:
-        return None
-    named = () if isinstance(keys, str) else tuple(keys)
-    if not 1 <= len(named) <= len(RawPair._fields) or len(set(named)) < len(named):
-        wanted = ", ".join(RawPair._fields)
-        raise ValueError(f'keys are different names for {wanted}, in this order, as ("noisy", "clean"); got {keys!r}')
-    return named
+        return PairForm(planes=planes)
+
+    names = () if isinstance(keys, str) else tuple(keys)
+    if not 1 <= len(names) <= len(RawPair._fields) or len(set(names)) < len(names):
+        listed = ", ".join(RawPair._fields)
+        raise ValueError(f'keys are different names for {listed}, in this order, as ("noisy", "clean"); got {keys!r}')
+    return PairForm(RawPair._fields[: len(names)], names, planes)
+
+
+def _planes_of(order: str | Sequence[str]) -> tuple[int, ...]:
+    if isinstance(order, str) and order in _ORDERS:
+        return _ORDERS[order]
+    names: list[str] = []
+    for letter in order:
+        if letter == "G":
+            letter = "Gb" if "Gr" in names else "Gr"
+        names.append(letter)
+    if sorted(names) != sorted(RAW_PLANES):
+        raise ValueError(f"order must be a CFA, RGBG or the like, or four of {', '.join(RAW_PLANES)}; got {order!r}")
+    return tuple(RAW_PLANES.index(name) for name in names)
 
 
 def save_params(params: AugmentParams, path: str | Path) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,12 +35,16 @@ Where = str | int | None
 """Where the picture is in a sample: a key, an index, or None if the sample is the picture."""
 
 
-def to_rgb_tensor(picture: Any) -> Tensor:
+def to_rgb_tensor(picture: Any, bgr: bool = False) -> Tensor:
     """Convert a picture to ``(3, H, W)``, uint8 or float32.
 
     The axis of length 1, 3 or 4 holds the channels; where both ends could, it is the first of a tensor and the last of
     an array. 8 bits and floats keep their values. Floats may pass half an 8-bit level beyond [0, 1], as resizing leaves
     them; they are checked on the CPU only, because elsewhere that would stall the device.
+
+    Args:
+        picture: as the module lists them.
+        bgr: whether its channels are in the order B, G, R, as ``cv2.imread`` gives them.
 
     Raises:
         ValueError: if it is no picture, or has values outside [0, 1].
@@ -48,20 +53,22 @@ def to_rgb_tensor(picture: Any) -> Tensor:
     if image.ndim == 2:
         image = image[None]
     if image.ndim != 3:
-        raise ValueError(f"a picture must be (3, H, W), (H, W, 3), grey or RGBA, got {_describe(picture)}")
-    return _rgb(image, picture)
+        raise ValueError(f"a picture must be (3, H, W), (H, W, 3), grey or RGBA, got {describe(picture)}")
+    rgb = _rgb(image, picture)
+    return rgb.flip(-3) if bgr else rgb
 
 
-def to_rgb_batch(pictures: Any) -> Tensor:
+def to_rgb_batch(pictures: Any, bgr: bool = False) -> Tensor:
     """Convert a batch to ``(B, 3, H, W)``, uint8 or float32; a single picture is a batch of one."""
     if is_picture(pictures):
-        return to_rgb_tensor(pictures)[None]
+        return to_rgb_tensor(pictures, bgr)[None]
     if isinstance(pictures, Sequence):
-        return stack_pictures([to_rgb_tensor(picture) for picture in pictures])
+        return stack_pictures([to_rgb_tensor(picture, bgr) for picture in pictures])
     image = _as_tensor(pictures)
     if image.ndim != 4:
-        raise ValueError(f"a batch must be (B, 3, H, W), (B, H, W, 3) or a list, got {_describe(pictures)}")
-    return _rgb(image, pictures)
+        raise ValueError(f"a batch must be (B, 3, H, W), (B, H, W, 3) or a list, got {describe(pictures)}")
+    rgb = _rgb(image, pictures)
+    return rgb.flip(-3) if bgr else rgb
 
 
 def stack_pictures(images: Sequence[Tensor]) -> Tensor:
@@ -118,7 +125,7 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
             raise ValueError(f"key={key!r}: samples are tuples of {len(sample)}; give the index of the picture")
         return where % len(sample)
     if key is not None:
-        raise ValueError(f"key={key!r}: samples are neither mappings nor tuples but {_describe(sample)}; omit key")
+        raise ValueError(f"key={key!r}: samples are neither mappings nor tuples but {describe(sample)}; omit key")
     return None
 
 
@@ -172,9 +179,13 @@ def _as_tensor(picture: Any) -> Tensor:
         if picture.mode not in _PIL_AS_RGB + _PIL_AS_IS:
             raise ValueError(f"a PIL image of mode {picture.mode!r} is not sRGB; convert it to RGB first")
         picture = picture.convert("RGB") if picture.mode in _PIL_AS_RGB else picture
+    if isinstance(picture, (str, Path)):
+        raise ValueError(
+            f"a picture must be read first, got the path {str(picture)!r:.100}; a folder's path is a dataset"
+        )
     array = np.array(picture)
     if array.dtype.kind not in "uif" or array.dtype.itemsize > 8:
-        raise ValueError(f"a picture must be a tensor, a NumPy array or a PIL image, got {_describe(picture)}")
+        raise ValueError(f"a picture must be a tensor, a NumPy array or a PIL image, got {describe(picture)}")
     return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
 
 
@@ -182,12 +193,12 @@ def _rgb(image: Tensor, original: Any) -> Tensor:
     """``(..., C, H, W)`` or ``(..., H, W, C)`` to ``(..., 3, H, W)``, uint8 or float32."""
     first, last = (image.shape[axis] in _CHANNELS for axis in (-3, -1))
     if not (first or last):
-        raise ValueError(f"a picture must be (3, H, W), (H, W, 3), grey or RGBA, got {_describe(original)}")
+        raise ValueError(f"a picture must be (3, H, W), (H, W, 3), grey or RGBA, got {describe(original)}")
     trailing = last and not (first and isinstance(original, Tensor))
     image = image.movedim(-1, -3) if trailing else image
     if image.shape[-3] == 4 and image.is_floating_point() and not (trailing and isinstance(original, np.ndarray)):
         raise ValueError(
-            f"{_describe(original)} has four channels: is this packed RAW? It needs sRGB; of RGBA pass the first three"
+            f"{describe(original)} has four channels: is this packed RAW? It needs sRGB; of RGBA pass the first three"
         )
     image = image.expand(*image.shape[:-3], 3, -1, -1) if image.shape[-3] == 1 else image[..., :3, :, :]
     if image.dtype == torch.uint8:
@@ -200,7 +211,8 @@ def _rgb(image: Tensor, original: Any) -> Tensor:
     return image.float()
 
 
-def _describe(value: Any) -> str:
+def describe(value: Any) -> str:
+    """Say what a value is, for messages: its type, and the shape of a tensor or array."""
     if isinstance(value, (Tensor, np.ndarray)):
         return f"{type(value).__name__} of shape {tuple(value.shape)}, {value.dtype}"
     return type(value).__name__

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from typing import Literal
 
 import torch
@@ -148,8 +149,10 @@ class Burst:
     def __post_init__(self) -> None:
         if not isinstance(self.frames, int) or self.frames < 1:
             raise ValueError(f"burst must be a number of frames, at least 1, got {self.frames!r}")
-        if len(self.motion) != 2 or not min(self.motion) >= 0:
+        if len(self.motion) != 2 or not all(_is_finite(most) and most >= 0 for most in self.motion):
             raise ValueError(f"motion must be (pixels, degrees), both at least 0, got {self.motion}")
+        if self.stops is not None and not all(_is_finite(stop) for stop in self.stops):
+            raise ValueError(f"stops must be finite numbers, got {self.stops}")
         if self.stops is not None and len(self.stops) != self.frames:
             raise ValueError(f"stops must be one exposure for each of {self.frames} frames, got {len(self.stops)}")
 
@@ -174,6 +177,10 @@ class Burst:
         stops = torch.tensor(self.stops or (0.0,) * self.frames, device=frames.device)
         stops = stops.repeat(len(frames) // self.frames)
         return (frames * torch.exp2(stops)[:, None, None, None]).clamp_max(1.0)
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, Real) and math.isfinite(value)
 
 
 def move(image: Tensor, motion: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from rawaug.data.pairs import Sample
 from rawaug.isp.stages import as_float
 from rawaug.noise.levels import uniform
 from rawaug.noise.models import Params, draw_normals, draw_seeds, per_picture, poisson
-from rawaug.plugin.dataset import crop_size, draw_patch
+from rawaug.plugin.crops import crop_size, draw_patch
 from rawaug.plugin.finishing import blur
 from rawaug.plugin.targets import compress_jpeg
 from rawaug.registry import Spec, check_settings, require_between, split_spec, suggest

@@ -24,7 +24,8 @@ from rawaug import bayer
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import RawPairs, RawPairStream, draw_crop
+from rawaug.plugin.crops import draw_crop
+from rawaug.plugin.dataset import RawPairs, RawPairStream
 from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
 
@@ -177,7 +178,7 @@ def test_what_makes_pairs_may_be_a_name(pictures: list[Tensor]) -> None:
     assert next(iter(wrap([pictures[0][None]], "universal"))).noisy.shape == (1, 4, 10, 17)
     assert RawPairs(pictures, "universal", crop=None)[0].noisy.shape == (4, 10, 17), "whole, without the odd line"
     with pytest.raises(TypeError, match="path"):
-        RawPairs(pictures, 3)  # type: ignore[arg-type]
+        RawPairs(pictures, 3)  # type: ignore[call-overload]
     with pytest.raises(FileNotFoundError, match="nosuch"):
         RawPairs(pictures, Path("nosuch.safetensors"))
 
@@ -271,7 +272,8 @@ def test_a_dataset_and_a_stream_show_the_same_parameters_and_what_they_draw(
     )
     assert of_dataset[:4] == ["dataset", "augment", "crop", "seed"]
     assert of_stream[: len(of_dataset)] == of_dataset
-    assert of_loader[1:] == [name for name in of_dataset[1:] if name in of_loader] + ["device"]
+    of_batches = ["device", "batch_size", "shuffle"]
+    assert of_loader[1:] == [name for name in of_dataset[1:] if name in of_loader] + of_batches
     pairs, stream = (
         RawPairs(pictures, augment, crop=(16, 12)),
         RawPairStream(iter(pictures), augment, crop=None, seed=3),

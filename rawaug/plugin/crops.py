@@ -1,0 +1,122 @@
+"""Crops and turns of pictures: drawn first, cut out after, as :class:`rawaug.AugmentParams` keeps them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, SupportsIndex
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from rawaug import bayer
+from rawaug.kernels.runtime import one_thread
+from rawaug.plugin.pictures import to_rgb_tensor, trim_to_even
+
+
+def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
+    """Height and width of a crop that is given as a side or as both; None means whole pictures.
+
+    Raises:
+        ValueError: if a side is odd, or it is neither.
+    """
+    if crop is None:
+        return None
+    sides: tuple[Any, ...] = ()
+    if isinstance(crop, SupportsIndex):
+        sides = (crop, crop)
+    elif isinstance(crop, Sequence):
+        sides = tuple(crop)
+    if len(sides) != 2 or not all(isinstance(side, SupportsIndex) for side in sides):
+        raise ValueError(f"crop must be an even side or (height, width), got {crop!r}")
+    height, width = (int(side) for side in sides)
+    return bayer.RandomCrop((height, width)).size
+
+
+def draw_crop(
+    picture: Tensor, size: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
+) -> Tensor:
+    """Draw where a picture is cropped and how the crop is turned, as :class:`AugmentParams` keeps it.
+
+    Args:
+        picture: ``(3, H, W)`` with even sides.
+        size: height and width of the crop; None for the whole picture.
+        turns: whether flips are drawn, and, of a square, quarter turns.
+        generator: on the CPU.
+        zoom: half of the crops are enlarged by up to this factor.
+
+    Returns:
+        ``(5,)`` top, left, H, W, view; with a zoom ``(6,)``, where the last is the number of rows that are enlarged.
+    """
+    height, width = picture.shape[-2:]
+    region = size or (height, width)
+    if size and zoom > 1.0:
+        share, exponent = torch.rand(2, generator=generator).tolist()
+        rows = size[0]
+        if share >= 0.5:
+            rows = math.ceil(size[0] / 2 * zoom**-exponent) * 2
+        smaller = draw_crop(picture, _region(size, rows), turns, generator)
+        return torch.cat([smaller, torch.tensor([rows])])
+
+    corner = bayer.RandomCrop(region).sample(height, width, generator)
+    view = torch.tensor(0)
+    if turns:
+        view = bayer.RandomTurn(bayer.CFA.RGGB, quarter=region[0] == region[1]).sample(generator)
+    return torch.cat([corner, torch.tensor([height, width]), view[None]])
+
+
+def draw_patch(
+    picture: Any,
+    size: tuple[int, int] | None,
+    turns: bool,
+    generator: torch.Generator,
+    zoom: float = 1.0,
+    bgr: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Draw a crop of a picture in any form, and cut it out.
+
+    Args:
+        picture: in any form that :mod:`rawaug.plugin.pictures` lists.
+        size: height and width of the crop; None for the whole picture.
+        turns, generator, zoom: as for :func:`draw_crop`.
+        bgr: whether the picture's channels are in the order B, G, R.
+
+    Returns:
+        The patch ``(3, *size)``, uint8 or float32, and its crop ``(5,)`` or ``(6,)``.
+    """
+    whole = trim_to_even(to_rgb_tensor(picture, bgr))
+    place = draw_crop(whole, size, turns, generator, zoom)
+    return cut_patch(whole, place, size), place
+
+
+def cut_patch(picture: Tensor, crop: Tensor, size: tuple[int, int] | None) -> Tensor:
+    """Cut the patch ``(3, *size)`` that a drawn crop ``(5,)`` or ``(6,)`` means out of a whole picture ``(3, H, W)``.
+
+    Raises:
+        ValueError: if the crop was drawn for a picture of another size.
+    """
+    top, left, height, width, view, rows = (*crop.tolist(), 0)[:6]
+    if picture.shape[-2:] != (height, width):
+        raise ValueError(f"the parameters belong to a picture of {height} x {width}, got {tuple(picture.shape[-2:])}")
+    region = _region(size, rows) if size else (height, width)
+    patch = bayer.crop(picture, top, left, *region)
+    if size and patch.shape[-2:] != size:
+        patch = enlarge(patch, size)
+    return bayer.turn(patch, view).contiguous()
+
+
+def _region(size: tuple[int, int], rows: int) -> tuple[int, int]:
+    """Even height and width of the ``rows`` that are enlarged to the crop; 0 rows for the crop itself."""
+    if not rows:
+        return size
+    return rows, math.ceil(size[1] * rows / size[0] / 2) * 2
+
+
+def enlarge(patch: Tensor, size: tuple[int, int]) -> Tensor:
+    """Enlarge a patch ``(3, h, w)`` to ``(3, *size)`` by bicubic interpolation; it keeps its type, uint8 or float."""
+    with one_thread():  # the same bits everywhere
+        larger = F.interpolate(patch[None].float(), size=size, mode="bicubic", align_corners=False)[0]
+    if patch.dtype == torch.uint8:
+        return larger.round_().clamp_(0, 255).to(torch.uint8)
+    return larger.clamp_(0.0, 1.0).to(patch.dtype)
