@@ -584,8 +584,8 @@ def _shot_read(spec: NoiseSpec | NoiseLevels, iso: Iso = None, poisson: bool = F
 
 _DRAWS = 2**14
 
-TYPICAL_SIGNAL = 0.06
-"""Geometric mean of the mean signals of photographs that the ISP ``universal`` made RAW."""
+TYPICAL_SIGNAL = 0.104
+"""Geometric mean of the mean signals of 137 photographs, each made RAW by four draws of the ISP ``universal``."""
 
 
 class ScaledLevels:
@@ -609,7 +609,8 @@ class CalibratedNoise(ShotReadNoise):
     Args:
         pair_psnr: in dB, over all pairs; a single one scatters as the law and the pictures do.
         signal: mean signal of the clean RAW, a number or one for each of some pictures; by default that of photographs
-            made RAW by ``universal``.
+            made RAW by ``universal``. Of other pictures or another ISP measure it, by
+            :meth:`rawaug.RawAugment.measure_signals`.
         levels: the law that is scaled, as :func:`rawaug.noise.noise_levels` knows it.
 
     Raises:

@@ -13,7 +13,7 @@ and the parameters replay the pair bit for bit. :mod:`rawaug.plugin.dataset` put
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy, deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, overload
@@ -415,6 +415,32 @@ class RawAugment(nn.Module):
     def device(self) -> torch.device:
         """The device that pairs are made on."""
         return self.isp.gain.log_gains.device
+
+    @torch.no_grad()
+    def measure_signals(self, pictures: Iterable[Any], draws: int = 4, seed: int = 0) -> list[float]:
+        """Measure the mean signal of the clean RAW that pictures become, for noise of a stated PSNR of their pairs.
+
+        Args:
+            pictures: some of those that are trained on, in any form that :mod:`rawaug.plugin.pictures` lists.
+            draws: camera settings that are drawn for each.
+            seed: of these draws.
+
+        Returns:
+            Mean signals, white = 1, one for each picture and draw.
+
+        Example:
+            >>> from rawaug.noise import CalibratedNoise
+            >>> augment = RawAugment(DictionaryISP())
+            >>> noise = CalibratedNoise(41.18, signal=augment.measure_signals([torch.rand(3, 32, 32)]))
+            >>> calibrated = augment.with_draws(noise)
+        """
+        signals = []
+        for number, picture in enumerate(pictures):
+            generator = keyed_generator(seed, "signals", number)
+            batch = self.as_batch(picture).to(self.device).expand(draws, -1, -1, -1)
+            clean = self._clean(batch, self._sample(batch, generator, None))
+            signals += clean.mean((1, 2, 3)).clamp(1e-6, 1.0).tolist()
+        return signals
 
     # -- pictures as a Dataset or a loader hands them over ------------------------------------------------------------
 

@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader, Dataset, default_collate
 
 from rawaug.isp.config import ISPConfig, ISPParams
 from rawaug.isp.model import DictionaryISP
+from rawaug.noise import CalibratedNoise
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.draw import Draw
@@ -303,3 +304,15 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         load_params(tmp_path / "text.safetensors")
     with pytest.raises(ValueError, match="crop missing"):
         AugmentParams.from_tensors({f"isp.{name}": torch.zeros(1) for name in ISPParams._fields})
+
+
+def test_noise_is_calibrated_to_the_pictures_and_the_isp_at_hand(augment: RawAugment) -> None:
+    pictures = [torch.full((3, 64, 64), level) for level in (0.2, 0.5, 0.8)]
+    law = (1e-3, 1e-6)
+    noise = CalibratedNoise(38.0, augment.measure_signals(pictures, draws=16), law)
+    calibrated = augment.with_draws(noise)
+    found = []
+    for picture in pictures:
+        pair = calibrated(picture.expand(32, -1, -1, -1), torch.Generator().manual_seed(1))
+        found.append(-10.0 * (pair.noisy - pair.clean).square().mean((1, 2, 3)).log10())
+    assert float(torch.cat(found).mean()) == pytest.approx(38.0, abs=0.4)
