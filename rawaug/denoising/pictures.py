@@ -1,44 +1,35 @@
 r"""What denoises developed pictures, sRGB ``(1, 3, H, W)`` in [0, 1], beside :class:`rawaug.RawDenoiser` for RAW.
 
-.. math:: d = f(x, \sigma), \qquad \sigma = s \sqrt{K r} / (1 + (D / r)^6)
+.. math:: d = x + w\, (f(x, s \sigma) - x)
 
-A network f that is told the level of the noise, its standard deviation :math:`\sigma`, also works where it is unknown,
-the level being 0. What it takes away then, x - f(x, 0), tells the level: r is the lower quartile of its deviation over
-squares of 16 x 16, which texture hardly moves. The estimate is unsure, since noise and detail are alike, so that the
-network does best when it is told the geometric mean of it and a usual level K; and a picture of which no more than D is
-taken away is clean. K and D are chosen on validation pictures. The strength s is 1 unless the user says otherwise.
-FFDNet, which needs a level, is told scikit-image's estimate. A network of this kind sees the picture twice, upright and
-turned by a quarter, estimates the level of each, and the mean is taken: half of what the self-ensemble gains, the mean
-of eight turns as for RAW.
+A network f is told the level of the noise, its standard deviation :math:`\sigma`, and the share w of its correction is
+applied; both are estimated from the picture, see :mod:`rawaug.denoising.picture_levels`. The strength s is 1 unless the
+user says otherwise. A network that estimates the level sees the picture twice, upright and turned by a quarter, and the
+mean is taken: half of what the self-ensemble gains, the mean of eight turns as for RAW.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 import denoisers
 from denoisers.classical import FILTERS
 from denoisers.files import find_denoiser, list_shipped
 from rawaug import bayer
 from rawaug.denoising.denoiser import CPU, Noisy, progress_by
+from rawaug.denoising.picture_levels import estimate_level, white_level
 from rawaug.denoising.weights import read_network
-from rawaug.errors import extra
 from rawaug.kernels.runtime import find_device, has_fast_bfloat16
 from rawaug.registry import Spec, spec_label, suggest
 
 PICTURES = "rawaug-srgb"
 """The default picture denoiser."""
-USUAL, CLEAN = 20.0 / 255.0, 1.0 / 255.0
-"""K, measured on CC15, and D, measured on clean photographs."""
-_SAMPLED, _SIDE, _SQUARE = 3, 256, 16
-"""For estimating the level: the number of parts in both directions, their side, and the side of the squares in them."""
 _TILE = 1280
 """Side of a tile; the default denoiser needs more than 2 GB for 12 megapixels at once."""
 TURNS = {1: (0,), 2: (0, 5), 4: range(4), 8: range(bayer.N_VIEWS)}
@@ -106,7 +97,7 @@ class PictureDenoiser:
         denoiser = FILTERS.make(spec)
 
         def run(srgb: Tensor) -> Tensor:
-            deviation = max(1e-4, strength * _white_level(srgb) if level is None else level)
+            deviation = max(1e-4, strength * white_level(srgb) if level is None else level)
             planes = (srgb[0] / deviation).permute(1, 2, 0).contiguous().numpy()
             return torch.from_numpy(deviation * denoiser.denoise(planes)).permute(2, 0, 1)[None].float()
 
@@ -121,7 +112,12 @@ class PictureDenoiser:
         def run(srgb: Tensor) -> Tensor:
             if not getattr(network, "reads_variance", False):
                 return denoisers.denoise_tiles(network, srgb, each=progress_by("tile"))
-            return _denoise_at(network, srgb, strength * estimate_level(network, srgb)) if strength else srgb
+            if strength == 0.0:
+                return srgb
+
+            noise = estimate_level(network, srgb)
+            denoised = _denoise_at(network, srgb, strength * noise.level)
+            return torch.lerp(srgb, denoised, noise.share)
 
         return cls(name, run, where)
 
@@ -164,30 +160,3 @@ def _denoise_at(network: Any, srgb: Tensor, level: float) -> Tensor:
     """The picture denoised by a network that is told the deviation of its noise, 0 for unknown."""
     variance = srgb.new_full((1, 1, 1, 1), level**2).expand_as(srgb)
     return denoisers.denoise_tiles(network, srgb, variance, tile=_TILE, each=progress_by("tile")).float()
-
-
-def estimate_level(network: Any, srgb: Tensor) -> float:
-    """The deviation that a network of pictures is told for ``(1, 3, H, W)``: see the module."""
-    if not getattr(network, "light", False):  # it cannot do without a level
-        return _white_level(srgb)
-    removed = [(part - network(part, torch.zeros_like(part))).float().square().mean(1) for part in _spread_parts(srgb)]
-    side = min(_SQUARE, *srgb.shape[-2:])
-    local = torch.cat([F.avg_pool2d(power, side).flatten() for power in removed]).sqrt().quantile(0.25)
-    return float((USUAL * local).sqrt() / (1.0 + (CLEAN / local.clamp_min(1e-6)) ** 6))
-
-
-def _white_level(srgb: Tensor) -> float:
-    with extra("raw"):
-        from skimage.restoration import estimate_sigma
-
-    return float(estimate_sigma(srgb[0].cpu().numpy(), channel_axis=0, average_sigmas=True))
-
-
-def _spread_parts(srgb: Tensor) -> Iterator[Tensor]:
-    """Squares that are spread over a picture, or the whole of a small one."""
-    height, width = srgb.shape[-2:]
-    tops, lefts = (sorted({(side - _SIDE) * k // (_SAMPLED - 1) for k in range(_SAMPLED)}) if side > _SIDE else [0]
-                   for side in (height, width))  # fmt: skip
-    for top in tops:
-        for left in lefts:
-            yield srgb[..., top : top + _SIDE, left : left + _SIDE].contiguous()
