@@ -28,7 +28,7 @@ from rawaug.errors import extra
 
 USUAL_LEVEL = 20.0 / 255.0
 """The usual level K, a standard deviation on the scale where white is 1."""
-OFFSET, BY_LEVEL, BY_UNEVENNESS = 3.3, 0.6, 9.0
+OFFSET, BY_LEVEL, BY_UNEVENNESS = 4.0, 0.6, 11.0
 """The constants a, b and c of the share."""
 
 _PARTS, _PART, _SQUARE = 3, 256, 16
