@@ -35,7 +35,6 @@ from rawaug.io.carried import (
     ASCII,
     BYTE,
     DOUBLE,
-    INTEROPERABILITY,
     LONG,
     RATIONAL,
     SHORT,
@@ -43,12 +42,12 @@ from rawaug.io.carried import (
     SUB_DIRECTORIES,
     UNDEFINED,
     Carried,
-    Entry,
     Preview,
     Tags,
     read_carried,
 )
 from rawaug.io.damage import tiled_digest
+from rawaug.io.directories import INTEROPERABILITY, Tag, pack_directory, pointer_tag
 from rawaug.io.gain_map import GainMap, of_planes, opcode_list
 from rawaug.io.raw import MONOCHROME, XYZ_FROM_SRGB, RawFrame
 from rawaug.io.tiff import (
@@ -333,24 +332,24 @@ def xyz_to_camera(frame: RawFrame) -> np.ndarray:
     return np.asarray(balanced / np.array(frame.daylight)[:, None])
 
 
-def _exif(frame: RawFrame, byte_order: str) -> list[Entry]:
+def _exif(frame: RawFrame, byte_order: str) -> list[Tag]:
     """ISO and exposure as an EXIF directory, with the version of EXIF that it follows; empty where nothing is known."""
     shot = frame.exposure
     entries = []
     for code, value in ((33434, shot.seconds), (33437, shot.f_number), (37386, shot.focal_length)):
         if value is not None:
-            entries.append(Entry(code, RATIONAL, 1, struct.pack(byte_order + "2I", *_rationals([value]))))
+            entries.append(Tag(code, RATIONAL, 1, struct.pack(byte_order + "2I", *_rationals([value]))))
 
     if frame.iso is not None:
-        entries.append(Entry(34855, SHORT, 1, struct.pack(byte_order + "H", min(round(frame.iso), _LARGEST_ISO))))
+        entries.append(Tag(34855, SHORT, 1, struct.pack(byte_order + "H", min(round(frame.iso), _LARGEST_ISO))))
         if frame.iso > _LARGEST_ISO:  # EXIF 2.3: the sensitivity is then the recommended exposure index
-            entries.append(Entry(34864, SHORT, 1, struct.pack(byte_order + "H", 2)))
-            entries.append(Entry(34866, LONG, 1, struct.pack(byte_order + "I", round(frame.iso))))
+            entries.append(Tag(34864, SHORT, 1, struct.pack(byte_order + "H", 2)))
+            entries.append(Tag(34866, LONG, 1, struct.pack(byte_order + "I", round(frame.iso))))
 
     if shot.date is not None:
-        entries.append(Entry(36867, ASCII, len(shot.date) + 1, shot.date.encode() + b"\0"))
+        entries.append(Tag(36867, ASCII, len(shot.date) + 1, shot.date.encode() + b"\0"))
     if entries:
-        entries.append(Entry(36864, UNDEFINED, 4, b"0230"))
+        entries.append(Tag(36864, UNDEFINED, 4, b"0230"))
     return entries
 
 
@@ -368,14 +367,14 @@ def _rationals(values: Iterable[float], denominator: int = 10**6) -> tuple[int, 
 # -- directories -------------------------------------------------------------------------------------------------------
 
 
-def _append_directories(path: Path, directories: dict[str, list[Entry]], carried: Carried) -> None:
+def _append_directories(path: Path, directories: dict[str, list[Tag]], carried: Carried) -> None:
     """Write sub-directories and previews behind the pixels, and have the first directory point at them."""
     with path.open("r+b") as file:
         order = "<" if file.read(2) == b"II" else ">"
         for name, entries in directories.items():
             if name == "ExifTag" and carried.interoperability:
                 place = _append(file, order, carried.interoperability)
-                entries = [*entries, Entry(INTEROPERABILITY, LONG, 1, struct.pack(order + "I", place))]
+                entries = [*entries, pointer_tag(order, INTEROPERABILITY, place)]
             place = _append(file, order, entries)
             _point(file, order, SUB_DIRECTORIES[name], [place])
 
@@ -389,20 +388,11 @@ def _append_directories(path: Path, directories: dict[str, list[Entry]], carried
             file.write(struct.pack(order + "H", LINEAR_PHOTOMETRIC))
 
 
-def _append(file: BinaryIO, order: str, entries: Sequence[Entry]) -> int:
-    """Write a directory at the end of a file, with the values that do not fit into it behind it; its place."""
+def _append(file: BinaryIO, order: str, entries: Sequence[Tag]) -> int:
+    """Write a directory at the end of a file and return its place."""
     start = _even_end(file)
-    beyond = start + 2 + 12 * len(entries) + 4
-    table, values = struct.pack(order + "H", len(entries)), b""
-    for entry in sorted(entries, key=lambda entry: entry.code):
-        table += struct.pack(order + "HHI", entry.code, entry.dtype, entry.values)
-        if len(entry.data) <= 4:
-            table += entry.data.ljust(4, b"\0")
-        else:
-            table += struct.pack(order + "I", beyond + len(values))
-            values += entry.data + bytes(len(entry.data) % 2)
     file.seek(start)
-    file.write(table + bytes(4) + values)
+    file.write(pack_directory(order, entries, start))
     return start
 
 
@@ -414,10 +404,10 @@ def _append_preview(file: BinaryIO, order: str, preview: Preview) -> int:
         file.write(segment)
 
     entries = [entry for entry in preview.entries if entry.code != _SUBFILE_TYPE]
-    entries.append(Entry(_SUBFILE_TYPE, LONG, 1, struct.pack(order + "I", 1)))
+    entries.append(Tag(_SUBFILE_TYPE, LONG, 1, struct.pack(order + "I", 1)))
     lengths = [len(segment) for segment in preview.segments]
     for code, numbers in zip(preview.codes, (places, lengths), strict=True):
-        entries.append(Entry(code, LONG, len(numbers), struct.pack(f"{order}{len(numbers)}I", *numbers)))
+        entries.append(Tag(code, LONG, len(numbers), struct.pack(f"{order}{len(numbers)}I", *numbers)))
     return _append(file, order, entries)
 
 

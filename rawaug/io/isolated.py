@@ -1,9 +1,9 @@
-"""Decoding in a helper process, where a file from a stranger must not crash or hang what matters.
+"""Decoding in a helper process, so that a damaged or hostile file cannot crash or hang the main process.
 
-LibRaw, OpenImageIO, SciPy and HDF5 are C and C++ code. :func:`isolated` runs a reader of theirs in a process that loky
-keeps: one that dies, or takes longer than ``RAWAUG_READ_SECONDS`` (60 by default), ends in an OSError that names the
-file, and the next file gets a new process. ``data check``, ``denoise``, ``hdr`` and MATLAB files are read like this;
-training reads in the workers of its DataLoader, at full speed.
+LibRaw, OpenImageIO, SciPy and HDF5 are C and C++ code. :func:`isolated` calls their readers in a process managed by
+loky. If the process dies, or needs more than ``RAWAUG_READ_SECONDS`` (60 by default), the caller gets an OSError that
+names the file, and the next file gets a new process. ``data check``, ``denoise``, ``hdr`` and the reader of MATLAB
+files use it. Training reads in the workers of its DataLoader, at full speed.
 """
 
 from __future__ import annotations
@@ -31,23 +31,32 @@ _one_at_a_time = threading.Lock()
 def isolated(read: Callable[..., T], *arguments: Any, name: object = None) -> T:
     """Call ``read(*arguments)`` in a helper process, or directly in a worker process or if the limit is 0."""
     seconds = time_limit()
-    if not seconds or multiprocessing.parent_process() is not None:
+    is_worker = multiprocessing.parent_process() is not None
+    if not seconds or is_worker:
         return read(*arguments)
+
     if name is None and arguments:
         name = arguments[0]
+
     with _one_at_a_time:
         try:
-            _helper().submit(_known, read).result()  # what it has to import is no part of the limit
-            value: T = _helper().submit(_in_folder, Path.cwd(), read, arguments).result(seconds)
-            return value
+            _helper().submit(_import_module, read).result()  # imports do not count towards the limit
+            value: T = _helper().submit(_call_in_folder, Path.cwd(), read, arguments).result(seconds)
         except TimeoutError:
             _stop_helper()
             raise OSError(f"{name}: cannot be read within {seconds:g} s ({LIMIT}); {_ADVICE}") from None
         except BrokenProcessPool as error:
             _stop_helper()
-            how = re.search(r"exit codes? .*\{(.*)\}", str(error))
-            why = f" ({how[1]})" if how else ""
-            raise OSError(f"{name}: crashes the decoder{why}; {_ADVICE}") from None
+            raise OSError(f"{name}: crashes the decoder{_exit_code(error)}; {_ADVICE}") from None
+    return value
+
+
+def _exit_code(error: BrokenProcessPool) -> str:
+    """The exit code in loky's message, in brackets after a space; empty if the message has none."""
+    match = re.search(r"exit codes? .*\{(.*)\}", str(error))
+    if match is None:
+        return ""
+    return f" ({match[1]})"
 
 
 @contextmanager
@@ -63,12 +72,13 @@ def damage_as_os_error(path: Path, what: str, *passed: type[Exception]) -> Itera
 
 
 def time_limit() -> float:
-    """Seconds that a file may take; 0 to read it in this process."""
+    """Maximum number of seconds for reading a file; 0 means that files are read in this process."""
     text = os.environ.get(LIMIT, str(SECONDS))
     try:
         seconds = float(text)
     except ValueError:
         seconds = -1.0
+
     if not 0 <= seconds < float("inf"):
         raise ValueError(f"{LIMIT}={text}: must be a number of seconds, or 0 to read in the same process")
     return seconds
@@ -79,10 +89,14 @@ def _helper() -> Any:
     """loky starts it without importing the user's script again, unlike multiprocessing's forkserver."""
     from loky import ProcessPoolExecutor
 
-    # the helper reads in its own process, and a crash is reported here, not by a traceback of its own
+    # the helper has no helper of its own, and the parent reports a crash, so that no traceback is printed
     env = {LIMIT: "0", "PYTHONFAULTHANDLER": "", "OPENBLAS_NUM_THREADS": "1"}
-    interrupts = signal.SIGINT, signal.SIG_IGN  # they are for the parent
-    return ProcessPoolExecutor(1, timeout=_IDLE_SECONDS, initializer=signal.signal, initargs=interrupts, env=env)
+
+    # only the parent handles Ctrl-C
+    ignore_interrupts = (signal.SIGINT, signal.SIG_IGN)
+    return ProcessPoolExecutor(
+        max_workers=1, timeout=_IDLE_SECONDS, initializer=signal.signal, initargs=ignore_interrupts, env=env
+    )
 
 
 def _stop_helper() -> None:
@@ -90,11 +104,11 @@ def _stop_helper() -> None:
     _helper.cache_clear()
 
 
-def _known(read: Callable[..., Any]) -> None:
-    """Unpickling the function has imported its module."""
+def _import_module(read: Callable[..., Any]) -> None:
+    """Import the module of a function, which unpickling the argument does."""
 
 
-def _in_folder(folder: Path, read: Callable[..., T], arguments: tuple[Any, ...]) -> T:
+def _call_in_folder(folder: Path, read: Callable[..., T], arguments: tuple[Any, ...]) -> T:
     os.chdir(folder)  # for relative paths
     return read(*arguments)
 

@@ -22,7 +22,7 @@ from rawaug.io.gain_map import GainMap, parse_gain_maps
 from rawaug.io.isolated import damage_as_os_error
 
 MOST_PAGES = 64
-"""Maximum number of directories of a TIFF, as damaged offsets can make circles of them."""
+"""Maximum number of directories in a TIFF. Damaged offsets can link directories in a circle."""
 
 MAKE, MODEL, ORIENTATION, DNG_VERSION, NOISE_PROFILE = 271, 272, 274, 50706, 51041
 _LINEARIZATION, _RAW_DIGEST, _NEW_RAW_DIGEST = 50712, 50972, 51111
@@ -41,12 +41,12 @@ class StoredMosaic:
     """How a DNG stores its mosaic.
 
     Attributes:
-        size: height and width, margins included.
-        compression: TIFF's number; 1 is none, 7 lossless JPEG.
+        size: height and width, including the margins.
+        compression: the TIFF code; 1 means none, 7 means lossless JPEG.
         segments: offset and length in bytes of each strip or tile.
-        plain: whether the stored numbers are whole ones of 9 to 16 bits that no table translates.
+        plain: whether the numbers are integers of 9 to 16 bits without a linearisation table.
         digest: MD5 of the numbers, row by row (RawImageDigest); None if the file has none.
-        tiled_digest: MD5 of the digests of tiles of 256 x 256 (NewRawImageDigest); None if the file has none.
+        tiled_digest: MD5 of the digests of the 256 x 256 tiles (NewRawImageDigest); None if the file has none.
     """
 
     size: tuple[int, int]
@@ -58,8 +58,11 @@ class StoredMosaic:
 
     @property
     def end(self) -> int:
-        """Bytes that the file has at least."""
-        return max((offset + length for offset, length in self.segments), default=0)
+        """Minimum size of the file in bytes."""
+        end = 0
+        for offset, length in self.segments:
+            end = max(end, offset + length)
+        return end
 
 
 @dataclass(frozen=True)
@@ -67,15 +70,15 @@ class TiffTags:
     """Tags of a RAW file; each field has its default where the tag is missing or the file is not a TIFF.
 
     Attributes:
-        make, model: of the camera.
+        make, model: the camera.
         noise_profile: (shot_var, read_var), the mean over planes.
-        noise_fault: what is wrong with a NoiseProfile that cannot be used; empty if nothing is.
-        orientations: EXIF's numbers, of every directory that states one.
-        compressions: TIFF's numbers, of every directory of a DNG.
+        noise_fault: why the NoiseProfile is unusable; empty if it is usable or absent.
+        orientations: the EXIF orientation of each directory that states one.
+        compressions: the TIFF compression code of each directory of a DNG.
         mosaic: how a DNG stores its mosaic.
-        black: levels of a cell that repeats over the active area, ``(rows, columns)``.
-        gain_maps: a DNG's correction of the lens shading.
-        black_rows, black_columns: by how much the level of each row and column differs from their mean.
+        black: black levels of the cell that repeats over the active area, ``(rows, columns)``.
+        gain_maps: the lens shading correction of a DNG.
+        black_rows, black_columns: deviation of the black level of each row and column from the mean.
         area: first row and column of the active area.
         cfa: rows of the pattern's cell, in the letters R, G and B.
     """
@@ -113,12 +116,19 @@ def _tags_of(pages: list[Any]) -> TiffTags:
 
     make = pages[0].tags.valueof(MAKE)
     model = pages[0].tags.valueof(MODEL)
-    orientations = tuple(int(page.tags.valueof(ORIENTATION)) for page in pages if ORIENTATION in page.tags)
-    if not any(DNG_VERSION in page.tags for page in pages):
-        return TiffTags(make, model, orientations=orientations)
+    orientations = []
+    for page in pages:
+        if ORIENTATION in page.tags:
+            orientations.append(int(page.tags.valueof(ORIENTATION)))
+    if not is_dng(pages):
+        return TiffTags(make, model, orientations=tuple(orientations))
 
+    compressions = []
+    for page in pages:
+        compressions.append(int(page.compression))
     profile, fault = _noise_profile(pages)
-    tags = TiffTags(make, model, profile, fault, orientations, tuple(int(page.compression) for page in pages))
+    tags = TiffTags(make, model, profile, fault, tuple(orientations), tuple(compressions))
+
     page = main_mosaic(pages)
     if page is None:
         return tags
@@ -138,12 +148,18 @@ def _tags_of(pages: list[Any]) -> TiffTags:
     )
 
 
+def is_dng(pages: list[Any]) -> bool:
+    """Whether any directory states a DNG version."""
+    return any(DNG_VERSION in page.tags for page in pages)
+
+
 def _stored_mosaic(page: Any, first: Any) -> StoredMosaic:
+    has_integers = page.sampleformat == 1 and 8 < page.bitspersample <= 16
     return StoredMosaic(
         size=(page.imagelength, page.imagewidth),
         compression=int(page.compression),
         segments=tuple(zip(page.dataoffsets, page.databytecounts, strict=True)),
-        plain=8 < page.bitspersample <= 16 and page.sampleformat == 1 and _LINEARIZATION not in page.tags,
+        plain=has_integers and _LINEARIZATION not in page.tags,
         digest=_digest(first, _RAW_DIGEST),
         tiled_digest=_digest(first, _NEW_RAW_DIGEST),
     )
@@ -151,9 +167,14 @@ def _stored_mosaic(page: Any, first: Any) -> StoredMosaic:
 
 def _digest(page: Any, code: int) -> bytes | None:
     value = page.tags.valueof(code)
-    if value is None or len(bytes(value)) != _DIGEST_BYTES or not any(bytes(value)):  # GoPros write zeros
+    if value is None:
         return None
-    return bytes(value)
+
+    digest = bytes(value)
+    is_empty = not any(digest)  # GoPros write zeros
+    if len(digest) != _DIGEST_BYTES or is_empty:
+        return None
+    return digest
 
 
 @contextmanager
@@ -168,18 +189,18 @@ def opened_tiff(path: Path) -> Iterator[Any]:
 
 @contextmanager
 def _quiet_tifffile() -> Iterator[None]:
-    """Keep tifffile's log lines of this thread away: what matters of a file is said by rawaug's own errors."""
+    """Silence tifffile's log messages from this thread; rawaug reports problems through its own errors."""
     logger = logging.getLogger("tifffile")
     thread = threading.get_ident()
 
-    def is_of_others(record: logging.LogRecord) -> bool:
+    def is_from_another_thread(record: logging.LogRecord) -> bool:
         return record.thread != thread
 
-    logger.addFilter(is_of_others)
+    logger.addFilter(is_from_another_thread)
     try:
         yield
     finally:
-        logger.removeFilter(is_of_others)
+        logger.removeFilter(is_from_another_thread)
 
 
 def tag_damage(path: Path) -> AbstractContextManager[None]:
@@ -191,7 +212,7 @@ def tag_damage(path: Path) -> AbstractContextManager[None]:
 
 
 def all_pages(tiff: Any) -> list[Any]:
-    """Every page of a file, those of its SubIFDs after the one that they belong to."""
+    """All pages of a file; the pages of a SubIFD follow their parent."""
     pages = list(islice(_pages(tiff.pages), MOST_PAGES + 1))
     if len(pages) > MOST_PAGES:
         raise ValueError(f"it has more than {MOST_PAGES} directories, or they point at one another in a circle")
@@ -205,18 +226,22 @@ def _pages(pages: Any) -> Iterator[Any]:
 
 
 def main_mosaic(pages: list[Any]) -> Any:
-    """The page that LibRaw reads: of several mosaics, as phones write them, the largest; None without any.
+    """The largest mosaic, which is the page that LibRaw reads; None if there is no mosaic.
 
-    The one plane of a monochrome sensor counts as a mosaic.
+    Phones write several mosaics. The single plane of a monochrome sensor counts as a mosaic.
     """
     mosaics = [page for page in pages if page.photometric == CFA_PHOTOMETRIC]
     if not mosaics:
         mosaics = [page for page in pages if page.photometric == LINEAR_PHOTOMETRIC and page.samplesperpixel == 1]
-    return max(mosaics, key=lambda page: page.imagelength * page.imagewidth, default=None)
+
+    def area(page: Any) -> int:
+        return int(page.imagelength * page.imagewidth)
+
+    return max(mosaics, key=area, default=None)
 
 
 def _noise_profile(pages: list[Any]) -> tuple[tuple[float, float] | None, str]:
-    """The mean over planes of the first profile, and what is wrong with it if it cannot be used."""
+    """The mean over planes of the first profile, and the reason if the profile is unusable."""
     for page in pages:
         tag = page.tags.get(NOISE_PROFILE)
         if tag is None:
@@ -230,13 +255,17 @@ def _noise_profile(pages: list[Any]) -> tuple[tuple[float, float] | None, str]:
         in_range = bool(((values >= 0) & (values <= 1)).all())  # False for NaN, too
         if not in_range or not (shot_vars + read_vars > 0).all():
             return None, f"is out of range: {', '.join(f'{value:g}' for value in values)}"
+
         count = len(shot_vars)
-        return (sum(shot_vars.tolist()) / count, sum(read_vars.tolist()) / count), ""
+        shot_var = sum(shot_vars.tolist()) / count
+        read_var = sum(read_vars.tolist()) / count
+        return (shot_var, read_var), ""
+
     return None, ""
 
 
 def _numbers(tag: Any) -> Any:
-    """The values of a tag, rationals divided, float64 ``(N,)``."""
+    """The values of a tag as float64 ``(N,)``; rationals are divided."""
     values = np.ravel(tag.value).astype(np.float64)
     if tag.dtype not in _RATIONALS:
         return values
@@ -245,43 +274,69 @@ def _numbers(tag: Any) -> Any:
 
 
 def _deltas(mosaic: Any, code: int) -> tuple[float, list[float]]:
-    """Offsets of the black level for each row or column of the active area: their mean, and what is left, if any."""
+    """The mean of the black level offsets of all rows or columns, and the deviation of each from it.
+
+    There are no deviations if the tag is missing or its values are equal.
+    """
     tag = mosaic.tags.get(code)
-    values: list[float] = [] if tag is None else _numbers(tag).tolist()
+    if tag is None:
+        return 0.0, []
+
+    values: list[float] = _numbers(tag).tolist()
     if not np.isfinite(values).all():
         raise ValueError(f"tag {code}: black levels that are not finite")
+
     mean = sum(values) / max(1, len(values))
-    left = [value - mean for value in values]
-    return mean, left if any(left) else []
+    deviations = [value - mean for value in values]
+    if not any(deviations):
+        return mean, []
+    return mean, deviations
 
 
-def _black(mosaic: Any, more: float) -> np.ndarray | None:
-    """Levels of a cell, of any size that the tags give."""
+def _black(mosaic: Any, offset: float) -> np.ndarray | None:
+    """The black levels of the repeating cell, ``(rows, columns)``, plus ``offset``; None if the file states none."""
     tag = mosaic.tags.get(_BLACK)
+    if tag is None and not offset:
+        return None
     if tag is None:
-        return np.full((1, 1), more) if more else None
-    levels = _numbers(tag) + more
+        return np.full((1, 1), offset)
+
+    levels = _numbers(tag) + offset
     if not np.isfinite(levels).all():
         raise ValueError("BlackLevel: levels that are not finite")
+
     rows, columns = mosaic.tags.valueof(_BLACK_REPEATS) or (1, 1)
-    return levels.reshape(rows, columns) if len(levels) == rows * columns else None
+    if len(levels) != rows * columns:
+        return None
+    return np.asarray(levels.reshape(rows, columns))
 
 
 def _cfa(mosaic: Any) -> tuple[str, ...] | None:
-    """The rows of the pattern's cell, of the colours R, G and B; None if it has others."""
-    size, colours = (mosaic.tags.valueof(code) for code in (_CFA_REPEATS, _CFA_PATTERN))
-    if size is None or colours is None or len(colours) != size[0] * size[1] or not set(colours) <= {0, 1, 2}:
+    """The rows of the pattern's cell in the letters R, G and B; None if the cell has other colours."""
+    size = mosaic.tags.valueof(_CFA_REPEATS)
+    colours = mosaic.tags.valueof(_CFA_PATTERN)
+    if size is None or colours is None:
         return None
-    text = "".join("RGB"[colour] for colour in colours)
-    return tuple(text[start : start + size[1]] for start in range(0, len(text), size[1]))
+
+    height, width = size[0], size[1]
+    if len(colours) != height * width or not set(colours) <= {0, 1, 2}:
+        return None
+
+    letters = "".join("RGB"[colour] for colour in colours)
+    rows = []
+    for start in range(0, len(letters), width):
+        rows.append(letters[start : start + width])
+    return tuple(rows)
 
 
 def _gain_maps(mosaic: Any) -> tuple[GainMap, ...]:
-    found: tuple[GainMap, ...] = ()
+    gain_maps: tuple[GainMap, ...] = ()
     for number, code in ((2, OPCODE_LIST_2), (3, OPCODE_LIST_3)):
         opcodes = mosaic.tags.valueof(code)
+        if not opcodes:
+            continue
         try:
-            found += parse_gain_maps(opcodes, on_mosaic=number == 2) if opcodes else ()
+            gain_maps += parse_gain_maps(opcodes, on_mosaic=number == 2)
         except ValueError as error:
             raise ValueError(f"OpcodeList{number}: {error}") from None
-    return found
+    return gain_maps

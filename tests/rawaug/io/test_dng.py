@@ -18,7 +18,8 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, mosaic, pattern, plane_indices
 from rawaug.io import GainMap, RawFrame, develop, dng, read_raw, read_raw_and_develop, write_dng
-from rawaug.io.carried import Entry, read_carried
+from rawaug.io.carried import read_carried
+from rawaug.io.directories import Tag
 from rawaug.io.gain_map import parse_gain_maps
 from rawaug.io.raw import MONOCHROME, Exposure
 
@@ -356,11 +357,11 @@ def test_makers_notes_and_interoperability(safe: bool, tmp_path: Path, bayer_dng
                 if tag.code in (33421, 33422) or tag.code > 50000]  # fmt: skip
     tifffile.imwrite(source, numbers, photometric=32803, metadata=None, extratags=[*kept, *extra])
     with source.open("r+b") as file:
-        inner = dng._append(file, "<", [Entry(1, 2, 4, b"R98\0"), Entry(2, 7, 4, b"0100")])
+        inner = dng._append(file, "<", [Tag(1, 2, 4, b"R98\0"), Tag(2, 7, 4, b"0100")])
         entries = [
-            Entry(37500, 7, 12, b"maker's note"),
-            Entry(40965, 4, 1, struct.pack("<I", inner)),
-            Entry(42036, 2, 8, b"EF 50mm\0"),
+            Tag(37500, 7, 12, b"maker's note"),
+            Tag(40965, 4, 1, struct.pack("<I", inner)),
+            Tag(42036, 2, 8, b"EF 50mm\0"),
         ]
         dng._point(file, "<", 34665, [dng._append(file, "<", entries)])
     write_dng(tmp_path / "a.dng", read_raw(source), source)
