@@ -12,7 +12,6 @@ from rawaug.version import __version__
 
 if TYPE_CHECKING:
     from rawaug.bayer import CFA as CFA
-    from rawaug.camera.fit import fit as fit
     from rawaug.denoising.denoiser import RawDenoiser as RawDenoiser
     from rawaug.denoising.frames import denoise as denoise
     from rawaug.isp.config import ISPConfig as ISPConfig
@@ -38,10 +37,10 @@ if TYPE_CHECKING:
     from rawaug.plugin.targets import Burst as Burst
     from rawaug.plugin.targets import Srgb as Srgb
     from rawaug.synthesis.folder import synth as synth
+    from rawaug.training.camera_fit import fit as fit
 
 _PUBLIC = {
     "rawaug.bayer": ("CFA",),
-    "rawaug.camera.fit": ("fit",),
     "rawaug.denoising.denoiser": ("RawDenoiser",),
     "rawaug.denoising.frames": ("denoise",),
     "rawaug.isp.config": ("ISPConfig", "ISPParams", "ISPResult"),
@@ -56,6 +55,7 @@ _PUBLIC = {
     "rawaug.plugin.params": ("AugmentParams", "RawPair", "load_params", "save_params"),
     "rawaug.plugin.targets": ("Burst", "Srgb"),
     "rawaug.synthesis.folder": ("synth",),
+    "rawaug.training.camera_fit": ("fit",),
 }
 _MODULE_OF = {name: module for module, names in _PUBLIC.items() for name in names}
 

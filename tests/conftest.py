@@ -39,7 +39,7 @@ torch.set_num_threads(1)
 settings.register_profile("rawaug", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("rawaug")
 multiprocessing.set_forkserver_preload(
-    ["rawaug.experiment.run", "rawaug.camera.fit", "rawaug.plugin.dataset", "lightning_fabric"]
+    ["rawaug.experiment.run", "rawaug.training.camera_fit", "rawaug.plugin.dataset", "lightning_fabric"]
 )
 
 

@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 FILES = sorted(file.relative_to(ROOT) for part in ("rawaug", "denoisers") for file in (ROOT / part).rglob("*.py"))
 BASE = {"bayer", "errors", "files", "metrics", "progress", "registry", "seeding", "version"}
 CAMERA = BASE | {"isp", "noise", "kernels", "denoisers"}
-PRODUCT = CAMERA | {"plugin", "data", "io", "synthesis", "camera", "denoising", "evaluation", "training"}
+PRODUCT = CAMERA | {"plugin", "data", "io", "synthesis", "denoising", "evaluation", "training"}
 MAY_IMPORT: dict[str, set[str]] = {
     "bayer": {"seeding"},
     "errors": set(),
@@ -29,13 +29,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),
     "denoisers": {"bayer", "errors", "files", "registry"},
     "kernels": {"bayer", "registry"},
-    "noise": BASE | {"isp", "kernels"},
+    "noise": BASE | {"isp", "io", "kernels"},
     "isp": BASE | {"kernels"},
     "io": BASE,
     "data": BASE | {"io"},
     "plugin": CAMERA | {"data", "io"},
     "synthesis": CAMERA | {"plugin", "data", "io"},
-    "camera": CAMERA | {"data", "io"},
     "denoising": CAMERA | {"io"},
     "evaluation": CAMERA | {"plugin", "data", "io", "denoising"},
     "training": CAMERA | {"plugin", "data", "io", "denoising", "evaluation"},

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from denoisers.files import FOLDER
-from rawaug.camera.psnr_r import psnr_r
 from rawaug.commands import OPTIONS, YAML
 from rawaug.data import open_pairs
 from rawaug.data.folders import Readable
 from rawaug.data.pair_folder import PairSettings
 from rawaug.denoising.denoiser import require_classical
 from rawaug.evaluation.evaluate import Evaluation, require_finite
+from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import Row, require_numbers, summary
 from rawaug.evaluation.tables import print_scores
 from rawaug.files import find_weights, read_metadata, require_writable

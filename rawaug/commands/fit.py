@@ -1,4 +1,4 @@
-"""``rawaug fit``: RAW files in, an ISP file out; in Python :func:`rawaug.fit`, of :mod:`rawaug.camera.fit`."""
+"""``rawaug fit``: RAW files in, an ISP file out; in Python :func:`rawaug.fit`, of :mod:`rawaug.training.camera_fit`."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from rawaug.camera.fit import fit, noise_figures
 from rawaug.commands import OPTIONS
 from rawaug.data.pair_folder import MosaicSettings
 from rawaug.errors import escape
 from rawaug.files import locked, require_writable
 from rawaug.isp.fit import FitConfig
 from rawaug.noise import MeasuredLevels, camera_law
+from rawaug.training.camera_fit import fit, noise_figures
 
 
 def run(

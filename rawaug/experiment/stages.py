@@ -16,7 +16,6 @@ from typing import Any
 import denoisers
 from denoisers.network import Denoiser
 from rawaug.bayer import CFA
-from rawaug.camera.fit import fit
 from rawaug.data.pairs import stamps
 from rawaug.errors import extra
 from rawaug.evaluation.scores import Row, group_rows, score, summary
@@ -29,6 +28,7 @@ from rawaug.progress import progress
 from rawaug.registry import Spec
 from rawaug.tasks.base import Task
 from rawaug.tasks.settings import Recipe
+from rawaug.training.camera_fit import fit
 from rawaug.training.config import weights_key
 from rawaug.training.estimators import Supervised
 from rawaug.training.loop import train

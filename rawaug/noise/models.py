@@ -31,7 +31,7 @@ from rawaug.noise.levels import NoiseLevels
 from rawaug.registry import Registry
 from rawaug.seeding import derive_seed, keyed_generator
 
-NOISE = Registry("noise", "rawaug.noise", "rawaug.noise", "rawaug.camera")
+NOISE = Registry("noise", "rawaug.noise", "rawaug.noise")
 """The noise models by name: subclasses of :class:`NoiseModel`; presets and cameras: :mod:`rawaug.noise.cameras`."""
 
 Params = dict[str, Tensor]

@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.camera.psnr_r import psnr_r
 from rawaug.data import open_pairs
 from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.figures import new_figure
+from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.tables import print_rows
 from rawaug.experiment.folder import claim, require_free
 from rawaug.experiment.recipe import EXPERIMENTS

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.camera.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
 from rawaug.data.pairs import Pair
+from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
 from rawaug.files import find_weights, write_json
 from rawaug.isp import staged
 from rawaug.isp.config import ISPParams

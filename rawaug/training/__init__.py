@@ -1,1 +1,1 @@
-"""Training a RAW denoiser, with clean targets or from noisy frames alone."""
+"""Fitting a camera's ISP, and training a RAW denoiser, with clean targets or from noisy frames alone."""

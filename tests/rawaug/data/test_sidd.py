@@ -16,7 +16,6 @@ from scipy.io import savemat
 from torch import Tensor
 
 from rawaug.bayer import CFA, mosaic, pack, turn
-from rawaug.camera.psnr_r import psnr_r
 from rawaug.cli import main
 from rawaug.commands.evaluate import run as evaluate
 from rawaug.commands.submit import submit
@@ -30,6 +29,7 @@ from rawaug.data import (
 from rawaug.data.formats import read_array
 from rawaug.data.sidd import HELD_BACK, PHONES, SiddBlocks, SiddFrames, SiddPlusBlocks, phone_of
 from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.io import RawFrame, write_picture
 from rawaug.io.pictures import view_of_orientation
 from rawaug.isp.config import ISPConfig

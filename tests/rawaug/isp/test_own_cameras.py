@@ -11,9 +11,9 @@ import yaml
 from torch import Tensor
 
 import rawaug
-from rawaug.camera.psnr_r import psnr_r
 from rawaug.commands import info
 from rawaug.data import demo_pairs
+from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.cameras import SRGB_TO_XYZ, XYZ_TO_SRGB, daylight_gains, load_cameras
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.own_cameras import Camera, adaptation, light_xyz

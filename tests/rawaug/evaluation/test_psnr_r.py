@@ -8,8 +8,8 @@ from typing import Any, cast
 import pytest
 import torch
 
-from rawaug.camera.psnr_r import block_psnr, psnr_r
 from rawaug.data import demo_pairs
+from rawaug.evaluation.psnr_r import block_psnr, psnr_r
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import patch_psnr

@@ -10,9 +10,9 @@ import torch
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.camera.dark_frames import DarkFrames
 from rawaug.io import RawFrame, read_raw, write_dng
 from rawaug.noise import noise_model
+from rawaug.noise.dark_frames import DarkFrames
 
 HOT = (7, 10)
 """The row and column of the one hot pixel, a blue one of GRBG."""

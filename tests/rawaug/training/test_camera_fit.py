@@ -12,8 +12,8 @@ import pytest
 import torch
 
 import rawaug
-from rawaug.camera.psnr_r import psnr_r
 from rawaug.cli import main
+from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.files import write_tensors
 from rawaug.io import read_picture, read_raw_and_develop, write_picture
 from rawaug.isp.fit import descent

@@ -17,10 +17,10 @@ from typing import Any, Literal, NamedTuple
 from torch import Tensor
 
 from rawaug.bayer import CFA, crop_to_cfa
-from rawaug.camera.psnr_r import psnr_r
 from rawaug.data import RawFolder, open_pairs
 from rawaug.data.folders import Kept, Readable, left_out
 from rawaug.data.pairs import Pair, shared_frame
+from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.io import RawFrame, read_raw
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
