@@ -1,16 +1,7 @@
-r"""RAW-sRGB pairs: one shot, sequences that read it when asked, which of them a recipe uses, and their noise.
+"""RAW-sRGB pairs, and lazy sequences of pairs.
 
-A frame is identified by the resolved paths of its files where it has some, else by its name: what is trained on must
-not be scored, and no frame has to be read to know. A dataset that knows more of its frames has ``labels``.
-
-The noise levels of a capture whose clean version is known,
-
-    E[(noisy - clean)^2 | clean = y] = shot_var y + read_var,
-
-are those of a line through the mean squared differences of equally filled bins of y, weighted by the inverse variance
-of these means, 2 (shot_var y + read_var)^2 / n, in a few rounds. Bins whose noise would reach black or white (three
-standard deviations) are left out while enough others remain: published frames are clipped there, which narrows the
-noise.
+The resolved paths of its files identify a frame, or its name if it has no files. So a recipe can check that it does not
+score the frames that it trains on, without reading any. Datasets that describe their frames have ``labels``.
 """
 
 from __future__ import annotations
@@ -19,16 +10,15 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate, groupby
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar, overload
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug.bayer import CFA, bin_mosaic, bin_mosaic_variance, crop_to_cfa, to_bayer
+from rawaug.data.noise_levels import measure_levels
 from rawaug.files import digest
 from rawaug.io import RawFrame
 from rawaug.io.pictures import MAX_PIXELS, decode_srgb, encode_srgb
@@ -91,33 +81,50 @@ class Pair:
     own_noise: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "cfa", CFA(self.cfa))  # or its name
+        object.__setattr__(self, "cfa", CFA(self.cfa))  # cfa may be the name of a pattern
+
         self._require_shape("srgb", self.srgb, 3, torch.uint8)
         self._require_shape("raw", self.raw, 1, torch.float32)
         if self.noisy is not None:
             self._require_shape("noisy", self.noisy, 1, torch.float32)
         if self.noisy_srgb is not None:
             self._require_shape("noisy_srgb", self.noisy_srgb, 3, torch.uint8)
-        if any(side % 2 or side == 0 for side in self.raw.shape[-2:]):
+
+        height, width = self.raw.shape[-2:]
+        if height % 2 or width % 2 or not height or not width:
             raise ValueError(f"pair {self.name}: the mosaic must have even sides, got {tuple(self.raw.shape)}")
         if self.color_matrix.shape != (3, 3):
             raise ValueError(f"pair {self.name}: color_matrix must be (3, 3), got {tuple(self.color_matrix.shape)}")
-        if (self.shot_var is None) != (self.read_var is None) or (self.noisy is None and self.shot_var is not None):
+
+        is_incomplete = (self.shot_var is None) != (self.read_var is None)
+        if is_incomplete or (self.noisy is None and self.shot_var is not None):
             raise ValueError(f"pair {self.name}: shot_var and read_var must be given together, with a noisy mosaic")
 
     @classmethod
-    def of_frame(cls, name: str, frame: RawFrame, srgb: Tensor, **known: Any) -> Pair:
-        """Make the pair of a RAW file and its picture, with further attributes that are ``known``.
+    def of_frame(cls, name: str, frame: RawFrame, srgb: Tensor, **attributes: Any) -> Pair:
+        """Make the pair of a RAW file and its picture, with further ``attributes`` of the pair.
 
-        A mosaic of another pattern than Bayer's becomes one of RGGB at half its sides.
+        A mosaic with another pattern than Bayer's is converted to RGGB at half its sides.
         """
-        mosaic, cfa = frame.mosaic, frame.cfa
+        mosaic = frame.mosaic
+        cfa = frame.cfa
         if cfa not in CFA.__members__:
-            mosaic, cfa = to_bayer(mosaic, cfa), CFA.RGGB
+            mosaic = to_bayer(mosaic, cfa)
+            cfa = CFA.RGGB
             height, width = mosaic.shape[-2:]
             srgb = _bin_picture(srgb[:, : 2 * height, : 2 * width], 2)
-        stated = (mosaic, CFA(cfa), frame.white_balance, frame.color_matrix)
-        return cls(name, srgb, *stated, camera=frame.camera, iso=frame.iso, **known)
+
+        return cls(
+            name=name,
+            srgb=srgb,
+            raw=mosaic,
+            cfa=CFA(cfa),
+            white_balance=frame.white_balance,
+            color_matrix=frame.color_matrix,
+            camera=frame.camera,
+            iso=frame.iso,
+            **attributes,
+        )
 
     @property
     def balance_known(self) -> bool:
@@ -127,6 +134,7 @@ class Pair:
         """This pair, with levels measured against ``raw`` if the capture states none."""
         if self.noisy is None or self.shot_var is not None:
             return self
+
         shot_var, read_var = measure_levels(self.raw, self.noisy)
         return replace(self, shot_var=shot_var, read_var=read_var, levels_from_clean=True)
 
@@ -138,48 +146,65 @@ class Pair:
             )
 
     def in_pattern(self, cfa: CFA | str) -> Pair:
-        """The frame without its outer rows or columns, where that gives it the pattern ``cfa``."""
+        """Crop the outer rows or columns so that the frame has the pattern ``cfa``."""
         target = CFA(cfa)
         if target == self.cfa:
             return self
-        return self._changed(lambda image: crop_to_cfa(image, self.cfa, target).contiguous(), cfa=target)
+
+        def crop(image: Tensor) -> Tensor:
+            return crop_to_cfa(image, self.cfa, target).contiguous()
+
+        return self._transform(crop, cfa=target)
 
     def middle(self, side: int) -> Pair:
-        """The middle ``side x side`` of the frame, or all of it along a side that is shorter; the CFA is kept."""
-        return self._changed(lambda image: centre(image, side // 2 * 2, side // 2 * 2))
+        """Crop the middle ``side x side`` of the frame, or its full length along a shorter side; the CFA stays."""
+        even_side = side // 2 * 2
+
+        def crop(image: Tensor) -> Tensor:
+            return centre(image, even_side, even_side)
+
+        return self._transform(crop)
 
     def binned(self, factor: int, together: bool = False) -> Pair:
         """The frame at 1 / ``factor`` of its sides, whose noise has about 1 / ``factor``^2 of the variance.
 
-        RAW by :func:`rawaug.bayer.bin_mosaic`, which explains ``together``; pictures are averaged in linear light.
+        :func:`rawaug.bayer.bin_mosaic` bins RAW and explains ``together``; pictures are averaged in linear light.
 
         Raises:
             ValueError: if a side is shorter than two of the new cell's.
         """
         if factor == 1 and not together:
             return self
-        height, width = (side // (2 * factor) * 2 * factor for side in self.raw.shape[-2:])
+
+        cell = 2 * factor
+        height = self.raw.shape[-2] // cell * cell
+        width = self.raw.shape[-1] // cell * cell
         if not min(height, width):
             raise ValueError(f"pair {self.name}: {tuple(self.raw.shape[-2:])} is too small to be binned by {factor}")
+
         levels: dict[str, Any] = {}
-        left = bin_mosaic_variance(factor, together)
+        scale = bin_mosaic_variance(factor, together)
         if self.shot_var is not None and self.read_var is not None:
-            levels |= {"shot_var": self.shot_var * left, "read_var": self.read_var * left}
+            levels["shot_var"] = self.shot_var * scale
+            levels["read_var"] = self.read_var * scale
         if self.own_noise is not None:
-            levels["own_noise"] = (self.own_noise[0] * left, self.own_noise[1] * left)
+            levels["own_noise"] = (self.own_noise[0] * scale, self.own_noise[1] * scale)
 
-        def binned(image: Tensor) -> Tensor:
-            cut = image[:, :height, :width]
-            return bin_mosaic(cut, self.cfa, factor, together) if len(cut) == 1 else _bin_picture(cut, factor)
+        def bin_image(image: Tensor) -> Tensor:
+            whole_cells = image[:, :height, :width]
+            if len(whole_cells) == 1:
+                return bin_mosaic(whole_cells, self.cfa, factor, together)
+            return _bin_picture(whole_cells, factor)
 
-        return self._changed(binned, **levels)
+        return self._transform(bin_image, **levels)
 
-    def _changed(self, change: Callable[[Tensor], Tensor], **known: Any) -> Pair:
-        """Copy the pair with every image changed, and attributes that are ``known`` besides."""
+    def _transform(self, change: Callable[[Tensor], Tensor], **attributes: Any) -> Pair:
+        """Copy the pair with ``change`` applied to every image, and with other ``attributes``."""
         for key in ("srgb", "raw", "noisy", "noisy_srgb"):
-            if (image := getattr(self, key)) is not None:
-                known[key] = change(image)
-        return replace(self, **known)
+            image = getattr(self, key)
+            if image is not None:
+                attributes[key] = change(image)
+        return replace(self, **attributes)
 
     def _require_shape(self, field: str, image: Tensor, channels: int, dtype: torch.dtype) -> None:
         expected = (channels, *self.raw.shape[-2:])
@@ -189,17 +214,17 @@ class Pair:
 
 
 def centre(image: Tensor, height: int, width: int, step: int = 2) -> Tensor:
-    """The middle of ``(..., H, W)``, or all of it along a side that is shorter.
+    """Crop the middle of ``(..., H, W)``, or its full length along a shorter side.
 
-    It begins at a multiple of ``step``: 2 keeps the pattern of a mosaic, 1 is that of packed RAW.
+    The crop begins at a multiple of ``step``. A step of 2 keeps the pattern of a mosaic; use 1 for packed RAW.
     """
-    sides = zip(image.shape[-2:], (height, width), strict=True)
-    top, left = (max(0, size - side) // (2 * step) * step for size, side in sides)
+    top = max(0, image.shape[-2] - height) // (2 * step) * step
+    left = max(0, image.shape[-1] - width) // (2 * step) * step
     return image[..., top : top + height, left : left + width].contiguous()
 
 
 def _bin_picture(srgb: Tensor, factor: int) -> Tensor:
-    """uint8 ``(3, H, W)``, averaged in linear light."""
+    """Average a picture in linear light, uint8 ``(3, H, W)``."""
     linear = F.avg_pool2d(decode_srgb(srgb.float() / 255), factor)
     return (encode_srgb(linear) * 255).round().to(torch.uint8)
 
@@ -221,7 +246,7 @@ class FrameLabel(NamedTuple):
 
 
 class Lazy(Sequence[T], ABC, Generic[T]):
-    """A sequence of named items that reads one at a time; the last one stays in memory."""
+    """A sequence of named items that are read on access; the last one stays in memory."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = list(names)
@@ -243,6 +268,7 @@ class Lazy(Sequence[T], ABC, Generic[T]):
     def __getitem__(self, index: int | slice) -> T | list[T]:
         if isinstance(index, slice):
             return [self[i] for i in range(len(self))[index]]
+
         index = range(len(self))[index]
         if self._last is None or self._last[0] != index:
             self._last = index, self.read(index)
@@ -250,7 +276,7 @@ class Lazy(Sequence[T], ABC, Generic[T]):
 
 
 class LazyPairs(Lazy[Pair]):
-    """Pairs, read when they are asked for."""
+    """Pairs that are read on access."""
 
     max_pixels: int = MAX_PIXELS
     """Maximum number of pixels of sRGB pictures and of mosaics in PNG files."""
@@ -258,13 +284,22 @@ class LazyPairs(Lazy[Pair]):
     """The labels of the frames, if the dataset knows them without reading a frame."""
 
     def files_of(self, index: int) -> Sequence[Path]:
-        """The files that identify a pair; none where its name does."""
+        """The files that identify a pair; empty if its name identifies it."""
         return ()
 
     def stamp(self, index: int) -> str:
         """Identify the content of a pair by the path, size and modification time of its files, or by its name."""
-        files = [f"{os.path.realpath(f)} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in self.files_of(index)]
-        return " ".join(files) or self.names[index]
+        parts = []
+        for file in self.files_of(index):
+            status = file.stat()
+            parts.append(f"{os.path.realpath(file)} {status.st_size} {status.st_mtime_ns}")
+        if not parts:
+            return self.names[index]
+        return " ".join(parts)
+
+
+_STAMP_STEP = 4099
+"""Step between the values of an image that identify it; a prime, so that no row or column is favoured."""
 
 
 class _InMemory(LazyPairs):
@@ -277,14 +312,19 @@ class _InMemory(LazyPairs):
 
     def stamp(self, index: int) -> str:
         pair = self.pairs[index]
-        known = repr((pair.name, pair.camera, pair.cfa, pair.white_balance, pair.raw.shape)).encode()
-        images = [image for image in (pair.srgb, pair.raw, pair.noisy) if image is not None]
-        return digest(known, *(image.flatten()[::4099].numpy().tobytes() for image in images))[:16]
+        parts = [repr((pair.name, pair.camera, pair.cfa, pair.white_balance, pair.raw.shape)).encode()]
+        for image in (pair.srgb, pair.raw, pair.noisy):
+            if image is not None:
+                sites = image.flatten()[::_STAMP_STEP]
+                parts.append(sites.numpy().tobytes())
+        return digest(*parts)[:16]
 
 
 def lazy(pairs: Sequence[Pair]) -> LazyPairs:
-    """The pairs as ones whose names and files are known without reading them."""
-    return pairs if isinstance(pairs, LazyPairs) else _InMemory(pairs)
+    """The pairs as a sequence with names and files, which are available without reading a pair."""
+    if isinstance(pairs, LazyPairs):
+        return pairs
+    return _InMemory(pairs)
 
 
 def names_of(pairs: Sequence[Pair]) -> list[str]:
@@ -292,8 +332,9 @@ def names_of(pairs: Sequence[Pair]) -> list[str]:
 
 
 def stamps(pairs: Sequence[Pair]) -> list[str]:
-    """A fingerprint for each frame, without reading its file."""
-    return [lazy(pairs).stamp(index) for index in range(len(pairs))]
+    """A fingerprint for each frame; no file is read."""
+    frames = lazy(pairs)
+    return [frames.stamp(index) for index in range(len(frames))]
 
 
 def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
@@ -302,24 +343,32 @@ def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
 
 
 def _identities(pairs: LazyPairs) -> set[str]:
-    found: set[str] = set()
+    identities: set[str] = set()
     for index, name in enumerate(pairs.names):
-        found |= {os.path.realpath(file) for file in pairs.files_of(index)} or {name}
-    return found
+        files = pairs.files_of(index)
+        identities.update(map(os.path.realpath, files))
+        if not files:
+            identities.add(name)
+    return identities
 
 
-def require_split(kind: str, split: str, known: Iterable[str]) -> None:
-    if split not in known:
-        raise ValueError(f"{kind}: no split {split}; use one of {', '.join(known)}")
+def require_split(kind: str, split: str, splits: Iterable[str]) -> None:
+    if split not in splits:
+        raise ValueError(f"{kind}: no split {split}; use one of {', '.join(splits)}")
 
 
 class SomePairs(LazyPairs):
     """Some pairs of a sequence, by index; all of them by default."""
 
     def __init__(self, pairs: Sequence[Pair], indices: Iterable[int] | None = None) -> None:
-        self.pairs, self.indices = lazy(pairs), list(range(len(pairs)) if indices is None else indices)
+        if indices is None:
+            indices = range(len(pairs))
+        self.pairs = lazy(pairs)
+        self.indices = list(indices)
         super().__init__([self.pairs.names[index] for index in self.indices])
-        self.labels = [self.pairs.labels[index] for index in self.indices] if self.pairs.labels else ()
+
+        if self.pairs.labels:
+            self.labels = [self.pairs.labels[index] for index in self.indices]
 
     def read(self, index: int) -> Pair:
         return self.pairs[self.indices[index]]
@@ -343,7 +392,7 @@ class Middles(SomePairs):
 
 
 class Binned(SomePairs):
-    """All pairs of a sequence, :meth:`Pair.binned`: references with less noise of their own.
+    """All pairs of a sequence, binned by :meth:`Pair.binned`: references with less noise of their own.
 
     Example:
         >>> from rawaug.data import demo_pairs
@@ -361,7 +410,10 @@ class Binned(SomePairs):
         return super().read(index).binned(self.factor, self.together)
 
     def stamp(self, index: int) -> str:
-        return f"{super().stamp(index)} binned by {self.factor}{', around one centre' * self.together}"
+        stamp = f"{super().stamp(index)} binned by {self.factor}"
+        if self.together:
+            stamp += ", around one centre"
+        return stamp
 
 
 OWN_PICTURES = "pairs"
@@ -369,7 +421,7 @@ OWN_PICTURES = "pairs"
 
 
 class PairPictures(Lazy[Tensor]):
-    """The pictures uint8 ``(3, H, W)`` of pairs; a pair is read when its picture is asked for."""
+    """The pictures of pairs, uint8 ``(3, H, W)``; a pair is read on access to its picture."""
 
     def __init__(self, pairs: Sequence[Pair]) -> None:
         self.pairs = pairs
@@ -377,95 +429,3 @@ class PairPictures(Lazy[Tensor]):
 
     def read(self, index: int) -> Tensor:
         return self.pairs[index].srgb
-
-
-def select_pairs(
-    pairs: Sequence[Pair], kept: int, count: int | None, select: str | Sequence[str] = "first"
-) -> list[int]:
-    """Choose ``count`` (None: all) of the first ``kept`` pairs without reading any; returns their indices."""
-    if not isinstance(select, str):
-        return _named(names_of(pairs)[:kept], select)[:count]
-    if select == "first":
-        return list(range(kept)[:count])
-    choices = {"scenes": whole_scenes, "phones": one_a_phone}
-    if select not in choices:
-        raise ValueError(f"data.select {select!r} is unknown; use first, {', '.join(choices)} or a list of names")
-    labels = lazy(pairs).labels
-    if not labels:
-        raise ValueError(f"data.select: {select} needs frames with labels, such as sidd:; use first or names")
-    return list(range(kept)) if count is None else choices[select](labels[:kept], count)
-
-
-def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
-    """Indices of the first scenes, in order of their names, whose frames are ``count`` in all."""
-    order = sorted(range(len(labels)), key=lambda k: labels[k].scene)
-    totals = list(accumulate(len(list(group)) for _, group in groupby(order, key=lambda k: labels[k].scene)))
-    if count not in totals:
-        near = sorted(totals, key=lambda total: abs(total - count))[:2]
-        use = " or ".join(map(str, sorted(near)))
-        raise ValueError(f"data.count: {count} pairs are not whole scenes; use {use}, or select: first")
-    return order[:count]
-
-
-def one_a_phone(labels: Sequence[FrameLabel], count: int) -> list[int]:
-    """Indices of ``count`` frames, one phone after another; of each phone evenly spread in ISO."""
-    phones = sorted({label.phone for label in labels})
-    chosen: list[list[int]] = []
-    for place, phone in enumerate(phones):
-        share = count // len(phones) + (place < count % len(phones))
-        frames = sorted((k for k, label in enumerate(labels) if label.phone == phone), key=lambda k: labels[k].iso)
-        if share > len(frames):
-            raise ValueError(f"data.count: {count} pairs are {share} of {phone}, which has {len(frames)}")
-        chosen.append([frames[(2 * i + 1) * len(frames) // (2 * share)] for i in range(share)])
-    longest = max(len(frames) for frames in chosen)
-    return [frames[i] for i in range(longest) for frames in chosen if i < len(frames)]
-
-
-def _named(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
-    indices: list[int] = []
-    for name in wanted:
-        found = [k for k, known in enumerate(names) if known == name or known.rpartition("_")[0] == name]
-        if not found:
-            examples = ", ".join(names[:3])
-            raise ValueError(f"data.select: {name} is not among the {len(names)} frames, such as {examples}")
-        indices += [k for k in found if k not in indices]
-    return indices
-
-
-# -- the noise of a capture --------------------------------------------------------------------------------------------
-
-_BINS = 64
-_FEWEST = 8
-_ROUNDS = 5
-_LEAST = 1e-9
-_SITES = 2**20
-
-
-def measure_noise(clean: np.ndarray, noisy: np.ndarray) -> tuple[float, float]:
-    """(shot_var, read_var) of ``noisy``, both positive; arrays of the same shape, black 0, white 1."""
-    signal = np.ravel(clean).astype(np.float64)
-    square = (np.ravel(noisy) - signal) ** 2
-    order = np.argsort(signal)
-    parts = [part for part in np.array_split(order, _BINS) if len(part)]
-    x, y = (np.array([values[part].mean() for part in parts]) for values in (signal, square))
-    weight: np.ndarray = np.ones_like(x)
-    for _ in range(_ROUNDS):
-        shot, read = _line(x, y, weight)
-        reach = 3 * np.sqrt(shot * x + read)
-        whole = (x > reach) & (x < 1 - reach)
-        weight = np.where(whole if whole.sum() >= _FEWEST else True, 1 / (shot * x + read) ** 2, 0.0)
-    return shot, read
-
-
-def measure_levels(clean: Tensor, noisy: Tensor) -> tuple[float, float]:
-    """:func:`measure_noise` of two mosaics ``(1, H, W)``, of about a million of their sites if they are larger."""
-    step = max(1, clean.numel() // _SITES) | 1  # odd, so that all four sites of the cell take part
-    return measure_noise(clean.flatten()[::step].numpy(), noisy.flatten()[::step].numpy())
-
-
-def _line(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    middle = np.average(x, weights=weight), np.average(y, weights=weight)
-    spread = np.average((x - middle[0]) ** 2, weights=weight)
-    slope = np.average((x - middle[0]) * (y - middle[1]), weights=weight) / spread if spread > 0 else 0.0
-    shot = float(np.clip(slope, _LEAST, max(middle[1] / max(middle[0], _LEAST), _LEAST)))
-    return shot, float(max(middle[1] - shot * middle[0], _LEAST))

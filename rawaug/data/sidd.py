@@ -1,11 +1,12 @@
 """SIDD: full frames of five phones, noisy and clean, with their pictures; blocks of 256 x 256; and the blocks of SIDD+.
 
-docs/datasets.md shows the files. RAW frames and blocks have white at 1, are black-subtracted and, by their makers,
-clipped at black; METADATA hold the DNG's tags. The pattern goes by phone (the dataset's ``bayer_patterns.csv``), that
-of a block by the phone of its scene instance in :data:`HELD_BACK`. Pictures of frames are upright and turned back by
-METADATA; those of blocks do not say how they were turned: a frame's blocks take that of the eight turns in which their
-green agrees best with the green of the mosaics. Blocks without pictures and METADATA have gains of 1 and show camera
-colour (``rendered`` is False): they can test a denoiser, but no ISP.
+docs/datasets.md shows the files. RAW frames and blocks have black at 0 and white at 1, and the makers clipped them at
+black. METADATA files hold the tags of the DNG. The phone determines the pattern (the dataset's ``bayer_patterns.csv``);
+:data:`HELD_BACK` lists the scene instance of each block, which names its phone. Pictures of frames are upright, and
+METADATA say how to turn them back. Pictures of blocks do not say how they were turned, so the blocks of a frame are
+turned to the one of eight views in which their green correlates best with the green of the mosaics. Blocks without
+pictures and METADATA have gains of 1 and show camera colour (``rendered`` is False). They can test a denoiser, but not
+an ISP.
 
 Source: A. Abdelhamed, S. Lin, M. S. Brown, "A high-quality denoising dataset for smartphone cameras", CVPR 2018, and
 the dataset's ``noise_level_functions.csv``; SIDD+: NTIRE 2020.
@@ -35,7 +36,8 @@ from rawaug import bayer
 from rawaug.bayer import CFA, turn_back
 from rawaug.data.development import UNKNOWN_COLOUR, develop_pair, gains_from_neutral, srgb_from_camera
 from rawaug.data.formats import read_array, read_value, to_raw
-from rawaug.data.pairs import DATASETS, FrameLabel, Lazy, LazyPairs, Pair, measure_levels, measure_noise
+from rawaug.data.noise_levels import measure_levels, measure_noise
+from rawaug.data.pairs import DATASETS, FrameLabel, Lazy, LazyPairs, Pair
 from rawaug.files import files_below, require_file
 from rawaug.io import RawFrame, read_picture
 from rawaug.io.pictures import view_of_orientation
@@ -49,17 +51,19 @@ PHONES = {
     "N6": ("Motorola Nexus 6", CFA.BGGR),
     "G4": ("LG G4", CFA.BGGR),
 }
-"""The phone and the pattern of its frames, by the code in the folder's name."""
+"""Name of each phone and the pattern of its frames, by the code in the names of folders."""
 
 _NAME = re.compile(r"\d{4}_(\d{3})_([A-Z0-9]{2})_(\d{5})_\d{5}_\d{4}_[LNH]")
 
 
 def label_of(name: str) -> FrameLabel:
-    """Read scene, phone and ISO from the name of a scene instance, which is that of its folder."""
-    found = _NAME.fullmatch(name)
-    if found is None or found[2] not in PHONES:
+    """Parse scene, phone and ISO from the name of a scene instance, which is the name of its folder."""
+    match = _NAME.fullmatch(name)
+    if match is None or match[2] not in PHONES:
         raise ValueError(f"{name}: is not a SIDD scene instance such as 0052_002_S6_01600_01000_5500_N")
-    return FrameLabel(found[1], found[2], int(found[3]))
+
+    scene, phone, iso = match.groups()
+    return FrameLabel(scene, phone, int(iso))
 
 
 def phone_of(name: str) -> tuple[str, CFA]:
@@ -72,76 +76,104 @@ def is_scene(name: str) -> bool:
 
 
 HELD_BACK = tuple(Path(__file__).with_name("sidd.txt").read_text(encoding="ascii").split())
-"""The scene instances of the blocks of validation and benchmark, in their order; none is among those for training."""
+"""The scene instances of the validation and benchmark blocks, in their order; training frames have others."""
 
 _FILE = re.compile(r"(?:\d{4}_)?(GT_RAW|NOISY_RAW|METADATA_RAW|GT_SRGB|NOISY_SRGB)_(\d{3})\.(?:mat|png)", re.IGNORECASE)
 
 
 class SiddFrames(LazyPairs):
-    """The full frames below a folder: SIDD Small or Medium, RAW, and the sRGB set if present.
+    """The full frames below a folder: SIDD Small or Medium in RAW, with the sRGB set if it is there.
 
-    Noise levels are those of a ``noise_level_functions.csv`` where there is one, else measured against the clean frame,
-    which the pair says (``levels_from_clean``). Where a frame's ``GT_SRGB`` picture is not there, the clean frame is
-    developed as the dataset's makers did; its ``NOISY_SRGB`` picture is read where there is one. Scene instances in
-    ``left_out`` are not taken.
+    Noise levels come from ``noise_level_functions.csv``, or are measured against the clean frame if that file is
+    missing (``levels_from_clean``). Without its ``GT_SRGB`` picture, a clean frame is developed as the makers of the
+    dataset did. A ``NOISY_SRGB`` picture is read if there is one. Scene instances in ``left_out`` are excluded.
     """
 
     def __init__(self, path: str | Path, left_out: Sequence[str] = HELD_BACK) -> None:
         self.path = Path(path)
-        self.shots = [
-            (scene, number, files)
-            for (scene, number), files in sorted(index_files(self.path).items())
-            if "NOISY_RAW" in files and scene not in left_out
-        ]
-        for _, number, files in self.shots:
-            missing = {"GT_RAW", "METADATA_RAW"} - set(files)
-            if missing:
-                raise ValueError(f"{files['NOISY_RAW']}: its {min(missing)}_{number} is missing; download it too")
+        self.shots = _shots_below(self.path, left_out)
         if not self.shots:
             raise ValueError(f"{path}: contains no NOISY_RAW training frames of SIDD")
+
         self.levels = noise_level_functions(self.path)
-        self.labels = [label_of(scene) for scene, *_ in self.shots]
+        self.labels = [label_of(scene) for scene, _, _ in self.shots]
         super().__init__([f"{scene}_{number}" for scene, number, _ in self.shots])
 
     def read(self, index: int) -> Pair:
         scene, _, files = self.shots[index]
-        clean, noisy = (mosaic_of(files[kind]) for kind in ("GT_RAW", "NOISY_RAW"))
+        clean = mosaic_of(files["GT_RAW"])
+        noisy = mosaic_of(files["NOISY_RAW"])
         if clean.shape != noisy.shape:
             sizes = f"{tuple(clean.shape[1:])} and {tuple(noisy.shape[1:])}"
             raise ValueError(f"{files['NOISY_RAW']}: the clean and the noisy frame differ in size, {sizes}")
+
         gains, matrix, view = colour_of(files["METADATA_RAW"])
-        (camera, cfa), published = phone_of(scene), self.levels.get(scene)
-        shot_var, read_var = published or measure_levels(clean, noisy)
-        known: dict[str, Any] = {"noisy": noisy, "shot_var": shot_var, "read_var": read_var, "camera": camera}
+        pictures = {}
         for key, kind in (("srgb", "GT_SRGB"), ("noisy_srgb", "NOISY_SRGB")):
             if kind in files:
-                known[key] = _turned_back(files[kind], view, self.max_pixels)
-        known["levels_from_clean"] = published is None
-        return develop_pair(self.names[index], clean, cfa, gains, matrix, **known)
+                pictures[key] = _turned_back(files[kind], view, self.max_pixels)
+
+        published = self.levels.get(scene)
+        shot_var, read_var = published or measure_levels(clean, noisy)
+        camera, cfa = phone_of(scene)
+        return develop_pair(
+            self.names[index],
+            clean,
+            cfa,
+            gains,
+            matrix,
+            noisy=noisy,
+            shot_var=shot_var,
+            read_var=read_var,
+            levels_from_clean=published is None,
+            camera=camera,
+            **pictures,
+        )
+
+
+def _shots_below(path: Path, left_out: Sequence[str]) -> list[tuple[str, str, dict[str, Path]]]:
+    """Scene instance, number and files (by kind) of each noisy frame below ``path``, in order."""
+    shots = []
+    for (scene, number), files in sorted(index_files(path).items()):
+        if "NOISY_RAW" not in files or scene in left_out:
+            continue
+        missing = {"GT_RAW", "METADATA_RAW"} - set(files)
+        if missing:
+            raise ValueError(f"{files['NOISY_RAW']}: its {min(missing)}_{number} is missing; download it too")
+        shots.append((scene, number, files))
+    return shots
 
 
 def mosaic_of(file: Path) -> Tensor:
-    """The mosaic ``x`` of a frame, float32 ``(1, H, W)``; of an odd side the last line is left out."""
+    """The mosaic ``x`` of a frame, float32 ``(1, H, W)``; an odd side loses its last line."""
     return _even(to_raw(read_array(file, "x"), 2, file))
 
 
 def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
-    """(shot_var, read_var) by scene instance, the mean over a mosaic's sites, from the CSV below ``path``, if any."""
+    """(shot_var, read_var) by scene instance, the mean over a mosaic's sites; empty without the CSV below ``path``."""
     file = min(files_below(path, ("noise_level_functions.csv",)), default=None)
     if file is None:
         return {}
+
     require_file(file)
     with file.open(encoding="utf-8-sig", newline="") as stream:
         rows = list(csv.DictReader(stream, skipinitialspace=True))
+
     levels = {}
     for row in rows:
         try:
-            shot, read = (sum(float(row[f"beta{k}_{colour}"]) for colour in "rggb") / 4 for k in (1, 2))
-            levels[row["scene_instance_id"]] = max(shot, 0.0), max(read, 0.0)
+            shot_var = _mean_over_sites(row, "beta1")
+            read_var = _mean_over_sites(row, "beta2")
+            levels[row["scene_instance_id"]] = (max(shot_var, 0.0), max(read_var, 0.0))
         except (KeyError, TypeError, ValueError) as error:
             columns = "scene_instance_id, beta1_r, beta2_r, beta1_g, beta2_g, beta1_b, beta2_b"
             raise ValueError(f"{file}: each row has the columns {columns}; {error!r} is wrong") from error
     return levels
+
+
+def _mean_over_sites(row: dict[str, str], parameter: str) -> float:
+    """The mean of a noise parameter over the sites R, G, G, B."""
+    return sum(float(row[f"{parameter}_{colour}"]) for colour in "rggb") / 4
 
 
 def index_files(path: Path) -> dict[tuple[str, str], dict[str, Path]]:
@@ -149,11 +181,14 @@ def index_files(path: Path) -> dict[tuple[str, str], dict[str, Path]]:
     NOISY_SRGB."""
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder of SIDD")
+
     index: dict[tuple[str, str], dict[str, Path]] = {}
     for file in files_below(path):
         scene = file.parent.name
-        if is_scene(scene) and (found := _FILE.fullmatch(file.name)):
-            index.setdefault((scene, found[2]), {})[found[1].upper()] = file
+        match = _FILE.fullmatch(file.name)
+        if match is not None and is_scene(scene):
+            kind, number = match[1].upper(), match[2]
+            index.setdefault((scene, number), {})[kind] = file
     return index
 
 
@@ -168,34 +203,42 @@ class Colour(NamedTuple):
 def colour_of(file: Path) -> Colour:
     tags: dict[str, Any] = read_value(file, "metadata")
     try:
-        gains, matrix = gains_from_neutral(tags["AsShotNeutral"]), srgb_from_camera(tags["ColorMatrix2"])
-        return Colour(gains, matrix, view_of_orientation(int(tags.get("Orientation", 1))))
+        gains = gains_from_neutral(tags["AsShotNeutral"])
+        matrix = srgb_from_camera(tags["ColorMatrix2"])
+        view = view_of_orientation(int(tags.get("Orientation", 1)))
+        return Colour(gains, matrix, view)
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise ValueError(f"{file}: has no valid AsShotNeutral and ColorMatrix2 ({error}); download it again") from error
 
 
 def _turned_back(file: Path, view: int, max_pixels: int) -> Tensor:
-    """The upright picture in ``file`` as the sensor saw it."""
-    return _even(turn_back(read_picture(file, max_pixels), view)).contiguous()
+    """The upright picture in ``file``, turned to the orientation of the sensor."""
+    picture = read_picture(file, max_pixels)
+    return _even(turn_back(picture, view)).contiguous()
 
 
 def _even(image: Tensor) -> Tensor:
-    height, width = (side // 2 * 2 for side in image.shape[-2:])
+    height = image.shape[-2] // 2 * 2
+    width = image.shape[-1] // 2 * 2
     return image[..., :height, :width]
 
 
 LEAST_LIKENESS = 0.8
-"""Minimum correlation of the greens for pictures that show the blocks of the mosaics."""
+"""Minimum correlation between the greens of the pictures and of the mosaics of a frame's blocks."""
 
 
 def turn_like(pictures: Tensor, mosaics: Tensor, cfa: CFA, what: str) -> Tensor:
-    """The pictures ``(K, 3, H, W)`` of a frame's blocks, turned as their mosaics ``(K, 1, H, W)`` are."""
-    square = pictures.shape[-2] == pictures.shape[-1]
-    views = range(bayer.N_VIEWS if square else bayer.N_VIEWS // 2)
+    """Turn the pictures ``(K, 3, H, W)`` of a frame's blocks to the view of their mosaics ``(K, 1, H, W)``."""
     planes = bayer.pack(mosaics, cfa)
-    raw = (planes[:, 1] + planes[:, 2]).clamp_min(0.0).sqrt()
+    raw_green = (planes[:, 1] + planes[:, 2]).clamp_min(0.0).sqrt()
     green = F.avg_pool2d(pictures[:, 1:2].float(), 2)[:, 0]
-    likeness = torch.stack([_correlation(bayer.turn_back(green, view), raw) for view in views])
+
+    n_views = bayer.N_VIEWS
+    is_square = pictures.shape[-2] == pictures.shape[-1]
+    if not is_square:  # quarter turns would change the shape
+        n_views //= 2
+
+    likeness = torch.stack([_correlation(bayer.turn_back(green, view), raw_green) for view in range(n_views)])
     best = int(likeness.argmax())
     if likeness[best] < LEAST_LIKENESS:
         raise ValueError(f"{what}: its pictures do not show its RAW blocks (correlation {likeness[best]:.2f})")
@@ -215,7 +258,7 @@ _NO_COLOUR = Colour(*UNKNOWN_COLOUR, 0)
 
 
 class Once(Generic[T]):
-    """Calls ``read`` once; its value, or its error, is that of every call."""
+    """A function that calls ``read`` once, and returns its value or raises its error on every call."""
 
     def __init__(self, read: Callable[[], T]) -> None:
         self.read = read
@@ -227,13 +270,14 @@ class Once(Generic[T]):
                 self._outcome = self.read()
             except (OSError, ValueError) as error:
                 self._outcome = error
+
         if isinstance(self._outcome, Exception):
             raise self._outcome.with_traceback(None)
         return self._outcome
 
 
-class _Known(NamedTuple):
-    """A frame of blocks: its name, phone and pattern, and its published levels and colour if there are any."""
+class _Frame(NamedTuple):
+    """A frame of blocks: its name, phone and pattern, and its published noise levels and colour if there are any."""
 
     name: str
     camera: str
@@ -243,68 +287,91 @@ class _Known(NamedTuple):
 
 
 class _Blocks(LazyPairs):
-    """Blocks, read all at once; what the 32 blocks of a frame share is kept for the last frame."""
+    """Blocks that are all read on the first access; what the blocks of a frame share is cached for the last frame."""
 
     def __init__(self, path: Path, frames: Sequence[str]) -> None:
         self.path = path
         self._all = Once(self._read_all)
-        self._frame: tuple[int, dict[str, Tensor], dict[str, Any]] | None = None
-        super().__init__([f"{name}_{block:02d}" for name in frames for block in range(BLOCKS)])
+        self._last_frame: tuple[int, dict[str, Tensor], dict[str, Any]] | None = None
+        super().__init__(_block_names(frames))
 
     @abstractmethod
     def _read_all(self) -> dict[str, Tensor]:
-        """``raw``, ``noisy`` and, where there are pictures, ``srgb`` and ``noisy_srgb``, ``(frames, 32, C, H, W)``."""
+        """``raw``, ``noisy`` and, if there are pictures, ``srgb`` and ``noisy_srgb``, ``(frames, 32, C, H, W)``."""
 
     @abstractmethod
-    def _known(self, number: int) -> _Known:
-        """What is known of the frame with this number."""
+    def _describe(self, number: int) -> _Frame:
+        """Describe the frame with this number."""
 
     def read(self, index: int) -> Pair:
         number, block = divmod(index, BLOCKS)
-        if self._frame is None or self._frame[0] != number:
-            self._frame = number, *self._shared(number)
-        _, images, shared = self._frame
-        known: dict[str, Any] = {key: image[block] for key, image in images.items()} | shared
-        return develop_pair(self.names[index], **known)
+        if self._last_frame is None or self._last_frame[0] != number:
+            images, attributes = self._read_frame(number)
+            self._last_frame = (number, images, attributes)
 
-    def _shared(self, number: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """The images of a frame's blocks, turned alike, and what else of a :class:`Pair` they share."""
-        images, known = {key: every[number] for key, every in self._all().items()}, self._known(number)
-        for key in {"srgb", "noisy_srgb"} & images.keys():
-            images[key] = turn_like(images[key], images["raw"], known.cfa, f"{self.path}: {known.name}")
-        shot_var, read_var = known.levels or measure_noise(images["raw"].numpy(), images["noisy"].numpy())
-        gains, matrix, _ = known.colour or _NO_COLOUR
-        return images, {
-            "cfa": known.cfa,
-            "camera": known.camera,
-            "white_balance": gains,
-            "color_matrix": matrix,
+        _, images, attributes = self._last_frame
+        blocks: dict[str, Any] = {}
+        for key, stack in images.items():
+            blocks[key] = stack[block]
+        return develop_pair(self.names[index], **blocks, **attributes)
+
+    def _read_frame(self, number: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """The images of a frame's blocks, turned alike, and the other attributes of a :class:`Pair` that they share."""
+        everything = self._all()
+        frame = self._describe(number)
+
+        images = {}
+        for key, stack in everything.items():
+            images[key] = stack[number]
+        for key in ("srgb", "noisy_srgb"):
+            if key in images:
+                images[key] = turn_like(images[key], images["raw"], frame.cfa, f"{self.path}: {frame.name}")
+
+        shot_var, read_var = frame.levels or measure_noise(images["raw"].numpy(), images["noisy"].numpy())
+        colour = frame.colour or _NO_COLOUR
+        attributes = {
+            "cfa": frame.cfa,
+            "camera": frame.camera,
+            "white_balance": colour.white_balance,
+            "color_matrix": colour.matrix,
             "shot_var": shot_var,
             "read_var": read_var,
-            "levels_from_clean": known.levels is None,
-            "color_known": known.colour is not None,
-            "rendered": "srgb" in images or known.colour is not None,
+            "levels_from_clean": frame.levels is None,
+            "color_known": frame.colour is not None,
+            "rendered": "srgb" in images or frame.colour is not None,
         }
+        return images, attributes
+
+
+def _block_names(frames: Sequence[str]) -> list[str]:
+    names = []
+    for frame in frames:
+        names += [f"{frame}_{block:02d}" for block in range(BLOCKS)]
+    return names
 
 
 class SiddBlocks(_Blocks):
     """The validation blocks, 1,280 pairs; all stay in memory (0.7 GB, pictures 0.5 GB) once the first is read.
 
-    Noise levels are those of a ``noise_level_functions.csv`` if there is one below the folder with the scene
-    instance, else measured on the 32 blocks of a frame against the clean ones.
+    Noise levels come from a ``noise_level_functions.csv`` below the folder that lists the scene instance. Otherwise
+    they are measured on the 32 blocks of a frame against the clean blocks.
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.files = [find_file(Path(path), f"Validation{kind}BlocksRaw.mat") for kind in ("Gt", "Noisy")]
+        self.clean_file = find_file(Path(path), "ValidationGtBlocksRaw.mat")
+        self.noisy_file = find_file(Path(path), "ValidationNoisyBlocksRaw.mat")
         super().__init__(Path(path), HELD_BACK)
 
-    def _known(self, number: int) -> _Known:
+    def _describe(self, number: int) -> _Frame:
         name = HELD_BACK[number]
-        return _Known(name, *phone_of(name), self._levels.get(name), self._colours.get(name))
+        camera, cfa = phone_of(name)
+        return _Frame(name, camera, cfa, self._levels.get(name), self._colours.get(name))
 
     def _read_all(self) -> dict[str, Tensor]:
-        clean, noisy = (blocks_of_scenes(file) for file in self.files)
-        _require_same_shape(clean, noisy, self.files[1])
+        clean = blocks_of_scenes(self.clean_file)
+        noisy = blocks_of_scenes(self.noisy_file)
+        _require_same_shape(clean, noisy, self.noisy_file)
+
         self._levels = noise_level_functions(self.path)
         self._colours = _colours(self.path)
         pictures = _pictures(self.path, "Validation{}BlocksSrgb.mat", ("Gt", "Noisy"), clean)
@@ -312,20 +379,28 @@ class SiddBlocks(_Blocks):
 
 
 class SiddBenchmark(Lazy[RawFrame]):
-    """The noisy blocks of ``BenchmarkNoisyBlocksRaw.mat`` below a folder, with their levels where these are published.
+    """The noisy blocks of ``BenchmarkNoisyBlocksRaw.mat`` below a folder, with their noise levels if published.
 
-    Results go to :func:`write_submission`, in the same order.
+    Pass the results to :func:`write_submission` in the same order.
     """
 
     def __init__(self, path: str | Path) -> None:
+        file = find_file(Path(path), "BenchmarkNoisyBlocksRaw.mat")
         self.levels = noise_level_functions(Path(path))
-        self._all = Once(partial(blocks_of_scenes, find_file(Path(path), "BenchmarkNoisyBlocksRaw.mat")))
-        super().__init__([f"{scene}_{block:02d}" for scene in HELD_BACK for block in range(BLOCKS)])
+        self._all = Once(partial(blocks_of_scenes, file))
+        super().__init__(_block_names(HELD_BACK))
 
     def read(self, index: int) -> RawFrame:
-        scene, block = divmod(index, BLOCKS)
-        (_, cfa), levels = phone_of(HELD_BACK[scene]), self.levels.get(HELD_BACK[scene])
-        return RawFrame(self._all()[scene, block], cfa, noise_profile=levels, name=self.names[index], color_known=False)
+        number, block = divmod(index, BLOCKS)
+        scene = HELD_BACK[number]
+        _, cfa = phone_of(scene)
+        return RawFrame(
+            self._all()[number, block],
+            cfa,
+            noise_profile=self.levels.get(scene),
+            name=self.names[index],
+            color_known=False,
+        )
 
 
 def write_submission(path: str | Path, blocks: Iterable[Tensor], side: int = 256) -> None:
@@ -338,14 +413,18 @@ def write_submission(path: str | Path, blocks: Iterable[Tensor], side: int = 256
     if path.suffix != ".csv":
         raise ValueError(f"{path}: a SIDD submission must be a .csv file")
     rows = []
-    for k, block in enumerate(blocks):
-        if block.shape != (1, side, side) or not (block.min() >= 0.0 and block.max() <= 1.0):  # NaN is refused as well
+    for number, block in enumerate(blocks):
+        in_range = bool(block.numel()) and bool(block.min() >= 0.0 and block.max() <= 1.0)  # False for NaN, too
+        if block.shape != (1, side, side) or not in_range:
             raise ValueError(
-                f"block {k}: must have values in [0, 1] and shape (1, {side}, {side}): {tuple(block.shape)}"
+                f"block {number}: must have values in [0, 1] and shape (1, {side}, {side}): {tuple(block.shape)}"
             )
-        rows.append((k, base64.b64encode(block[0].cpu().numpy().astype("<f4").tobytes()).decode()))
+        content = block[0].cpu().numpy().astype("<f4").tobytes()
+        rows.append((number, base64.b64encode(content).decode()))
+
     if len(rows) != len(HELD_BACK) * BLOCKS:
         raise ValueError(f"{path}: a submission must have {len(HELD_BACK) * BLOCKS} blocks, got {len(rows)}")
+
     with path.open("w", encoding="ascii", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(["ID", "BLOCK"])
@@ -354,24 +433,29 @@ def write_submission(path: str | Path, blocks: Iterable[Tensor], side: int = 256
 
 @DATASETS.register("siddplus")
 class SiddPlusBlocks(_Blocks):
-    """The validation blocks of SIDD+, 1,024 pairs, whatever the split; noise is measured as for :class:`SiddBlocks`."""
+    """The validation blocks of SIDD+, 1,024 pairs, for any split; noise is measured as for :class:`SiddBlocks`."""
 
     def __init__(self, path: str | Path, split: str = "test") -> None:
-        self.files = [find_file(Path(path), f"siddplus_valid_{kind}_raw.mat") for kind in ("gt", "noisy")]
+        self.clean_file = find_file(Path(path), "siddplus_valid_gt_raw.mat")
+        self.noisy_file = find_file(Path(path), "siddplus_valid_noisy_raw.mat")
         self.cfas = _patterns(find_file(Path(path), "siddplus_*bayer_patterns.csv"))
-        super().__init__(Path(path), [f"siddplus_{k:02d}" for k in range(len(self.cfas))])
+        super().__init__(Path(path), [f"siddplus_{number:02d}" for number in range(len(self.cfas))])
 
-    def _known(self, number: int) -> _Known:
-        return _Known(f"frame {number}", "SIDD+", self.cfas[number])
+    def _describe(self, number: int) -> _Frame:
+        return _Frame(f"frame {number}", "SIDD+", self.cfas[number])
 
     def _read_all(self) -> dict[str, Tensor]:
-        clean, noisy = (to_raw(read_array(file, file.stem), 3, file) for file in self.files)
-        _require_same_shape(clean, noisy, self.files[1])
+        clean = to_raw(read_array(self.clean_file, self.clean_file.stem), 3, self.clean_file)
+        noisy = to_raw(read_array(self.noisy_file, self.noisy_file.stem), 3, self.noisy_file)
+        _require_same_shape(clean, noisy, self.noisy_file)
         if len(clean) != len(self):
-            raise ValueError(f"{self.files[0]}: has {len(clean)} blocks, but there are patterns for {len(self)}")
-        pictures = _pictures(self.path, "siddplus_valid_{}_srgb.mat", ("gt", "noisy"), clean)
-        images = {"raw": clean, "noisy": noisy, **pictures}
-        return {key: every.unflatten(0, (-1, BLOCKS)) for key, every in images.items()}
+            raise ValueError(f"{self.clean_file}: has {len(clean)} blocks, but there are patterns for {len(self)}")
+
+        images = {"raw": clean, "noisy": noisy}
+        images |= _pictures(self.path, "siddplus_valid_{}_srgb.mat", ("gt", "noisy"), clean)
+        for key, stack in images.items():
+            images[key] = stack.unflatten(0, (-1, BLOCKS))
+        return images
 
 
 @DATASETS.register("sidd")
@@ -400,12 +484,16 @@ def sidd_cc_pairs(path: str, split: str) -> Sequence[Pair]:
 
 def find_file(path: Path, pattern: str) -> Path:
     """The one file of this name below ``path``, or ``path`` itself."""
-    found = [path] if path.is_file() and path.match(pattern) else _matching(path, pattern)
-    if not found:
+    if path.is_file() and path.match(pattern):
+        return path
+
+    matches = _matching(path, pattern)
+    if not matches:
         raise FileNotFoundError(f"{path}: contains no {pattern}; docs/datasets.md says where to get it")
-    if len(found) > 1:
-        raise ValueError(f"{path}: contains {len(found)} files {pattern}, such as {found[0]}; give a folder with one")
-    return found[0]
+    if len(matches) > 1:
+        example = f"such as {matches[0]}"
+        raise ValueError(f"{path}: contains {len(matches)} files {pattern}, {example}; give a folder with one")
+    return matches[0]
 
 
 def _matching(folder: Path, pattern: str) -> list[Path]:
@@ -413,31 +501,38 @@ def _matching(folder: Path, pattern: str) -> list[Path]:
 
 
 def _pictures(path: Path, pattern: str, kinds: tuple[str, str], clean: Tensor) -> dict[str, Tensor]:
-    """Pictures uint8 of the clean and noisy blocks, with the axes of ``clean``, as far as their files exist."""
-    found, expected = {}, (*clean.shape[:-3], *clean.shape[-2:], 3)
+    """The uint8 pictures of the clean and noisy blocks, with the axes of ``clean``, as far as their files exist."""
+    expected = (*clean.shape[:-3], *clean.shape[-2:], 3)
+    pictures = {}
     for key, kind in zip(("srgb", "noisy_srgb"), kinds, strict=True):
-        if not _matching(path, name := pattern.format(kind)):
+        name = pattern.format(kind)
+        if not _matching(path, name):
             continue
+
         file = find_file(path, name)
         array = read_array(file, file.stem)
         if array.dtype.name != "uint8" or array.shape != expected:
             raise ValueError(f"{file}: holds {array.dtype} {array.shape}; the mosaics need uint8 {expected}")
-        found[key] = torch.from_numpy(array).movedim(-1, -3)
-    return found
+        pictures[key] = torch.from_numpy(array).movedim(-1, -3)
+    return pictures
 
 
 def _patterns(file: Path) -> list[CFA]:
+    """The patterns in the first column of a CSV file, one for each frame."""
     require_file(file)
+    patterns = []
     try:
         with file.open(encoding="utf-8-sig", newline="") as stream:
-            names = [row[0].strip().upper() for row in csv.reader(stream) if row]
-        return [CFA(name) for name in names]
+            for row in csv.reader(stream):
+                if row:
+                    patterns.append(CFA(row[0].strip().upper()))
     except (ValueError, csv.Error) as error:
         raise ValueError(f"{file}: is not a list of patterns, one for each frame ({error}); copy it again") from None
+    return patterns
 
 
 def blocks_of_scenes(file: Path) -> Tensor:
-    """``(40, 32, 1, H, W)``."""
+    """The blocks in a file, ``(40, 32, 1, H, W)``."""
     blocks = to_raw(read_array(file, file.stem), 4, file)
     if blocks.shape[:2] != (len(HELD_BACK), BLOCKS):
         raise ValueError(f"{file}: holds {tuple(blocks.shape[:2])} blocks, the published file {len(HELD_BACK), BLOCKS}")
@@ -445,8 +540,16 @@ def blocks_of_scenes(file: Path) -> Tensor:
 
 
 def _colours(path: Path) -> dict[str, Colour]:
-    files = {scene: found["METADATA_RAW"] for (scene, _), found in index_files(path).items() if "METADATA_RAW" in found}
-    return {scene: colour_of(file) for scene, file in files.items() if scene in HELD_BACK}
+    """The colour of each scene instance of the blocks that has a METADATA file below ``path``."""
+    files = {}
+    for (scene, _), files_of_frame in index_files(path).items():
+        if scene in HELD_BACK and "METADATA_RAW" in files_of_frame:
+            files[scene] = files_of_frame["METADATA_RAW"]
+
+    colours = {}
+    for scene, file in files.items():
+        colours[scene] = colour_of(file)
+    return colours
 
 
 def _require_same_shape(clean: Tensor, noisy: Tensor, file: Path) -> None:

@@ -8,7 +8,8 @@ from typing import Any
 
 from rawaug.data import open_pictures
 from rawaug.data.folders import Cached, Readable, left_out
-from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, SomePairs, names_of, select_pairs, shared_frame
+from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, SomePairs, names_of, shared_frame
+from rawaug.data.selection import select_pairs
 from rawaug.files import find_weights
 from rawaug.isp.model import DictionaryISP
 from rawaug.tasks.base import TASKS, Task

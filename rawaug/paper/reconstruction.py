@@ -21,7 +21,8 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.folders import Readable, skip_broken
-from rawaug.data.pairs import Pair, SomePairs, names_of, select_pairs, shared_frame
+from rawaug.data.pairs import Pair, SomePairs, names_of, shared_frame
+from rawaug.data.selection import select_pairs
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.folder import claim, require_free, run_folder

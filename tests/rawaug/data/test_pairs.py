@@ -12,18 +12,16 @@ import torch
 from rawaug.bayer import CFA, bin_mosaic, bin_mosaic_variance, mosaic
 from rawaug.data import Binned, demo_pairs, open_pairs
 from rawaug.data.folders import Readable
+from rawaug.data.noise_levels import measure_noise
 from rawaug.data.pairs import (
     FrameLabel,
     LazyPairs,
     Pair,
     PairPictures,
-    measure_noise,
-    one_a_phone,
-    select_pairs,
     shared_frame,
     stamps,
-    whole_scenes,
 )
+from rawaug.data.selection import one_a_phone, select_pairs, whole_scenes
 from rawaug.experiment.inputs import open_inputs
 from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 

@@ -11,7 +11,6 @@ import torch
 from rawaug.bayer import CFA, pack
 from rawaug.data import open_pairs
 from rawaug.data.dslrs import DslrFrames
-from rawaug.data.pairs import select_pairs
 from rawaug.data.phones import (
     CAMERAS,
     LIGHTS,
@@ -26,6 +25,7 @@ from rawaug.data.phones import (
     tone_curve,
 )
 from rawaug.data.scenes import camera_in_light, scene_files, white_point
+from rawaug.data.selection import select_pairs
 from rawaug.data.sidd import HELD_BACK, label_of
 from rawaug.io.pictures import write_picture
 

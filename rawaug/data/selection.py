@@ -1,0 +1,99 @@
+"""The selection of pairs for a recipe: the first ones, whole scenes, one of each phone in turn, or names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rawaug.data.pairs import FrameLabel, Pair, lazy, names_of
+
+
+def select_pairs(
+    pairs: Sequence[Pair], available: int, count: int | None, select: str | Sequence[str] = "first"
+) -> list[int]:
+    """Select ``count`` of the first ``available`` pairs, all if it is None; returns their indices and reads no pair.
+
+    ``select`` is a method (``first``, ``scenes`` or ``phones``) or a list of names.
+    """
+    if not isinstance(select, str):
+        return _indices_of_names(names_of(pairs)[:available], select)[:count]
+    if select == "first":
+        return list(range(available)[:count])
+
+    methods = {"scenes": whole_scenes, "phones": one_a_phone}
+    if select not in methods:
+        raise ValueError(f"data.select {select!r} is unknown; use first, {', '.join(methods)} or a list of names")
+    labels = lazy(pairs).labels
+    if not labels:
+        raise ValueError(f"data.select: {select} needs frames with labels, such as sidd:; use first or names")
+
+    if count is None:
+        return list(range(available))
+    return methods[select](labels[:available], count)
+
+
+def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
+    """Indices of the frames of the first scenes in order of their names, ``count`` frames in all."""
+
+    def scene_of(index: int) -> str:
+        return labels[index].scene
+
+    order = sorted(range(len(labels)), key=scene_of)
+    totals = []
+    for place, index in enumerate(order, start=1):
+        is_last_of_scene = place == len(order) or scene_of(order[place]) != scene_of(index)
+        if is_last_of_scene:
+            totals.append(place)
+
+    if count not in totals:
+        nearest = sorted(totals, key=lambda total: abs(total - count))[:2]
+        advice = " or ".join(map(str, sorted(nearest)))
+        raise ValueError(f"data.count: {count} pairs are not whole scenes; use {advice}, or select: first")
+    return order[:count]
+
+
+def one_a_phone(labels: Sequence[FrameLabel], count: int) -> list[int]:
+    """Indices of ``count`` frames that take turns among the phones; those of each phone are evenly spread in ISO."""
+
+    def iso_of(index: int) -> int:
+        return labels[index].iso
+
+    frames_of: dict[str, list[int]] = {}
+    for index, label in enumerate(labels):
+        frames_of.setdefault(label.phone, []).append(index)
+
+    selection: list[list[int]] = []
+    phones = sorted(frames_of)
+    for place, phone in enumerate(phones):
+        share = count // len(phones)
+        if place < count % len(phones):
+            share += 1
+        frames = sorted(frames_of[phone], key=iso_of)
+        if share > len(frames):
+            raise ValueError(f"data.count: {count} pairs are {share} of {phone}, which has {len(frames)}")
+        selection.append([frames[(2 * turn + 1) * len(frames) // (2 * share)] for turn in range(share)])
+
+    order: list[int] = []
+    for turn in range(max(map(len, selection))):
+        for frames in selection:
+            if turn < len(frames):
+                order.append(frames[turn])
+    return order
+
+
+def _indices_of_names(names: Sequence[str], selection: Sequence[str]) -> list[int]:
+    """Indices of the frames in ``selection``, which has names of frames or of scene instances."""
+    indices: list[int] = []
+    for name in selection:
+        matches = []
+        for index, frame in enumerate(names):
+            instance = frame.rpartition("_")[0]
+            if name in (frame, instance):
+                matches.append(index)
+
+        if not matches:
+            examples = ", ".join(names[:3])
+            raise ValueError(f"data.select: {name} is not among the {len(names)} frames, such as {examples}")
+        for index in matches:
+            if index not in indices:
+                indices.append(index)
+    return indices
