@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -81,7 +82,8 @@ def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
         ValueError: if there are fewer than two frames.
     """
     require_free(ablation, overwrite)
-    pairs = list(skip_broken(open_pairs(ablation.data, split="train"), "data"))[: ablation.count]
+    readable = skip_broken(open_pairs(ablation.data, split="train"), "data")
+    pairs = list(islice(readable, ablation.count))
     if len(pairs) < 2:
         raise ValueError(f"data: {ablation.data} has {len(pairs)} frame; leave-one-out needs two or more")
     config, folder = replace(ablation.fit, seed=ablation.seed), claim(ablation, overwrite)

@@ -14,6 +14,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
+from rawaug.denoising.denoiser import require_classical
 from rawaug.evaluation.page import Figure, Page, command_line
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.folder import claim, require_free
@@ -122,8 +123,12 @@ def run_paper(paper: Paper, overwrite: bool = False) -> dict[str, Any]:
         By table (``table1``, ``table2``, ``table3``, ``ablation``) its rows, as ``paper.json`` has them.
     """
     require_free(paper, overwrite)
-    folder = claim(paper, overwrite)
+    for name in paper.parts:
+        settings = paper.part(name)
+        if isinstance(settings, Recipe):
+            require_classical(settings.classical)  # a library that is missing is named before hours are spent
 
+    folder = claim(paper, overwrite)
     for name in paper.parts:
         settings = paper.part(name)
         if isinstance(settings, Comparison):
