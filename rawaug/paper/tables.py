@@ -14,12 +14,11 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from rawaug.denoising.denoiser import require_classical
 from rawaug.evaluation.page import Figure, Page, command_line
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.folder import claim, require_free
 from rawaug.experiment.recipe import EXPERIMENTS
-from rawaug.experiment.run import run
+from rawaug.experiment.run import find_classical, run
 from rawaug.files import write_json
 from rawaug.paper import published
 from rawaug.paper.ablation import Ablation, ablate
@@ -126,7 +125,7 @@ def run_paper(paper: Paper, overwrite: bool = False) -> dict[str, Any]:
     for name in paper.parts:
         settings = paper.part(name)
         if isinstance(settings, Recipe):
-            require_classical(settings.classical)  # a library that is missing is named before hours are spent
+            find_classical(settings.classical, shown=False)  # a library that is missing is named before hours are spent
 
     folder = claim(paper, overwrite)
     for name in paper.parts:
