@@ -1,4 +1,4 @@
-r"""A plain development of RAW to sRGB, with the colours that DNG's tags and their like state.
+r"""A plain development of RAW to sRGB, with the colours of DNG's tags.
 
     srgb = encode(M diag(white_balance) demosaic(raw)),    M = (diag(X S 1)^-1 X S)^-1
 
@@ -6,8 +6,8 @@ with X from XYZ to the camera (DNG's ColorMatrix) and S from linear sRGB to XYZ 
 white balance is the inverse of DNG's AsShotNeutral. There is no tone curve but sRGB's, as in SIDD's pictures
 (A. Abdelhamed, S. Lin, M. S. Brown, CVPR 2018).
 
-Pictures of pairs are demosaiced by Malvar, He and Cutler's interpolation; scores and figures take bilinear
-interpolation, which treats all denoisers alike.
+Pictures of pairs use the demosaicing of Malvar, He and Cutler. Scores and figures use bilinear interpolation, which
+favours no denoiser.
 """
 
 from __future__ import annotations
@@ -34,12 +34,13 @@ def srgb_from_camera(xyz_to_camera: np.ndarray) -> Tensor:
     camera = np.asarray(xyz_to_camera, np.float64).reshape(3, 3) @ XYZ_FROM_SRGB
     if not (np.isfinite(camera).all() and camera.sum(axis=1).all()):
         raise ValueError(f"{np.ravel(xyz_to_camera).tolist()} is not a valid XYZ-to-camera matrix")
+
     return torch.from_numpy(np.linalg.inv(camera / camera.sum(axis=1, keepdims=True))).float()
 
 
 def gains_from_neutral(as_shot_neutral: np.ndarray) -> tuple[float, float, float]:
-    """Multipliers of R, G, B, green being 1."""
-    red, green, blue = (float(value) for value in np.ravel(as_shot_neutral))
+    """Multipliers of R, G and B from the tag AsShotNeutral; that of green is 1."""
+    red, green, blue = map(float, np.ravel(as_shot_neutral))
     if not (min(red, green, blue) > 0 and max(red, green, blue) < np.inf):
         raise ValueError(f"AsShotNeutral {red:g}, {green:g}, {blue:g} is not positive")
     return green / red, 1.0, green / blue
@@ -63,29 +64,34 @@ def render_raw(
         >>> render_raw(torch.full((1, 8, 8), 0.5), "RGGB", (1, 1, 1), torch.eye(3)).mean().item()  # doctest: +ELLIPSIS
         0.735...
     """
-    return render_rgb(bayer.demosaic(raw[None], cfa, demosaicing)[0], gains, matrix, exposure, least)
+    rgb = bayer.demosaic(raw[None], cfa, demosaicing)[0]
+    return render_rgb(rgb, gains, matrix, exposure, least)
 
 
 def render_rgb(
     rgb: Tensor, gains: Sequence[float], matrix: Tensor, exposure: float = 1.0, least: float | None = 0.0
 ) -> Tensor:
     """Linear camera RGB ``(3, H, W)`` as a picture; arguments as in :func:`render_raw`."""
-    balanced = (rgb * exposure * torch.tensor(gains).reshape(3, 1, 1)).clamp(least, 1)
-    return encode_srgb(torch.einsum("ij,jhw->ihw", matrix, balanced).clamp(0, 1))
+    balanced = rgb * exposure * torch.tensor(gains).reshape(3, 1, 1)
+    balanced = balanced.clamp(least, 1)
+
+    linear = torch.einsum("ij,jhw->ihw", matrix, balanced).clamp(0, 1)
+    return encode_srgb(linear)
 
 
 def develop_mosaic(raw: Tensor, cfa: CFA, gains: tuple[float, float, float], matrix: Tensor) -> Tensor:
-    """A mosaic ``(1, H, W)`` as the picture of a pair, uint8 ``(3, H, W)``."""
-    return (render_raw(raw, cfa, gains, matrix) * 255).round_().to(torch.uint8)
+    """Develop a mosaic ``(1, H, W)`` to the picture of a pair, uint8 ``(3, H, W)``."""
+    picture = render_raw(raw, cfa, gains, matrix)
+    return (picture * 255).round_().to(torch.uint8)
 
 
 def develop_pair(
-    name: str, raw: Tensor, cfa: CFA, white_balance: tuple[float, float, float], color_matrix: Tensor, **known: Any
+    name: str, raw: Tensor, cfa: CFA, white_balance: tuple[float, float, float], color_matrix: Tensor, **attributes: Any
 ) -> Pair:
-    """A pair whose picture, unless one is ``known``, is a plain development of its RAW."""
-    if "srgb" not in known:
-        known["srgb"] = develop_mosaic(raw, cfa, white_balance, color_matrix)
-    return Pair(name, raw=raw, cfa=cfa, white_balance=white_balance, color_matrix=color_matrix, **known)
+    """Make a pair with further ``attributes``; without ``srgb`` its picture is a plain development of its RAW."""
+    if "srgb" not in attributes:
+        attributes["srgb"] = develop_mosaic(raw, cfa, white_balance, color_matrix)
+    return Pair(name, raw=raw, cfa=cfa, white_balance=white_balance, color_matrix=color_matrix, **attributes)
 
 
 def develop_packed(packed: Tensor, cfa: CFA, pair: Pair, exposure: float = 1.0) -> Tensor:
@@ -98,4 +104,7 @@ def exposure_of(packed: Tensor, pair: Pair) -> float:
     """The factor that brings the brightest percent of a clean frame to white."""
     green = packed[:, 1:3].flatten()
     stride = max(1, green.numel() // 1_000_000)
-    return float(0.9 / torch.quantile(green[::stride], 0.99).clamp_min(1e-3)) / max(1.0, min(pair.white_balance))
+    brightest = torch.quantile(green[::stride], 0.99).clamp_min(1e-3)
+
+    least_gain = max(1.0, min(pair.white_balance))
+    return float(0.9 / brightest) / least_gain

@@ -58,48 +58,55 @@ def dead_leaves(height: int, width: int, sources: Sequence[Tensor], generator: t
             raise ValueError(f"a source must be uint8 (3, h, w) with sides of at least 32, got {got}")
     if not sources or min(height, width) < 16:
         raise ValueError(f"dead leaves need sources ({len(sources)}) and sides of at least 16 ({height} x {width})")
-    photographs = [source.permute(1, 2, 0).contiguous().numpy() for source in sources]
-    fits = min(min(photograph.shape[:2]) for photograph in photographs) / 2 - 1
-    radii = (_OVERSAMPLING * _LEAST_RADIUS, min(fits, _OVERSAMPLING * max(height, width) / 3))
-    fine = _fine_picture(_OVERSAMPLING * height, _OVERSAMPLING * width, photographs, radii, generator)
     n = _OVERSAMPLING
-    total = sum(fine[i::n, j::n].astype(np.uint16) for i in range(n) for j in range(n))
-    return torch.from_numpy(np.rint(total / n**2).astype(np.uint8)).permute(2, 0, 1).contiguous()
+    photographs = []
+    largest = n * max(height, width) / 3
+    for source in sources:
+        photographs.append(source.permute(1, 2, 0).contiguous().numpy())
+        largest = min(largest, min(source.shape[1:]) / 2 - 1)
+    fine = _fine_picture(n * height, n * width, photographs, (n * _LEAST_RADIUS, largest), generator)
+
+    cells = fine.reshape(height, n, width, n, 3)
+    mean = cells.sum(axis=(1, 3), dtype=np.uint16) / n**2
+    return torch.from_numpy(np.rint(mean).astype(np.uint8)).permute(2, 0, 1).contiguous()
 
 
 def _fine_picture(
     height: int, width: int, photographs: list[np.ndarray], radii: tuple[float, float], generator: torch.Generator
 ) -> np.ndarray:
-    """Disks front to back until every pixel is covered, uint8 ``(height, width, 3)``."""
+    """Lay disks front to back until every pixel is covered, uint8 ``(height, width, 3)``."""
     picture = np.zeros((height, width, 3), np.uint8)
     bare = np.ones((height, width), bool)
     smallest, largest = radii
     while bare.any():
         u = torch.rand(7, _BATCH, generator=generator, dtype=torch.float64).numpy()
-        # inverse of the distribution function of r^-3 between the two radii
+
+        # the inverse of the distribution function of r^-3 between the two radii
         radius = (smallest**-2 - u[0] * (smallest**-2 - largest**-2)) ** -0.5
-        # centres as far outside as the largest disk reaches, so that the border is like the middle
+
+        # some centres are outside, as far as the largest disk reaches, so that the border resembles the middle
         y = u[1] * (height + 2 * largest) - largest
         x = u[2] * (width + 2 * largest) - largest
+
         edges = _edges(y, x, radius, bare.shape)
         for k in np.flatnonzero(_bare_pixels(bare, edges)):
-            disk, photograph = (y[k], x[k], radius[k]), photographs[int(u[3, k] * len(photographs))]
+            disk = (y[k], x[k], radius[k])
+            photograph = photographs[int(u[3, k] * len(photographs))]
             _lay(picture, bare, disk, edges[:, k].tolist(), photograph, u[4:, k])
     return picture
 
 
 def _edges(y: np.ndarray, x: np.ndarray, radius: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Top, bottom, left and right of each disk within the picture, ``(4, N)``; bottom and right are exclusive."""
-    ends = [
-        end.clip(0, side)
-        for centre, side in ((y, shape[0]), (x, shape[1]))
-        for end in (np.ceil(centre - radius), np.floor(centre + radius) + 1)
-    ]
-    return np.stack(ends).astype(np.int64)
+    top = np.ceil(y - radius).clip(0, shape[0])
+    bottom = (np.floor(y + radius) + 1).clip(0, shape[0])
+    left = np.ceil(x - radius).clip(0, shape[1])
+    right = (np.floor(x + radius) + 1).clip(0, shape[1])
+    return np.stack([top, bottom, left, right]).astype(np.int64)
 
 
 def _bare_pixels(bare: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """How many pixels between the edges are bare, by summed areas; what is covered never becomes bare again."""
+    """Count the bare pixels between the edges by summed areas; covered pixels never become bare again."""
     areas = np.pad(bare.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32), ((1, 0), (1, 0)))
     top, bottom, left, right = edges
     return np.asarray(areas[bottom, right] - areas[top, right] - areas[bottom, left] + areas[top, left])
@@ -113,16 +120,26 @@ def _lay(
     photograph: np.ndarray,
     u: np.ndarray,
 ) -> None:
-    """Put one disk (row, column, radius) where ``bare``; ``u`` are uniform: window (2), flat or textured."""
-    (y, x, radius), (top, bottom, left, right) = disk, edges
+    """Draw the bare part of a disk (row, column, radius), flat or textured by a window of a photograph.
+
+    The uniform numbers ``u`` choose the place of the window (two) and whether the disk is flat.
+    """
+    y, x, radius = disk
+    top, bottom, left, right = edges
     free = bare[top:bottom, left:right]
     if not free.any():
         return
-    rows, columns = np.arange(top, bottom) - y, np.arange(left, right) - x
+
+    rows = np.arange(top, bottom) - y
+    columns = np.arange(left, right) - x
     leaf = free & (rows[:, None] ** 2 + columns**2 <= radius**2)
-    i = int(u[0] * (photograph.shape[0] - (bottom - top)))
-    j = int(u[1] * (photograph.shape[1] - (right - left)))
-    window = photograph[i, j] if u[2] < _FLAT_SHARE else photograph[i : i + bottom - top, j : j + right - left]
+
+    height, width = bottom - top, right - left
+    i = int(u[0] * (photograph.shape[0] - height))
+    j = int(u[1] * (photograph.shape[1] - width))
+    window = photograph[i : i + height, j : j + width]
+    if u[2] < _FLAT_SHARE:
+        window = photograph[i, j]
     np.copyto(picture[top:bottom, left:right], window, where=leaf[..., None])
     free &= ~leaf
 
@@ -144,7 +161,7 @@ Rng = np.random.Generator
 
 
 class Shapes(Dataset[Tensor]):
-    """``count`` different pictures, uint8 ``(3, side, side)``, each drawn when it is asked for, in half a second.
+    """``count`` different pictures, uint8 ``(3, side, side)``, drawn on access, which takes half a second each.
 
     Picture i depends on (seed, i) alone.
 
@@ -168,7 +185,7 @@ class Shapes(Dataset[Tensor]):
 
 @PICTURES.register("shapes")
 def open_shapes(path: str = "", min_side: int = 2) -> Shapes:
-    """``shapes:100``, a hundred pictures of :data:`SIDE`, larger where crops are."""
+    """Open ``shapes:100``, a hundred pictures with sides of :data:`SIDE`, or of ``min_side`` if it is larger."""
     if not path.isdecimal():
         raise ValueError(f"shapes:{path}: write the number of pictures, such as shapes:100")
     return Shapes(int(path), max(SIDE, min_side))
@@ -181,23 +198,28 @@ def draw_shapes(side: int, rng: Rng) -> Tensor:
 
     fine = side * _OVERSAMPLING
     picture = Image.new("RGB", (fine, fine), _colour(rng))
-    smallest, largest = (_OVERSAMPLING * rng.choice(radii) for radii in (_SMALLEST, _LARGEST))
+    smallest = _OVERSAMPLING * rng.choice(_SMALLEST)
+    largest = _OVERSAMPLING * rng.choice(_LARGEST)
     kinds = rng.permutation(list(KINDS))[: rng.integers(2, len(KINDS) + 1)]
-    left = rng.choice(_COVER) * fine**2
-    while left > 0:
+
+    area = rng.choice(_COVER) * fine**2
+    while area > 0:
         u = rng.random()
         radius = ((1 - u) * smallest**-2 + u * largest**-2) ** -0.5  # inverse of the distribution function of R^-3
         centre = rng.random(2) * fine
-        KINDS[str(rng.choice(kinds))](picture, centre, radius, rng)
-        left -= 3 * radius**2
+        draw = KINDS[str(rng.choice(kinds))]
+        draw(picture, centre, radius, rng)
+        area -= 3 * radius**2
+
     picture = picture.resize((side, side), Image.Resampling.BOX)
-    if blur := float(rng.choice(_BLUR)):
+    blur = float(rng.choice(_BLUR))
+    if blur:
         picture = picture.filter(ImageFilter.GaussianBlur(blur))
     return _shaded(np.asarray(picture, np.float32), rng)
 
 
 def _shaded(picture: np.ndarray, rng: Rng) -> Tensor:
-    """Lit from one side, ``(side, side, 3)`` to uint8 ``(3, side, side)``."""
+    """Light a picture ``(side, side, 3)`` from one side; returns uint8 ``(3, side, side)``."""
     place = np.linspace(-0.5, 0.5, len(picture), dtype=np.float32)
     down, right = rng.normal(0.0, 0.35, 2).astype(np.float32)
     lit = picture * np.exp(down * place[:, None] + right * place)[..., None]
@@ -205,10 +227,12 @@ def _shaded(picture: np.ndarray, rng: Rng) -> Tensor:
 
 
 def _colour(rng: Rng) -> Colour:
-    """Any hue, mostly pale, dark and light ones most often."""
-    hue, saturation, value = rng.random(), min(1.0, abs(rng.normal(0.0, 0.35))), rng.beta(1.2, 1.2)
-    red, green, blue = (int(255 * channel) for channel in colorsys.hsv_to_rgb(hue, saturation, value))
-    return red, green, blue
+    """Draw a colour of any hue, mostly pale; the value is uniform but for rare extremes."""
+    hue = rng.random()
+    saturation = min(1.0, abs(rng.normal(0.0, 0.35)))
+    value = rng.beta(1.2, 1.2)
+    red, green, blue = colorsys.hsv_to_rgb(hue, saturation, value)
+    return int(255 * red), int(255 * green), int(255 * blue)
 
 
 def _ellipse(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:

@@ -1,10 +1,10 @@
-r"""The files that a mosaic, or both mosaics of a noisy/clean pair, are read from and written to, by extension.
+r"""The file formats of mosaics and of noisy/clean pairs of mosaics, by extension.
 
     y = (d - black) / (white - black)
 
-for a digital number d, which may not exceed white (except in camera RAW, which :func:`rawaug.io.read_raw` reads). What
-a file does not state (CFA, levels) must be given; what it states cannot be overridden. Floating point without levels
-holds y itself.
+for a digital number d, which may not exceed white (except in camera RAW, which :func:`rawaug.io.read_raw` reads). The
+caller must give the CFA and levels that a file does not state, and cannot override those that it states. Floating point
+numbers without levels are y itself.
 
 ======  ==============================================  =============================================  ===============
 file    numbers                                         metadata                                       written
@@ -19,10 +19,10 @@ tiff    the first page                                  its description, as JSON
 png     16 bits, one channel                            none                                           no
 ======  ==============================================  =============================================  ===============
 
-MATLAB files of version 5 are read through SciPy, those of 7.3 (HDF5 behind 512 bytes of header) through h5py. A 7.3
-file holds a matrix with its axes in reverse, since MATLAB counts down the columns and HDF5 along the rows: read
-naively, a picture comes transposed, and a GRBG mosaic looks like GBRG. Here all axes are MATLAB's. Source: MathWorks,
-"MAT-File Format".
+SciPy reads MATLAB files of version 5, and h5py those of version 7.3 (HDF5 after 512 bytes of header). A 7.3 file stores
+the axes of a matrix in reverse, since MATLAB stores column by column and HDF5 row by row: without correction a picture
+is transposed, and a GRBG mosaic looks like GBRG. All axes here are those of MATLAB. Source: MathWorks, "MAT-File
+Format".
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 _TEXT = b"MATLAB 5.0"
 _UNREADABLE = "cannot be read as a MATLAB file"
 MAX_BYTES = 2**30
-"""Maximum size of a variable in a file; those of the published datasets have at most 0.5 GiB."""
+"""Maximum size of a variable in a file. Variables of the published datasets have at most 0.5 GiB."""
 
 
 def mat_version(path: str | Path) -> str:
@@ -61,6 +61,7 @@ def mat_version(path: str | Path) -> str:
     require_file(path, "MATLAB file")
     with Path(path).open("rb") as file:
         header = file.read(512 + len(_HDF5))
+
     if header.startswith(_HDF5) or header[512:] == _HDF5:
         return "7.3"
     if header.startswith(_TEXT) and header[126:128] in (b"IM", b"MI"):
@@ -69,6 +70,7 @@ def mat_version(path: str | Path) -> str:
 
 
 def variables(path: str | Path) -> list[str]:
+    """The names of the variables in a MATLAB file."""
     return list(isolated(_shapes, Path(path)))
 
 
@@ -90,9 +92,10 @@ def read_value(path: str | Path, name: str) -> Any:
 
 
 def to_raw(values: np.ndarray, axes: int, file: Path) -> Tensor:
-    """RAW of two or more ``axes`` and white 1 as float32, with a channel axis before the last two."""
+    """Convert an array of normalised RAW with ``axes`` axes to float32, with a channel axis before the last two."""
     if values.ndim != axes or values.dtype.kind != "f" or not values.size:
         raise ValueError(f"{file}: holds {values.dtype} {values.shape}; normalised RAW is floats with {axes} axes")
+
     low, high = float(values.min()), float(values.max())
     if not (low > -1 and high <= 1):
         raise ValueError(f"{file}: has values from {low:.4g} to {high:.4g}; normalised RAW has black at 0, white at 1")
@@ -100,15 +103,21 @@ def to_raw(values: np.ndarray, axes: int, file: Path) -> Tensor:
 
 
 def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """The variables by name; HDF5 states their shapes with their values."""
+    """The shape of each variable; empty in version 7.3, where HDF5 states the shapes with the values."""
     version = mat_version(path)
+    shapes: dict[str, tuple[int, ...]] = {}
     with damage_as_os_error(path, _UNREADABLE):
         if version == "5":
             from scipy.io import whosmat
 
-            return {name: shape for name, shape, _ in whosmat(path)}
-        with _hdf5(path) as file:
-            return {name: () for name in file if not name.startswith("#")}
+            for name, shape, _ in whosmat(path):
+                shapes[name] = shape
+        else:
+            with _hdf5(path) as file:
+                for name in file:
+                    if not name.startswith("#"):  # MATLAB's own references
+                        shapes[name] = ()
+    return shapes
 
 
 def _hdf5(path: Path) -> Any:
@@ -119,18 +128,23 @@ def _hdf5(path: Path) -> Any:
 
 
 def _read(path: Path, name: str, plain: bool) -> Any:
-    shapes, version = _shapes(path), mat_version(path)
+    shapes = _shapes(path)
+    version = mat_version(path)
     if name not in shapes:
         raise ValueError(f"{path}: has no variable {name}; its variables are: {', '.join(shapes) or 'none'}")
+
     with damage_as_os_error(path, _UNREADABLE):
         if version == "5":
             from scipy.io import loadmat
 
             _require_size(8 * math.prod(shapes[name]), name)
             return loadmat(path, variable_names=[name], simplify_cells=plain)[name]
+
         with _hdf5(path) as file:
             node = _member(file, name)
-            return _plain(node, file) if plain else np.ascontiguousarray(_values(node).T)
+            if plain:
+                return _plain(node, file)
+            return np.ascontiguousarray(_values(node).T)
 
 
 def _require_size(size: int, name: str) -> None:
@@ -139,7 +153,7 @@ def _require_size(size: int, name: str) -> None:
 
 
 def _member(group: Any, name: str) -> Any:
-    """A member of a group; HDF5 links are refused, since they can point to any file on this machine."""
+    """A member of a group. Links are refused, since they can point to any file on this machine."""
     import h5py
 
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
@@ -148,7 +162,7 @@ def _member(group: Any, name: str) -> Any:
 
 
 def _values(node: Any) -> Any:
-    """The values of an HDF5 dataset; refuses external storage and datasets above the size limit."""
+    """The values of an HDF5 dataset. External storage and datasets above the size limit are refused."""
     if node.external or node.is_virtual:
         raise ValueError(f"{node.name} is stored in another file")
     _require_size(node.size * node.dtype.itemsize, node.name)
@@ -156,11 +170,17 @@ def _values(node: Any) -> Any:
 
 
 def _plain(node: Any, file: Any) -> Any:
+    """The value of an HDF5 node as :func:`read_value` returns it."""
     import h5py
 
     if isinstance(node, h5py.Group):
-        fields = {key: _plain(_member(node, key), file) for key in node}
-        return _struct_array(fields) if _is_struct_array(node) else fields
+        fields = {}
+        for key in node:
+            fields[key] = _plain(_member(node, key), file)
+        if _is_struct_array(node):
+            return _struct_array(fields)
+        return fields
+
     value = _values(node)
     if h5py.check_ref_dtype(node.dtype) is not None:
         return [_plain(file[reference], file) for reference in np.ravel(value, order="F")]
@@ -172,18 +192,18 @@ def _plain(node: Any, file: Any) -> Any:
 
 
 def _is_struct_array(group: Any) -> bool:
-    """Whether the fields of a struct refer to values of several elements; unlike cells they have no class."""
+    """Whether a struct has several elements. Its fields then hold references, but, unlike cells, have no class."""
     import h5py
 
     for field in group.values():
-        refers = isinstance(field, h5py.Dataset) and h5py.check_ref_dtype(field.dtype) is not None
-        if not refers or "MATLAB_class" in field.attrs:
+        has_references = isinstance(field, h5py.Dataset) and h5py.check_ref_dtype(field.dtype) is not None
+        if not has_references or "MATLAB_class" in field.attrs:
             return False
     return len(group) > 0
 
 
 def _struct_array(fields: Mapping[str, list[Any]]) -> list[dict[str, Any]]:
-    """The elements of a struct array, by the values of each field."""
+    """The elements of a struct array, given the values of each field."""
     elements = []
     for values in zip(*fields.values(), strict=True):
         elements.append(dict(zip(fields, values, strict=True)))
@@ -198,37 +218,39 @@ Metadata = dict[str, Any]
 
 
 def parse_metadata(values: Mapping[str, Any], where: str | Path) -> Metadata:
-    """Metadata of plain values or arrays; other keys, and None, are left out."""
-    found: Metadata = {}
+    """Parse metadata from plain values or arrays; other keys, and values of None, are ignored."""
+    metadata: Metadata = {}
     for key, value in values.items():
-        if key in KINDS and value is not None:
-            try:
-                found[key] = KINDS[key](value)
-            except (TypeError, ValueError, OverflowError) as error:
-                raise ValueError(f"{where}: {key} is not valid: {' '.join(str(error).split())}") from error
-    return found
+        if key not in KINDS or value is None:
+            continue
+        try:
+            metadata[key] = KINDS[key](value)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"{where}: {key} is not valid: {' '.join(str(error).split())}") from error
+    return metadata
 
 
 def complete_metadata(stated: Metadata, given: Metadata, file: Path) -> Metadata:
-    """Add what is ``given`` to what a file states; ValueError where they contradict each other."""
+    """Add the metadata of the caller (``given``) to those of a file; ValueError if they contradict each other."""
     for key, value in given.items():
         own = stated.get(key, value)
         if own != value:
-            raise ValueError(f"{file}: states {key} {_shown(own)}, not {_shown(value)} as given; leave {key} out")
+            raise ValueError(f"{file}: states {key} {_format(own)}, not {_format(value)} as given; leave {key} out")
     return given | stated
 
 
 def levels(value: Any) -> tuple[float, ...]:
-    """One level, or those of R, Gr, Gb, B; four equal ones are one."""
-    floats = _floats(value)
-    found = floats[:1] if len(set(floats)) == 1 else floats
-    if len(found) not in (1, 4):
-        raise ValueError(f"{len(found)} levels; use one, or those of R, Gr, Gb, B")
-    return found
+    """Parse one level, or the levels of R, Gr, Gb, B; four equal levels become one."""
+    numbers = _floats(value)
+    if len(set(numbers)) == 1:
+        numbers = numbers[:1]
+    if len(numbers) not in (1, 4):
+        raise ValueError(f"{len(numbers)} levels; use one, or those of R, Gr, Gb, B")
+    return numbers
 
 
 def _floats(value: Any) -> tuple[float, ...]:
-    floats = tuple(float(number) for number in np.ravel(value))
+    floats = tuple(map(float, np.ravel(value)))
     if not floats or not np.isfinite(floats).all():
         raise ValueError(f"{np.ravel(value).tolist()} must be finite numbers")
     return floats
@@ -240,9 +262,10 @@ def _one(value: Any) -> float:
 
 
 def _variance(value: Any) -> float:
-    if _one(value) < 0:
-        raise ValueError(f"{_one(value):g} is negative")
-    return _one(value)
+    variance = _one(value)
+    if variance < 0:
+        raise ValueError(f"{variance:g} is negative")
+    return variance
 
 
 def _gains(value: Any) -> tuple[float, float, float]:
@@ -259,25 +282,31 @@ def _cfa(value: Any) -> CFA:
     return CFA(str(names[0]).strip().upper())
 
 
+def _matrix(value: Any) -> Tensor:
+    return torch.tensor(_floats(value)).reshape(3, 3)
+
+
 KINDS: dict[str, Callable[[Any], Any]] = {
     "cfa": _cfa,
     "black": levels,
     "white": _one,
     "white_balance": _gains,
-    "color_matrix": lambda value: torch.tensor(_floats(value)).reshape(3, 3),
+    "color_matrix": _matrix,
     "shot_var": _variance,
     "read_var": _variance,
 }
-"""The keys of the metadata, each with the function that parses its value."""
+"""The keys of metadata, each with the function that parses its value."""
 
 
-def _shown(value: Any) -> str:
-    return "/".join(f"{level:g}" for level in value) if isinstance(value, tuple) else f"{value}"
+def _format(value: Any) -> str:
+    if isinstance(value, tuple):
+        return "/".join(f"{level:g}" for level in value)
+    return str(value)
 
 
 # -- files, by extension ----------------------------------------------------------------------------------------------
 
-Found = tuple[np.ndarray, Mapping[str, Any]]
+Contents = tuple[np.ndarray, Mapping[str, Any]]
 """The numbers of a file, and its metadata."""
 
 
@@ -285,88 +314,115 @@ class _Unclear(ValueError):
     """The file is intact, but it does not say which array is the mosaic."""
 
 
-def _read_npz(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
+def _read_npz(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
+    def select(names: list[str]) -> list[str]:
+        return [_name_of(file, names, which, alone), *KINDS.keys() & set(names)]
+
     with damage_as_os_error(file, "cannot be read as NPZ", _Unclear):
-        arrays = read_npz(file, lambda names: [_name_of(file, names, which, alone), *KINDS.keys() & set(names)])
-        return arrays.pop(next(name for name in arrays if name not in KINDS)), arrays
+        arrays = read_npz(file, select)
+
+    stated = {}
+    for name, array in arrays.items():
+        if name in KINDS:
+            stated[name] = array
+        else:
+            numbers = array
+    return numbers, stated
 
 
-def read_npz(file: Path, wanted: Callable[[list[str]], Iterable[str]]) -> dict[str, np.ndarray]:
-    """The arrays of a file that ``wanted`` chooses by their names; together at most :data:`MAX_BYTES`."""
-    # opened here, since NumPy leaves the files of damaged archives open
-    with file.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
-        names = list(wanted(list(arrays.files)))
-        size = sum(arrays.zip.getinfo(f"{name}.npy").file_size for name in names)
+def read_npz(file: Path, select: Callable[[list[str]], Iterable[str]]) -> dict[str, np.ndarray]:
+    """The arrays of a file that ``select`` chooses by their names; together they may have :data:`MAX_BYTES`."""
+    # opened here, since NumPy does not close the files of damaged archives
+    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+        names = list(select(list(archive.files)))
+        size = 0
+        for name in names:
+            size += archive.zip.getinfo(f"{name}.npy").file_size
         if size > MAX_BYTES:
             raise ValueError(f"declares {size} bytes, above the limit of {MAX_BYTES}")
-        return {name: arrays[name] for name in names}
+
+        arrays = {}
+        for name in names:
+            arrays[name] = archive[name]
+        return arrays
 
 
-def _read_npy(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
-    """The array of a file, whose header says how large it is; objects, which are pickles, are refused by NumPy."""
-    with damage_as_os_error(file, "cannot be read as NPY", _Unclear), file.open("rb") as opened:
-        version = np.lib.format.read_magic(opened)
-        read_header = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }.get(version)
-        if read_header is None:
+def _read_npy(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
+    """The array of a file. Its header states its size; NumPy refuses objects, which are pickles."""
+    with damage_as_os_error(file, "cannot be read as NPY", _Unclear), file.open("rb") as stream:
+        version = np.lib.format.read_magic(stream)
+        if version == (1, 0):
+            shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+        elif version == (2, 0):
+            shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
+        else:
             raise ValueError(f"version {version[0]}.{version[1]} of the format")
-        shape, _, dtype = read_header(opened)
         _require_size(math.prod(shape) * dtype.itemsize, "its array")
-        opened.seek(0)
-        return np.load(opened, allow_pickle=False), {}
+
+        stream.seek(0)
+        return np.load(stream, allow_pickle=False), {}
 
 
 def write_npz(file: Path, clean: Tensor, noisy: Tensor, stated: Mapping[str, Any]) -> None:
-    """Packed RAW ``(4, h, w)`` (or mosaics of other patterns) of a pair, and what is ``stated`` of both."""
-    arrays: dict[str, Any] = {
-        key: np.array(value, None if key == "cfa" else np.float32) for key, value in stated.items()
-    }
-    with replacing(file) as partial, partial.open("wb") as opened:
-        np.savez(opened, **arrays, clean=clean.numpy(), noisy=noisy.numpy())
+    """Write packed RAW ``(4, h, w)`` (or mosaics of other patterns) of a pair, and their metadata (``stated``)."""
+    arrays: dict[str, Any] = {}
+    for key, value in stated.items():
+        dtype = None if key == "cfa" else np.float32
+        arrays[key] = np.array(value, dtype)
+
+    with replacing(file) as partial, partial.open("wb") as stream:
+        np.savez(stream, **arrays, clean=clean.numpy(), noisy=noisy.numpy())
 
 
-def _read_mat(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
+def _read_mat(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
     names = variables(file)
-    stated = {name: read_value(file, name) for name in names if name in KINDS}
+    stated = {}
+    for name in names:
+        if name in KINDS:
+            stated[name] = read_value(file, name)
     return read_array(file, _name_of(file, names, which, alone)), stated
 
 
-def _read_tiff(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
+def _read_tiff(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
     with damage_as_os_error(file, "cannot be read as TIFF", OSError), opened_tiff(file) as tiff:
         page = tiff.pages[0]
         if page.nbytes > MAX_BYTES:
             raise ValueError(f"its first page declares {page.nbytes} bytes, above the limit of {MAX_BYTES}")
-        text = getattr(page, "description", "")
-        try:
-            stated = json.loads(text) if text.startswith("{") else {}
-        except ValueError:  # a description of another program
-            stated = {}
-        return page.asarray(), stated
+        return page.asarray(), _parse_description(getattr(page, "description", ""))
+
+
+def _parse_description(text: str) -> Mapping[str, Any]:
+    """The metadata in the description of a TIFF; empty if another program wrote it."""
+    if not text.startswith("{"):
+        return {}
+    try:
+        stated: Mapping[str, Any] = json.loads(text)
+    except ValueError:
+        return {}
+    return stated
 
 
 def write_tiff(file: Path, image: Tensor, stated: Mapping[str, Any]) -> None:
-    """A mosaic ``(1, H, W)`` or colour ``(3, H, W)`` in its own type; float32 has black 0 and white 1."""
+    """Write a mosaic ``(1, H, W)`` or colour ``(3, H, W)`` in its own type; float32 has black 0 and white 1."""
     with extra("raw"):
         import tifffile
 
+    pixels, photometric = image[0].numpy(), "minisblack"
+    if len(image) == 3:
+        pixels, photometric = image.permute(1, 2, 0).numpy(), "rgb"
+    description = json.dumps(stated, sort_keys=True)
     with replacing(file) as partial:
-        kind: dict[str, Any] = {"description": json.dumps(stated, sort_keys=True), "metadata": None}
-        if len(image) == 3:
-            tifffile.imwrite(partial, image.permute(1, 2, 0).numpy(), photometric="rgb", **kind)
-        else:
-            tifffile.imwrite(partial, image[0].numpy(), photometric="minisblack", **kind)
+        tifffile.imwrite(partial, pixels, photometric=photometric, description=description, metadata=None)
 
 
-def _read_png(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
+def _read_png(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
     numbers = read_plane(file, max_pixels)
     if numbers.dtype != np.uint16:
         raise ValueError(f"{file}: has 8 bits; a mosaic needs a PNG of 16 bits")
     return numbers, {}
 
 
-READERS: dict[str, Callable[[Path, str, bool, int], Found]] = {
+READERS: dict[str, Callable[[Path, str, bool, int], Contents]] = {
     ".npz": _read_npz,
     ".npy": _read_npy,
     ".tif": _read_tiff,
@@ -383,7 +439,18 @@ TWO_IN_ONE = (".npz", ".mat")
 
 
 def read_mosaic(file: Path, which: str, given: Metadata, alone: bool = False, max_pixels: int = MAX_PIXELS) -> RawFrame:
-    """The noisy or clean mosaic (``which``) of a file, which is ``alone`` if it holds both by these names."""
+    """Read a mosaic.
+
+    Args:
+        file: the file.
+        which: ``noisy`` or ``clean``, the name of the array.
+        given: metadata that the file does not state.
+        alone: whether the file holds both mosaics of a pair, so that its only array is not enough.
+        max_pixels: the limit of a PNG.
+
+    Raises:
+        ValueError: if the extension is unknown, or the metadata are incomplete or contradict each other.
+    """
     suffix = file.suffix.lower()
     if suffix in RAW_EXTENSIONS:
         frame = read_raw(file)
@@ -391,21 +458,25 @@ def read_mosaic(file: Path, which: str, given: Metadata, alone: bool = False, ma
         return frame
     if suffix not in READERS:
         raise ValueError(f"{file}: cannot hold a mosaic; use {', '.join(READERS)} or a RAW format")
+
     require_file(file)
     numbers, values = READERS[suffix](file, which, alone, max_pixels)
-    stated = complete_metadata(parse_metadata(values, file), given, file)
-    if "cfa" not in stated:
+    metadata = complete_metadata(parse_metadata(values, file), given, file)
+    if "cfa" not in metadata:
         raise ValueError(f"{file}: does not state its CFA; give cfa, such as RGGB")
-    known: dict[str, Any] = {"color_known": {"white_balance", "color_matrix"} <= stated.keys()}
-    if known["color_known"]:
-        known |= {"white_balance": stated["white_balance"], "color_matrix": stated["color_matrix"]}
-    if {"shot_var", "read_var"} <= stated.keys():
-        known["noise_profile"] = stated["shot_var"], stated["read_var"]
-    return RawFrame(_scale_to_raw(file, numbers, stated), stated["cfa"], **known)
+
+    attributes: dict[str, Any] = {"color_known": False}
+    if {"white_balance", "color_matrix"} <= metadata.keys():
+        attributes["color_known"] = True
+        attributes["white_balance"] = metadata["white_balance"]
+        attributes["color_matrix"] = metadata["color_matrix"]
+    if {"shot_var", "read_var"} <= metadata.keys():
+        attributes["noise_profile"] = (metadata["shot_var"], metadata["read_var"])
+    return RawFrame(_scale_to_raw(file, numbers, metadata), metadata["cfa"], **attributes)
 
 
 def _name_of(file: Path, names: Iterable[str], which: str, alone: bool) -> str:
-    """The array of a file that is the mosaic: the one of that name, or the only one."""
+    """The name of the array that is the mosaic: ``which``, or that of the only array."""
     arrays = [name for name in names if name not in KINDS]
     if which in arrays:
         return which
@@ -414,32 +485,39 @@ def _name_of(file: Path, names: Iterable[str], which: str, alone: bool) -> str:
     raise _Unclear(f"{file}: has no array {which}, but {', '.join(arrays) or 'none'}; name its mosaics noisy and clean")
 
 
-def _scale_to_raw(file: Path, numbers: np.ndarray, stated: Metadata) -> Tensor:
-    """Numbers as RAW float32 ``(1, H, W)``, black 0, white 1."""
+def _scale_to_raw(file: Path, numbers: np.ndarray, metadata: Metadata) -> Tensor:
+    """Scale numbers to RAW float32 ``(1, H, W)``, black 0, white 1."""
     if numbers.dtype.kind not in "fui" or not numbers.size:
         raise ValueError(f"{file}: holds {numbers.dtype} {numbers.shape}; a mosaic must hold numbers")
-    if numbers.dtype.kind == "f" and not {"black", "white"} & stated.keys():
-        stated = stated | {"black": (0.0,), "white": 1.0}
+
+    states_levels = "black" in metadata or "white" in metadata
+    if numbers.dtype.kind == "f" and not states_levels:
+        metadata = metadata | {"black": (0.0,), "white": 1.0}
     for key in ("black", "white"):
-        if key not in stated:
+        if key not in metadata:
             raise ValueError(f"{file}: does not state its {key} level; give black and white")
-    black, white, cfa = stated["black"], stated["white"], stated["cfa"]
+
+    black, white, cfa = metadata["black"], metadata["white"], metadata["cfa"]
     if white <= max(black):
-        raise ValueError(f"{file}: white level {white:g} is not above black level {_shown(black)}")
+        raise ValueError(f"{file}: white level {white:g} is not above black level {_format(black)}")
     low, high = float(numbers.min()), float(numbers.max())
     if not (high <= white and low > 2 * min(black) - white):
-        stated_range = f"black {_shown(black)} and white {white:g}; give the right black and white"
-        raise ValueError(f"{file}: has values from {low:.4g} to {high:.4g}, outside {stated_range}")
+        expected = f"black {_format(black)} and white {white:g}; give the right black and white"
+        raise ValueError(f"{file}: has values from {low:.4g} to {high:.4g}, outside {expected}")
+
     packed = _packed(file, torch.from_numpy(np.ascontiguousarray(numbers, np.float32)), cfa)
-    sites = torch.tensor(black, dtype=torch.float32).reshape(-1, 1, 1)
-    return bayer.unpack((packed - sites) / (white - sites), cfa)
+    black_of_planes = torch.tensor(black, dtype=torch.float32).reshape(-1, 1, 1)
+    return bayer.unpack((packed - black_of_planes) / (white - black_of_planes), cfa)
 
 
 _SHAPES = "a mosaic (H, W), or packed RAW (4, h, w) or (h, w, 4)"
 
 
 def _packed(file: Path, numbers: Tensor, cfa: CFA) -> Tensor:
-    """Pack a mosaic ``(H, W)`` or ``(1, H, W)``; packed RAW has its planes first, or last where those alone are 4."""
+    """Packed RAW ``(4, h, w)`` of a mosaic ``(H, W)`` or ``(1, H, W)``, or of packed RAW with its planes first or last.
+
+    Planes are last if the last axis has 4 elements and the first does not.
+    """
     if numbers.ndim == 3 and numbers.shape[0] == 4:
         return numbers
     if numbers.ndim == 3 and numbers.shape[-1] == 4:
@@ -448,5 +526,6 @@ def _packed(file: Path, numbers: Tensor, cfa: CFA) -> Tensor:
         numbers = numbers[0]
     if numbers.ndim != 2 or min(numbers.shape) < 2:
         raise ValueError(f"{file}: has shape {tuple(numbers.shape)}; use {_SHAPES}")
-    height, width = (side // 2 * 2 for side in numbers.shape)
+
+    height, width = numbers.shape[0] // 2 * 2, numbers.shape[1] // 2 * 2
     return bayer.pack(numbers[None, :height, :width], cfa)

@@ -1,7 +1,7 @@
 """A folder of noisy/clean RAW pairs, yours or written by ``rawaug synth``: ``pairs:PATH``.
 
-The clean frame of ``NAME_noisy.EXT`` is ``NAME_clean.EXT`` beside it; NPZ and MATLAB files of other names hold both.
-Other names go by a pattern: the parts of ``noisy`` under ``*`` and ``?`` stand at the same places in ``clean``.
+The clean frame of ``NAME_noisy.EXT`` is ``NAME_clean.EXT`` beside it; NPZ and MATLAB files with other names hold both.
+Patterns match files with other names: ``*`` and ``?`` stand for the same text in the patterns of noisy and clean files.
 :mod:`rawaug.data.formats` lists the formats.
 """
 
@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rawaug.bayer import CFA
 from rawaug.data.development import UNKNOWN_COLOUR, develop_pair
@@ -92,44 +92,68 @@ class PairFolder(LazyPairs):
 
     def files_of(self, index: int) -> Sequence[Path]:
         _, noisy, clean = self.pairs[index]
-        return tuple(dict.fromkeys((noisy, clean)))
+        if noisy == clean:
+            return (noisy,)
+        return (noisy, clean)
 
     def stamp(self, index: int) -> str:
-        given = tuple(self.given.get(key) for key in ("cfa", "black", "white"))
-        return super().stamp(index) + (f" {given}" if any(given) else "")
+        stamp = super().stamp(index)
+        metadata = (self.given.get("cfa"), self.given.get("black"), self.given.get("white"))
+        if any(metadata):
+            stamp += f" {metadata}"
+        return stamp
 
     def read(self, index: int) -> Pair:
-        name, *files = self.pairs[index]
-        alone = files[0] == files[1]
-        noisy = read_mosaic(files[0], "noisy", self.given, alone, self.max_pixels)
-        clean = read_mosaic(files[1], "clean", self.given, alone, self.max_pixels)
-        for what, one, other in (
-            ("size", tuple(noisy.mosaic.shape[1:]), tuple(clean.mosaic.shape[1:])),
-            ("CFA", noisy.cfa, clean.cfa),
-        ):
-            if one != other:
-                raise ValueError(f"{files[0]}: the clean and the noisy frame differ in {what}, {other} and {one}")
+        name, noisy_file, clean_file = self.pairs[index]
+        alone = noisy_file == clean_file
+        noisy = read_mosaic(noisy_file, "noisy", self.given, alone, self.max_pixels)
+        clean = read_mosaic(clean_file, "clean", self.given, alone, self.max_pixels)
+
+        difference = ""
+        if noisy.cfa != clean.cfa:
+            difference = f"CFA, {clean.cfa} and {noisy.cfa}"
+        if noisy.mosaic.shape != clean.mosaic.shape:
+            difference = f"size, {tuple(clean.mosaic.shape[1:])} and {tuple(noisy.mosaic.shape[1:])}"
+        if difference:
+            raise ValueError(f"{noisy_file}: the clean and the noisy frame differ in {difference}")
         if noisy.cfa not in CFA.__members__:
             raise ValueError(
-                f"{files[0]}: is a mosaic of {noisy.cfa}, and pairs are of Bayer's; check it as a RAW file"
+                f"{noisy_file}: has the pattern {noisy.cfa}, but pairs need a Bayer pattern; check it as a RAW file"
             )
-        stated = [(frame.white_balance, frame.color_matrix) for frame in (clean, noisy) if frame.color_known]
-        colour = stated[0] if stated else UNKNOWN_COLOUR
+
+        gains, matrix = UNKNOWN_COLOUR
+        if clean.color_known:
+            gains, matrix = clean.white_balance, clean.color_matrix
+        elif noisy.color_known:
+            gains, matrix = noisy.white_balance, noisy.color_matrix
         shot_var, read_var = noisy.noise_profile or (None, None)
-        known: dict[str, Any] = {"noisy": noisy.mosaic, "shot_var": shot_var, "read_var": read_var}
-        known |= {"color_known": bool(stated), "camera": noisy.camera, "iso": noisy.iso}
-        return develop_pair(name, clean.mosaic, CFA(clean.cfa), *colour, **known)
+        return develop_pair(
+            name,
+            clean.mosaic,
+            CFA(clean.cfa),
+            gains,
+            matrix,
+            noisy=noisy.mosaic,
+            shot_var=shot_var,
+            read_var=read_var,
+            color_known=clean.color_known or noisy.color_known,
+            camera=noisy.camera,
+            iso=noisy.iso,
+        )
 
 
 def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:
     """Raise ValueError if a folder of RAW files holds noisy frames, by their names."""
     files = set(map(os.path.realpath, folder.files))
     for file in folder.files:
-        found = re.fullmatch(r"(.*)_noisy", file.stem, re.IGNORECASE)
-        partner = found and file.with_name(f"{found[1]}_clean{file.suffix}")
-        if partner and os.path.realpath(partner) in files:
+        match = re.fullmatch(r"(.*)_noisy", file.stem, re.IGNORECASE)
+        if match is None:
+            continue
+
+        partner = file.with_name(f"{match[1]}_clean{file.suffix}")
+        if os.path.realpath(partner) in files:
             raise ValueError(f"{file}: is the noisy frame of {partner.name}; read both as pairs:{spec}")
-        if found and as_clean:
+        if as_clean:
             advice = f"noisy/clean pairs are read as pairs:{spec}; rename it if it is clean"
             raise ValueError(f"{file}: is noisy by its name and would be taken for a clean frame; {advice}")
 
@@ -145,36 +169,57 @@ def looks_like_pairs(files: Sequence[Path]) -> bool:
 
 
 def _pairs_below(path: Path, noisy: str | None, clean: str | None) -> list[PairFiles]:
+    """The pairs of a folder, or those that a file belongs to, sorted by path."""
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such folder of noisy/clean pairs")
     top = path if path.is_dir() else path.parent
-    readable = sorted(files_below(top, READABLE))
-    by_pattern = pairs_by_pattern(top, readable, noisy or NOISY, clean or clean_pattern(noisy or NOISY))
-    found = list(by_pattern)
+    files = sorted(files_below(top, READABLE))
+
+    pairs = pairs_by_pattern(top, files, noisy or NOISY, clean or clean_pattern(noisy or NOISY))
     if noisy is None:
-        known = {file for pair in found for file in pair[1:]}
-        others = [file for file in readable if file not in known]
-        found += [PairFiles(_stem(top, file), file, file) for file in others if file.suffix.lower() in TWO_IN_ONE]
-        strange = [file for file in others if file.suffix.lower() not in TWO_IN_ONE]
-        if strange and path.is_dir():
-            more = f" (and {len(strange) - 1} others)" if len(strange) > 1 else ""
-            raise ValueError(f"{strange[0]}{more}: is neither {NOISY} nor {CLEAN}; give a pattern of the noisy files")
+        others = set(files)
+        for pair in pairs:
+            others -= {pair.noisy, pair.clean}
+        pairs = pairs + _two_in_one(top, sorted(others), is_strict=path.is_dir())
     if path.is_file():
-        found = [pair for pair in found if path in pair[1:]]
-    if not found:
-        wanted = noisy or f"{NOISY}, {CLEAN}"
-        raise ValueError(f"{path}: contains no noisy/clean pair named {wanted}{_unread_kinds(top)}")
-    repeated = Counter(pair.name for pair in found)
-    named = (p if repeated[p.name] == 1 else p._replace(name=p.noisy.relative_to(top).as_posix()) for p in found)
-    return sorted(named, key=lambda pair: pair.noisy)
+        pairs = [pair for pair in pairs if path in (pair.noisy, pair.clean)]
+    if not pairs:
+        names = noisy or f"{NOISY}, {CLEAN}"
+        raise ValueError(f"{path}: contains no noisy/clean pair named {names}{_unread_kinds(top)}")
+
+    counts = Counter(pair.name for pair in pairs)
+    unique = []
+    for pair in sorted(pairs, key=lambda pair: pair.noisy):
+        if counts[pair.name] > 1:
+            pair = pair._replace(name=pair.noisy.relative_to(top).as_posix())
+        unique.append(pair)
+    return unique
+
+
+def _two_in_one(top: Path, files: Sequence[Path], is_strict: bool) -> list[PairFiles]:
+    """The files that hold both mosaics of a pair; others raise a ValueError if ``is_strict``."""
+    pairs = []
+    others = []
+    for file in files:
+        if file.suffix.lower() in TWO_IN_ONE:
+            pairs.append(PairFiles(_stem(top, file), file, file))
+        else:
+            others.append(file)
+
+    if others and is_strict:
+        more = ""
+        if len(others) > 1:
+            more = f" (and {len(others) - 1} others)"
+        raise ValueError(f"{others[0]}{more}: is neither {NOISY} nor {CLEAN}; give a pattern of the noisy files")
+    return pairs
 
 
 def _unread_kinds(top: Path) -> str:
-    """Say which files are noisy or clean by their names, but of a kind that is not read."""
+    """A clause that lists the extensions of files with noisy or clean in their names that cannot be read."""
     extensions = set()
     for file in files_below(top):
-        named = re.search("noisy|clean", file.stem, re.IGNORECASE)
-        if named and file.suffix.lower() not in READABLE:
+        is_of_pair = re.search("noisy|clean", file.stem, re.IGNORECASE)
+        if is_of_pair and file.suffix.lower() not in READABLE:
             extensions.add(file.suffix.lower())
     if not extensions:
         return ""
@@ -185,21 +230,25 @@ def pairs_by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -
     """Match every noisy file with its clean one."""
     if len(_WILD.findall(noisy)) != len(_WILD.findall(clean)):
         raise ValueError(f"the patterns {noisy} and {clean} must have the same number of * and ?")
-    of_noisy, of_clean = (_by_wild_parts(top, files, pattern) for pattern in (noisy, clean))
+    of_noisy = _by_wild_parts(top, files, noisy)
+    of_clean = _by_wild_parts(top, files, clean)
     for parts in sorted(of_noisy.keys() ^ of_clean.keys()):
         if parts in of_noisy:
             raise FileNotFoundError(f"{of_noisy[parts]}: has no clean frame named {clean}; add it, or set that pattern")
         raise FileNotFoundError(f"{of_clean[parts]}: has no noisy frame named {noisy}; add it, or remove this one")
-    if same := of_noisy.items() & of_clean.items():
+    same = of_noisy.items() & of_clean.items()
+    if same:
         raise ValueError(f"{min(same)[1]}: would be its own clean frame by the pattern {clean}")
-    return [
-        PairFiles(re.sub(r"_noisy$", "", _stem(top, file), flags=re.IGNORECASE), file, of_clean[parts])
-        for parts, file in of_noisy.items()
-    ]
+
+    pairs = []
+    for parts, file in of_noisy.items():
+        name = re.sub(r"_noisy$", "", _stem(top, file), flags=re.IGNORECASE)
+        pairs.append(PairFiles(name, file, of_clean[parts]))
+    return pairs
 
 
 def _by_wild_parts(top: Path, files: Sequence[Path], pattern: str) -> dict[tuple[str, ...], Path]:
-    """The files that match a pattern, by their folder and what its ``*`` and ``?`` stand for there."""
+    """The files that match a pattern, by their folder and the text that its ``*`` and ``?`` stand for."""
     wild = {"*": "([^/]*)", "?": "([^/])"}
     expression = "((?:.*/)?)"
     for part in re.split(r"([*?])", pattern):

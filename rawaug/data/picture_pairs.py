@@ -1,4 +1,4 @@
-"""Pairs of developed pictures: a noisy shot, and what it would be without noise, as real test sets have them.
+"""Pairs of developed pictures from real test sets: a noisy shot, and a clean reference.
 
 - ``cc15:DIR``: ``*_real.*`` beside ``*_mean.*``, the mean of 500 shots. Nam, Hwang, Matsushita and Kim, "A Holistic
   Approach to Cross-Channel Image Noise Modeling and Its Application to Image Denoising", CVPR 2016.
@@ -42,12 +42,14 @@ class PicturePair:
     clean: Tensor
 
     def middle(self, crop: int) -> PicturePair:
-        """The middle of both, ``crop x crop``."""
-        return PicturePair(self.name, *(centre(x, crop, crop, step=1) for x in (self.noisy, self.clean)))
+        """Crop the middle of both pictures, ``crop x crop``."""
+        noisy = centre(self.noisy, crop, crop, step=1)
+        clean = centre(self.clean, crop, crop, step=1)
+        return PicturePair(self.name, noisy, clean)
 
 
 class PicturePairs(LazyPairs):
-    """Pairs of developed pictures, each read when it is asked for.
+    """Pairs of developed pictures, read on access.
 
     Args:
         names: a name for each pair.
@@ -130,10 +132,16 @@ def _matched(folder: Path, noisy: str, clean: str) -> PicturePairs:
         raise ValueError(f"{folder}: has no pictures named {noisy} and {clean}")
     pairs.sort(key=lambda pair: pair.noisy)
 
-    def read(index: int) -> tuple[Tensor, Tensor]:
-        return read_picture(pairs[index].noisy), read_picture(pairs[index].clean)
+    names, files = [], []
+    for pair in pairs:
+        names.append(pair.name)
+        files.append((pair.noisy, pair.clean))
 
-    return PicturePairs([pair.name for pair in pairs], [(pair.noisy, pair.clean) for pair in pairs], read)
+    def read(index: int) -> tuple[Tensor, Tensor]:
+        noisy_file, clean_file = files[index]
+        return read_picture(noisy_file), read_picture(clean_file)
+
+    return PicturePairs(names, files, read)
 
 
 @PICTURE_PAIRS.register("sidd-srgb")
@@ -148,5 +156,9 @@ def _blocks(folder: Path) -> PicturePairs:
             )
         arrays.append(torch.from_numpy(array).flatten(0, 1).movedim(-1, 1))
     noisy, clean = arrays
+
+    def read(index: int) -> tuple[Tensor, Tensor]:
+        return noisy[index].contiguous(), clean[index].contiguous()
+
     names = [f"block {number:04d}" for number in range(len(noisy))]
-    return PicturePairs(names, [()] * len(names), lambda k: (noisy[k].contiguous(), clean[k].contiguous()))
+    return PicturePairs(names, [()] * len(names), read)

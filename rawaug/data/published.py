@@ -1,13 +1,13 @@
 """Published sets of RAW files or crops: MIT-Adobe FiveK, RAWIR, RGB2RAW, Zurich, RawBench, and the package's own.
 
-docs/datasets.md describes them, with their sources and licences. What is assumed besides:
+docs/datasets.md describes them, with their sources and licences. The readers make these assumptions:
 
-- *FiveK*: ``fivek.json`` beside this file lists the numbers of the splits, those of InvISP.
-- *RAWIR*, AIM 2022 and *RGB2RAW*: planes are R, G of the red row, G of the blue row, B, taken to be black-subtracted.
-  White is 2^10 where the picture is a JPEG (AIM 2022), 2^12 - 1 where it is a PNG, ``max_val`` of an ``.npz``. White
-  balance and colour matrix come as pickles, which are not opened: gains are 1 and the matrix is the identity.
-- *Zurich*: its loader divides by 1020 and leaves black in; the black level is that of Z. Zhang et al., "Learning
-  RAW-to-sRGB mappings with inaccurately aligned supervision", ICCV 2021.
+- *FiveK*: ``fivek.json`` beside this file lists the numbers of InvISP's splits.
+- *RAWIR*, AIM 2022 and *RGB2RAW*: planes are R, G of the red row, G of the blue row and B, black-subtracted. White is
+  2^10 if the picture is a JPEG (AIM 2022), 2^12 - 1 if it is a PNG, and ``max_val`` in an ``.npz``. White balance and
+  colour matrix are pickles, which are never opened, so gains are 1 and the matrix is the identity.
+- *Zurich*: the dataset's loader divides by 1020 without subtracting black. The black level is that of Z. Zhang et al.,
+  "Learning RAW-to-sRGB mappings with inaccurately aligned supervision", ICCV 2021.
 - ``real:``: ``real_frames/LICENCE.md`` names source and licence (CC0).
 """
 
@@ -51,28 +51,37 @@ def fivek_pairs(
 ) -> RawFolder:
     """The pairs of a split below a folder, Canon before Nikon, each sorted by number.
 
-    ``adjust_maximum_thr`` and ``jpeg_quality`` are those of :class:`rawaug.data.RawFolder`.
+    :class:`rawaug.data.RawFolder` explains ``adjust_maximum_thr`` and ``jpeg_quality``.
     """
-    wanted = [number for camera in cameras for number in fivek_numbers(camera, split)]
-    files = {found[1]: file for file in files_in(path, "FiveK", (".dng",)) if (found := FIVEK_DNG.fullmatch(file.name))}
-    missing = [number for number in wanted if number not in files]
+    numbers = []
+    for camera in cameras:
+        numbers += fivek_numbers(camera, split)
+
+    file_of: dict[str, Path] = {}
+    for file in files_in(path, "FiveK", (".dng",)):
+        match = FIVEK_DNG.fullmatch(file.name)
+        if match is not None:
+            file_of[match[1]] = file
+
+    missing = [number for number in numbers if number not in file_of]
     if missing:
         raise FileNotFoundError(
-            f"{path}: {len(missing)} of the {len(wanted)} DNGs of fivek {'+'.join(cameras)}, {split}, are missing, "
+            f"{path}: {len(missing)} of the {len(numbers)} DNGs of fivek {'+'.join(cameras)}, {split}, are missing, "
             f"first a{missing[0]}-*.dng"
         )
-    chosen = [files[number] for number in wanted]
-    return RawFolder(chosen, camera_jpeg=False, adjust_maximum_thr=adjust_maximum_thr, jpeg_quality=jpeg_quality)
+    files = [file_of[number] for number in numbers]
+    return RawFolder(files, camera_jpeg=False, adjust_maximum_thr=adjust_maximum_thr, jpeg_quality=jpeg_quality)
 
 
 for _camera in CAMERAS:
     _of_camera = partial(fivek_pairs, cameras=[_camera])
     DATASETS.register(f"fivek_{_camera}")(_of_camera)
-    # InvISP's pictures as its published script makes them
+    # the settings of InvISP's published script
     DATASETS.register(f"invisp_{_camera}")(partial(_of_camera, adjust_maximum_thr=0.75, jpeg_quality=90))
 
 
 def fivek_numbers(camera: str, split: str) -> list[str]:
+    """The numbers of a split's DNGs, such as ``"0001"``."""
     if camera not in CAMERAS:
         raise ValueError(f"fivek: no camera {camera}; use one of {', '.join(CAMERAS)}")
     require_split("fivek", split, _SPLITS[camera])
@@ -81,23 +90,28 @@ def fivek_numbers(camera: str, split: str) -> list[str]:
 
 
 WHITE = {".jpg": 2**10, ".png": 2**12 - 1}
-"""White level by the picture's extension."""
+"""White level by the extension of the picture."""
 
 RAWIR_FOLDERS = {"train": "train", "validation": "val", "test": "test"}
 
 
 @DATASETS.register("rawir")
 class Rawir(LazyPairs):
-    """The pairs below a folder, in RGGB; of subfolders ``train``, ``val`` or ``test`` only the one of the split.
+    """The pairs below a folder, in RGGB.
 
-    ``white`` is in digital numbers, by default as :data:`WHITE` says.
+    A folder with subfolders ``train``, ``val`` or ``test`` has the pairs of a split in its subfolder. ``white`` is in
+    digital numbers; :data:`WHITE` has the defaults.
     """
 
     def __init__(self, path: str | Path, split: str = "train", white: float | None = None) -> None:
         require_split("rawir", split, RAWIR_FOLDERS)
-        folder, self.white = Path(path), white
-        if any((folder / name).is_dir() for name in RAWIR_FOLDERS.values()):
+        self.white = white
+
+        folder = Path(path)
+        has_splits = any((folder / name).is_dir() for name in RAWIR_FOLDERS.values())
+        if has_splits:
             folder = folder / RAWIR_FOLDERS[split]
+
         self.files = self.of_split(files_in(folder, "RAWIR", (".npy", ".npz")), split)
         if not self.files:
             raise ValueError(f"{path}: has no pair for {split}; it needs files of {TENTH} RAWs")
@@ -105,43 +119,51 @@ class Rawir(LazyPairs):
         super().__init__([str(file.relative_to(folder).with_suffix("")) for file in self.files])
 
     def of_split(self, files: list[Path], split: str) -> list[Path]:
-        """Choose the files of a split: here all, since every split is a folder."""
+        """Choose the files of a split; here all, since every split has a folder."""
         return files
 
     def camera_of(self, file: Path) -> str:
         return "unknown"
 
     def read(self, index: int) -> Pair:
-        file, picture = self.files[index], self.pictures[index]
+        file = self.files[index]
+        picture = self.pictures[index]
+        is_phone = any("p20" in part.lower() for part in file.parts)  # its JPEGs are not registered
         return Pair(
             name=self.names[index],
             srgb=read_picture(picture, self.max_pixels),
             raw=unpack(read_packed(file, picture, self.white), CFA.RGGB),
             cfa=CFA.RGGB,
             camera=self.camera_of(file),
-            registered=not any("p20" in part.lower() for part in file.parts),
+            registered=not is_phone,
         )
 
 
 def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
-    """Packed RAW ``(4, h, w)`` of a file, white at 1; an ``.npz`` or the picture beside it says which white level."""
+    """Packed RAW ``(4, h, w)`` of a file, white at 1.
+
+    The white level is ``white``, or that of an ``.npz``, or that of the extension of the picture beside the file.
+    """
     with damage_as_os_error(file, "cannot be read as packed RAW"):
         if file.suffix == ".npz":
             arrays = read_npz(file, lambda names: ["raw", "max_val"])
-            numbers, stated = arrays["raw"], float(arrays["max_val"])
+            numbers = arrays["raw"]
+            white = white or float(arrays["max_val"])
         else:
             require_file(file)
-            # mapped: one that claims more than the file holds takes no memory
-            numbers, stated = np.lib.format.open_memmap(file, mode="r"), None
+            # memory-mapped, so that a file with a wrong header takes no memory
+            numbers = np.lib.format.open_memmap(file, mode="r")
+
     if numbers.ndim != 3 or numbers.shape[2] != 4 or numbers.dtype.kind != "u" or not numbers.size:
         raise ValueError(f"{file}: packed RAW must be unsigned (h, w, 4), got {numbers.dtype} {numbers.shape}")
-    white = white or stated or WHITE[picture.suffix.lower()]
+    white = white or WHITE[picture.suffix.lower()]
     if numbers.max() > white:
         raise ValueError(f"{file}: has value {numbers.max()}, above the white level {white:g}; pass white=")
     return torch.from_numpy(numbers.astype(np.float32)).permute(2, 0, 1) / white
 
 
 def picture_beside(file: Path) -> Path:
+    """The picture with the stem of a file, in its folder; FileNotFoundError if there is none."""
     for suffix in WHITE:
         if file.with_suffix(suffix).is_file():
             return file.with_suffix(suffix)
@@ -150,6 +172,7 @@ def picture_beside(file: Path) -> Path:
 
 TENTH = 10
 _TURN = {"test": (0,), "validation": (1,), "train": tuple(range(2, TENTH))}
+"""The places of each split's RAWs in every ten RAWs of a folder."""
 
 
 @DATASETS.register("rgb2raw")
@@ -158,18 +181,21 @@ class Rgb2Raw(Rawir):
 
     def of_split(self, files: list[Path], split: str) -> list[Path]:
         """Choose the files of a split by the place of their RAW among those of the folder."""
-        places: dict[Path, dict[str, int]] = {}
+        files_of_split = []
+        places_in: dict[Path, dict[str, int]] = {}
         for file in files:
-            shots = places.setdefault(file.parent, {})
-            shots.setdefault(_raw_id(file), len(shots))
-        return [file for file in files if places[file.parent][_raw_id(file)] % TENTH in _TURN[split]]
+            places = places_in.setdefault(file.parent, {})
+            place = places.setdefault(_raw_id(file), len(places))
+            if place % TENTH in _TURN[split]:
+                files_of_split.append(file)
+        return files_of_split
 
     def camera_of(self, file: Path) -> str:
         return file.parent.name
 
 
 def _raw_id(file: Path) -> str:
-    """``12_3`` is crop 3 of RAW 12."""
+    """The RAW that a crop belongs to: ``12_3`` is crop 3 of RAW 12."""
     return file.stem.rpartition("_")[0] or file.stem
 
 
@@ -186,11 +212,20 @@ class Zurich(LazyPairs):
         self.folder = Path(path) / split
         files = files_in(self.folder / "huawei_raw", "Zurich RAW to RGB", (".png",))
         self.files = sorted(files, key=lambda file: (len(file.stem), file.stem))  # 2 comes before 10
-        existing = {file.stem for file in (self.folder / "canon").glob("*.jpg")}
-        if missing := [file.stem for file in self.files if file.stem not in existing]:
-            first = self.folder / "canon" / f"{missing[0]}.jpg"
-            raise FileNotFoundError(f"{first}: is missing, and {len(missing) - 1} others")
+
+        pictures = set((self.folder / "canon").glob("*.jpg"))
+        missing = []
+        for file in self.files:
+            picture = self._picture(file)
+            if picture not in pictures:
+                missing.append(picture)
+        if missing:
+            raise FileNotFoundError(f"{missing[0]}: is missing, and {len(missing) - 1} others")
+
         super().__init__([f"{split}_{file.stem}" for file in self.files])
+
+    def _picture(self, file: Path) -> Path:
+        return self.folder / "canon" / f"{file.stem}.jpg"
 
     def read(self, index: int) -> Pair:
         file = self.files[index]
@@ -198,10 +233,11 @@ class Zurich(LazyPairs):
         scale = 1.0 if numbers.dtype == np.uint16 else 0.25
         if numbers.max() >= scale * 2**_BITS:
             raise ValueError(f"{file}: has value {numbers.max()}, more than {_BITS} bits; give a file of this dataset")
+
         light = (numbers.astype(np.float32) - scale * BLACK) / (scale * (ZURICH_WHITE - BLACK))
         return Pair(
             name=self.names[index],
-            srgb=read_picture(self.folder / "canon" / f"{file.stem}.jpg", self.max_pixels),
+            srgb=read_picture(self._picture(file), self.max_pixels),
             raw=torch.from_numpy(np.minimum(light, 1))[None],
             cfa=CFA.RGGB,
             camera="Huawei P20 (picture: Canon 5D Mark IV)",
@@ -211,43 +247,57 @@ class Zurich(LazyPairs):
 
 _NOISY_SHOT = re.compile(r"(Scene_\d+)_ISO\d+(?:_\d+)?", re.IGNORECASE)
 _UNCLIPPED = 0.9
+"""Maximum of the values that the exposures are compared at."""
 
 
 @DATASETS.register("rawbench")
 class RawBench(LazyPairs):
     """Shots of a Sony A7C II, ``Scene_0001/Scene_0001_ISO3200_1.ARW``, and their mean at ISO 100 in ``gt`` beside them.
 
-    Settings were held but for the ISO, so the clean frame is brought to the noisy one's exposure: it is multiplied by
-    the ratio of their means, where neither is clipped, and has noise of its own that this ratio amplifies. The picture
-    is a plain development of it. There are no splits.
+    The shots of a scene differ only in ISO. The clean frame is scaled to the exposure of the noisy frame, by the ratio
+    of their means where neither is clipped, which also amplifies its own noise. The picture is a plain development of
+    it. There are no splits.
     """
 
     def __init__(self, path: str | Path, split: str = "test") -> None:
-        files = files_in(path, "RawBench", RAW_EXTENSIONS)
-        self.files = [file for file in files if file.parent.name != "gt" and _NOISY_SHOT.fullmatch(file.stem)]
+        self.files = []
+        for file in files_in(path, "RawBench", RAW_EXTENSIONS):
+            if file.parent.name != "gt" and _NOISY_SHOT.fullmatch(file.stem):
+                self.files.append(file)
         if not self.files:
             raise ValueError(f"{path}: contains no RAW file named as Scene_0001_ISO3200_1.ARW")
-        self.clean = {file.parent: sorted(files_below(file.parent / "gt", RAW_EXTENSIONS)) for file in self.files}
-        missing = next((folder for folder, clean in self.clean.items() if not clean), None)
-        if missing is not None:
-            raise FileNotFoundError(f"{missing / 'gt'}: has no RAW file at ISO 100; download it too")
+
+        self.clean: dict[Path, list[Path]] = {}
+        for file in self.files:
+            folder = file.parent / "gt"
+            if file.parent not in self.clean:
+                self.clean[file.parent] = sorted(files_below(folder, RAW_EXTENSIONS))
+            if not self.clean[file.parent]:
+                raise FileNotFoundError(f"{folder}: has no RAW file at ISO 100; download it too")
         super().__init__([file.stem for file in self.files])
 
     def files_of(self, index: int) -> Sequence[Path]:
-        return (self.files[index], *self.clean[self.files[index].parent])
+        file = self.files[index]
+        return (file, *self.clean[file.parent])
 
     def read(self, index: int) -> Pair:
-        noisy, *clean = (read_raw(file) for file in self.files_of(index))
-        if any(frame.mosaic.shape != noisy.mosaic.shape or frame.cfa != noisy.cfa for frame in clean):
-            raise ValueError(f"{self.files[index]}: differs in size or pattern from its gt")
-        dark = torch.stack([frame.mosaic for frame in clean]).mean(0)
-        whole = (noisy.mosaic < _UNCLIPPED) & (dark < _UNCLIPPED)
-        ratio = noisy.mosaic[whole].mean() / dark[whole].mean().clamp_min(1e-6)
-        raw = (dark * ratio).clamp(max=1.0)
+        noisy_file, *clean_files = self.files_of(index)
+        noisy = read_raw(noisy_file)
+        mosaics = []
+        for file in clean_files:
+            frame = read_raw(file)
+            if frame.mosaic.shape != noisy.mosaic.shape or frame.cfa != noisy.cfa:
+                raise ValueError(f"{noisy_file}: differs in size or pattern from its gt")
+            mosaics.append(frame.mosaic)
+        mean = torch.stack(mosaics).mean(0)
+
+        unclipped = (noisy.mosaic < _UNCLIPPED) & (mean < _UNCLIPPED)
+        exposure = noisy.mosaic[unclipped].mean() / mean[unclipped].mean().clamp_min(1e-6)
+        raw = (mean * exposure).clamp(max=1.0)
+
         srgb = develop_mosaic(raw, CFA(noisy.cfa), noisy.white_balance, noisy.color_matrix)
-        clean_frame = replace(noisy, mosaic=raw)
-        known = {"noisy": noisy.mosaic, "color_known": noisy.color_known}
-        return Pair.of_frame(self.names[index], clean_frame, srgb, **known)
+        clean = replace(noisy, mosaic=raw)
+        return Pair.of_frame(self.names[index], clean, srgb, noisy=noisy.mosaic, color_known=noisy.color_known)
 
 
 REAL_FRAMES = Path(__file__).with_name("real_frames")
@@ -257,7 +307,7 @@ REAL_BLACK, REAL_WHITE = 512, 16383
 
 @DATASETS.register("real")
 class RealFrames(LazyPairs):
-    """The frames of a split, ``real:train``; ``own_noise`` of each pair is what is left of its reference's noise."""
+    """The frames of a split, such as ``real:train``; ``own_noise`` of a pair is the noise of its reference."""
 
     def __init__(self, path: str = "", split: str = "test") -> None:
         split = path or split
@@ -266,12 +316,24 @@ class RealFrames(LazyPairs):
 
     def read(self, index: int) -> Pair:
         name = self.names[index]
-        known = _real_frames()[name]
-        cfa, gains, matrix = CFA(known["cfa"]), tuple(known["white_balance"]), torch.tensor(known["color_matrix"])
+        frame = _real_frames()[name]
+        cfa = CFA(frame["cfa"])
+
+        # a PNG holds the four planes below each other
         numbers = read_plane(REAL_FRAMES / f"{name}.png").astype(np.float32)
-        planes = torch.from_numpy((numbers - REAL_BLACK) / (REAL_WHITE - REAL_BLACK)).reshape(4, -1, numbers.shape[-1])
-        shot = {"camera": known["camera"], "iso": known["iso"], "own_noise": tuple(known["own_noise"])}
-        return develop_pair(name, unpack(planes, cfa), cfa, gains, matrix, **shot)
+        light = (numbers - REAL_BLACK) / (REAL_WHITE - REAL_BLACK)
+        planes = torch.from_numpy(light).reshape(4, -1, numbers.shape[-1])
+
+        return develop_pair(
+            name,
+            unpack(planes, cfa),
+            cfa,
+            tuple(frame["white_balance"]),
+            torch.tensor(frame["color_matrix"]),
+            camera=frame["camera"],
+            iso=frame["iso"],
+            own_noise=tuple(frame["own_noise"]),
+        )
 
 
 @cache
