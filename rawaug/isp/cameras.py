@@ -58,18 +58,27 @@ class CameraMatrices(NamedTuple):
 
     def select(self, names: Sequence[str]) -> Tensor:
         """The matrices ``(N, 3, 3)`` of N cameras by name, whatever the case of the letters; ValueError if unknown."""
-        return self.xyz_to_camera[[self.names.index(find_camera(name, self.names)) for name in names]]
+        rows = []
+        for name in names:
+            listed_name = find_camera(name, self.names)
+            rows.append(self.names.index(listed_name))
+        return self.xyz_to_camera[rows]
 
 
 @cache
 def load_cameras() -> CameraMatrices:
     """Load the cameras of the package's table; where two sources name one camera, LibRaw's comes first."""
     text = resources.files("rawaug.isp").joinpath("facts/camera_matrices.tsv").read_text("utf-8")
-    rows = [line.split("\t") for line in text.splitlines()[2:]]
-    matrices = torch.tensor([[float(value) for value in row[2:11]] for row in rows], dtype=torch.float64)
-    matrices = matrices.reshape(-1, 3, 3) / 1e4
+    names = []
+    rows = []
+    for line in text.splitlines()[2:]:
+        maker, model, *columns = line.split("\t")
+        names.append(f"{maker} {model}")
+        rows.append([float(value) for value in columns[:9]])
+
+    matrices = torch.tensor(rows, dtype=torch.float64).reshape(-1, 3, 3) / 1e4
     green = responses(matrices, white_point(D65))[:, 1, None, None]
-    return CameraMatrices(tuple(f"{maker} {model}" for maker, model, *_ in rows), matrices / green)
+    return CameraMatrices(tuple(names), matrices / green)
 
 
 def camera_from_srgb(xyz_to_camera: Tensor) -> Tensor:
@@ -148,11 +157,13 @@ def light_range(light: float | str | None) -> LightRange:
     """The lights of one colour temperature in kelvin, one of :data:`LAMPS` by name, or those of :data:`PHOTOGRAPHS`."""
     if light is None:
         return PHOTOGRAPHS
+
     if isinstance(light, str):
         if light not in LAMPS:
             listed, near = ", ".join(LAMPS), suggest(light, LAMPS)
             raise ValueError(f"light {light!r} is unknown; use a colour temperature or one of {listed}{near}")
         return PHOTOGRAPHS._replace(lamps=1.0, among=np.array([LAMPS[light]]))
+
     if not WARMEST <= light <= COLDEST:
         raise ValueError(f"light must be {WARMEST:g} to {COLDEST:g} kelvin, got {light:g}")
     return LightRange((float(light), float(light)), lamps=0.0)
@@ -168,6 +179,7 @@ def daylight(kelvin: Array) -> Array:
     t = (1e3 / kelvin)[..., None]
     c0, c1, c2, c3 = _DAYLIGHT
     both = ((c3 * t + c2) * t + c1) * t + c0
+
     x = np.where(kelvin <= 7000, both[..., 0], both[..., 1])
     return np.stack([x, (2.87 - 3.0 * x) * x - 0.275], axis=-1)
 
@@ -176,7 +188,10 @@ def move_off_locus(xy: Array, kelvin: Array, duv: Array) -> Array:
     """Move ``xy`` ``(..., 2)`` by ``duv`` ``(...)`` along the normal of the Planckian locus at ``kelvin`` ``(...)``."""
     rate = _planckian_uv(kelvin)[1]
     normal = rate[..., ::-1] * (1.0, -1.0)  # to higher v: the locus runs to lower u as it gets hotter
-    return _xy_from_uv(_uv_from_xy(xy) + (duv / np.hypot(rate[..., 0], rate[..., 1]))[..., None] * normal)
+    length = np.hypot(rate[..., 0], rate[..., 1])
+
+    uv = _uv_from_xy(xy) + (duv / length)[..., None] * normal
+    return _xy_from_uv(uv)
 
 
 def white_point(xy: Array | tuple[float, float]) -> Tensor:
@@ -187,26 +202,32 @@ def white_point(xy: Array | tuple[float, float]) -> Tensor:
 def sample_lights(batch: int, generator: torch.Generator, lights: LightRange = ALL_LIGHTS) -> Array:
     """Draw white points ``(batch, 3)``, XYZ with Y = 1; where both loci are defined, each as often as the other."""
     kelvin, lamps, among, by_day = lights
-    drawn = torch.rand(batch, 4, generator=generator, dtype=torch.float64).numpy()
+    uniform = torch.rand(batch, 4, generator=generator, dtype=torch.float64).numpy()
     duv = DUV_SPREAD * torch.randn(batch, generator=generator, dtype=torch.float64).numpy()
-    temperature = 1.0 / (1 / kelvin[1] + (1 / kelvin[0] - 1 / kelvin[1]) * drawn[:, 0])
-    on_daylight = drawn[:, 1] < 0.5
+
+    temperature = 1.0 / (1 / kelvin[1] + (1 / kelvin[0] - 1 / kelvin[1]) * uniform[:, 0])
+    on_daylight = uniform[:, 1] < 0.5
     if by_day:
         sunny = torch.rand(batch, generator=generator, dtype=torch.float64).numpy() < by_day
         mired = torch.normal(*DAYLIGHT_MIRED, (batch,), generator=generator, dtype=torch.float64).numpy()
         temperature = np.where(sunny, (1e6 / mired.clip(1.0)).clip(*kelvin), temperature)
         on_daylight |= sunny
     on_daylight &= temperature >= DAYLIGHT_FROM
-    xy = np.where(on_daylight[:, None], daylight(np.maximum(temperature, DAYLIGHT_FROM)), planckian(temperature))
-    lamp = among[(drawn[:, 3] * len(among)).astype(np.int64)]
-    return _white_point(move_off_locus(np.where(drawn[:, 2:3] < lamps, lamp, xy), temperature, duv))
+
+    by_daylight = daylight(np.maximum(temperature, DAYLIGHT_FROM))
+    on_locus = np.where(on_daylight[:, None], by_daylight, planckian(temperature))
+    lamp = among[(uniform[:, 3] * len(among)).astype(np.int64)]
+    xy = np.where(uniform[:, 2:3] < lamps, lamp, on_locus)
+    return _white_point(move_off_locus(xy, temperature, duv))
 
 
 def _planckian_uv(kelvin: Array) -> tuple[Array, Array]:
     """Krystek's (u, v) ``(..., 2)`` of a black body, and their rates of change with the temperature."""
     t = kelvin[..., None]
     c0, c1, c2 = _PLANCKIAN
-    value, rate = (c2 * t + c1) * t + c0, 2.0 * c2 * t + c1
+    value = (c2 * t + c1) * t + c0
+    rate = 2.0 * c2 * t + c1
+
     uv = value[..., :2] / value[..., 2:]
     return uv, (rate[..., :2] - uv * rate[..., 2:]) / value[..., 2:]
 

@@ -51,26 +51,40 @@ class ISPConfig:
     cameras: int = 0
 
     def __post_init__(self) -> None:
-        CFA(self.cfa)
-        for key in ("stages", "encoder_widths"):  # a recipe or a file gives lists
-            if not isinstance(getattr(self, key), (tuple, list)):
-                raise ValueError(f"{key} must be a list, got {getattr(self, key)!r:.100}")
-            object.__setattr__(self, key, tuple(getattr(self, key)))
+        CFA(self.cfa)  # raises for an unknown pattern
+
+        for key in ("stages", "encoder_widths"):
+            values = getattr(self, key)
+            if not isinstance(values, (tuple, list)):  # a recipe or a file gives lists
+                raise ValueError(f"{key} must be a list, got {values!r:.100}")
+            object.__setattr__(self, key, tuple(values))
+
         for key in ("encoders", "attention"):
-            if not isinstance(getattr(self, key), bool):
-                raise ValueError(f"{key} must be true or false, got {getattr(self, key)!r:.100}")
-        limits = {"colour_atoms": (1, MOST_ATOMS), "gain_atoms": (1, MOST_ATOMS), "tone_atoms": (0, MOST_ATOMS)}
-        for key, (least, most) in {**limits, "cameras": (0, MOST_CAMERAS)}.items():
-            require_between(key, getattr(self, key), least, most)
+            flag = getattr(self, key)
+            if not isinstance(flag, bool):
+                raise ValueError(f"{key} must be true or false, got {flag!r:.100}")
+
+        require_between("colour_atoms", self.colour_atoms, 1, MOST_ATOMS)
+        require_between("gain_atoms", self.gain_atoms, 1, MOST_ATOMS)
+        require_between("tone_atoms", self.tone_atoms, 0, MOST_ATOMS)
+        require_between("cameras", self.cameras, 0, MOST_CAMERAS)
+
+        self._check_encoder_widths()
+        if self.knee is not None:
+            require_between("knee", self.knee, 0.0, 0.999)
+        self._check_stages()
+
+    def _check_encoder_widths(self) -> None:
         if len(self.encoder_widths) != 3:
             raise ValueError(f"encoder_widths must be three numbers, got {self.encoder_widths!r:.100}")
         for width in self.encoder_widths:
             require_between("encoder_widths", width, 1, MOST_FEATURES)
-        if self.knee is not None:
-            require_between("knee", self.knee, 0.0, 0.999)
-        named = all(isinstance(stage, str) for stage in self.stages)
-        if not self.stages or not named or len({*self.stages}) < len(self.stages):
+
+    def _check_stages(self) -> None:
+        are_names = all(isinstance(stage, str) for stage in self.stages)
+        if not self.stages or not are_names or len({*self.stages}) < len(self.stages):
             raise ValueError(f"stages must be one or more names, each at most once, got {self.stages!r:.100}")
+
         if (self.tone_atoms > 0) != ("curve" in self.stages):
             raise ValueError(f"tone_atoms must be at least 1 with the stage curve and 0 without, got {self.tone_atoms}")
 

@@ -120,6 +120,7 @@ class CameraDictionary(ColourDictionary):
         """Mix the atoms by weights ``(B, N)`` into float64 matrices ``(B, 3, 3)`` from XYZ, green 1 in D65."""
         weights = weights.double()
         matrix = torch.einsum("bn,nij->bij", weights, self.atoms().double())
+
         return (weights @ self.responses())[:, :, None] * matrix @ XYZ_TO_SRGB.to(matrix)
 
     def weights_for(self, white_balance: Tensor) -> Tensor:
@@ -158,6 +159,7 @@ def project_to_simplex(weights: Tensor) -> Tensor:
     ordered = weights.sort(dim=1, descending=True).values
     excess = ordered.cumsum(dim=1) - 1.0
     rank = torch.arange(1, weights.shape[1] + 1, device=weights.device)
+
     support = (ordered * rank > excess).sum(dim=1, keepdim=True)
     threshold = excess.gather(1, support - 1) / support
     return (weights - threshold).clamp_min(0.0)
@@ -165,8 +167,8 @@ def project_to_simplex(weights: Tensor) -> Tensor:
 
 def perturb(weights: Tensor, strength: float, generator: torch.Generator) -> Tensor:
     """Augment weights ``(B, N)``: add ``strength * N(0, I)`` and project them back to the simplex."""
-    noise = torch.randn(weights.shape, generator=generator, device=generator.device, dtype=torch.float32).to(weights)
-    return project_to_simplex(weights + strength * noise)
+    noise = torch.randn(weights.shape, generator=generator, device=generator.device, dtype=torch.float32)
+    return project_to_simplex(weights + strength * noise.to(weights))
 
 
 def convex_weights(batch: int, atoms: int, generator: torch.Generator) -> Tensor:
@@ -191,9 +193,9 @@ def sparse_shares(batch: int, atoms: int, mixed: int, generator: torch.Generator
         Indices and float64 shares, both ``(batch, mixed)``.
     """
     # Squares of normals, divided by their sum, crowd the corners and edges of a hull.
-    chosen = torch.randint(atoms, (batch, mixed), generator=generator)
+    indices = torch.randint(atoms, (batch, mixed), generator=generator)
     squares = torch.randn(batch, mixed, generator=generator, dtype=torch.float64) ** 2
-    return chosen, squares / squares.sum(dim=1, keepdim=True)
+    return indices, squares / squares.sum(dim=1, keepdim=True)
 
 
 def nearest_in_hull(points: Tensor, atoms: Tensor) -> tuple[Tensor, Tensor]:
@@ -206,16 +208,19 @@ def nearest_in_hull(points: Tensor, atoms: Tensor) -> tuple[Tensor, Tensor]:
     """
     gram, correlation = atoms @ atoms.mT, points @ atoms.mT
     rate = 1.0 / torch.linalg.eigvalsh(gram)[..., -1:, None]
+
     weights = torch.full_like(correlation, 1.0 / atoms.shape[-2])
     ahead, momentum = weights, torch.ones_like(correlation[..., :1])
     for _ in range(_STEPS):
         gradient = ahead @ gram - correlation
         new = project_to_simplex((ahead - rate * gradient).flatten(0, -2)).reshape(weights.shape)
+
         uphill = (gradient * (new - weights)).sum(dim=-1, keepdim=True) > 0
         momentum = torch.where(uphill, torch.ones_like(momentum), momentum)
         later = 0.5 * (1.0 + (1.0 + 4.0 * momentum**2).sqrt())
         ahead = new + (momentum - 1.0) / later * (new - weights)
         weights, momentum = new, later
+
     return weights, (weights @ atoms - points).square().sum(dim=-1)
 
 
@@ -230,10 +235,9 @@ class CameraSampler:
     """
 
     def __init__(self, cameras: CameraDictionary, tone_atoms: int, lights: LightRange, consistent: bool = True) -> None:
-        self.known, self.atoms, self.responses = (
-            tensor.detach().to("cpu", torch.float64).numpy()
-            for tensor in (cameras.known, cameras.atoms().flatten(1), cameras.responses())
-        )
+        self.known = _as_array(cameras.known)
+        self.atoms = _as_array(cameras.atoms().flatten(1))
+        self.responses = _as_array(cameras.responses())
         self.tone_atoms, self.lights, self.consistent = tone_atoms, lights, consistent
 
     def sample(self, batch: int, generator: torch.Generator, device: torch.device | str = "cpu") -> ISPParams:
@@ -244,35 +248,44 @@ class CameraSampler:
         weights, balance = self._cameras_in_light(batch, generator)
         if not self.consistent:
             _, balance = self._cameras_in_light(batch, generator)
-        matrix = (weights @ self.atoms).reshape(-1, 3, 3)
-        gains = balance / balance.min(axis=1, keepdims=True)
-        drawn = (weights, matrix, gains)
-        colour_weights, matrices, channel_gains = (torch.from_numpy(x).to(device, torch.float32) for x in drawn)
-        tones = none = channel_gains[:, :0]
+
+        colour_weights = torch.from_numpy(weights).to(device, torch.float32)
+        matrices = torch.from_numpy((weights @ self.atoms).reshape(-1, 3, 3)).to(device, torch.float32)
+        gains = torch.from_numpy(balance / balance.min(axis=1, keepdims=True)).to(device, torch.float32)
+
+        tones = none = gains[:, :0]
         if self.tone_atoms:
             atoms, shares = sparse_shares(batch, self.tone_atoms, TONES_MIXED, generator)
-            tones = shares.new_zeros(batch, self.tone_atoms).scatter_add_(1, atoms, shares).to(channel_gains)
-        return ISPParams(colour_weights, none, matrices, channel_gains, tones)
+            tones = shares.new_zeros(batch, self.tone_atoms).scatter_add_(1, atoms, shares).to(gains)
+        return ISPParams(colour_weights, none, matrices, gains, tones)
 
     def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Array, Array]:
         """Draw weights ``(B, N)`` and balances ``(B, 3)``, again where the gains are implausible."""
         weights, balance = np.empty((batch, self.known.shape[1])), np.empty((batch, 3))
-        open_ = np.arange(batch)
+        rest = np.arange(batch)
         for _ in range(_ROUNDS):
-            chosen, shares = sparse_shares(len(open_), len(self.known), CAMERAS_MIXED, generator)
-            drawn = np.einsum("bm,bmn->bn", shares.numpy(), self.known[chosen.numpy()])
-            light = sample_lights(len(open_), generator, self.lights)
-            weights[open_], balance[open_] = drawn, self.balance(drawn, light)
-            open_ = open_[~is_plausible(balance[open_])]
-            if not len(open_):
+            cameras, shares = sparse_shares(len(rest), len(self.known), CAMERAS_MIXED, generator)
+            mixtures = np.einsum("bm,bmn->bn", shares.numpy(), self.known[cameras.numpy()])
+            light = sample_lights(len(rest), generator, self.lights)
+            weights[rest] = mixtures
+            balance[rest] = self.balance(mixtures, light)
+
+            rest = rest[~is_plausible(balance[rest])]
+            if not len(rest):
                 return weights, balance
+
         raise ValueError(f"no light of {self.lights.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}")
 
     def balance(self, weights: Array, light: Array) -> Array:
         """Compute the white balance ``(B, 3)``, green 1, of mixtures ``(B, N)`` in light of white points ``(B, 3)``."""
         linear = light @ XYZ_TO_SRGB.numpy().T
-        response = weights @ self.responses * np.einsum("bij,bj->bi", (weights @ self.atoms).reshape(-1, 3, 3), linear)
+        matrices = (weights @ self.atoms).reshape(-1, 3, 3)
+        response = weights @ self.responses * np.einsum("bij,bj->bi", matrices, linear)
         return np.asarray(response[:, 1:2] / response)
+
+
+def _as_array(tensor: Tensor) -> Array:
+    return np.asarray(tensor.detach().to("cpu", torch.float64).numpy())
 
 
 def is_plausible(balance: Array) -> NDArray[np.bool_]:

@@ -62,16 +62,20 @@ def merge_exposures(isp: DictionaryISP, pictures: Sequence[Tensor], ev: Sequence
         ValueError: if exposures or shapes do not fit the pictures, or two exposures are equal.
     """
     _require_bracket(pictures, ev)
+
     nearest = min(range(len(ev)), key=lambda k: abs(ev[k]))
     params = isp.choose(as_display_referred(pictures[nearest]))
+
     total = exposure = torch.zeros(())
     for picture, stops in zip(pictures, ev, strict=True):
         x = as_display_referred(picture)
         weight = confidence(x)
         if stops == min(ev):
             weight = weight.clamp_min(_LAST_RESORT)
+
         total = total + weight * _linear_reverse(isp, x, params)
         exposure = exposure + weight * 2.0**stops
+
     return ISPResult(total / exposure, params)
 
 
@@ -91,24 +95,31 @@ def render_exposure(isp: DictionaryISP, raw: Tensor, params: ISPParams, ev: floa
     raw = raw * 2.0**ev
     light = raw
     for stage in reversed(isp.ordered_stages):
-        light = stage.forward(light, params) if stage.makes > 2 else light
+        if stage.makes > 2:
+            light = stage.forward(light, params)
     light = light.amax(dim=1, keepdim=True)
-    return isp.forward_pixels(raw * _compress(light) / light.clamp_min(MIDDLE_GREY), params).clamp(0.0, 1.0)
+
+    compressed = raw * _compress(light) / light.clamp_min(MIDDLE_GREY)
+    return isp.forward_pixels(compressed, params).clamp(0.0, 1.0)
 
 
 def _linear_reverse(isp: DictionaryISP, x: Tensor, params: ISPParams) -> Tensor:
     """Compute x5 from x, dividing plainly by the gains: highlight-safe gains are not linear in the scene."""
     for stage in isp.ordered_stages:
-        plain = isinstance(stage, WhiteBalance)
-        x = inverse_gains(x, params.gains, knee=None) if plain else stage.reverse(x, params)
+        if isinstance(stage, WhiteBalance):
+            x = inverse_gains(x, params.gains, knee=None)
+        else:
+            x = stage.reverse(x, params)
     return x
 
 
 def _compress(light: Tensor) -> Tensor:
     """Compute f(L), held to at least a, so that its ratio to ``max(L, a)`` is 1 in the shadows."""
     flat = light.flatten(1)
-    brightest = flat.kthvalue(max(round(_SCENE_WHITE * flat.shape[1]), 1), dim=1).values.clamp_min(1.0)
+    rank = max(round(_SCENE_WHITE * flat.shape[1]), 1)
+    brightest = flat.kthvalue(rank, dim=1).values.clamp_min(1.0)
     white = ((brightest - MIDDLE_GREY) / (1.0 - MIDDLE_GREY)).reshape(-1, 1, 1, 1)
+
     u = (light.clamp_min(MIDDLE_GREY) - MIDDLE_GREY) / (1.0 - MIDDLE_GREY)
     return MIDDLE_GREY + (1.0 - MIDDLE_GREY) * u * (1.0 + u / white**2) / (1.0 + u)
 
@@ -117,6 +128,9 @@ def _require_bracket(pictures: Sequence[Tensor], ev: Sequence[float]) -> None:
     if not pictures or len(pictures) != len(ev):
         raise ValueError(f"one exposure for each picture is needed, got {len(ev)} for {len(pictures)}")
     if len(set(ev)) != len(ev):
-        raise ValueError(f"exposures must differ, got {' '.join(f'{stops:+g}' for stops in ev)} EV")
-    if len(shapes := {tuple(picture.shape): None for picture in pictures}) > 1:
+        exposures = " ".join(f"{stops:+g}" for stops in ev)
+        raise ValueError(f"exposures must differ, got {exposures} EV")
+
+    shapes = dict.fromkeys(tuple(picture.shape) for picture in pictures)
+    if len(shapes) > 1:
         raise ValueError(f"pictures must have one shape, got {' and '.join(map(str, shapes))}")

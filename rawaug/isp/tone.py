@@ -40,13 +40,16 @@ def srgb_to_linear(code: Tensor) -> Tensor:
 
 def to_linear(srgb: Tensor, tables: Tensor) -> Tensor:
     """Map pictures ``(B, C, H, W)``, uint8 or float in [0, 1], each by its own table ``(B, 1021)``, to linear light."""
-    return apply_curves(tables[:, ::STEPS] if srgb.dtype == torch.uint8 else tables, srgb)
+    if srgb.dtype == torch.uint8:
+        tables = tables[:, ::STEPS]
+    return apply_curves(tables, srgb)
 
 
 def to_code(linear: Tensor, tables: Tensor) -> Tensor:
     """Invert :func:`to_linear`: linear light ``(B, C, H, W)``, held to [0, 1], to sRGB codes in [0, 1], float32."""
     light = linear.clamp(0.0, 1.0).flatten(1).to(tables)
     right = torch.searchsorted(tables, light).clamp(1, NODES - 1)
+
     low, high = tables.gather(1, right - 1), tables.gather(1, right)
     share = ((light - low) / (high - low).clamp_min(1e-12)).clamp(0.0, 1.0)
     return ((right - 1 + share) / (NODES - 1)).reshape(linear.shape)
@@ -60,7 +63,8 @@ class ToneDictionary(nn.Module):
 
     def __init__(self, atoms: int) -> None:
         super().__init__()
-        self.register_buffer("curves", srgb_to_linear(torch.linspace(0.0, 1.0, NODES)).repeat(atoms, 1))
+        standard = srgb_to_linear(torch.linspace(0.0, 1.0, NODES))
+        self.register_buffer("curves", standard.repeat(atoms, 1))
         self.register_buffer("typical", torch.full((atoms,), 1.0 / atoms))
 
     def combine(self, weights: Tensor) -> Tensor:
@@ -77,10 +81,11 @@ class ToneDictionary(nn.Module):
         if weights.is_cuda or weights.requires_grad or torch.compiler.is_compiling():
             yield from zip(weights.unbind(1), self.curves, strict=True)
             return
-        unused = weights == 0
-        most = weights.shape[1] - int(unused.sum(dim=1).min())
-        chosen = unused.to(torch.uint8).argsort(dim=1, stable=True)[:, :most]
-        for weight, atom in zip(weights.gather(1, chosen).unbind(1), chosen.unbind(1), strict=True):
+
+        is_zero = weights == 0
+        most = weights.shape[1] - int(is_zero.sum(dim=1).min())
+        atoms = is_zero.to(torch.uint8).argsort(dim=1, stable=True)[:, :most]
+        for weight, atom in zip(weights.gather(1, atoms).unbind(1), atoms.unbind(1), strict=True):
             yield weight, self.curves[atom]
 
 
@@ -94,6 +99,7 @@ class ToneCurve(Stage):
         super().__init__(config)
         if {"tone", "gamma"} & set(config.stages):
             raise ValueError(f"stages: 'curve' replaces tone and gamma, got {' '.join(config.stages)}")
+
         self.dictionary = ToneDictionary(config.tone_atoms)
         self.slopes: Tensor | None = None  # (K, PIECES), l, during a fit
 
@@ -107,17 +113,20 @@ class ToneCurve(Stage):
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         """Put the curves ``(B, 1021)`` of ``params`` into ``batch``; ``place`` and ``size`` do not matter."""
-        return batch._replace(curves=self.dictionary.combine(params.tone_weights.to(batch.matrix)))
+        weights = params.tone_weights.to(batch.matrix)
+        return batch._replace(curves=self.dictionary.combine(weights))
 
     def describe(self) -> str:
         """Say how many curves there are, and their light at code 128."""
-        return f"tone curves: {self.config.tone_atoms}, at code 128 " + " ".join(
-            f"{value:.3f}" for value in self.dictionary.curves[:, 128 * STEPS].tolist()
-        )
+        light = self.dictionary.curves[:, 128 * STEPS].tolist()
+        values = " ".join(f"{value:.3f}" for value in light)
+        return f"tone curves: {self.config.tone_atoms}, at code 128 {values}"
 
     def coarse_parameters(self) -> dict[str, Tensor]:
         """The logarithms of the slopes on each piece, during a fit."""
-        return {} if self.slopes is None else {"slopes": self.slopes}
+        if self.slopes is None:
+            return {}
+        return {"slopes": self.slopes}
 
     def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
         """Compute the reverse pass itself, ``(B, 3, H, W)``, under the slopes of the fit."""
@@ -129,6 +138,7 @@ class ToneCurve(Stage):
         code = torch.linspace(0.0, 1.0, NODES, dtype=torch.float64)
         curve = (code + toe * (1.0 - code)) ** gamma
         self.dictionary.curves.copy_((curve - curve[0]) / (1.0 - curve[0]))
+
         self.slopes = torch.zeros(self.config.tone_atoms, PIECES)
 
     @torch.no_grad()
@@ -139,13 +149,17 @@ class ToneCurve(Stage):
 
     def parameters_of(self, forward: bool) -> dict[str, Tensor]:
         """The slopes for a fit of the reverse pass, nothing for one of the forward pass."""
-        return {} if forward or self.slopes is None else {f"{self.name}.slopes": self.slopes}
+        if forward or self.slopes is None:
+            return {}
+        return {f"{self.name}.slopes": self.slopes}
 
     def _bend(self) -> Tensor:
         """Bend the curves by the slopes of a fit, ``(K, 1021)``."""
         if self.slopes is None:
             return self.dictionary.curves
-        rises = self.dictionary.curves.diff(dim=1) * self.slopes.exp().repeat_interleave((NODES - 1) // PIECES, dim=1)
+
+        factors = self.slopes.exp().repeat_interleave((NODES - 1) // PIECES, dim=1)
+        rises = self.dictionary.curves.diff(dim=1) * factors
         heights = torch.nn.functional.pad(rises.cumsum(dim=1), (1, 0))
         return heights / heights[:, -1:]
 
@@ -155,4 +169,7 @@ class ToneCurve(Stage):
         if params is not None and params.tone_weights.shape[1]:
             weights = params.tone_weights.to(weights)
         weights = weights.expand(batch, -1)
-        return self.dictionary.combine(weights) if self.slopes is None else weights @ self._bend()
+
+        if self.slopes is not None:
+            return weights @ self._bend()
+        return self.dictionary.combine(weights)
