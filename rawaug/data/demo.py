@@ -80,19 +80,21 @@ class DemoCamera:
     def sample(self, generator: torch.Generator, iso: int | None = None) -> Shot:
         """Draw the parameters of a shot; the ISO too, unless it is given."""
         place, red, blue, exposure, level = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
+
+        # interpolate between two illuminants; real light deviates from their line by a few percent
         position = place * (len(_ILLUMINANTS) - 1)
         k = int(position)
-        (red0, blue0), (red1, blue1) = _ILLUMINANTS[k : k + 2]
         t = position - k
+        (red0, blue0), (red1, blue1) = _ILLUMINANTS[k : k + 2]
+        red_gain = (red0 + t * (red1 - red0)) * (0.98 + 0.04 * red)
+        blue_gain = (blue0 + t * (blue1 - blue0)) * (0.98 + 0.04 * blue)
+
+        if iso is None:
+            iso = list(NOISE_LEVELS)[int(level * len(NOISE_LEVELS))]
         return Shot(
-            # real light leaves the line from daylight to tungsten by a few percent
-            white_balance=(
-                (red0 + t * (red1 - red0)) * (0.98 + 0.04 * red),
-                1.0,
-                (blue0 + t * (blue1 - blue0)) * (0.98 + 0.04 * blue),
-            ),
+            white_balance=(red_gain, 1.0, blue_gain),
             exposure=_EXPOSURE[0] + exposure * (_EXPOSURE[1] - _EXPOSURE[0]),
-            iso=iso if iso is not None else list(NOISE_LEVELS)[int(level * len(NOISE_LEVELS))],
+            iso=iso,
             noise_seed=int(torch.randint(2**62, (), generator=generator)),
         )
 
@@ -102,6 +104,7 @@ class DemoCamera:
             raise ValueError(f"{name}: a scene must be uint8 (3, H, W), at least 4 x 4, got {tuple(picture.shape)}")
         exposed = self._expose(picture, shot)
         clean = _digitise(exposed)
+
         shot_var, read_var = NOISE_LEVELS[shot.iso]
         generator = torch.Generator().manual_seed(shot.noise_seed)
         electrons = torch.poisson(exposed / shot_var, generator=generator)
@@ -127,14 +130,19 @@ class DemoCamera:
         """The light on the sensor before noise, ``(1, H, W)``, white = 1."""
         from kornia.filters import gaussian_blur2d
 
-        scene = gaussian_blur2d(decode_srgb(picture[None].float() / 255), 5, (_BLUR, _BLUR))[0]
+        scene = decode_srgb(picture[None].float() / 255)
+        scene = gaussian_blur2d(scene, 5, (_BLUR, _BLUR))[0]
+
         to_camera = torch.linalg.inv(torch.tensor(_COLOR_MATRIX))
         camera = torch.einsum("ij,jhw->ihw", to_camera, scene) / _column(shot.white_balance)
-        return mosaic(shot.exposure * _shading(*picture.shape[-2:]) * camera, self.cfa).clamp(min=0)
+
+        light = shot.exposure * _shading(*picture.shape[-2:]) * camera
+        return mosaic(light, self.cfa).clamp(min=0)
 
     def _render(self, raw: Tensor, shot: Shot) -> Tensor:
-        flat = raw / _shading(*raw.shape[-2:])
-        camera = demosaic(flat[None], self.cfa, "malvar")[0] * _column(shot.white_balance)
+        """Develop a mosaic ``(1, H, W)`` to uint8 ``(3, H, W)``."""
+        unshaded = raw / _shading(*raw.shape[-2:])
+        camera = demosaic(unshaded[None], self.cfa, "malvar")[0] * _column(shot.white_balance)
         linear = torch.einsum("ij,jhw->ihw", torch.tensor(_COLOR_MATRIX), camera.clamp(0, 1)).clamp(0, 1)
         return (_tone(linear) * 255).round().to(torch.uint8)
 
@@ -153,7 +161,7 @@ def _shading(height: int, width: int) -> Tensor:
 
 
 def _digitise(light: Tensor) -> Tensor:
-    """Through the converter's digital numbers and back: RAW with black 0, white 1."""
+    """Quantise RAW with black 0 and white 1 to the digital numbers of the converter."""
     numbers = (light * (WHITE - BLACK) + BLACK).round().clamp(0, WHITE)
     return (numbers - BLACK) / (WHITE - BLACK)
 
@@ -188,7 +196,11 @@ def demo_photographs(split: str) -> dict[str, Tensor]:
 
 
 def demo_files() -> list[Path]:
-    return [_folder() / file for files in (*PHOTOGRAPHS.values(), PICTURES_ONLY) for file in files]
+    """The files of all photographs."""
+    files: list[Path] = []
+    for names in (*PHOTOGRAPHS.values(), PICTURES_ONLY):
+        files += [_folder() / name for name in names]
+    return files
 
 
 def demo_pairs(split: str, count: int | None = None) -> list[Pair]:
@@ -209,7 +221,8 @@ def demo_pairs(split: str, count: int | None = None) -> list[Pair]:
         (torch.Size([1, 288, 448]), <CFA.GRBG: 'GRBG'>, True)
     """
     require_split("demo", split, PHOTOGRAPHS)
-    count = PAIRS[split] if count is None else count
+    if count is None:
+        count = PAIRS[split]
     if count < 1:
         raise ValueError(f"demo:{split}: count must be at least 1, got {count}")
     return [_pair(split, k) for k in range(count)]
@@ -241,14 +254,15 @@ def demo_pictures(count: int = 32) -> PicturesInMemory:
     """
     if count < 1:
         raise ValueError(f"demo: count must be at least 1, got {count}")
-    photographs = _users_photographs()
-    leaves = (_leaves(k) for k in range(count - len(photographs)))
-    return PicturesInMemory([*photographs[:count], *leaves])
+    pictures = _users_photographs()[:count]
+    for k in range(count - len(pictures)):
+        pictures.append(_leaves(k))
+    return PicturesInMemory(pictures)
 
 
 @DATASETS.register("demo")
 def open_demo(path: str = "", split: str = "test") -> list[Pair]:
-    """``demo:SPLIT``, or ``demo:`` and the split that is asked for."""
+    """Open ``demo:SPLIT``, or the ``split`` of ``demo:``."""
     return demo_pairs(path or split)
 
 
@@ -271,31 +285,40 @@ def _leaves(k: int) -> Tensor:
 @cache
 def _pair(split: str, k: int) -> Pair:
     photographs = demo_photographs(split)
-    scenes = list(photographs) if split == "train" else [*photographs, "leaves"]
-    scene, turn = scenes[k % len(scenes)], k // len(scenes)
+    scenes = list(photographs)
+    if split != "train":
+        scenes.append("leaves")
+    turn, place = divmod(k, len(scenes))
+    scene = scenes[place]
+
     generator = keyed_generator(0, "demo pair", split, k)
     if scene == "leaves":
         picture = dead_leaves(*FRAME, list(photographs.values()), generator)
     else:
         picture = _random_crop(photographs[scene], generator)
-    levels = list(NOISE_LEVELS)
-    # every scene meets every ISO in time, and a few pairs already span the range
-    iso = levels[(1 + turn + len(levels) // len(scenes) * (k % len(scenes))) % len(levels)]
+    # each scene gets every ISO in turn, and the first few pairs span the range
+    isos = list(NOISE_LEVELS)
+    iso = isos[(1 + turn + len(isos) // len(scenes) * place) % len(isos)]
     return DemoCamera().capture(picture, generator, name=f"{split}_{k:02d}_{scene}", iso=iso)
 
 
 def _random_crop(photograph: Tensor, generator: torch.Generator) -> Tensor:
-    top, left = (
-        int(torch.randint(side - size + 1, (), generator=generator))
-        for side, size in zip(photograph.shape[-2:], FRAME, strict=True)
-    )
-    crop = photograph[:, top : top + FRAME[0], left : left + FRAME[1]]
-    return crop.flip(-1) if torch.rand((), generator=generator) < 0.5 else crop
+    """Draw a window of :data:`FRAME`, flipped with probability 1/2."""
+    height, width = FRAME
+    y = int(torch.randint(photograph.shape[-2] - height + 1, (), generator=generator))
+    x = int(torch.randint(photograph.shape[-1] - width + 1, (), generator=generator))
+    crop = photograph[:, y : y + height, x : x + width]
+    if torch.rand((), generator=generator) < 0.5:
+        crop = crop.flip(-1)
+    return crop
 
 
 @cache
 def _read(files: tuple[str, ...]) -> dict[str, Tensor]:
-    return {Path(file).stem: read_picture(_folder() / file) for file in files}
+    pictures = {}
+    for file in files:
+        pictures[Path(file).stem] = read_picture(_folder() / file)
+    return pictures
 
 
 def _folder() -> Path:

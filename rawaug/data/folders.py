@@ -1,9 +1,9 @@
-"""Folders: of sRGB pictures, of RAW files, and what becomes of the files in them that cannot be read.
+"""Folders of sRGB pictures and of RAW files, and the treatment of unreadable files in them.
 
-A picture folder is listed and not opened: a file is judged when its turn comes. One that cannot be used is replaced by
-the next that can, in the order of the paths, so that a sample is the same whoever asks, in whatever order, with any
-number of workers. Damaged files are marked in memory shared by all workers: the main process can report them, and no
-worker opens one twice. Pairs that cannot be read are skipped and reported.
+A picture folder lists its files without opening them, and checks a file when it is read. The next usable file, in the
+order of the paths, replaces an unusable one, so that a sample does not depend on the order of access or the number of
+workers. All workers mark damaged files in shared memory, so that the main process can report them and no worker opens
+one twice. Unreadable pairs are skipped and reported.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ from rawaug.io.raw import RAW_EXTENSIONS
 
 _JPEG_SUFFIXES = (".jpg", ".JPG", ".jpeg", ".JPEG")
 _JPEG_MARGIN = 0.03
-"""Maximum number of lines by which the sizes of a JPEG and of LibRaw's RAW may differ."""
-_NAMED = 20
+"""Maximum share by which the sides of a JPEG and of LibRaw's RAW may exceed the common size."""
+_MAX_NAMES = 20
+"""Maximum number of files that an error names."""
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
 
@@ -62,14 +63,17 @@ class PictureFolder(Dataset[Tensor]):
         self, path: str | Path, min_side: int = 2, max_pixels: int = MAX_PIXELS, allowed_share: float = 0.05
     ) -> None:
         self.path = Path(path)
-        self.min_side, self.max_pixels, self.allowed_share = min_side, max_pixels, allowed_share
+        self.min_side = min_side
+        self.max_pixels = max_pixels
+        self.allowed_share = allowed_share
+
         listing = list_pictures(self.path)
         self.left_out = listing.lines()
         if self.path.is_file():
             self.path = self.path.parent
-        names = [str(file.relative_to(self.path)) for file in listing.files]
-        # an array, since the reference counts of a list would be copied into every forked worker, page by page
-        self._names = np.array([os.fsencode(name) for name in names])
+
+        # an array, since forked workers would copy a list page by page as its reference counts change
+        self._names = np.array([os.fsencode(file.relative_to(self.path)) for file in listing.files])
         self._bad = torch.zeros(len(self), dtype=torch.uint8).share_memory_()
         self._reasons: dict[int, str] = {}
 
@@ -108,7 +112,7 @@ class PictureFolder(Dataset[Tensor]):
         """The files that could not be used, with the reason, as far as any worker has met them."""
         reasons: dict[Path, str] = {}
         for index in self._bad_indices():
-            if index not in self._reasons:  # met by a worker
+            if index not in self._reasons:  # a worker has met it
                 self._reasons[index] = self._ask_again(index)
             reasons[self.file(index)] = self._reasons[index]
         return reasons
@@ -126,7 +130,7 @@ class PictureFolder(Dataset[Tensor]):
         return f"{self.file(index)}: was damaged, but is readable now"
 
     def report(self) -> str:
-        """Name the files that were skipped so far, with the reasons, and the kinds of files that are left out."""
+        """A text about the files that were skipped so far, with the reasons, and the kinds of files not used."""
         skipped = self.skipped
         head = f"{escape(self.path)}: none of {len(self)} pictures skipped so far"
         if skipped:
@@ -134,7 +138,7 @@ class PictureFolder(Dataset[Tensor]):
         return "\n".join([head, *map(escape, skipped.values()), *self.left_out])
 
     def _attempt(self, index: int) -> Tensor | None:
-        """The picture, or None if it is damaged, which is then remembered."""
+        """The picture; None if the file is damaged, which is then marked."""
         try:
             return self.read(index)
         except (OSError, ValueError) as error:
@@ -151,8 +155,8 @@ class PictureFolder(Dataset[Tensor]):
         if len(bad) <= self.allowed_share * len(self):
             return
 
-        names = [str(self.file(index)) for index in bad[:_NAMED]]
-        if len(bad) > _NAMED:
+        names = [str(self.file(index)) for index in bad[:_MAX_NAMES]]
+        if len(bad) > _MAX_NAMES:
             names.append("...")
         count = f"{len(bad)} of {len(self)} pictures are unusable, more than allowed_share {self.allowed_share:.0%}"
         raise ValueError(f"{self.path}: {count}: {', '.join(names)}; last: {self._reasons[last]}")
@@ -161,68 +165,77 @@ class PictureFolder(Dataset[Tensor]):
 def reports(pictures: Any) -> list[str]:
     """The report of each folder in ``pictures`` that leaves files out, including cached and concatenated ones."""
     if isinstance(pictures, PictureFolder):
-        return [pictures.report()] if pictures.skipped or pictures.left_out else []
+        if pictures.skipped or pictures.left_out:
+            return [pictures.report()]
+        return []
 
-    inside = [getattr(pictures, "pictures", None)]
+    parts = [getattr(pictures, "pictures", None)]
     if isinstance(pictures, ConcatDataset):
-        inside = list(pictures.datasets)
+        parts = list(pictures.datasets)
+
     lines: list[str] = []
-    for dataset in inside:
-        if dataset is not None:
-            lines += reports(dataset)
+    for part in parts:
+        if part is not None:
+            lines += reports(part)
     return lines
 
 
 class Cached(Dataset[T]):
-    """A dataset that keeps up to ``megabytes`` of its pictures, or of what holds some, in each worker its own.
+    """A cache for a dataset; each worker has its own.
 
     Args:
-        pictures: what is kept, or what each item is made of.
-        megabytes: the most that is kept; the rest is read and made again whenever it is asked for.
-        make: makes an item of one of the ``pictures``; by default it is one of them.
+        pictures: the dataset.
+        megabytes: the size of the cache; other items are read and made anew on every access.
+        make: a function from a picture to an item; by default items are the pictures.
     """
 
     def __init__(self, pictures: Sequence[T] | Any, megabytes: int, make: Callable[[Any], T] | None = None) -> None:
-        self.pictures, self.make, self._left = pictures, make, megabytes * 2**20
-        self._kept: dict[int, T] = {}
+        self.pictures = pictures
+        self.make = make
+        self._free_bytes = megabytes * 2**20
+        self._cache: dict[int, T] = {}
 
     def __len__(self) -> int:
         return len(self.pictures)
 
     def __getitem__(self, index: int) -> T:
-        if index in self._kept:
-            return self._kept[index]
+        if index in self._cache:
+            return self._cache[index]
 
-        item = self.pictures[index]
-        if self.make is not None:
-            item = self.make(item)
+        picture = self.pictures[index]
+        item: T = picture if self.make is None else self.make(picture)
         size = _bytes_of(item)
-        if size <= self._left:
-            self._left -= size
-            self._kept[index] = item
-        kept_or_not: T = item
-        return kept_or_not
+        if size <= self._free_bytes:
+            self._free_bytes -= size
+            self._cache[index] = item
+        return item
 
 
 def _bytes_of(item: Any) -> int:
-    """The memory of a tensor, or of the tensors that are attributes of an object."""
-    parts = [item] if isinstance(item, Tensor) else vars(item).values()
-    return sum(part.nbytes for part in parts if isinstance(part, Tensor))
+    """The memory of a tensor, or of the tensors among the attributes of an object."""
+    if isinstance(item, Tensor):
+        return item.nbytes
+
+    size = 0
+    for value in vars(item).values():
+        if isinstance(value, Tensor):
+            size += value.nbytes
+    return size
 
 
 class Kept(SomePairs):
-    """Pairs that are read once: up to ``megabytes`` of them stay in memory."""
+    """Pairs that are read once; up to ``megabytes`` of them stay in memory."""
 
     def __init__(self, pairs: Sequence[Pair], megabytes: int = 1024) -> None:
         super().__init__(pairs)
-        self._kept: Cached[Pair] = Cached(self.pairs, megabytes)
+        self._cached_pairs: Cached[Pair] = Cached(self.pairs, megabytes)
 
     def read(self, index: int) -> Pair:
-        return self._kept[index]
+        return self._cached_pairs[index]
 
 
 class Readable(Sequence[Pair]):
-    """Pairs without those that cannot be read, whose reasons are kept; ValueError on iteration if none can."""
+    """Pairs that skip unreadable ones and record the reasons; ValueError on iteration if all are unreadable."""
 
     def __init__(self, pairs: Sequence[Pair]) -> None:
         self.pairs = pairs
@@ -239,6 +252,7 @@ class Readable(Sequence[Pair]):
             pair = self.attempt(index, self.pairs.__getitem__)
             if pair is not None:
                 yield pair
+
         if self.broken and len(self.broken) == len(self.pairs):
             raise ValueError(f"none of the {len(self.pairs)} frames can be read; {self.reasons()[0]}")
 
@@ -257,11 +271,12 @@ class Readable(Sequence[Pair]):
         return [self.broken[index] for index in sorted(self.broken)]
 
     def kept(self) -> Sequence[Pair]:
-        """The pairs without those found broken so far; the original sequence if none was."""
+        """The pairs without those that were unreadable so far; the original sequence if there are none."""
         if not self.broken:
             return self.pairs
-        whole = [index for index in range(len(self.pairs)) if index not in self.broken]
-        return SomePairs(self.pairs, whole)
+
+        readable = [index for index in range(len(self.pairs)) if index not in self.broken]
+        return SomePairs(self.pairs, readable)
 
 
 def left_out(pairs: Readable, of: str) -> list[str]:
@@ -269,6 +284,7 @@ def left_out(pairs: Readable, of: str) -> list[str]:
     reasons = pairs.reasons()
     if not reasons:
         return []
+
     return [f"left out of {escape(of)}: {len(reasons)} of {len(pairs)} frames, unreadable", *map(escape, reasons)]
 
 
@@ -307,12 +323,16 @@ class RawFolder(LazyPairs):
         jpeg_quality: int | None = None,
         max_pixels: int = MAX_PIXELS,
     ) -> None:
-        paths = [path] if isinstance(path, (str, Path)) else path
+        if isinstance(path, (str, Path)):
+            path = [path]
         self.files: list[Path] = []
-        for one in paths:
-            self.files += files_in(one, "RAW", RAW_EXTENSIONS)
+        for folder in path:
+            self.files += files_in(folder, "RAW", RAW_EXTENSIONS)
+
         self.camera_jpeg = camera_jpeg
-        self.adjust_maximum_thr, self.jpeg_quality, self.max_pixels = adjust_maximum_thr, jpeg_quality, max_pixels
+        self.adjust_maximum_thr = adjust_maximum_thr
+        self.jpeg_quality = jpeg_quality
+        self.max_pixels = max_pixels
         super().__init__(_names(self.files))
 
     def files_of(self, index: int) -> Sequence[Path]:
@@ -322,28 +342,51 @@ class RawFolder(LazyPairs):
         file = self.files[index]
         jpeg = _jpeg_beside(file) if self.camera_jpeg else None
         if jpeg is not None:
-            frame = read_raw(file)
-            srgb = turn_back(read_picture(jpeg, self.max_pixels), frame.upright_view)
-            size = [min(a, b) // 2 * 2 for a, b in zip(srgb.shape[-2:], frame.mosaic.shape[-2:], strict=True)]
-            sides = (*srgb.shape[-2:], *frame.mosaic.shape[-2:])
-            if all(side - least <= _JPEG_MARGIN * side for side, least in zip(sides, size * 2, strict=True)):
-                frame = replace(frame, mosaic=centre(frame.mosaic, *size))
-                return Pair.of_frame(self.names[index], frame, centre(srgb, *size), registered=False)
-            sizes = "is {} x {} but its RAW file is {} x {}".format(*sides)
-            warnings.warn(f"{jpeg}: {sizes}; using LibRaw's rendering instead", stacklevel=2)
+            pair = self._pair_with_jpeg(self.names[index], file, jpeg)
+            if pair is not None:
+                return pair
+
         frame, srgb = read_raw_and_develop(file, self.adjust_maximum_thr)
-        srgb = srgb if self.jpeg_quality is None else recode_jpeg(srgb, self.jpeg_quality)
+        if self.jpeg_quality is not None:
+            srgb = recode_jpeg(srgb, self.jpeg_quality)
         return Pair.of_frame(self.names[index], frame, srgb)
+
+    def _pair_with_jpeg(self, name: str, file: Path, jpeg: Path) -> Pair | None:
+        """The pair of a RAW file and its JPEG, cut to the smaller size; None, with a warning, if the sizes differ."""
+        frame = read_raw(file)
+        srgb = turn_back(read_picture(jpeg, self.max_pixels), frame.upright_view)
+
+        size = []
+        fits = True
+        for jpeg_side, raw_side in zip(srgb.shape[-2:], frame.mosaic.shape[-2:], strict=True):
+            side = min(jpeg_side, raw_side) // 2 * 2
+            size.append(side)
+            for own_side in (jpeg_side, raw_side):
+                fits = fits and own_side - side <= _JPEG_MARGIN * own_side
+        if not fits:
+            sides = (*srgb.shape[-2:], *frame.mosaic.shape[-2:])
+            sizes = "is {} x {} but its RAW file is {} x {}".format(*sides)
+            warnings.warn(f"{jpeg}: {sizes}; using LibRaw's rendering instead", stacklevel=3)
+            return None
+
+        frame = replace(frame, mosaic=centre(frame.mosaic, *size))
+        return Pair.of_frame(name, frame, centre(srgb, *size), registered=False)
 
 
 def _names(files: Sequence[Path]) -> list[str]:
+    """The stems of files, or their paths below the common folder if two stems are equal."""
     names = [file.stem for file in files]
-    if len(set(names)) < len(names):
-        paths = [file.absolute() for file in files]
-        above = os.path.commonpath([path.parent for path in paths])
-        names = [path.relative_to(above).as_posix() for path in paths]
-    return names
+    if len(set(names)) == len(names):
+        return names
+
+    paths = [file.absolute() for file in files]
+    common_folder = os.path.commonpath([path.parent for path in paths])
+    return [path.relative_to(common_folder).as_posix() for path in paths]
 
 
 def _jpeg_beside(file: Path) -> Path | None:
-    return next((jpeg for suffix in _JPEG_SUFFIXES if (jpeg := file.with_suffix(suffix)).is_file()), None)
+    for suffix in _JPEG_SUFFIXES:
+        jpeg = file.with_suffix(suffix)
+        if jpeg.is_file():
+            return jpeg
+    return None

@@ -1,4 +1,4 @@
-"""Pairs and pictures by name: a path, or ``kind:path`` of a dataset that a reader is registered for."""
+"""Pairs and pictures by name: a path, or ``kind:path`` for a dataset with a registered reader."""
 
 from __future__ import annotations
 
@@ -64,9 +64,10 @@ def open_pairs(
         return folder
 
     reader = _reader(DATASETS, str(spec), kind, path, "a RAW file or folder")
-    path, named = _path_and_split(path)
-    chosen = check_settings(f"{kind}:", reader, settings, given=("path", "split")) if settings else {}
-    pairs: Sequence[Pair] = reader(path, named or split, **chosen)
+    path, split_of_spec = _path_and_split(path)
+    if settings:
+        settings = check_settings(f"{kind}:", reader, settings, given=("path", "split"))
+    pairs: Sequence[Pair] = reader(path, split_of_spec or split, **settings)
     if max_pixels is not None and isinstance(pairs, LazyPairs):
         pairs.max_pixels = max_pixels
     return pairs
@@ -76,7 +77,8 @@ def _as_they_are(pairs: Sequence[Pair], settings: Mapping[str, Any]) -> Sequence
     _require_none(settings, "a sequence of pairs")
     if isinstance(pairs, LazyPairs):
         return pairs
-    if not isinstance(pairs, Sequence) or not pairs or not all(isinstance(pair, Pair) for pair in pairs):
+    is_valid = isinstance(pairs, Sequence) and len(pairs) > 0 and all(isinstance(pair, Pair) for pair in pairs)
+    if not is_valid:
         raise ValueError(f"data must be a path, kind:path or a non-empty list of Pair, got {type(pairs).__name__}")
     return pairs
 
@@ -114,8 +116,8 @@ def open_pictures(spec: str | Path | Sequence[str | Path], min_side: int = 2, ma
 
 def _reader(kinds: Registry, spec: str, kind: str, path: str, other: str) -> Callable[[str, Any], Any]:
     if kind not in kinds:
-        known = ", ".join(f"{name}:" for name in kinds)
-        raise ValueError(f"{spec}: unknown {kinds.kind}; use {known} or the path of {other}{suggest(kind, kinds)}")
+        prefixes = ", ".join(f"{name}:" for name in kinds)
+        raise ValueError(f"{spec}: unknown {kinds.kind}; use {prefixes} or the path of {other}{suggest(kind, kinds)}")
 
     reader: Callable[[str, Any], Any] = kinds[kind]
     if not path and inspect.signature(reader).parameters["path"].default is inspect.Parameter.empty:
