@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from rawaug.commands import YAML
 from rawaug.evaluation.comparison import Comparison
@@ -16,7 +16,7 @@ def run(
     bin: int = 1,
     count: int = 6,
     crop: int = 384,
-    noise: Annotated[str | list[str] | tuple[float, float] | None, YAML] = None,
+    noise: Annotated[str | list[str] | tuple[float, float] | dict[str, Any] | None, YAML] = None,
     iso: list[float] | None = None,
     seed: int = 0,
     device: str = "cpu",
@@ -36,8 +36,9 @@ def run(
         bin: average this many sites of a colour in both directions, to leave less of the frames' own noise.
         count: number of frames.
         crop: side of the middle of each frame that is used, in pixels of the mosaic.
-        noise: noise in place of the four strengths: a preset, a measured camera, or [shot_var, read_var].
-        iso: ISO values of that camera, a column each.
+        noise: noise in place of the four strengths: a preset, a measured camera, [shot_var, read_var], or a law of
+            your own as {name: MeasuredNoise, settings: ...}.
+        iso: ISO values of that camera or law, a column each.
         seed: seed of the noise.
         device: device for networks: cpu, cuda, ...
         json: write the result as JSON to this file.

@@ -13,11 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from denoisers.classical import FILTERS
 from rawaug.cli import COMMANDS, app, main
 from rawaug.commands.run import keys_of
 from rawaug.data import demo_pictures
+from rawaug.evaluation.benchmark import strengths_of
 from rawaug.experiment.recipe import kinds, settings_of
 from rawaug.io import write_picture
 
@@ -250,3 +252,15 @@ def test_threads_sleep_where_they_wait_unless_the_user_says_otherwise(monkeypatc
     monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
     main([])
     assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"
+
+
+def test_benchmark_takes_a_law_of_ones_own_at_an_iso() -> None:
+    levels = "[{iso: 100, shot_var: 5.0e-5, read_var: 1.7e-8}, {iso: 6400, shot_var: 3.1e-3, read_var: 3.8e-6}]"
+    law = f"{{name: MeasuredNoise, settings: {{camera: M1, levels: {levels}}}}}"
+
+    _, bound, _ = app.parse_args(["benchmark", "--noise", law, "--iso", "800"], exit_on_error=False, print_error=False)
+    levels_at = strengths_of(bound.arguments["noise"], bound.arguments["iso"])
+
+    shot_var, read_var = levels_at["ISO 800"].sample(1, torch.Generator())
+    assert 5.0e-5 < float(shot_var) < 3.1e-3
+    assert 1.7e-8 < float(read_var) < 3.8e-6
