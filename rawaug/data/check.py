@@ -10,7 +10,7 @@ from __future__ import annotations
 import pickle
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
@@ -32,7 +32,8 @@ from rawaug.io import RawFrame, read_raw
 from rawaug.io.content import RAW_EXTENSIONS, content_of, list_files, picture_extensions
 from rawaug.io.isolated import isolated
 
-_SHOWN = 6
+_MAX_VALUES = 6
+"""Maximum number of values of a property that a report lists."""
 _PAIRS = "pairs:"
 
 
@@ -61,16 +62,18 @@ class PartReport:
 
         lines = [head]
         for what, counts in self.counts.items():
-            shown = [f"{escape(value)} ({count})" for value, count in counts.most_common(_SHOWN)]
-            if len(counts) > _SHOWN:
-                shown.append(f"{len(counts) - _SHOWN} more")
-            lines.append(f"  {what}: {', '.join(shown)}")
+            values = [f"{escape(value)} ({count})" for value, count in counts.most_common(_MAX_VALUES)]
+            if len(counts) > _MAX_VALUES:
+                values.append(f"{len(counts) - _MAX_VALUES} more")
+            lines.append(f"  {what}: {', '.join(values)}")
 
         lines.append(f"  damaged: {len(self.broken) or 'none'}")
-        lines += [f"    {escape(line)}" for line in self.broken]
+        for line in self.broken:
+            lines.append(f"    {escape(line)}")
         if self.unfit:
             lines.append(f"  whole, but not usable: {len(self.unfit)}")
-            lines += [f"    {escape(line)}" for line in self.unfit]
+        for line in self.unfit:
+            lines.append(f"    {escape(line)}")
         return "\n".join(lines)
 
 
@@ -88,12 +91,18 @@ class DataReport:
     @property
     def broken(self) -> list[str]:
         """The reasons of damaged items."""
-        return [line for part in self.parts for line in part.broken]
+        lines: list[str] = []
+        for part in self.parts:
+            lines += part.broken
+        return lines
 
     @property
     def unfit(self) -> list[str]:
         """The reasons of items that are whole but not usable, such as a linear DNG among mosaics."""
-        return [line for part in self.parts for line in part.unfit]
+        lines: list[str] = []
+        for part in self.parts:
+            lines += part.unfit
+        return lines
 
     def __str__(self) -> str:
         return "\n".join([escape(self.path), *map(str, self.parts), *self.left_out])
@@ -107,36 +116,42 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
     settings = {key: value for key, value in settings.items() if value is not None}
     if str(path).startswith(_PAIRS):
         folder = Path(str(path).removeprefix(_PAIRS))
-        PairFolder(folder, **settings)  # raises for a wrong setting
-        return DataReport(folder, [_part("noisy/clean pairs", partial(PairFolder, folder, **settings), first)])
+        open_folder = partial(PairFolder, folder, **settings)
+        open_folder()  # raises for a wrong setting
+        return DataReport(folder, [_part("noisy/clean pairs", open_folder, first)])
     if settings:
         raise ValueError(f"{path}: {', '.join(settings)} can only be given for {_PAIRS}PATH")
+
     kind, colon, _ = str(path).partition(":")
     if colon and not Path(path).exists():
-        parts = [_part(what, opened, first) for what, opened in _of_kind(kind, str(path))]
+        parts = _parts(_of_kind(kind, str(path)), first)
         return DataReport(Path(path), [part for part in parts if part.items] or parts)
+
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
-    datasets = list(_datasets(path))
-    known = datasets or list(_files(path))
-    left_out = [] if datasets or path.is_file() else _left_out(path)
-    if not known:
-        there = "; ".join(left_out) or "see docs/datasets.md"
-        raise ValueError(f"{path}: contains no known dataset, RAW file or picture; {there}")
-    return DataReport(path, [_part(what, open_part, first) for what, open_part in known], left_out)
+    openers = list(_datasets(path))
+    left_out: list[str] = []
+    if not openers:
+        openers = list(_files(path))
+        if path.is_dir():
+            left_out = _left_out(path)
+    if not openers:
+        contents = "; ".join(left_out) or "see docs/datasets.md"
+        raise ValueError(f"{path}: contains no known dataset, RAW file or picture; {contents}")
+    return DataReport(path, _parts(openers, first), left_out)
 
 
 def _left_out(folder: Path) -> list[str]:
-    """A line for each kind of file in a folder that is neither RAW nor a picture that can be read here."""
-    read = (*RAW_EXTENSIONS, *picture_extensions())
+    """A line for each kind of file in a folder that is neither RAW nor a readable picture."""
+    extensions = (*RAW_EXTENSIONS, *picture_extensions())
     if looks_like_pairs(list(files_below(folder))):
-        read = (*read, *READABLE)
-    return list_files(folder, read, "neither RAW nor a picture that is known").lines()
+        extensions = (*extensions, *READABLE)
+    return list_files(folder, extensions, "neither RAW nor a picture that is known").lines()
 
 
 def _of_kind(kind: str, spec: str) -> list[tuple[str, Callable[[], Any]]]:
-    """What ``kind:path`` may open everywhere else: pairs, pictures, or both."""
+    """How to open ``kind:path``, which may be pairs, pictures, or both."""
     openers: list[tuple[str, Callable[[], Any]]] = []
     if kind in DATASETS:
         openers.append((f"pairs of {spec}", partial(open_pairs, spec)))
@@ -149,25 +164,30 @@ def _of_kind(kind: str, spec: str) -> list[tuple[str, Callable[[], Any]]]:
 
 def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     """The published datasets recognised by file names, and how to open each."""
-    found = list(files_below(path))
-    files = {file.name for file in found}
-    if any("GT_RAW" in file.name.upper() and is_scene(file.parent.name) for file in found):
+    files = list(files_below(path))
+    names = {file.name for file in files}
+    if any("GT_RAW" in file.name.upper() and is_scene(file.parent.name) for file in files):
         yield "SIDD, full frames", partial(SiddFrames, path)
-    if any(re.fullmatch(r"Validation\w+BlocksRaw\.mat", name) for name in files):
+    if any(re.fullmatch(r"Validation\w+BlocksRaw\.mat", name) for name in names):
         yield "SIDD, validation blocks", partial(SiddBlocks, path)
-    if "BenchmarkNoisyBlocksRaw.mat" in files:
+    if "BenchmarkNoisyBlocksRaw.mat" in names:
         yield "SIDD, benchmark blocks (noisy only)", partial(SiddBenchmark, path)
-    if any(re.fullmatch(r"siddplus_valid_\w+_raw\.mat", name) for name in files):
+    if any(re.fullmatch(r"siddplus_valid_\w+_raw\.mat", name) for name in names):
         yield "SIDD+, validation blocks", partial(SiddPlusBlocks, path)
     if (path / "info.mat").is_file():
         yield "DND, boxes (noisy only)", partial(Dnd, path)
-    if any((path / split / "huawei_raw").is_dir() for split in ("train", "test")):
+    has_npy = any(name.endswith(".npy") for name in names)
+    if (path / "train" / "huawei_raw").is_dir() or (path / "test" / "huawei_raw").is_dir():
         for split in ("train", "test"):
             yield f"Zurich RAW to RGB, {split}", partial(Zurich, path, split)
-    elif any(name.endswith(".npy") for name in files) and not looks_like_pairs(found):
-        splits = [split for split, name in RAWIR_FOLDERS.items() if (path / name).is_dir()]
-        for split in splits or ["train"]:
-            yield f"RAWIR or AIM 2022{', ' + split if splits else ''}", partial(Rawir, path, split)
+    elif has_npy and not looks_like_pairs(files):
+        has_splits = False
+        for split, folder in RAWIR_FOLDERS.items():
+            if (path / folder).is_dir():
+                has_splits = True
+                yield f"RAWIR or AIM 2022, {split}", partial(Rawir, path, split)
+        if not has_splits:
+            yield "RAWIR or AIM 2022", partial(Rawir, path, "train")
 
 
 def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
@@ -200,6 +220,13 @@ class _RawFrames(Lazy[RawFrame]):
 
     def read(self, index: int) -> RawFrame:
         return read_raw(self.files[index])
+
+
+def _parts(openers: Iterable[tuple[str, Callable[[], Any]]], first: int | None) -> list[PartReport]:
+    parts = []
+    for what, open_part in openers:
+        parts.append(_part(what, open_part, first))
+    return parts
 
 
 def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartReport:
@@ -236,17 +263,23 @@ def _facts(opening: bytes, index: int) -> dict[str, str]:
     """Size, pattern, levels, camera and ISO of an item, which is a picture, pair, RAW frame or noisy block."""
     items = _opened(opening)
     item = getattr(items, "read", items.__getitem__)(index)
-    image: Tensor = item.raw if isinstance(item, Pair) else getattr(item, "mosaic", item)
-    facts = {"sizes": f"{image.shape[-2]} x {image.shape[-1]}"}
-    if item is image:
-        return facts
+    if not isinstance(item, (Pair, RawFrame)):
+        return {"sizes": _size(item)}
+
+    if isinstance(item, Pair):
+        facts = {"sizes": _size(item.raw)}
+        levels: Any = (item.shot_var, item.read_var)
+    else:
+        facts = {"sizes": _size(item.mosaic)}
+        levels = item.noise_profile
     facts["cfas"] = str(item.cfa)
-    levels = (item.shot_var, item.read_var) if isinstance(item, Pair) else item.noise_profile
+
     if isinstance(item, RawFrame) and item.white > 1:
         black = "/".join(f"{level:g}" for level in dict.fromkeys(item.black))
         facts["levels"] = f"black {black}, white {item.white:g}"
     elif levels is not None and None not in levels:
         facts["levels"] = "shot_var {:.1e}, read_var {:.1e}".format(*levels)
+
     if item.camera != "unknown":
         facts["cameras"] = item.camera
     if isinstance(item, RawFrame) and item.remarks:
@@ -254,3 +287,7 @@ def _facts(opening: bytes, index: int) -> dict[str, str]:
     if item.iso:
         facts["iso"] = f"{item.iso:g}"
     return facts
+
+
+def _size(image: Tensor) -> str:
+    return f"{image.shape[-2]} x {image.shape[-1]}"

@@ -107,11 +107,15 @@ def draw_window(file: Path, size: tuple[int, int], generator: torch.Generator, m
     zoom, down, right, mirror = torch.rand(4, generator=generator, dtype=torch.float64).tolist()
     height, width = linear.shape[-2:]
     largest = min(height / size[0], width / size[1])
-    scale = max(largest**zoom, 1.0) if largest > 1.0 else largest
-    taken = [min(side, max(1, round(target * scale))) for side, target in zip((height, width), size, strict=True)]
-    top = int(down * (height - taken[0] + 1))
-    left = int(right * (width - taken[1] + 1))
-    window = linear[None, :, top : top + taken[0], left : left + taken[1]]
+    scale = largest
+    if largest > 1.0:
+        scale = max(largest**zoom, 1.0)
+
+    window_height = min(height, max(1, round(size[0] * scale)))
+    window_width = min(width, max(1, round(size[1] * scale)))
+    y = int(down * (height - window_height + 1))
+    x = int(right * (width - window_width + 1))
+    window = linear[None, :, y : y + window_height, x : x + window_width]
     if tuple(window.shape[-2:]) != size:
         window = F.interpolate(window, size, mode="bilinear", antialias=True, align_corners=False)
     window = gaussian_blur2d(window, 5, (_LENS_BLUR, _LENS_BLUR))

@@ -152,7 +152,9 @@ def reason(source: Any) -> str:
         lines = source.geterror().strip().splitlines()
     except UnicodeDecodeError:  # it quotes the damaged file
         return "its header is damaged"
-    return lines[0] if lines else ""
+    if not lines:
+        return ""
+    return lines[0]
 
 
 def _decode_with_oiio(path: Path, name: str, max_pixels: int, coarse: bool, headers: Headers) -> Decoded:
@@ -188,16 +190,26 @@ def _decode_with_oiio(path: Path, name: str, max_pixels: int, coarse: bool, head
         orientation = spec.get_int_attribute("Orientation", 1)
     if name in _UPRIGHT:
         orientation = 1
+    if profile is not None:
+        profile = bytes(profile)
+    colours, alpha = _split_alpha(pixels, has_alpha)
     return Decoded(
-        colours=pixels[..., :-1] if has_alpha else pixels,
-        alpha=pixels[..., -1:] if has_alpha else None,
+        colours=colours,
+        alpha=alpha,
         associated=associated,
         format=name,
         linear=name in _LINEAR_FORMATS,
-        profile=None if profile is None else bytes(profile),
+        profile=profile,
         orientation=orientation,
         headers=headers,
     )
+
+
+def _split_alpha(pixels: np.ndarray, has_alpha: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    """Colours ``(H, W, C)`` and alpha ``(H, W, 1)`` of pixels whose last channel may be alpha."""
+    if not has_alpha:
+        return pixels, None
+    return pixels[..., :-1], pixels[..., -1:]
 
 
 def _moves(source: Any, spec: Any) -> bool:
@@ -258,18 +270,21 @@ class _Refused(ValueError):
 def _of_pillow(image: Any, path: Path, name: str, headers: Headers, orientation: int | None = None) -> Decoded:
     if image.mode in ("CMYK", "YCCK", "LAB"):
         raise _Refused(f"{path}: is {image.mode}; convert it to sRGB first")
-    if image.mode in ("P", "PA") or "transparency" in image.info:
-        image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
-    if image.mode not in ("L", "LA", "RGB", "RGBA"):
-        image = image.convert("L" if image.mode == "1" else "RGB")
+    if "transparency" in image.info or image.mode == "PA":
+        image = image.convert("RGBA")
+    elif image.mode == "1":
+        image = image.convert("L")
+    elif image.mode not in ("L", "LA", "RGB", "RGBA"):
+        image = image.convert("RGB")
 
     profile = image.info.get("icc_profile")
     pixels = np.array(image)
     if pixels.ndim == 2:
         pixels = pixels[..., None]
+    colours, alpha = _split_alpha(pixels, image.mode in ("LA", "RGBA"))
     return Decoded(
-        colours=pixels[..., :-1] if image.mode in ("LA", "RGBA") else pixels,
-        alpha=pixels[..., -1:] if image.mode in ("LA", "RGBA") else None,
+        colours=colours,
+        alpha=alpha,
         associated=False,
         format=name,
         linear=False,
@@ -281,12 +296,15 @@ def _of_pillow(image: Any, path: Path, name: str, headers: Headers, orientation:
 
 def _decode_heif(path: Path, name: str, max_pixels: int, headers: Headers) -> Decoded:
     """HEIC by libheif, AVIF by Pillow; colours that are named by numbers alone get a profile."""
-    readable = reads_heic() if name == "HEIC" else reads_avif()
-    if not readable:
-        library = "pillow_heif is not installed" if name == "HEIC" else "this Pillow does not read AVIF"
-        raise ValueError(f"{path}: is {name}, and {library}; {how_to_install('heif')}")
+    if name == "HEIC":
+        if not reads_heic():
+            raise ValueError(f"{path}: is HEIC, and pillow_heif is not installed; {how_to_install('heif')}")
+        decoded = _decode_heic(path, max_pixels)
+    else:
+        if not reads_avif():
+            raise ValueError(f"{path}: is AVIF, and this Pillow does not read AVIF; {how_to_install('heif')}")
+        decoded = _decode_avif(path, max_pixels, headers)
 
-    decoded = _decode_heic(path, max_pixels) if name == "HEIC" else _decode_avif(path, max_pixels, headers)
     if decoded.profile is None and headers.code_points is not None:
         primaries, transfer = headers.code_points
         decoded = decoded._replace(profile=profile_of_code_points(primaries, transfer, path))
@@ -321,10 +339,10 @@ def _decode_heic(path: Path, max_pixels: int) -> Decoded:
 
     if pixels.ndim == 2:
         pixels = pixels[..., None]
-    has_alpha = pixels.shape[-1] in (2, 4)
+    colours, alpha = _split_alpha(pixels, pixels.shape[-1] in (2, 4))
     return Decoded(
-        colours=pixels[..., :-1] if has_alpha else pixels,
-        alpha=pixels[..., -1:] if has_alpha else None,
+        colours=colours,
+        alpha=alpha,
         associated="a" in mode,  # "RGBa" is multiplied by alpha, "RGBA" is not
         format="HEIC",
         linear=False,
@@ -335,7 +353,9 @@ def _decode_heic(path: Path, max_pixels: int) -> Decoded:
 
 
 def _without_prefix(exif: bytes | None) -> bytes | None:
-    return exif.removeprefix(b"Exif\0\0") if exif else None
+    if not exif:
+        return None
+    return exif.removeprefix(b"Exif\0\0")
 
 
 def _is_jpeg_of_many_bits(path: Path) -> bool:

@@ -69,15 +69,19 @@ class TiffFile:
         self._file = file
         self.end = file.seek(0, 2)
 
-        head = self.read(0, 16) if self.end >= 16 else self.read(0, 8).ljust(16, b"\0")
-        if head[:2] not in (b"II", b"MM"):
+        head = self.read(0, max(8, min(16, self.end))).ljust(16, b"\0")
+        orders = {b"II": "<", b"MM": ">"}
+        if head[:2] not in orders:
             raise DamagedTags("no TIFF header")
-        self.order = "<" if head[:2] == b"II" else ">"
+        self.order = orders[head[:2]]
 
-        self.big = struct.unpack(self.order + "H", head[2:4])[0] == 43
-        self.first: int = struct.unpack(self.order + ("Q" if self.big else "I"), head[8:16] if self.big else head[4:8])[
-            0
-        ]
+        (version,) = struct.unpack_from(self.order + "H", head, 2)
+        self.big = version == 43
+        self.first: int
+        if self.big:
+            (self.first,) = struct.unpack_from(self.order + "Q", head, 8)
+        else:
+            (self.first,) = struct.unpack_from(self.order + "I", head, 4)
 
     def directory(self, place: int) -> Directory:
         """The directory that begins at ``place``."""
@@ -113,12 +117,15 @@ class TiffFile:
         return Tag(entry.code, entry.dtype, entry.values, self.read(entry.place, entry.size))
 
     def tags(self, entries: Iterable[Entry]) -> list[Tag]:
-        """Tags with their values, which may overlap in a hostile file, and have a limit together."""
-        chosen = list(entries)
-        size = sum(entry.size for entry in chosen)
-        if size > MOST_BYTES:
-            raise DamagedTags(f"tags of {size} bytes")
-        return [self.tag(entry) for entry in chosen]
+        """Tags with their values. Their total size is limited, since values may overlap in a hostile file."""
+        tags = []
+        size = 0
+        for entry in entries:
+            size += entry.size
+            if size > MOST_BYTES:
+                raise DamagedTags(f"tags of {size} bytes")
+            tags.append(self.tag(entry))
+        return tags
 
     def numbers(self, entry: Entry | None) -> tuple[int, ...]:
         """The whole numbers of a tag; none where it is missing or holds others."""
@@ -132,15 +139,19 @@ class TiffFile:
     def number(self, directory: Directory, code: int, default: int = 0) -> int:
         """The first whole number of a tag."""
         numbers = self.numbers(directory.entries.get(code))
-        return numbers[0] if numbers else default
+        if not numbers:
+            return default
+        return numbers[0]
 
     def rational(self, entry: Entry | None) -> float:
         """The first number of a tag of fractions; 0 where it is missing, holds others, or divides by zero."""
         if entry is None or entry.dtype not in (5, 10):
             return 0.0
         letter = "I" if entry.dtype == 5 else "i"
-        over, under = struct.unpack_from(f"{self.order}2{letter}", self.tag(entry).data)
-        return over / under if under else 0.0
+        numerator, denominator = struct.unpack_from(f"{self.order}2{letter}", self.tag(entry).data)
+        if not denominator:
+            return 0.0
+        return float(numerator / denominator)
 
     def _following(self, place: int, pointer: str) -> int:
         """Where the next directory begins. Some programs leave this out behind the last one."""
