@@ -45,13 +45,18 @@ def inverse(z: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Te
     black; the levels are those of :func:`forward`.
     """
     shot, read = _levels(z, shot_var, read_var)
-    pictures = zip(z, shot.flatten().tolist(), read.flatten().tolist(), strict=True)
-    return torch.stack([s * _counts(picture, math.sqrt(r) / s) for picture, s, r in pictures])
+
+    pictures = []
+    for picture, s, r in zip(z, shot.flatten().tolist(), read.flatten().tolist(), strict=True):
+        pictures.append(s * _counts(picture, math.sqrt(r) / s))
+    return torch.stack(pictures)
 
 
 def _levels(like: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> tuple[Tensor, Tensor]:
     shape = (len(like), *(1,) * (like.ndim - 1))
-    shot, read = (torch.as_tensor(v).to(like).expand(len(like)).reshape(shape) for v in (shot_var, read_var))
+    shot = torch.as_tensor(shot_var).to(like).expand(len(like)).reshape(shape)
+    read = torch.as_tensor(read_var).to(like).expand(len(like)).reshape(shape)
+
     if not (shot > 0).all() or not (read >= 0).all():
         raise ValueError(f"variance stabilisation needs shot_var > 0 and read_var >= 0, got {shot_var} and {read_var}")
     return shot, read
@@ -59,9 +64,12 @@ def _levels(like: Tensor, shot_var: float | Tensor, read_var: float | Tensor) ->
 
 def _counts(z: Tensor, sigma: float) -> Tensor:
     """Look up the expected photons for the mean z, with read noise of ``sigma`` photons."""
-    counts, means = (t.to(z) for t in _table(sigma))
+    counts, means = _table(sigma)
+    counts, means = counts.to(z), means.to(z)
+
     right = torch.searchsorted(means, z.contiguous()).clamp_(1, len(means) - 1)
     step = (means[right] - means[right - 1]).clamp_min(torch.finfo(z.dtype).tiny)  # the first ones at a high sigma: 0
+
     low = torch.lerp(counts[right - 1], counts[right], ((z - means[right - 1]) / step).clamp(0, 1))
     high = z.square() / 4 - 0.125 - sigma**2
     return torch.where(z > means[-1], high, low)
@@ -72,8 +80,10 @@ def _table(sigma: float) -> tuple[Tensor, Tensor]:
     counts = torch.linspace(0, math.sqrt(TABLE_COUNTS), 512, dtype=torch.float64).square()
     k = torch.arange(0.0, 3 * TABLE_COUNTS, dtype=torch.float64)
     n = torch.linspace(-8, 8, 801, dtype=torch.float64)
+
     weights = torch.exp(-n.square() / 2)
     root = 2 * (k[:, None] + sigma * n + 0.375 + sigma**2).clamp_(min=0).sqrt_()
-    given_k = root @ (weights / weights.sum())
+    means_by_count = root @ (weights / weights.sum())
+
     log_pmf = torch.special.xlogy(k, counts[:, None]) - counts[:, None] - torch.lgamma(k + 1)
-    return counts, log_pmf.exp() @ given_k
+    return counts, log_pmf.exp() @ means_by_count

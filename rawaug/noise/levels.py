@@ -62,7 +62,7 @@ def normal(generator: torch.Generator, *shape: int) -> Tensor:
 
 def log_uniform(limits: tuple[float, float], batch: int, generator: torch.Generator) -> Tensor:
     """Draw ``(batch,)`` numbers whose logarithms are uniform between those of ``limits``."""
-    low, high = (math.log(limit) for limit in limits)
+    low, high = math.log(limits[0]), math.log(limits[1])
     return torch.exp(low + (high - low) * uniform(generator, batch))
 
 
@@ -98,8 +98,13 @@ class MixedLevels:
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw a law for each picture and its levels from that law, ``(batch,)``."""
         which = torch.randint(len(self.laws), (batch,), generator=generator, device=generator.device)
-        drawn = torch.stack([torch.stack(law.sample(batch, generator)) for law in self.laws])
-        shot_var, read_var = drawn[which, :, torch.arange(batch, device=which.device)].unbind(1)
+
+        levels = []
+        for law in self.laws:
+            levels.append(torch.stack(law.sample(batch, generator)))
+
+        pictures = torch.arange(batch, device=which.device)
+        shot_var, read_var = torch.stack(levels)[which, :, pictures].unbind(1)
         return shot_var, read_var
 
 
@@ -117,6 +122,7 @@ class Preset:
         """Draw shot_var log-uniformly and read_var around its line, ``(batch,)``."""
         shot_var = log_uniform(self.shot_range, batch, generator)
         scatter = self.line["sigma"] * normal(generator, batch)
+
         # The slope is the same in any base; intercept and scatter are exponents of the preset's own.
         exponent = (self.line["intercept"] + scatter) * math.log(self.base)
         return shot_var, shot_var ** self.line["slope"] * torch.exp(exponent)
@@ -130,7 +136,12 @@ def iso_limits(camera: str, iso: Iso, measured: tuple[float, float]) -> tuple[fl
     """The limits of the draw that ``iso`` asks for; ValueError if they are outside the measured range."""
     if iso is None:
         return measured
-    low, high = (iso, iso) if isinstance(iso, (int, float)) else (iso[0], iso[1])
+
+    if isinstance(iso, (int, float)):
+        low = high = iso
+    else:
+        low, high = iso
+
     if not measured[0] <= low <= high <= measured[1]:
         raise ValueError(f"ISO {iso} is outside the measured range of {camera}, {measured[0]:g} to {measured[1]:g}")
     return float(low), float(high)
@@ -145,7 +156,9 @@ def interpolate_levels(table: Tensor, iso: Tensor) -> tuple[Tensor, Tensor]:
     at = iso.log().double()
     right = torch.bucketize(at, x).clamp(1, len(x) - 1)
     t = (at - x[right - 1]) / (x[right] - x[right - 1])
-    shot_var, read_var = (torch.exp(torch.lerp(y[right - 1], y[right], t)).float() for y in (shot, read))
+
+    shot_var = torch.lerp(shot[right - 1], shot[right], t).exp().float()
+    read_var = torch.lerp(read[right - 1], read[right], t).exp().float()
     return shot_var, read_var
 
 
@@ -159,7 +172,11 @@ class SiddLevels:
 
     def __init__(self, phone: str, iso: Iso = None) -> None:
         levels = _entry("SIDD phone", phone, load_presets()["sidd_noise_level_function"]["cameras"])
-        rows = sorted((float(iso), *pair) for iso, pair in levels.items())
+        rows = []
+        for row_iso, (shot_var, read_var) in levels.items():
+            rows.append((float(row_iso), shot_var, read_var))
+        rows.sort()
+
         self.table = torch.tensor(rows, dtype=torch.float64).log().T.contiguous()
         self.iso = iso_limits(phone, iso, (rows[0][0], rows[-1][0]))
 
@@ -177,9 +194,14 @@ class PmridLevels:
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw an ISO for each picture, log-uniformly, and compute its levels, ``(batch,)``."""
-        iso, white = log_uniform(self.iso, batch, generator), self.law["white_dn"]
-        (k1, k0), (s2, s1, s0) = self.law["K"], self.law["sigma2"]
-        return (k1 * iso + k0) / white, ((s2 * iso + s1) * iso + s0) / white**2
+        iso = log_uniform(self.iso, batch, generator)
+        white = self.law["white_dn"]
+        k1, k0 = self.law["K"]
+        s2, s1, s0 = self.law["sigma2"]
+
+        gain = k1 * iso + k0
+        read_var_dn = (s2 * iso + s1) * iso + s0
+        return gain / white, read_var_dn / white**2
 
 
 class EldLevels:
@@ -208,6 +230,7 @@ class EldLevels:
     def typical(self) -> tuple[float, float]:
         """Compute (shot_var, read_var) without the scatter, at the geometric mean of the limits."""
         gain = math.sqrt(self.iso[0] * self.iso[1]) * (self.camera["Kmin"] / self.lowest_iso)
+
         line = self.camera["gaussian"]
         read_sd = math.exp(line["slope"] * math.log(gain) + line["bias"]) / self.white_dn
         return gain / self.white_dn, read_sd**2

@@ -43,7 +43,8 @@ _GROUP = 2**18
 """Number of values whose photons are drawn at a time: many small pictures, or one large one."""
 INVERSION_LIMIT = 10.0
 """The rate from which counts are drawn by the expansion, whose distribution function errs by 5e-5."""
-_CACHED = 2**15  # counts that are drawn together on a CPU, to stay in its cache
+_CPU_PIECE = 2**15
+"""Number of counts that are drawn at a time on a CPU, to stay in its cache."""
 
 
 class NoiseModel(ABC):
@@ -118,10 +119,10 @@ def per_picture(value: Tensor, like: Tensor) -> Tensor:
 
 def draw_normals(like: Tensor, generators: Iterable[torch.Generator]) -> Tensor:
     """Draw standard normals in the shape ``(B, ...)`` and type of ``like`` from one generator for each picture."""
-    drawn = torch.empty_like(like, memory_format=torch.contiguous_format)
-    for picture, generator in zip(drawn, generators, strict=True):
+    values = torch.empty_like(like, memory_format=torch.contiguous_format)
+    for picture, generator in zip(values, generators, strict=True):
         picture.normal_(generator=generator)
-    return drawn
+    return values
 
 
 class ShotReadModel(NoiseModel):
@@ -139,7 +140,9 @@ class ShotReadModel(NoiseModel):
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
         """Compute ``shot_var max(clean, 0) + read_var``, ``(B, 4, h, w)``."""
-        return noise_variance(clean, *(per_picture(params[name], clean) for name in ("shot_var", "read_var")))
+        shot_var = per_picture(params["shot_var"], clean)
+        read_var = per_picture(params["read_var"], clean)
+        return noise_variance(clean, shot_var, read_var)
 
 
 class ShotReadNoise(ShotReadModel):
@@ -171,24 +174,34 @@ class ShotReadNoise(ShotReadModel):
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
         """Add the noise to ``clean`` ``(B, 4, h, w)`` without the clip at white."""
         noisy, _ = self._add_noise(clean, params, white=math.inf)
-        return noisy if out is None else out.copy_(noisy)
+        if out is None:
+            return noisy
+        return out.copy_(noisy)
 
     def _add_noise(self, clean: Tensor, params: Params, white: float, mapped: bool = False) -> tuple[Tensor, Tensor]:
         in_pytorch = partial(self._in_pytorch, clean, params, white, mapped)
         if clean.dtype != torch.float32:
             return in_pytorch()
+
         levels = torch.stack([params["shot_var"], params["read_var"]], dim=1)
         return fastest("shot_read", clean, levels, self._keys(params), white, mapped, otherwise=in_pytorch)
 
     def _in_pytorch(self, clean: Tensor, params: Params, white: float, with_variance: bool) -> tuple[Tensor, Tensor]:
         deviation = self.variance(clean, params).sqrt_()
         noisy = torch.addcmul(clean, self._normals(clean, params), deviation).clamp_(max=white)
-        return noisy, self.variance(noisy, params) if with_variance else noisy[:, :, :0]
+        if with_variance:
+            return noisy, self.variance(noisy, params)
+        return noisy, noisy[:, :, :0]
 
     def _normals(self, like: Tensor, params: Params) -> Tensor:
-        if like.device.type == "cpu":
-            return torch.stack([normals(key, *like.shape[-2:]) for key in self._keys(params)]).to(like)
-        return draw_normals(like, self.generators(params, like.device))
+        if like.device.type != "cpu":
+            return draw_normals(like, self.generators(params, like.device))
+
+        height, width = like.shape[-2:]
+        pictures = []
+        for key in self._keys(params):
+            pictures.append(normals(key, height, width))
+        return torch.stack(pictures).to(like)
 
     def _keys(self, params: Params) -> list[int]:
         return [derive_seed(seed, self.stream) for seed in params["seed"].tolist()]
@@ -200,12 +213,16 @@ class PoissonGaussianNoise(ShotReadModel):
     @torch.no_grad()
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
         """Add photon and read noise to ``clean`` ``(B, 4, h, w)`` without the clip at white."""
-        noisy = torch.empty_like(clean, memory_format=torch.contiguous_format) if out is None else out
+        noisy = out
+        if noisy is None:
+            noisy = torch.empty_like(clean, memory_format=torch.contiguous_format)
+
         generators = list(self.generators(params, clean.device))
-        together = max(1, _GROUP // max(1, clean[:1].numel()))
-        for first in range(0, len(clean), together):
-            group = slice(first, first + together)
-            torch.add(clean[group], self._noise(clean[group], params, group, generators[group]), out=noisy[group])
+        pictures = max(1, _GROUP // max(1, clean[:1].numel()))
+        for first in range(0, len(clean), pictures):
+            group = slice(first, first + pictures)
+            noise = self._noise(clean[group], params, group, generators[group])
+            torch.add(clean[group], noise, out=noisy[group])
         return noisy
 
     def _noise(self, clean: Tensor, params: Params, group: slice, generators: Sequence[torch.Generator]) -> Tensor:
@@ -213,8 +230,10 @@ class PoissonGaussianNoise(ShotReadModel):
         shot_var = per_picture(params["shot_var"][group], clean)
         light = clean.clamp(min=0)
         photons = poisson(light / shot_var.clamp(min=_NO_SHOT), draw_normals(clean, generators)).mul_(shot_var)
-        noise = photons.sub_(light).masked_fill_(shot_var <= _NO_SHOT, 0.0)
-        return noise.add_(self.read_noise(clean, {name: value[group] for name, value in params.items()}, generators))
+        shot_noise = photons.sub_(light).masked_fill_(shot_var <= _NO_SHOT, 0.0)
+
+        group_params = {name: value[group] for name, value in params.items()}
+        return shot_noise.add_(self.read_noise(clean, group_params, generators))
 
     def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
         """Draw read noise in the shape ``(B, 4, h, w)`` of ``like``, from one generator for each picture."""
@@ -230,12 +249,15 @@ def poisson(rate: Tensor, normals: Tensor) -> Tensor:
     :data:`INVERSION_LIMIT` the distribution function is summed; from there on its inverse is Giles' expansion in
     ``rate**-0.5`` (Algorithm 955, ACM TOMS 2016), rounded down.
     """
-    piece = _CACHED if rate.device.type == "cpu" else max(rate.numel(), 1)
+    piece = max(rate.numel(), 1)
+    if rate.device.type == "cpu":
+        piece = _CPU_PIECE
+
     for part, out in zip(rate.reshape(-1).split(piece), normals.view(-1).split(piece), strict=True):
         low = part < INVERSION_LIMIT
-        walked = _invert_sum(part[low], out[low]).to(out)
+        low_counts = _invert_sum(part[low], out[low]).to(out)
         out.copy_(_invert_expansion(part, out))
-        out[low] = walked
+        out[low] = low_counts
     return normals
 
 
@@ -243,18 +265,24 @@ def _invert_expansion(rate: Tensor, w: Tensor) -> Tensor:
     """Invert the distribution function by Giles' expansion to the order 1 / rate, rounded down."""
     root = rate.clamp(min=INVERSION_LIMIT).sqrt()
     w2 = w * w
+
     tail = (-8 / 405 + w2 * (7 / 810 + w2 / 270)) / root - w * (1 / 36 + w2 / 72)
     return (rate + w * root + (1 / 3 + w2 / 6) + tail / root).floor_().clamp_(min=0)
 
 
 def _invert_sum(rate: Tensor, w: Tensor) -> Tensor:
     """Count the k with F(k) < Phi(w), in double precision: in single, the sum would stop short of the far tail."""
-    rate, u = rate.double(), torch.special.ndtr(w.double()).clamp_(max=1 - 1e-13)  # which the sum does reach
+    rate = rate.double()
+    u = torch.special.ndtr(w.double()).clamp_(max=1 - 1e-13)  # the sum reaches this limit
+
     term = torch.exp(-rate)
-    total, count, k = term.clone(), torch.zeros_like(rate), 0
+    total = term.clone()
+    count = torch.zeros_like(rate)
+    k = 0
     while (below := total < u).any():
         k += 1
         count += below
         term *= rate / k
         total += term
+
     return count

@@ -368,19 +368,33 @@ class SensorNoise(Compose):
         require_not_negative(told=told)
         require_between("share", share, 0.0, 1.0)
         self.told, self.share = told, share
-        levels = noise_levels(levels) if isinstance(levels, (str, Sequence)) else levels
+        if isinstance(levels, (str, Sequence)):
+            levels = noise_levels(levels)
+
         # The greens differ in the light that they get, and photons are counted after that.
-        models: list[NoiseModel] = [GreenImbalance(green_imbalance)] if green_imbalance else []
+        models: list[NoiseModel] = []
+        if green_imbalance:
+            models.append(GreenImbalance(green_imbalance))
+
         if tukey_lambda is not None:
-            models += [TukeyLambdaNoise(levels, tukey_lambda)]
+            models.append(TukeyLambdaNoise(levels, tukey_lambda))
+        elif poisson:
+            models.append(PoissonGaussianNoise(levels))
         else:
-            models += [PoissonGaussianNoise(levels) if poisson else ShotReadNoise(levels)]
-        models += [RowNoise(row_var)] if row_var else []
-        models += [ColumnNoise(column_var)] if column_var else []
-        models += [BlackOffset(black_offset_sd)] if black_offset_sd else []
-        models += [ColourBias(colour_bias_sd)] if colour_bias_sd else []
-        models += [DefectPixels(dead, hot, clusters)] if dead or hot else []
-        models += [] if bits is None else [Quantisation(bits, black_level)]
+            models.append(ShotReadNoise(levels))
+
+        if row_var:
+            models.append(RowNoise(row_var))
+        if column_var:
+            models.append(ColumnNoise(column_var))
+        if black_offset_sd:
+            models.append(BlackOffset(black_offset_sd))
+        if colour_bias_sd:
+            models.append(ColourBias(colour_bias_sd))
+        if dead or hot:
+            models.append(DefectPixels(dead, hot, clusters))
+        if bits is not None:
+            models.append(Quantisation(bits, black_level))
         super().__init__(models)
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
@@ -389,14 +403,18 @@ class SensorNoise(Compose):
         if self.told != (1.0, 1.0):
             params["told"] = log_uniform(self.told, batch, generator)
         if self.share < 1:
-            for name in [key for key in _ABSENT if key in params]:
-                params[name][uniform(generator, batch) >= self.share] = _ABSENT[name]
+            for name, absence in _ABSENT.items():
+                if name in params:
+                    params[name][uniform(generator, batch) >= self.share] = absence
+
         return params
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
         """Add up the variances ``(B, 4, h, w)``, wrong by the factor ``told`` as a file's tag may be."""
         variance = super().variance(clean, params)
-        return variance.mul_(per_picture(params["told"], clean)) if "told" in params else variance
+        if "told" not in params:
+            return variance
+        return variance.mul_(per_picture(params["told"], clean))
 
 
 @NOISE.register("EldNoise")
@@ -414,6 +432,7 @@ class EldNoise(Compose):
         self.law = EldLevels(camera, iso)
         shapes = self.law.camera["tukey_lambda_shape"]
         self.shapes = torch.tensor(shapes, dtype=torch.float32)
+
         tails = TukeyLambdaNoise(FixedLevels(0, 0), (min(shapes), max(shapes)))
         bias = ColourBias(self.law.camera["colour_bias_sd_dn"] / self.law.white_dn)
         rounding = Quantisation(bits=14, black_level=2**14 - 1 - int(self.law.white_dn))
@@ -422,8 +441,9 @@ class EldNoise(Compose):
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         """Draw the parameters of all effects, each ``(batch,)``, at one gain a picture."""
         gain = self.law.sample_gain(batch, generator)
-        chosen = torch.randint(len(self.shapes), (batch,), generator=generator, device=generator.device)
-        shape = self.shapes.to(generator.device)[chosen]
+        index = torch.randint(len(self.shapes), (batch,), generator=generator, device=generator.device)
+        shape = self.shapes.to(generator.device)[index]
+
         unit_var = gain.new_tensor([tukey_lambda_variance(value) for value in shape.tolist()])
         return super().sample(batch, generator) | {
             "shot_var": gain / self.law.white_dn,
