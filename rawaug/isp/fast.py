@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import nullcontext
 from copy import deepcopy
 from functools import partial
 from itertools import pairwise
@@ -50,13 +49,17 @@ class BakedISP(nn.Module):
     def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
         super().__init__()
         self.isp, self.config = deepcopy(isp), isp.config
-        for name, table in zip(("table", "attention"), _tables(isp, nodes), strict=True):
-            self.register_buffer(name, table)
+
+        table, attention = _tables(isp, nodes)
+        self.register_buffer("table", table)
+        self.register_buffer("attention", attention)
 
     @torch.no_grad()
     def choose(self, srgb: Tensor) -> ISPParams:
         """The setting that the encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``, as the ISP would."""
-        with one_thread() if self.config.encoders else nullcontext():  # the same choice in every process
+        if not self.config.encoders:
+            return self.isp.choose(srgb)
+        with one_thread():  # the same choice in every process
             return self.isp.choose(srgb)
 
     @torch.no_grad()
@@ -74,15 +77,17 @@ class BakedISP(nn.Module):
             float32 ``(B, 4, H/2, W/2)``, planes R, Gr, Gb, B.
         """
         _require_batch(srgb, params, place)
-        camera, size = self._camera(srgb, params, place), (srgb.shape[-2], srgb.shape[-1])
+
+        camera = self._camera(srgb, params, place)
+        size = srgb.shape[-2], srgb.shape[-1]
         gain = _place_gain(self.isp.ordered_stages, place, size, self.table, forward=False)
         if gain is None:
             return _pass(srgb, camera, white)
 
         raw = _pass(srgb, camera, math.inf)
         with one_thread():  # PyTorch's threads do not survive the fork of a worker
-            sites = torch.cat([gain[..., i::2, j::2] for i, j in CFA(self.config.cfa).sites], dim=1)
-            return (raw * sites).clamp_max(white)
+            planes = [gain[..., i::2, j::2] for i, j in CFA(self.config.cfa).sites]
+            return (raw * torch.cat(planes, dim=1)).clamp_max(white)
 
     @torch.no_grad()
     def colours(
@@ -101,40 +106,61 @@ class BakedISP(nn.Module):
             float32 ``(B, 3, H, W)``.
         """
         _require_batch(srgb, params, place)
-        camera, rgb = self._camera(srgb, params, place), []
+
+        camera = self._camera(srgb, params, place)
         gain = None
         if shaded:
             size = srgb.shape[-2], srgb.shape[-1]
             gain = _place_gain(self.isp.ordered_stages, place, size, self.table, forward=False)
         else:
             camera = camera._replace(attention=camera.attention[:0], shading=camera.shading[:0])
-        ceiling = white if gain is None else math.inf
+        ceiling = math.inf
+        if gain is None:
+            ceiling = white
+        planes = []
         for colour in range(3):
             sites = torch.tensor([(i, j, colour) for i, j in CFA.RGGB.sites])
-            rgb.append(unpack(_pass(srgb, camera._replace(sites=sites), ceiling), CFA.RGGB))
-        colours = torch.cat(rgb, dim=1)
-        return colours if gain is None else (colours * gain).clamp_max(white)
+            packed = _pass(srgb, camera._replace(sites=sites), ceiling)
+            planes.append(unpack(packed, CFA.RGGB))
+        rgb = torch.cat(planes, dim=1)
+
+        if gain is None:
+            return rgb
+        return (rgb * gain).clamp_max(white)
 
     @torch.no_grad()
     def shade(self, x4: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor:
         """Apply the shading and attention of the lens to x4 ``(B, 3, H, W)``; the result is x5."""
         camera = self._camera(x4, params, place)
+        x5 = x4
+
         mask = fall_off(camera, 0, *x4.shape[-2:])
-        x5 = x4 if mask is None else x4 * mask
+        if mask is not None:
+            x5 = x5 * mask
         if camera.attention.numel():
             x5 = x5 * look_up(camera.attention, x5)[:, :1]
-        gain = _place_gain(self.isp.ordered_stages, place, (x4.shape[-2], x4.shape[-1]), self.table, forward=False)
-        return x5 if gain is None else x5 * gain
+
+        size = x4.shape[-2], x4.shape[-1]
+        gain = _place_gain(self.isp.ordered_stages, place, size, self.table, forward=False)
+        if gain is not None:
+            x5 = x5 * gain
+        return x5
 
     def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> Camera:
         table = self.table
         matrix, floor, frame, curves, shading = _batch_params(self.isp.ordered_stages, srgb, params, place, table)
         if curves.numel():
             table = table[:0]
-            curves = curves[:, ::STEPS] if srgb.dtype == torch.uint8 else curves
-        knee, rise = self.config.knee, highlight_rise(floor, self.config.knee)
+            if srgb.dtype == torch.uint8:
+                curves = curves[:, ::STEPS]
+
+        knee = self.config.knee
+        rise = highlight_rise(floor, knee)
         colour = torch.cat([matrix, matrix.mean(dim=1, keepdim=True), floor, rise], dim=1)
-        sites = [(i, j, c) for c, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True)]
+
+        sites = []
+        for channel, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True):
+            sites.append((i, j, channel))
         return Camera(table, curves, self.attention, colour, knee or 0.0, frame, shading, torch.tensor(sites))
 
 
@@ -146,9 +172,12 @@ class FastForward(nn.Module):
 
     def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
         super().__init__()
-        self.cfa, self.isp = CFA(isp.cfa), deepcopy(isp).requires_grad_(False)
-        for name, table in zip(("table", "attention"), _tables(isp, nodes, forward=True), strict=True):
-            self.register_buffer(name, table)
+        self.cfa = CFA(isp.cfa)
+        self.isp = deepcopy(isp).requires_grad_(False)
+
+        table, attention = _tables(isp, nodes, forward=True)
+        self.register_buffer("table", table)
+        self.register_buffer("attention", attention)
 
     def forward(self, linear: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor:
         """Develop linear camera RGB x5 ``(B, 3, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1], float32.
@@ -158,11 +187,15 @@ class FastForward(nn.Module):
         Differentiable with respect to ``linear`` and to the matrix and gains of ``params``.
         """
         _require_batch(linear, params, place)
-        display, linear = self._display(linear, params, place), linear.float()
+
+        display = self._display(linear, params, place)
+        linear = linear.float()
         gain = self._gain(linear, place)
-        linear = linear if gain is None else linear * gain
-        learning = linear.requires_grad or display.matrix.requires_grad or display.gains.requires_grad
-        if learning and torch.is_grad_enabled():
+        if gain is not None:
+            linear = linear * gain
+
+        needs_gradient = linear.requires_grad or display.matrix.requires_grad or display.gains.requires_grad
+        if needs_gradient and torch.is_grad_enabled():
             return render(linear, display)
         return fastest("render", linear, display, otherwise=lambda: render(linear, display))
 
@@ -182,24 +215,46 @@ class FastForward(nn.Module):
             For each of ``raws`` sRGB ``(B, 3, H, W)`` in [0, 1].
         """
         directional = any(method in bayer.DIRECTIONAL for method in methods)
-        if directional and len(methods) > 1:  # a picture is the same whatever is beside it
-            alone = []
-            for i, method in enumerate(methods):
-                own, at = ISPParams(*(value[i, None] for value in params)), None if place is None else place[i, None]
-                alone.append(self.develop([raw[i, None] for raw in raws], [method], own, at))
-            return [torch.cat(pictures) for pictures in zip(*alone, strict=True)]
-        display, gain = self._display(raws[0], params, place), self._gain(raws[0], place)
+        if directional and len(methods) > 1:
+            return self._develop_each(raws, methods, params, place)
+
+        display = self._display(raws[0], params, place)
+        gain = self._gain(raws[0], place)
         if gain is not None:  # the gains change slowly: it is alike before demosaicing and after
             raws = [raw * gain for raw in raws]
 
         def in_steps(raw: Tensor) -> Tensor:
-            found = [self._demosaic_balanced(*one) for one in zip(raw.split(1), methods, display.gains, strict=True)]
-            linear = torch.cat(found)
+            pictures = []
+            for picture, method, gains in zip(raw.split(1), methods, display.gains, strict=True):
+                pictures.append(self._demosaic_balanced(picture, method, gains))
+            linear = torch.cat(pictures)
             return fastest("render", linear, display, otherwise=lambda: render(linear, display))
 
-        if directional:
-            return [in_steps(raw) for raw in raws]
-        return [fastest("develop", raw, display, self.cfa, methods, otherwise=partial(in_steps, raw)) for raw in raws]
+        developed = []
+        for raw in raws:
+            if directional:
+                srgb = in_steps(raw)
+            else:
+                srgb = fastest("develop", raw, display, self.cfa, methods, otherwise=partial(in_steps, raw))
+            developed.append(srgb)
+        return developed
+
+    def _develop_each(
+        self, raws: Sequence[Tensor], methods: Sequence[str], params: ISPParams, place: Tensor | None
+    ) -> list[Tensor]:
+        """Develop picture by picture, so that each is the same whatever is beside it."""
+        pictures: list[list[Tensor]] = [[] for _ in raws]
+        for i, method in enumerate(methods):
+            own_params = ISPParams(*(value[i, None] for value in params))
+            own_place = None
+            if place is not None:
+                own_place = place[i, None]
+
+            own_raws = [raw[i, None] for raw in raws]
+            developed = self.develop(own_raws, [method], own_params, own_place)
+            for group, picture in zip(pictures, developed, strict=True):
+                group.append(picture)
+        return [torch.cat(group) for group in pictures]
 
     def _gain(self, image: Tensor, place: Tensor | None) -> Tensor | None:
         size = image.shape[-2], image.shape[-1]
@@ -209,25 +264,24 @@ class FastForward(nn.Module):
         """Demosaic ``(1, 1, H, W)``; a choice of direction needs balanced RAW clipped at black, as developers do it."""
         if method not in bayer.DIRECTIONAL:
             return bayer.demosaic(raw, self.cfa, method)
+
         balance = gains[:3, None, None]
-        sites = bayer.mosaic(balance.expand(3, 2, 2), self.cfa).repeat(1, raw.shape[-2] // 2, raw.shape[-1] // 2)
+        cell = bayer.mosaic(balance.expand(3, 2, 2), self.cfa)
+        sites = cell.repeat(1, raw.shape[-2] // 2, raw.shape[-1] // 2)
         balanced = (raw * sites).clamp_min(0.0)
-        return fastest(
-            "demosaic_directional",
-            balanced,
-            self.cfa,
-            method,
-            otherwise=lambda: bayer.demosaic(balanced, self.cfa, method),
-        ).div_(balance)
+
+        plain = partial(bayer.demosaic, balanced, self.cfa, method)
+        rgb = fastest("demosaic_directional", balanced, self.cfa, method, otherwise=plain)
+        return rgb.div_(balance)
 
     def _display(self, linear: Tensor, params: ISPParams, place: Tensor | None) -> Display:
-        matrix, floor, frame, curves, shading = _batch_params(
-            self.isp.ordered_stages, linear, params, place, self.table
-        )
-        table = self.table[:0] if curves.numel() else self.table
+        table = self.table
+        matrix, floor, frame, curves, shading = _batch_params(self.isp.ordered_stages, linear, params, place, table)
         if curves.numel():
+            table = table[:0]
             light = torch.linspace(0.0, 1.0, CURVE_NODES).square().to(curves).expand(len(curves), 1, 1, -1)
             curves = to_code(light, curves)[:, 0, 0]
+
         gains = 1.0 / floor[:, 0]
         gains = torch.cat([gains, gains.amin(dim=1, keepdim=True)], dim=1)
         return Display(table, curves, self.attention, torch.linalg.pinv(matrix), gains, frame, shading)
@@ -241,28 +295,36 @@ def _tables(isp: DictionaryISP, nodes: int, forward: bool = False) -> tuple[Tens
         order = " ".join(isp.config.stages)
         raise ValueError(f"augmentation needs the ISP's stages in the usual order, got {order}; fit it anew")
     cube = node_colours(nodes)
-    tables = Tables(cube, cube.square() if forward else cube)
     with torch.autocast(isp.gain.log_gains.device.type, enabled=False):
-        for stage in reversed(isp.ordered_stages) if forward else isp.ordered_stages:
-            tables = stage.bake_forward(tables) if forward else stage.bake(tables)
-    empty = torch.empty(0, 0, 0, 4)
-    return _as_table(tables.x2, nodes), empty if tables.attention is None else _as_table(tables.attention, nodes)
+        if forward:
+            tables = Tables(cube, cube.square())
+            for stage in reversed(isp.ordered_stages):
+                tables = stage.bake_forward(tables)
+        else:
+            tables = Tables(cube, cube)
+            for stage in isp.ordered_stages:
+                tables = stage.bake(tables)
+
+    attention = torch.empty(0, 0, 0, 4)
+    if tables.attention is not None:
+        attention = _as_table(tables.attention, nodes)
+    return _as_table(tables.x2, nodes), attention
 
 
 def _batch_params(
     stages: Sequence[Stage], image: Tensor, params: ISPParams, place: Tensor | None, table: Tensor
 ) -> BatchParams:
     batch, _, height, width = image.shape
-    made = BatchParams(
-        torch.eye(3).to(table).expand(batch, 3, 3),
-        torch.ones(batch, 1, 3).to(table),
-        table.new_zeros(batch, 6),
-        table.new_empty(batch, 0),
-        table.new_empty(0),
+    batch_params = BatchParams(
+        matrix=torch.eye(3).to(table).expand(batch, 3, 3),
+        floor=torch.ones(batch, 1, 3).to(table),
+        frame=table.new_zeros(batch, 6),
+        curves=table.new_empty(batch, 0),
+        shading=table.new_empty(0),
     )
     for stage in stages:
-        made = stage.adjust(made, params, place, (height, width))
-    return made
+        batch_params = stage.adjust(batch_params, params, place, (height, width))
+    return batch_params
 
 
 @torch.no_grad()
@@ -279,15 +341,20 @@ def _place_gain(
     gaining = [stage for stage in stages if stage.has_place_gain]
     if not gaining:
         return None
+
     height, width = size
-    places = [[0, 0, height, width]] * batch if place is None else place.tolist()
-    frame = like.new_tensor([mask_frame(one, height, width, (0.0, 0.0)) for one in places])
+    places = [[0, 0, height, width]] * batch
+    if place is not None:
+        places = place.tolist()
+    frame = like.new_tensor([mask_frame(row, height, width, (0.0, 0.0)) for row in places])
+
     down = torch.linspace(0.0, height - 1.0, min(PLACE_NODES, height)).to(like)[:, None]
     right = torch.linspace(0.0, width - 1.0, min(PLACE_NODES, width)).to(like)
     start_y, start_x, down_y, down_x, right_y, right_x = frame[:, :, None, None].unbind(1)
-    coordinates = torch.stack(
-        [start_y + down * down_y + right * right_y, start_x + down * down_x + right * right_x], dim=1
-    )
+    y = start_y + down * down_y + right * right_y
+    x = start_x + down * down_x + right * right_x
+    coordinates = torch.stack([y, x], dim=1)
+
     gain = torch.ones_like(coordinates[:, :1])
     for stage in gaining:
         gain = gain * stage.place_gain(coordinates, forward)
@@ -295,7 +362,8 @@ def _place_gain(
 
 
 def _pass(srgb: Tensor, camera: Camera, white: float) -> Tensor:
-    srgb = srgb if srgb.dtype == torch.uint8 else srgb.float()
+    if srgb.dtype != torch.uint8:
+        srgb = srgb.float()
     return fastest("unprocess", srgb, camera, white, otherwise=lambda: unprocess(srgb, camera, white))
 
 

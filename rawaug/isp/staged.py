@@ -63,10 +63,12 @@ class Encoder(nn.Module):
         ``widths`` are their features.
         """
         atoms = len(self.prior)
-        channels = (3 * atoms, *widths)
         layers: list[nn.Module] = []
-        for i in range(3):
-            layers += [nn.Conv2d(channels[i], channels[i + 1], 3, stride=2, padding=1), nn.ReLU()]
+        channels = 3 * atoms
+        for width in widths:
+            layers += [nn.Conv2d(channels, width, 3, stride=2, padding=1), nn.ReLU()]
+            channels = width
+
         head = nn.Linear(widths[-1], atoms)
         nn.init.zeros_(head.weight)
         nn.init.zeros_(head.bias)
@@ -98,7 +100,8 @@ def thumbnail(image: Tensor) -> Tensor:
     """Average a picture ``(B, 3, H, W)`` down to at most :data:`THUMBNAIL` pixels a side."""
     height, width = image.shape[-2:]
     scale = THUMBNAIL / max(height, width, THUMBNAIL)
-    return F.adaptive_avg_pool2d(image, (max(1, round(height * scale)), max(1, round(width * scale))))
+    size = max(1, round(height * scale)), max(1, round(width * scale))
+    return F.adaptive_avg_pool2d(image, size)
 
 
 class StagedISP(nn.Module):
@@ -110,13 +113,18 @@ class StagedISP(nn.Module):
         """The record of the fit, as plain values by name."""
         self.config = config or ISPConfig()
         """The parts that it is made of; :meth:`configure` and :meth:`use_encoders` change them."""
+
         with initialise_from(seed):
             self.colour = ColourDictionary(self.config.colour_atoms)
             if self.config.cameras:
                 self.colour = CameraDictionary(self.config.colour_atoms, self.config.cameras)
             self.gain = GainDictionary(self.config.gain_atoms)
-            made = [STAGES[name](self.config) for name in self.config.stages]
-            self.stages = nn.ModuleDict({stage.name: stage for stage in made})
+
+            self.stages = nn.ModuleDict()
+            for name in self.config.stages:
+                stage = STAGES[name](self.config)
+                self.stages[stage.name] = stage
+
             self.reverse_encoders, self.forward_encoders = Encoders(self.config), Encoders(self.config)
         self.use_encoders(self.config.encoders, seed)
 
@@ -132,13 +140,18 @@ class StagedISP(nn.Module):
 
     def find(self, kind: type[S]) -> S | None:
         """The stage of this class, or None."""
-        return next((stage for stage in self.ordered_stages if isinstance(stage, kind)), None)
+        for stage in self.ordered_stages:
+            if isinstance(stage, kind):
+                return stage
+        return None
 
     def configure(self, **changes: Any) -> None:
         """Change settings that need no new parameters: ``cfa``, ``knee``, or ``stages`` to fewer of them."""
         config = replace(self.config, **changes)
-        if absent := [name for name in config.stages if name not in self.stages]:
-            raise ValueError(f"stages: {absent[0]!r} is not in this ISP, which has {' '.join(self.stages)}")
+        for name in config.stages:
+            if name not in self.stages:
+                raise ValueError(f"stages: {name!r} is not in this ISP, which has {' '.join(self.stages)}")
+
         self.config = config
         self.stages = nn.ModuleDict({name: self.stages[name] for name in config.stages})
         for stage in self.ordered_stages:
@@ -147,22 +160,29 @@ class StagedISP(nn.Module):
     def use_encoders(self, enabled: bool, seed: int = 0) -> None:
         """Make networks for the encoders, drawn from ``seed``, or remove them; existing ones stay as they are."""
         with initialise_from(derive_seed(seed, "encoders")):
-            for encoder in (module for module in self.modules() if isinstance(module, Encoder)):
+            for module in list(self.modules()):
+                if not isinstance(module, Encoder):
+                    continue
                 if not enabled:
-                    encoder.layers = None
-                elif not encoder.looks:
-                    encoder.add_layers(self.config.encoder_widths)
+                    module.layers = None
+                elif not module.looks:
+                    module.add_layers(self.config.encoder_widths)
+
         self.configure(encoders=enabled)
 
     @property
     def tone(self) -> ToneDictionary | None:
         """The dictionary of tone curves; None where the curve is learned."""
         stage = self.find(ToneCurve)
-        return stage.dictionary if stage else None
+        if stage is None:
+            return None
+        return stage.dictionary
 
     def typical_tones(self) -> Tensor:
         """Weights ``(K,)`` of the tone curves where nothing is known of a picture; none where the curve is learned."""
-        return self.tone.typical if self.tone else self.colour.matrices.new_zeros(0)
+        if self.tone is None:
+            return self.colour.matrices.new_zeros(0)
+        return self.tone.typical
 
     def reverse_pixels(
         self, x: Tensor, params: ISPParams, coordinates: Tensor | None = None, seen: dict[str, Tensor] | None = None
@@ -207,13 +227,15 @@ class StagedISP(nn.Module):
     def linear(self, x: Tensor) -> Tensor:
         """Compute x2 from sRGB, both ``(B, 3, H, W)``, by the stages in their usual order; it needs no setting."""
         for stage in sorted(self.ordered_stages, key=lambda stage: stage.makes):
-            x = stage.reverse(x, None) if stage.makes <= 2 else x
+            if stage.makes <= 2:
+                x = stage.reverse(x, None)
         return x
 
     def remove_shading(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
         """Compute x4 from x5, both ``(B, 3, H, W)``; the forward encoders look at x4."""
         for stage in reversed(self.ordered_stages):
-            x = stage.forward(x, None, coordinates) if stage.makes >= 5 else x
+            if stage.makes >= 5:
+                x = stage.forward(x, None, coordinates)
         return x
 
 
@@ -243,17 +265,21 @@ def with_white_balance(
         if balance.shape not in ((3,), (1, 3), (batch, 3)):
             raise ValueError(f"white_balance must be (3,) or ({batch}, 3), got {tuple(balance.shape)}")
         _require_factor("white_balance", balance)
+
         balance = (balance / balance[..., 1:2]).expand_as(params.gains)
         weights = isp.colour.weights_for(balance)
         matrix, gains = isp.colour.combine(weights), isp.colour.gains_for(balance, weights)
         params = params._replace(colour_weights=weights, matrix=matrix, gains=gains)
+
     if digital_gain is not None:
         digital = torch.as_tensor(digital_gain, dtype=params.gains.dtype, device=params.gains.device).reshape(-1, 1)
         if len(digital) not in (1, batch):
             raise ValueError(f"digital_gain must be a number or ({batch},), got {len(digital)}")
         _require_factor("digital_gain", digital)
+
         own = params.gains[:, 1:2] / params.matrix[:, 1:2].sum(2)
         params = params._replace(gains=params.gains / own * digital)
+
     return params
 
 
@@ -277,24 +303,32 @@ def with_tone(isp: StagedISP, params: ISPParams, tone: Tone | None) -> ISPParams
         return params
     if isp.tone is None:
         raise ValueError("tone: this ISP has learned a curve of its own; only one with a dictionary of curves takes it")
-    names = list(isp.info.get("tones", ()))
     count = len(isp.tone.curves)
     if isinstance(tone, Tensor):
         weights = tone.to(params.gains)
+    elif isinstance(tone, str):
+        weights = _tone_shares(isp, {tone: 1.0}, params.gains.new_zeros(count))
     else:
-        shares = {tone: 1.0} if isinstance(tone, str) else tone
-        weights = params.gains.new_zeros(count)
-        for name, share in shares.items():
-            if name not in names:
-                raise ValueError(f"tone {name!r} is unknown; use one of {', '.join(names)}{suggest(name, names)}")
-            weights[names.index(name)] = share
+        weights = _tone_shares(isp, tone, params.gains.new_zeros(count))
+
     batch = len(params.gains)
     if weights.shape not in ((count,), (1, count), (batch, count)):
         raise ValueError(f"tone must be ({count},) or ({batch}, {count}), got {tuple(weights.shape)}")
+
     total = weights.sum(dim=-1, keepdim=True)
     if not (weights >= 0).all() or not ((total > 0) & total.isfinite()).all():
         raise ValueError("tone: shares must not be negative, and one must be positive")
     return params._replace(tone_weights=(weights / total).expand(batch, count))
+
+
+def _tone_shares(isp: StagedISP, shares: Mapping[str, float], weights: Tensor) -> Tensor:
+    """Put shares by the names of tone curves into ``weights`` ``(K,)``."""
+    names = list(isp.info.get("tones", ()))
+    for name, share in shares.items():
+        if name not in names:
+            raise ValueError(f"tone {name!r} is unknown; use one of {', '.join(names)}{suggest(name, names)}")
+        weights[names.index(name)] = share
+    return weights
 
 
 def _require_factor(name: str, value: Tensor) -> None:
@@ -320,10 +354,12 @@ def with_raw_samples(
         ValueError: if a reading is NaN or lies outside the picture.
     """
     _require_places(raw_samples, x)
+
     rows, columns = raw_samples[..., 0].long(), raw_samples[..., 1].long()
     batch = torch.arange(len(x), device=x.device)[:, None]
     pixels = x[batch, :, rows, columns].transpose(1, 2)[:, :, None]
     where = coordinates.expand(len(x), -1, -1, -1)[batch, :, rows, columns].transpose(1, 2)[:, :, None]
+
     channel = torch.tensor(isp.cfa.channels, device=x.device)[rows % 2, columns % 2]
     own = F.one_hot(channel, 3).transpose(1, 2).to(x)
     value = raw_samples[..., 2]
@@ -331,10 +367,10 @@ def with_raw_samples(
     params = _solve(isp, pixels, where, own, value, params)
     if isp.tone is not None and isinstance(isp.colour, CameraDictionary):
         for _ in range(ROUNDS):
-            params = _solve(
-                isp, pixels, where, own, value, _fit_mixtures(isp.colour, isp.tone, pixels, own, value, params)
-            )
+            params = _fit_mixtures(isp.colour, isp.tone, pixels, own, value, params)
+            params = _solve(isp, pixels, where, own, value, params)
         return params
+
     light = params.gains / params.matrix.sum(2) / (params.colour_weights @ isp.colour.neutral).exp()
     weights = isp.colour.weights_for(light)
     params = params._replace(colour_weights=weights, matrix=isp.colour.combine(weights))
@@ -347,25 +383,29 @@ def _fit_mixtures(
     """Fit the mixture of curves, then that of cameras, under the gains that ``params`` have."""
     target = value * torch.einsum("bck,bc->bk", own, params.gains)
     weight = ((value < CLIPPED) / (value.clamp_min(0.0) + SHADOW)).sqrt()
-    seen = torch.einsum("bck,bcd->bkd", own, params.matrix)
-    curved = torch.stack([apply_curves(curve.expand(len(pixels), -1), pixels) for curve in tones.curves], dim=1)
-    makes = torch.einsum("bkd,bndk->bnk", seen, curved[:, :, :, 0])
-    tone_weights = _nearest(weight * target, weight[:, None] * makes, tones.typical)
+    rows = torch.einsum("bck,bcd->bkd", own, params.matrix)
+    linear = torch.stack([apply_curves(curve.expand(len(pixels), -1), pixels) for curve in tones.curves], dim=1)
+    readings = torch.einsum("bkd,bndk->bnk", rows, linear[:, :, :, 0])
+    tone_weights = _nearest(weight * target, weight[:, None] * readings, tones.typical)
+
     x2 = apply_curves(tones.combine(tone_weights), pixels)[:, :, 0]
-    makes = torch.einsum("bck,ncd,bdk->bnk", own, cameras.atoms(), x2)
-    colour_weights = _nearest(weight * target, weight[:, None] * makes, cameras.typical)
+    readings = torch.einsum("bck,ncd,bdk->bnk", own, cameras.atoms(), x2)
+    colour_weights = _nearest(weight * target, weight[:, None] * readings, cameras.typical)
     matrix = cameras.combine(colour_weights)
     return params._replace(tone_weights=tone_weights, colour_weights=colour_weights, matrix=matrix)
 
 
-def _nearest(target: Tensor, makes: Tensor, typical: Tensor) -> Tensor:
-    """Find weights ``(B, N)`` whose mixture of ``makes`` ``(B, N, K)`` is nearest to ``target`` ``(B, K)``."""
+def _nearest(target: Tensor, readings: Tensor, typical: Tensor) -> Tensor:
+    """Find weights ``(B, N)`` whose mixture of ``readings`` ``(B, N, K)`` is nearest to ``target`` ``(B, K)``."""
     rows = []
-    for row, atoms in zip(target.double(), makes.double(), strict=True):
-        pull = (PULL * atoms.square().mean() * atoms.shape[1]).sqrt() * torch.eye(len(atoms)).to(atoms)
+    for row, atoms in zip(target.double(), readings.double(), strict=True):
         # A mixture that the readings leave open falls back on the typical weights.
+        pull = (PULL * atoms.square().mean() * atoms.shape[1]).sqrt() * torch.eye(len(atoms)).to(atoms)
         point = torch.cat([row, typical.to(atoms) @ pull])
-        rows.append(nearest_in_hull(point[None], torch.cat([atoms, pull], dim=1))[0][0])
+
+        weights, _ = nearest_in_hull(point[None], torch.cat([atoms, pull], dim=1))
+        rows.append(weights[0])
+
     return torch.stack(rows).to(target.dtype)
 
 
@@ -374,6 +414,7 @@ def _require_places(raw_samples: Tensor, x: Tensor) -> None:
         raise ValueError(f"raw_samples are ({len(x)}, K, 3) of (row, column, value), got {tuple(raw_samples.shape)}")
     if not raw_samples.isfinite().all():
         raise ValueError("raw_samples: a value is NaN; remove such readings")
+
     sides = torch.tensor(x.shape[-2:], device=raw_samples.device)
     if ((raw_samples[..., :2] < 0) | (raw_samples[..., :2] >= sides)).any():
         raise ValueError(f"raw_samples: a row or column is outside the picture, {x.shape[-2]} x {x.shape[-1]}")
@@ -391,5 +432,7 @@ def _solve(isp: StagedISP, pixels: Tensor, where: Tensor, own: Tensor, value: Te
         residual = (y - inverse[..., None] * x5).abs() / (y.clamp_min(0.0) + SHADOW).sqrt()
         typical = residual.masked_fill(usable == 0, torch.nan).nanmedian(dim=2, keepdim=True).values.clamp_min(1e-6)
         weight = usable / (y.clamp_min(0.0) + SHADOW) / (1.0 + (residual / (2.0 * typical)) ** 2)
-    known = (usable.sum(2) > 0) & (inverse > 0)
-    return params._replace(gains=torch.where(known, 1.0 / inverse.clamp_min(1e-6), params.gains))
+
+    solvable = (usable.sum(2) > 0) & (inverse > 0)
+    gains = torch.where(solvable, 1.0 / inverse.clamp_min(1e-6), params.gains)
+    return params._replace(gains=gains)

@@ -54,7 +54,9 @@ _HALF_LEVEL = 0.5 / 255
 
 def as_float(srgb: Tensor) -> Tensor:
     """Convert a picture ``(..., 3, H, W)`` from uint8 to float32 in [0, 1]; floats pass as they are."""
-    return srgb.float() / 255.0 if srgb.dtype == torch.uint8 else srgb
+    if srgb.dtype == torch.uint8:
+        return srgb.float() / 255.0
+    return srgb
 
 
 def as_display_referred(srgb: Tensor) -> Tensor:
@@ -63,6 +65,7 @@ def as_display_referred(srgb: Tensor) -> Tensor:
         raise ValueError(f"a picture must be a dense tensor, got {srgb.layout}; call to_dense()")
     if srgb.dtype not in (torch.uint8, torch.float32):
         raise ValueError(f"a picture must be uint8 or float32 in [0, 1], got {srgb.dtype}; convert it first")
+
     require_display_range(srgb)
     return as_float(srgb)
 
@@ -76,14 +79,20 @@ def require_display_range(image: Tensor) -> None:
     # Only on the CPU: elsewhere reading a value back would stall the device.
     if image.device.type != "cpu" or image.dtype == torch.uint8 or not image.numel():
         return
-    low, high = (float(value) for value in torch.aminmax(image.detach()))
-    if not (low >= -_HALF_LEVEL and high <= 1 + _HALF_LEVEL):
-        if missing := int(image.isnan().sum()):
-            raise ValueError(f"a float picture is in [0, 1], got NaN in {missing} of {image.numel()} values")
-        advice = "normalise after rawaug, or divide by the largest value that it can have"
-        if low >= -_OVERSHOOT and high <= 1.0 + _OVERSHOOT:
-            advice = "call clamp(0, 1) if an interpolation has overshot, and normalise after rawaug"
-        raise ValueError(f"a float picture must be in [0, 1], got {low:.4g} to {high:.4g}; {advice}")
+
+    lowest, highest = torch.aminmax(image.detach())
+    low, high = float(lowest), float(highest)
+    if low >= -_HALF_LEVEL and high <= 1 + _HALF_LEVEL:
+        return
+
+    missing = int(image.isnan().sum())
+    if missing:
+        raise ValueError(f"a float picture is in [0, 1], got NaN in {missing} of {image.numel()} values")
+
+    advice = "normalise after rawaug, or divide by the largest value that it can have"
+    if low >= -_OVERSHOOT and high <= 1.0 + _OVERSHOOT:
+        advice = "call clamp(0, 1) if an interpolation has overshot, and normalise after rawaug"
+    raise ValueError(f"a float picture must be in [0, 1], got {low:.4g} to {high:.4g}; {advice}")
 
 
 def _pixelwise(hidden: int, outputs: int, inputs: int = 3) -> nn.Sequential:
@@ -91,9 +100,12 @@ def _pixelwise(hidden: int, outputs: int, inputs: int = 3) -> nn.Sequential:
     last = nn.Conv2d(WIDTH, outputs, 1)
     nn.init.zeros_(last.weight)
     last.bias = nn.Parameter(torch.zeros(outputs))
+
     layers: list[nn.Module] = []
-    for channels in [inputs, *[WIDTH] * (hidden - 1)]:
+    channels = inputs
+    for _ in range(hidden):
         layers += [nn.Conv2d(channels, WIDTH, 1), nn.ReLU()]
+        channels = WIDTH
     return nn.Sequential(*layers, last)
 
 
@@ -114,10 +126,12 @@ class ToneNetwork(nn.Module):
         # Three hidden features pass x on (it is not negative, so ReLU keeps it), and the last layer adds the rest.
         *hidden, last = (layer for layer in self.layers if isinstance(layer, nn.Conv2d))
         through = torch.eye(3)[..., None, None]
+
         for layer in hidden:
             layer.weight[:3] = 0.0
             layer.weight[:3, :3] = through
             layer.get_parameter("bias")[:3] = 0.0
+
         last.weight.zero_()
         last.weight[:, :3] = -toe * through
         last.get_parameter("bias").fill_(toe)
@@ -148,13 +162,16 @@ def inverse_gains(x: Tensor, gains: Tensor, knee: float | None = HIGHLIGHT_KNEE)
     inverse = (1.0 / gains)[:, :, None, None]
     if knee is None:
         return x * inverse
+
     mask = ((x.mean(dim=1, keepdim=True) - knee) / (1.0 - knee)).clamp(0.0, 1.0) ** 2
     return x * torch.maximum(mask + (1.0 - mask) * inverse, inverse)
 
 
 def highlight_rise(floor: Tensor, knee: float | None) -> Tensor:
     """How much brighter a spared highlight is where the mask is 1; ``floor`` ``(..., 3)`` is one over the gains."""
-    return torch.zeros_like(floor) if knee is None else (1.0 - floor).clamp_min(0.0)
+    if knee is None:
+        return torch.zeros_like(floor)
+    return (1.0 - floor).clamp_min(0.0)
 
 
 def apply_gains(x: Tensor, gains: Tensor) -> Tensor:
@@ -177,6 +194,7 @@ def frame_coordinates(
     """
     full_height, full_width = frame or (height, width)
     half_diagonal = 0.5 * (full_height**2 + full_width**2) ** 0.5
+
     y = (torch.arange(height, dtype=torch.float32) + (offset[0] + 0.5 - full_height / 2)) / half_diagonal
     x = (torch.arange(width, dtype=torch.float32) + (offset[1] + 0.5 - full_width / 2)) / half_diagonal
     return torch.stack(torch.meshgrid(y, x, indexing="ij"))[None]
@@ -184,7 +202,9 @@ def frame_coordinates(
 
 def coordinates_or_full(x: Tensor, coordinates: Tensor | None) -> Tensor:
     """``coordinates`` ``(B, 2, H, W)``, or those of a full frame, in the type of the image ``x`` ``(B, 3, H, W)``."""
-    return (frame_coordinates(*x.shape[-2:]) if coordinates is None else coordinates).to(x)
+    if coordinates is None:
+        coordinates = frame_coordinates(*x.shape[-2:])
+    return coordinates.to(x)
 
 
 class GaussianMask(nn.Module):
@@ -210,7 +230,8 @@ class GaussianMask(nn.Module):
     def forward(self, coordinates: Tensor) -> Tensor:
         """Compute the mask ``(B, 1, H, W)``, in (0, 1], at coordinates ``(B, 2, H, W)``."""
         p = coordinates - self.mean[None, :, None, None]
-        return torch.exp(-0.5 * torch.einsum("bihw,ij,bjhw->bhw", p, self.precision, p))[:, None]
+        square = torch.einsum("bihw,ij,bjhw->bhw", p, self.precision, p)
+        return torch.exp(-0.5 * square)[:, None]
 
     @torch.no_grad()
     def set(self, mean: Tensor, precision: Tensor) -> None:
@@ -218,6 +239,7 @@ class GaussianMask(nn.Module):
         values, vectors = torch.linalg.eigh(precision)
         root = vectors @ torch.diag(values.clamp_min(LEAST_FACTOR**2).sqrt())
         lower = torch.linalg.qr(root.T).R.T
+
         self.mean.copy_(mean)
         self.factor.copy_(torch.stack([lower[0, 0], lower[1, 0], lower[1, 1]]))
 
@@ -308,11 +330,15 @@ class Stage(nn.Module, ABC):
 
     def bake(self, tables: Tables) -> Tables:
         """Put what this stage does to every picture alike into the tables of the reverse pass."""
-        return tables._replace(x2=self.reverse(tables.x2, None)) if self.makes <= 2 else tables
+        if self.makes > 2:
+            return tables
+        return tables._replace(x2=self.reverse(tables.x2, None))
 
     def bake_forward(self, tables: Tables) -> Tables:
         """Put what this stage does to every picture alike into the tables of the forward pass, whose x2 is sRGB."""
-        return tables._replace(x2=self.forward(tables.x2, None)) if self.makes <= 2 else tables
+        if self.makes > 2:
+            return tables
+        return tables._replace(x2=self.forward(tables.x2, None))
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         """Put what this stage does to these pictures into ``batch``.
@@ -372,14 +398,18 @@ class Stage(nn.Module, ABC):
 
     def parameters_of(self, forward: bool) -> dict[str, Tensor]:
         """The parameters that a fit of the forward or of the reverse pass changes, as ``stage.name``."""
-        named = self.named_parameters()
-        return {f"{self.name}.{key}": p for key, p in named if key.startswith("forward_") == forward}
+        parameters: dict[str, Tensor] = {}
+        for key, parameter in self.named_parameters():
+            if key.startswith("forward_") == forward:
+                parameters[f"{self.name}.{key}"] = parameter
+        return parameters
 
 
 def node_colours(nodes: int) -> Tensor:
     """The colours at the nodes of a table, float32 ``(1, 3, N, N * N)``; the axes of the cube are B, G, R."""
     axis = torch.linspace(0.0, 1.0, nodes, dtype=torch.float32)
-    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).flip(0).reshape(1, 3, nodes, nodes**2)
+    cube = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"))
+    return cube.flip(0).reshape(1, 3, nodes, nodes**2)
 
 
 @STAGES.register("tone")
@@ -509,14 +539,20 @@ class LensShading(Stage):
     def __init__(self, config: ISPConfig) -> None:
         super().__init__(config)
         self.mask = GaussianMask()
-        self.reverse_attention = AttentionMask() if config.attention else None
-        self.forward_attention = AttentionMask() if config.attention else None
+        self.reverse_attention: AttentionMask | None = None
+        self.forward_attention: AttentionMask | None = None
+        if config.attention:
+            self.reverse_attention = AttentionMask()
+            self.forward_attention = AttentionMask()
 
     def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x5 = x4 G(p) A(x4 G(p), p), both ``(B, 3, H, W)``."""
         where = coordinates_or_full(x, coordinates)
         x = x * self.mask(where)
-        return x if self.reverse_attention is None else x * self.reverse_attention(x, where)
+
+        if self.reverse_attention is None:
+            return x
+        return x * self.reverse_attention(x, where)
 
     def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x4 from x5, both ``(B, 3, H, W)``: divide by the mask, then apply the forward attention.
@@ -526,6 +562,7 @@ class LensShading(Stage):
         where = coordinates_or_full(x, coordinates)
         if self.forward_attention is None:
             return x / self.mask(where)
+
         x = x * self.forward_attention.of_place(where) / self.mask(where)
         return x * self.forward_attention.of_colour(x)
 
@@ -543,8 +580,12 @@ class LensShading(Stage):
         ``place`` and ``size`` are as in :meth:`Stage.adjust`; ``params`` do not matter.
         """
         centre = (float(self.mask.mean[0]), float(self.mask.mean[1]))
-        places = [[0, 0, *size]] * len(batch.frame) if place is None else place.tolist()
-        frame = batch.frame.new_tensor([mask_frame(p, *size, centre) for p in places]).reshape(len(batch.frame), 6)
+        places = [[0, 0, *size]] * len(batch.frame)
+        if place is not None:
+            places = place.tolist()
+        rows = [mask_frame(row, *size, centre) for row in places]
+        frame = batch.frame.new_tensor(rows).reshape(len(batch.frame), 6)
+
         precision = self.mask.precision * (0.5 / math.log(2.0))
         shading = torch.stack([precision[0, 0], 2.0 * precision[0, 1], precision[1, 1]])
         return batch._replace(frame=frame, shading=shading)
@@ -556,15 +597,19 @@ class LensShading(Stage):
 
     def place_gain(self, coordinates: Tensor, forward: bool) -> Tensor:
         """Compute the attention's gains by place ``(B, 1, H, W)``, in the direction asked for."""
-        attention = self.forward_attention if forward else self.reverse_attention
+        attention = self.reverse_attention
+        if forward:
+            attention = self.forward_attention
+
         if attention is None:
             return super().place_gain(coordinates, forward)
         return attention.of_place(coordinates)
 
     def describe(self) -> str:
         """Describe the mask by its mean and precision."""
-        mean, precision = self.mask.mean.tolist(), self.mask.precision.flatten().tolist()
-        return f"shading: mean {mean}, precision {[round(p, 3) for p in precision]}"
+        mean = self.mask.mean.tolist()
+        precision = [round(entry, 3) for entry in self.mask.precision.flatten().tolist()]
+        return f"shading: mean {mean}, precision {precision}"
 
     def coarse_parameters(self) -> dict[str, Tensor]:
         """The five numbers of the mask."""
@@ -576,7 +621,9 @@ class LensShading(Stage):
 
 
 def _bake_attention(tables: Tables, mask: AttentionMask | None) -> Tables:
-    return tables if mask is None else tables._replace(attention=mask.of_colour(tables.cube))
+    if mask is None:
+        return tables
+    return tables._replace(attention=mask.of_colour(tables.cube))
 
 
 def require_params(params: ISPParams | None) -> ISPParams:
