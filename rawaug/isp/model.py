@@ -8,7 +8,7 @@ Source: Conde et al., "Model-Based Image Signal Processors via Learnable Diction
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -47,10 +47,11 @@ class DictionaryISP(StagedISP):
     def __repr__(self) -> str:
         """Tell the pattern, the stages and the sizes of the dictionaries in a line."""
         config = self.config
-        known = f" of {config.cameras} published cameras" if config.cameras else ""
-        atoms = (
-            f"{config.colour_atoms} colour atoms{known}, {config.gain_atoms} gain and {config.tone_atoms} tone atoms"
-        )
+        colours = f"{config.colour_atoms} colour atoms"
+        if config.cameras:
+            colours += f" of {config.cameras} published cameras"
+
+        atoms = f"{colours}, {config.gain_atoms} gain and {config.tone_atoms} tone atoms"
         return f"DictionaryISP, {self.cfa}, stages {' '.join(self.stages)}: {atoms}"
 
     # -- settings ---------------------------------------------------------------------------------------------------
@@ -76,10 +77,15 @@ class DictionaryISP(StagedISP):
         A camera in a light where the atoms are published cameras, else mixtures of the atoms with uniform weights.
         """
         config, device = self.config, self.colour.matrices.device
-        if (cameras := self.camera_sampler()) is not None:
-            return cameras.sample(batch, generator, device)
-        atoms = [n for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
-        return self.params_from_weights(*(convex_weights(batch, n, generator).to(device) for n in atoms))
+        sampler = self.camera_sampler()
+        if sampler is not None:
+            return sampler.sample(batch, generator, device)
+
+        weights = []
+        for atoms in (config.colour_atoms, config.gain_atoms, config.tone_atoms):
+            if atoms:
+                weights.append(convex_weights(batch, atoms, generator).to(device))
+        return self.params_from_weights(*weights)
 
     def camera_sampler(self, consistent: bool = True, light: float | str | None = None) -> CameraSampler | None:
         """Make the sampler that draws cameras in a light; None unless the colour atoms are published cameras.
@@ -102,12 +108,15 @@ class DictionaryISP(StagedISP):
         encoders = self.reverse_encoders
         if not self.config.encoders:
             return self.params_from_weights(encoders.colour(srgb), encoders.gain(srgb))
+
         x2 = self.linear(thumbnail(stages.as_float(srgb)))
         candidates = torch.einsum("nij,bjhw->bnihw", self.colour.atoms(), x2)
         colour_weights = encoders.colour(candidates)
         x3 = torch.einsum("bn,bnihw->bihw", colour_weights, candidates)
-        gains = self.gain.channel_gains()
-        balanced = [stages.inverse_gains(x3, g.expand(len(x3), 3), self.config.knee) for g in gains]
+
+        balanced = []
+        for gains in self.gain.channel_gains():
+            balanced.append(stages.inverse_gains(x3, gains.expand(len(x3), 3), self.config.knee))
         return self.params_from_weights(colour_weights, encoders.gain(torch.stack(balanced, dim=1)))
 
     def choose_forward(self, x4: Tensor) -> ISPParams:
@@ -115,6 +124,7 @@ class DictionaryISP(StagedISP):
         small = thumbnail(x4)
         balanced = small[:, None] * self.gain.channel_gains()[None, :, :, None, None]
         gain_weights = self.forward_encoders.gain(balanced)
+
         x3 = stages.apply_gains(small, self.gain.combine(gain_weights))
         candidates = torch.einsum("nij,bjhw->bnihw", torch.linalg.pinv(self.colour.atoms()), x3)
         return self.params_from_weights(self.forward_encoders.colour(candidates), gain_weights)
@@ -159,19 +169,21 @@ class DictionaryISP(StagedISP):
         """
         if srgb.ndim != 4 or srgb.shape[1] != 3 or min(srgb.shape[2:]) < 2:
             raise ValueError(f"sRGB must have shape (B, 3, H >= 2, W >= 2), got {tuple(srgb.shape)}")
+
         with self._float32(srgb):
             x = stages.as_display_referred(srgb)
+
             params = staged.with_white_balance(self, params or self.choose(x), white_balance, digital_gain)
             params = staged.with_tone(self, params, tone)
             if len(params.gains) != len(x):
                 raise ValueError(f"the parameters are for {len(params.gains)} pictures, but the batch has {len(x)}")
             if raw_samples is not None:
-                params = staged.with_raw_samples(
-                    self, x, params, raw_samples, stages.coordinates_or_full(x, coordinates)
-                )
-            seen: dict[str, Tensor] = {}
-            x5 = self.reverse_pixels(x, params, coordinates, seen if intermediates else None)
-            return ISPResult(bayer.mosaic(x5, self.cfa), params, seen)
+                where = stages.coordinates_or_full(x, coordinates)
+                params = staged.with_raw_samples(self, x, params, raw_samples, where)
+
+            images: dict[str, Tensor] = {}
+            x5 = self.reverse_pixels(x, params, coordinates, images if intermediates else None)
+            return ISPResult(bayer.mosaic(x5, self.cfa), params, images)
 
     def _float32(self, like: Tensor) -> torch.autocast:
         """Keep the pass in float32, in mixed precision too; ValueError if the ISP is of another type or device."""
@@ -214,18 +226,27 @@ class DictionaryISP(StagedISP):
                 params = self.choose_forward(self.remove_shading(x5, coordinates))
             params = staged.with_white_balance(self, params, white_balance, None)
             params = staged.with_tone(self, params, tone)
-            seen: dict[str, Tensor] = {"x5": x5}
-            srgb = self.forward_pixels(x5, params, coordinates, seen if intermediates else None)
-        return ISPResult(srgb.clamp(0.0, 1.0), params, seen if intermediates else {})
+
+            if not intermediates:
+                srgb = self.forward_pixels(x5, params, coordinates)
+                return ISPResult(srgb.clamp(0.0, 1.0), params)
+
+            images: dict[str, Tensor] = {"x5": x5}
+            srgb = self.forward_pixels(x5, params, coordinates, images)
+            return ISPResult(srgb.clamp(0.0, 1.0), params, images)
 
     # -- as numbers -------------------------------------------------------------------------------------------------
 
     def typical_setting(self, white_balance: Sequence[float] | None = None) -> ISPParams:
         """The setting of one picture that the constants choose, under as-shot multipliers R, G, B if there are any."""
         encoders = self.reverse_encoders
-        weights = [encoder.prior.softmax(0)[None] for encoder in (encoders.colour, encoders.gain)]
-        given = None if white_balance is None else tuple(white_balance)
-        return staged.with_white_balance(self, self.params_from_weights(*weights), given, None)
+        colour_weights = encoders.colour.prior.softmax(0)[None]
+        gain_weights = encoders.gain.prior.softmax(0)[None]
+        params = self.params_from_weights(colour_weights, gain_weights)
+
+        if white_balance is None:
+            return params
+        return staged.with_white_balance(self, params, tuple(white_balance), None)
 
     @torch.no_grad()
     def reverse_table(self, setting: ISPParams, nodes: int = 33) -> Tensor:
@@ -236,7 +257,10 @@ class DictionaryISP(StagedISP):
         """
         cube = stages.node_colours(nodes)
         shading = self.find(stages.LensShading)
-        centre = torch.zeros(2) if shading is None else shading.mask.mean
+        centre = torch.zeros(2)
+        if shading is not None:
+            centre = shading.mask.mean
+
         coordinates = centre[None, :, None, None].expand(1, 2, *cube.shape[-2:])
         return self.reverse_pixels(cube, setting, coordinates)[0].flatten(1).T.contiguous()
 
@@ -289,16 +313,16 @@ class DictionaryISP(StagedISP):
         """
         if is_camera_file(name):
             return restrict_to_cameras(cls.from_pretrained("universal"), name)
+
         path = find_weights(name)
         header, state = read_tensors(path, _ADVICE, _INFINITE)
         if header.get("kind") != "isp":
             raise ValueError(f"{path}: contains {header.get('kind', 'no rawaug weights')}, not an ISP")
         try:
             isp = cls(ISPConfig(**parse_object(header["config"])))
-            shapes, needed = ({k: v.shape for k, v in tensors.items()} for tensors in (state, isp.state_dict()))
-            if wrong := sorted(key for key in shapes | needed if shapes.get(key) != needed.get(key)):
-                raise ValueError(f"tensor {wrong[0]} does not fit")
+            _require_shapes(state, isp.state_dict())
             isp.load_state_dict(state)
+
             for part, atoms in (("colour", isp.colour.atoms()), ("gain", isp.gain.channel_gains())):
                 if not atoms.isfinite().all():
                     raise ValueError(f"its {part} atoms are not finite")
@@ -325,19 +349,29 @@ def restrict_to_cameras(
     """
     if not isinstance(isp.colour, CameraDictionary):
         raise ValueError("camera: needs an ISP with published cameras, such as universal")
-    cameras = [names] if isinstance(names, (str, Path, Camera)) else list(names)
-    own = [as_camera(camera) for camera in cameras if isinstance(camera, Camera) or is_camera_file(camera)]
+    if isinstance(names, (str, Path, Camera)):
+        names = [names]
+
+    own = []
+    published = []
+    for name in names:
+        if isinstance(name, Camera) or is_camera_file(name):
+            own.append(as_camera(name))
+        else:
+            published.append(str(name))
+
     if own:
-        published = [camera for camera in cameras if not (isinstance(camera, Camera) or is_camera_file(camera))]
-        cfa = own[0].cfa  # the table of published cameras has no patterns
-        return _with_own_cameras(isp, [*own, *(replace(Camera.published(str(name)), cfa=cfa) for name in published)])
+        for name in published:
+            camera = Camera.published(name)
+            own.append(replace(camera, cfa=own[0].cfa))  # the table of published cameras has no patterns
+        return _with_own_cameras(isp, own)
 
     listed = load_cameras()
-    known = [find_camera(str(name), listed.names) for name in cameras]
-    narrowed = _without_colour(isp, colour_atoms=len(known), cameras=len(known))
+    cameras = [find_camera(name, listed.names) for name in published]
+    narrowed = _without_colour(isp, colour_atoms=len(cameras), cameras=len(cameras))
     assert isinstance(narrowed.colour, CameraDictionary)
-    narrowed.colour.set_cameras(listed.select(known), torch.eye(len(known)))
-    narrowed.info = {**isp.info, "cameras": known}
+    narrowed.colour.set_cameras(listed.select(cameras), torch.eye(len(cameras)))
+    narrowed.info = {**isp.info, "cameras": cameras}
     return narrowed.to(isp.colour.matrices.device).eval()
 
 
@@ -418,6 +452,12 @@ def _tones_of(isp: DictionaryISP, cameras: Sequence[Camera]) -> tuple[list[str],
             unknown = f"camera {camera.name!r}: tone {camera.tone!r:.80} is unknown"
             raise ValueError(f"{unknown}; use points or one of {', '.join(names)}{suggest(camera.tone, names)}")
     return list(tones), torch.stack(list(tones.values()))
+
+
+def _require_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    for key in sorted({*tensors, *expected}):
+        if key not in tensors or key not in expected or tensors[key].shape != expected[key].shape:
+            raise ValueError(f"tensor {key} does not fit")
 
 
 def _of_colour(key: str) -> bool:

@@ -129,7 +129,9 @@ class FitFrames(NamedTuple):
     def some(self, frames: Sequence[int]) -> FitFrames:
         """Take some of the frames by their numbers."""
         index = torch.tensor(frames)
-        return FitFrames(PixelSamples(*(value[index] for value in self.pixels)), [self.shots[k] for k in frames])
+        pixels = PixelSamples(*(value[index] for value in self.pixels))
+        shots = [self.shots[k] for k in frames]
+        return FitFrames(pixels, shots)
 
 
 def sample_pixels(pairs: Iterable[FramePair], pixels: int, seed: int, noisy: bool = False) -> FitFrames:
@@ -144,28 +146,45 @@ def sample_pixels(pairs: Iterable[FramePair], pixels: int, seed: int, noisy: boo
     Raises:
         ValueError: if there is no frame, or one lacks its colours or its noisy RAW.
     """
-    drawn = [_sample_frame(pair, pixels, seed, noisy) for pair in pairs]
-    if not drawn:
+    frames = []
+    shots = []
+    for pair in pairs:
+        samples, shot = _sample_frame(pair, pixels, seed, noisy)
+        frames.append(samples)
+        shots.append(shot)
+    if not frames:
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")
-    frames, shots = zip(*drawn, strict=True)
-    return FitFrames(PixelSamples(*(torch.stack(values) for values in zip(*frames, strict=True))), list(shots))
+
+    stacked = (torch.stack(values) for values in zip(*frames, strict=True))
+    return FitFrames(PixelSamples(*stacked), shots)
 
 
 def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple[PixelSamples, FrameSummary]:
     if not pair.color_known:
         raise ValueError(f"{pair.name}: its white balance and colour matrix are unknown; use an ISP such as universal")
-    raw = pair.noisy if noisy else pair.raw
+    raw: Tensor | None
+    if noisy:
+        raw = pair.noisy
+    else:
+        raw = pair.raw
     if raw is None:
         raise ValueError(f"{pair.name}: has no noisy RAW; fit on clean frames or add noise first")
     generator = keyed_generator(seed, "pixels", pair.name)
     draw = _sites if pair.registered else _blocks
     try:
-        drawn = draw(pair.srgb, raw, pair.cfa, pixels, generator)
+        samples = draw(pair.srgb, raw, pair.cfa, pixels, generator)
     except ValueError as error:
         raise ValueError(f"{pair.name}: {error}") from None
-    small_srgb, small_raw = thumbnail(as_float(pair.srgb[None])), thumbnail(_colours(raw, pair.cfa)[None])
-    stated = (pair.name, pair.camera, CFA(pair.cfa), pair.white_balance)
-    return drawn, FrameSummary(*stated, small_srgb, small_raw, pair.registered)
+    summary = FrameSummary(
+        name=pair.name,
+        camera=pair.camera,
+        cfa=CFA(pair.cfa),
+        white_balance=pair.white_balance,
+        srgb=thumbnail(as_float(pair.srgb[None])),
+        raw=thumbnail(_colours(raw, pair.cfa)[None]),
+        registered=pair.registered,
+    )
+    return samples, summary
 
 
 def _sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:
@@ -173,6 +192,7 @@ def _sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Ge
     height, width = raw.shape[-2:]
     row = torch.randint(height, (pixels,), generator=generator)
     column = torch.randint(width, (pixels,), generator=generator)
+
     scale = 255.0 if srgb.dtype == torch.uint8 else 1.0
     pixel = srgb[:, row, column].float() / scale
     reading = raw[0, row, column]
@@ -183,9 +203,11 @@ def _sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Ge
     corners = torch.stack([srgb[:, top + i, left + j].float() / scale for i in (0, 1) for j in (0, 1)])
     sites = torch.stack([raw[0, top + i, left + j] for i, j in cfa.sites])
     cell_raw = torch.stack([sites[0], (sites[1] + sites[2]) / 2, sites[3]])
+
     spread = (corners.amax(0) - corners.amin(0)).amax(0)
     unclipped = (corners.amax((0, 1)) < CLIPPED_SRGB) & (cell_raw.amax(0) < CLIPPED_RAW)
     weight = unclipped / (1.0 + (spread * 32.0) ** 2)
+
     coordinates = frame_coordinates(height, width)[0, :, row, column]
     return _samples(pixel, reading * own, own, own * inside, coordinates, corners.mean(0), cell_raw, weight)
 
@@ -197,6 +219,7 @@ def _blocks(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.G
     likeness = float(torch.corrcoef(greens)[0, 1])
     if likeness < LEAST_LIKENESS:
         raise ValueError(f"sRGB and RAW hardly correlate ({likeness:.2f}); are they from the same shot?")
+
     index = torch.randint(blocks.clipped.numel(), (pixels,), generator=generator)
     pixel, reading = blocks.srgb.flatten(1)[:, index], blocks.raw.flatten(1)[:, index]
     inside = ~blocks.clipped.flatten()[index] & (pixel.amax(0) < CLIPPED_SRGB)
@@ -226,11 +249,14 @@ def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA) -> Blocks:
     height, width = raw.shape[-2:]
     dy, dx = find_shift(srgb, raw, cfa)
     top, left = -(min(dy, 0) // 2) * 2, -(min(dx, 0) // 2) * 2
-    rows, columns = (height - top - max(dy, 0)) // BLOCK * BLOCK, (width - left - max(dx, 0)) // BLOCK * BLOCK
+    rows = (height - top - max(dy, 0)) // BLOCK * BLOCK
+    columns = (width - left - max(dx, 0)) // BLOCK * BLOCK
+
     window = raw[:, top : top + rows, left : left + columns]
     x = as_float(srgb[:, top + dy : top + dy + rows, left + dx : left + dx + columns])
     low_srgb = F.avg_pool2d(x[None] ** 2.2, BLOCK)[0] ** (1 / 2.2)
     low_raw = F.avg_pool2d(_colours(window, cfa)[None], BLOCK // 2)[0]
+
     clipped = F.max_pool2d((window >= CLIPPED_RAW).float()[None], BLOCK)[0, 0] > 0
     coordinates = frame_coordinates(rows, columns, (top, left), (height, width))
     return Blocks(low_srgb, low_raw, clipped, F.avg_pool2d(coordinates, BLOCK))
