@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -39,36 +40,41 @@ def psnr_r(
         ValueError: if the picture is not in the camera's colours, as SIDD's blocks without their sRGB files.
     """
     pair.require_rendered()
-    given = pair.white_balance if white_balance else None
+    as_shot = pair.white_balance if white_balance else None
 
     def choose(srgb: Tensor) -> ISPParams:
-        params = staged.with_white_balance(isp, isp.choose(srgb), given, None)
+        params = staged.with_white_balance(isp, isp.choose(srgb), as_shot, None)
         return staged.with_tone(isp, params, tone)
 
     if pair.registered:
         params = choose(pair.srgb[None])
 
-        def made(patch: Tensor, place: Tensor) -> Tensor:
+        def reverse(patch: Tensor, place: Tensor) -> Tensor:
             return bayer.mosaic(isp.reverse_pixels(as_float(patch), params, place), pair.cfa)
 
-        return windows_psnr(made, pair, patches)
+        return windows_psnr(reverse, pair, patches)
+
     blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
     params = choose(blocks.srgb[None])
-    return block_psnr(isp.reverse_pixels(blocks.srgb[None], params, blocks.coordinates)[0], blocks.raw, blocks.clipped)
+    estimate = isp.reverse_pixels(blocks.srgb[None], params, blocks.coordinates)[0]
+    return block_psnr(estimate, blocks.raw, blocks.clipped)
 
 
-def block_psnr(made: Tensor, raw: Tensor, clipped: Tensor) -> float:
+def block_psnr(estimate: Tensor, raw: Tensor, clipped: Tensor) -> float:
     """PSNR between block averages ``(3, h, w)``, blocks with a clipped reading ``(h, w)`` left out."""
-    error = (made.clamp(0.0, 1.0) - raw) ** 2
+    error = (estimate.clamp(0.0, 1.0) - raw) ** 2
     return -10.0 * error[:, ~clipped].mean().log10().item()
 
 
 def windows_of(pair: Pair, count: int | None) -> list[tuple[int, int]]:
     """Corners of ``count`` random patches of the frame, keyed by its name; all of :func:`patch_psnr`'s if None."""
-    rows, columns = (range(0, max(side - PATCH, 0) + 1, PATCH) for side in pair.raw.shape[-2:])
-    every = [(top, left) for top in rows for left in columns]
+    height, width = pair.raw.shape[-2:]
+    rows = range(0, max(height - PATCH, 0) + 1, PATCH)
+    columns = range(0, max(width - PATCH, 0) + 1, PATCH)
+    every = list(product(rows, columns))
     if count is None or count >= len(every):
         return every
+
     order = torch.randperm(len(every), generator=keyed_generator("windows", pair.name)).tolist()
     return [every[k] for k in sorted(order[:count])]
 
@@ -76,7 +82,8 @@ def windows_of(pair: Pair, count: int | None) -> list[tuple[int, int]]:
 @torch.no_grad()
 def windows_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair, count: int | None) -> float:
     """Mean PSNR over windows; ``make`` maps an sRGB patch ``(1, 3, h, w)`` and its place in the frame to RAW."""
-    values, (height, width) = [], pair.raw.shape[-2:]
+    height, width = pair.raw.shape[-2:]
+    values = []
     for top, left in windows_of(pair, count):
         window = (None, slice(None), slice(top, top + PATCH), slice(left, left + PATCH))
         place = frame_coordinates(min(PATCH, height), min(PATCH, width), (top, left), (height, width))

@@ -7,7 +7,7 @@ if they are given: on the captured noisy mosaic of a pair where it has one, else
 from __future__ import annotations
 
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -85,34 +85,59 @@ def fit(
     if noise == "off" and dark is not None:
         raise ValueError(f"dark {dark}: has no use with noise: off; leave one of them out")
     start = time.perf_counter()
-    mosaics = {key: value for key, value in (("cfa", cfa), ("black", black), ("white", white)) if value is not None}
+
+    mosaics: dict[str, Any] = {}
+    for key, value in (("cfa", cfa), ("black", black), ("white", white)):
+        if value is not None:
+            mosaics[key] = value
     pairs = _pairs(source, camera_jpeg, mosaics)
+    frames = Readable(pairs)
+
     watch = None
     if held_out is not None:
-        others = _pairs(held_out, camera_jpeg, mosaics if str(held_out).startswith("pairs:") else {})
-        if (seen := shared_frame(others, pairs)) is not None:
-            raise ValueError(f"held-out: {seen} is also fitted; hold out other frames")
-        watch = _Watch(others)
-    frames = Readable(pairs)
+        watch = _Watch(_held_out_pairs(held_out, pairs, camera_jpeg, mosaics))
+
     estimate = _measured_noise(frames, noise, dark)  # before the fit: what fails here fails early
-    figures = None if camera is None else as_camera(camera)
+
+    figures = None
+    if camera is not None:
+        figures = as_camera(camera)
     isp = fit_isp(frames, FitConfig(**settings), progress, state, watch, figures)
     if figures is not None:
         isp.info["started_from"] = figures.name
+
+    unreadable = left_out(frames, "the fit")
     if watch is not None:
         watch(isp)
         isp.info["held_out"] = watch.scores
-    if lines := [*left_out(frames, "the fit"), *left_out(watch.pairs if watch else Readable([]), "held-out frames")]:
-        isp.info["unreadable"] = lines
+        unreadable = [*unreadable, *left_out(watch.pairs, "held-out frames")]
+    if unreadable:
+        isp.info["unreadable"] = unreadable
+
     if isinstance(estimate, str):
         isp.info["noise_not_measured"] = estimate
     elif estimate is not None:
         isp.info["noise"] = estimate.law.spec()
         if noise_figure is not None:
             estimate.plot(noise_figure)
+
     isp.info["rendering"] = rendering_of(pairs, len(isp.info["frames"]), isp.info["registered"])
     isp.info["seconds"] = round(time.perf_counter() - start, 2)
     return isp
+
+
+def _held_out_pairs(
+    held_out: str | Path | Sequence[Pair], pairs: Sequence[Pair], camera_jpeg: bool, mosaics: Mapping[str, Any]
+) -> Sequence[Pair]:
+    """Open the held-out frames; ValueError if one of them is among those fitted, ``pairs``."""
+    if not str(held_out).startswith("pairs:"):
+        mosaics = {}
+    others = _pairs(held_out, camera_jpeg, mosaics)
+
+    shared = shared_frame(others, pairs)
+    if shared is not None:
+        raise ValueError(f"held-out: {shared} is also fitted; hold out other frames")
+    return others
 
 
 def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> CameraNoise | str | None:
@@ -131,6 +156,7 @@ def rendering_of(pairs: Sequence[Pair], frames: int, registered: int) -> str:
     """What rendering the fit was to, whose tone curve and colours the ISP undoes; registered pairs are no JPEGs."""
     own = "LibRaw" if isinstance(pairs, RawFolder) else "sRGB of the pairs"
     counts = {own: registered, "JPEG of the camera": frames - registered}
+
     return ", ".join(f"{name} ({count} of {frames})" for name, count in counts.items() if count)
 
 
@@ -142,10 +168,15 @@ class _Watch:
         self.scores: list[dict[str, float]] = []
 
     def __call__(self, isp: DictionaryISP) -> str:
-        scores = [[psnr_r(isp, pair, known, WATCHED_PATCHES) for known in (False, True)] for pair in self.pairs]
-        blind, given = (fmean(of_frames) for of_frames in zip(*scores, strict=True))
-        self.scores.append({"blind": round(blind, 2), "as_shot": round(given, 2)})
-        return f"held out {blind:.2f} dB, {given:.2f} dB with as-shot gains"
+        blind_scores = []
+        as_shot_scores = []
+        for pair in self.pairs:
+            blind_scores.append(psnr_r(isp, pair, False, WATCHED_PATCHES))
+            as_shot_scores.append(psnr_r(isp, pair, True, WATCHED_PATCHES))
+
+        blind, as_shot = fmean(blind_scores), fmean(as_shot_scores)
+        self.scores.append({"blind": round(blind, 2), "as_shot": round(as_shot, 2)})
+        return f"held out {blind:.2f} dB, {as_shot:.2f} dB with as-shot gains"
 
 
 def _pairs(
@@ -155,16 +186,18 @@ def _pairs(
         source = [source]
     if not hasattr(source, "__getitem__") or not len(source):
         raise ValueError("nothing to fit; give one or more files, folders or pairs")
+
     if isinstance(source[0], Pair):
         if mosaics:
             raise ValueError(f"{', '.join(mosaics)} can only be given for pairs:PATH; each Pair has its own")
         return source  # type: ignore[return-value]
     if not isinstance(source[0], (str, Path)):
         raise ValueError(f"a fit takes files, folders or Pairs, got {type(source[0]).__name__}; see docs/fit.md")
-    opened = [open_pairs(str(item), split="train", as_clean=False, **mosaics) for item in source]
-    if len(opened) == 1 and not isinstance(opened[0], RawFolder):
-        return opened[0]
-    for item, pairs in zip(source, opened, strict=True):
+
+    for item in source:
+        pairs = open_pairs(str(item), split="train", as_clean=False, **mosaics)
+        if len(source) == 1 and not isinstance(pairs, RawFolder):
+            return pairs
         if not isinstance(pairs, RawFolder):
             raise ValueError(f"{item}: a kind:path dataset cannot be combined with other files; give it alone")
     return RawFolder(map(str, source), camera_jpeg=camera_jpeg)
@@ -185,10 +218,21 @@ class CameraNoise(NamedTuple):
 def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) -> CameraNoise:
     """(shot_var, read_var) of one camera at each ISO of its files, with the measured points."""
     by_iso = _by_iso(_frames(pairs))
-    dark_by_iso = None if dark is None else _by_iso(_frames(RawFolder(dark)))
-    estimates = {iso: _measured(iso, frames, dark_by_iso) for iso, frames in by_iso.items()}
-    camera = next((f.camera for frames in by_iso.values() for f in frames if f.camera != _UNKNOWN), _UNKNOWN)
-    levels = [IsoLevel(iso, e.shot_var, e.read_var, round(e.r2, 4), len(by_iso[iso])) for iso, e in estimates.items()]
+    dark_by_iso = None
+    if dark is not None:
+        dark_by_iso = _by_iso(_frames(RawFolder(dark)))
+
+    camera = _UNKNOWN
+    estimates = {}
+    levels = []
+    for iso, frames in by_iso.items():
+        estimate = _measured(iso, frames, dark_by_iso)
+        estimates[iso] = estimate
+        levels.append(IsoLevel(iso, estimate.shot_var, estimate.read_var, round(estimate.r2, 4), len(frames)))
+        for frame in frames:
+            if camera == _UNKNOWN:
+                camera = frame.camera
+
     return CameraNoise(MeasuredLevels(levels, camera), estimates)
 
 
@@ -197,16 +241,19 @@ def _measured(
 ) -> NoiseEstimate:
     """The line of the frames of one ISO."""
     where = "" if iso is None else f" at ISO {iso:g}"
+
     read_var = None
     if dark is not None:
         matching = dark.get(iso) or dark.get(None)
         if matching is None:
             raise ValueError(f"dark: has no frame{where}; give dark frames at every measured ISO")
         read_var = estimate_dark_noise(*_aligned(matching)).read_var
+
     try:
         estimate = estimate_noise(*_aligned(frames), read_var=read_var)
     except ValueError as error:
         raise ValueError(f"noise{where}: {error}") from None
+
     if estimate.shot_var <= 0.0 or estimate.r2 < WORST_FIT:
         advice = "use one camera at one ISO" if iso is None else "use unprocessed RAW files with flat areas"
         raise ValueError(f"noise{where}: the frames do not fit one noise law (R^2 {estimate.r2:.2f}); {advice}")
@@ -215,13 +262,15 @@ def _measured(
 
 def _by_iso(frames: Sequence[RawFrame]) -> dict[float | None, list[RawFrame]]:
     """The frames by ISO, ascending; those of two cameras do not share a law."""
-    cameras = dict.fromkeys(frame.camera for frame in frames if frame.camera != _UNKNOWN)
+    cameras = Counter(frame.camera for frame in frames if frame.camera != _UNKNOWN)
     if len(cameras) > 1:
-        counted = ", ".join(f"{name} ({sum(f.camera == name for f in frames)})" for name in cameras)
-        raise ValueError(f"noise: the frames are from {len(cameras)} cameras, {counted}; measure each separately")
+        counts = ", ".join(f"{name} ({count})" for name, count in cameras.items())
+        raise ValueError(f"noise: the frames are from {len(cameras)} cameras, {counts}; measure each separately")
+
     by_iso: dict[float | None, list[RawFrame]] = defaultdict(list)
     for frame in frames:
         by_iso[frame.iso].append(frame)
+
     if None in by_iso and len(by_iso) > 1:
         raise ValueError(f"noise: {len(by_iso[None])} of {len(frames)} frames have no ISO; measure them separately")
     return dict(sorted(by_iso.items(), key=lambda item: item[0] or 0.0))
@@ -230,12 +279,19 @@ def _by_iso(frames: Sequence[RawFrame]) -> dict[float | None, list[RawFrame]]:
 def _frames(pairs: Sequence[Pair]) -> list[RawFrame]:
     """Frames spread over ``pairs``; of :class:`Readable` ones those that can be read. RAW files are not developed."""
     last = len(pairs) - 1
-    spread = [round(k * last / (MOST_FRAMES - 1)) for k in range(MOST_FRAMES)]
-    indices = range(len(pairs)) if last < MOST_FRAMES else spread
+    indices = list(range(len(pairs)))
+    if last >= MOST_FRAMES:
+        indices = [round(k * last / (MOST_FRAMES - 1)) for k in range(MOST_FRAMES)]
+
     if not isinstance(pairs, Readable):
         return [_frame(pairs, index) for index in indices]
-    found = (pairs.attempt(index, partial(_frame, pairs.pairs)) for index in indices)
-    frames = [frame for frame in found if frame is not None]
+
+    frames = []
+    for index in indices:
+        frame = pairs.attempt(index, partial(_frame, pairs.pairs))
+        if frame is not None:
+            frames.append(frame)
+
     if pairs.broken and not frames:
         raise ValueError(f"noise: none of {len(indices)} frames can be read; {pairs.reasons()[0]}")
     return frames
@@ -245,7 +301,8 @@ def _frame(pairs: Sequence[Pair], index: int) -> RawFrame:
     if isinstance(pairs, RawFolder):
         return read_raw(pairs.files[index])
     pair = pairs[index]
-    return RawFrame(pair.raw if pair.noisy is None else pair.noisy, pair.cfa, camera=pair.camera, iso=pair.iso)
+    mosaic = pair.raw if pair.noisy is None else pair.noisy
+    return RawFrame(mosaic, pair.cfa, camera=pair.camera, iso=pair.iso)
 
 
 def _aligned(frames: Sequence[RawFrame]) -> tuple[list[Tensor], str]:
