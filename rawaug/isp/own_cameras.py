@@ -186,14 +186,17 @@ class Camera:
     def _check_grid(self) -> None:
         if self.bits is not None and (not isinstance(self.bits, int) or not 1 <= self.bits <= 16):
             raise self._error("bits", f"must be a whole number from 1 to 16, got {self.bits!r}")
+
         for key in ("black_level", "white_level"):
             value = getattr(self, key)
             if value is not None and not (_is_number(value) and value >= 0):
                 raise self._error(key, f"must be a number of DN, at least 0, got {value!r:.100}")
+
         if self.white_level is None and self.bits is None:
             if self.black_level:
                 raise self._error("black_level", "needs bits or white_level as well")
             return
+
         if not self.full_scale > 0:
             raise self._error("black_level", f"{self.black_level:g} DN is not below white, {self.white:g} DN")
         if self.bits is not None and self.white > 2**self.bits - 1:
@@ -249,9 +252,12 @@ class Camera:
                 number = float(iso)
             except (TypeError, ValueError):
                 number = math.nan
+
             if not 0 < number < math.inf:
                 raise self._error("noise", f"has levels by ISO, a positive number, got {iso!r:.100}")
+
             levels.append(Level(number, *self._variances(values, f" at ISO {number:g}")))
+
         return sorted(levels, key=lambda level: level.iso or 0.0)
 
     def _variances(self, values: Any, where: str) -> tuple[float, float]:
@@ -261,7 +267,9 @@ class Camera:
             keys = ("K", "sigma") if in_dn else ("shot_var", "read_var")
             if set(values) != set(keys):
                 raise self._error("noise", f"{where} is {{{keys[0]}, {keys[1]}}}, got {', '.join(map(str, values))}")
+
             values = [values[key] for key in keys]
+
         if not isinstance(values, list) or len(values) != 2 or not all(_is_number(value) for value in values):
             raise self._error("noise", f"{where} must be two numbers, got {values!r:.100}")
 
@@ -274,7 +282,9 @@ class Camera:
                 raise self._error(
                     "noise", f"{where} has variances {first:g} and {second:g}, as no sensor has; {advice}"
                 )
+
             return first, second
+
         if self.bits is None and self.white_level is None:
             raise self._error("noise", f"{where} is in DN: give white_level or bits, and black_level")
         return first / self.full_scale, (second / self.full_scale) ** 2
@@ -286,10 +296,12 @@ class Camera:
         """
         if not self.levels:
             return None
+
         rows = []
         for level in self.levels:
             row = {"iso": level.iso, "shot_var": level.shot_var, "read_var": level.read_var}
             rows.append({key: value for key, value in row.items() if value is not None})
+
         settings: dict[str, Any] = {"camera": self.name, "levels": rows}
         if self.quantum:
             settings["quantum"] = self.quantum
@@ -315,10 +327,12 @@ class Camera:
             stated = gains.get(light)
             if stated is None:
                 stated = self._implied_gains(light, matrices)
+
             stated = stated / stated[1]
             to_d65 = adaptation(light_xyz(light), light_xyz(_REFERENCE))
             from_xyz = torch.diag(1.0 / stated) @ matrix @ XYZ_TO_SRGB @ to_d65
             anchors.append(Anchor(light, light_mired(light), matrix, stated, from_xyz))
+
         return anchors
 
     def _by_light(self, key: str, value: Any, shape: tuple[int, ...]) -> dict[str, Tensor]:
@@ -326,6 +340,7 @@ class Camera:
             return {}
         if not isinstance(value, dict):
             value = {_REFERENCE: value}
+
         by_light = {}
         for light, numbers in value.items():
             name = str(light)
@@ -334,11 +349,14 @@ class Camera:
                 by_light[name] = torch.tensor(numbers, dtype=torch.float64)
             except (TypeError, ValueError) as error:
                 raise self._error(key, f"of light {name!r:.40} cannot be read: {error}") from None
+
             if by_light[name].shape != shape or not by_light[name].isfinite().all():
                 size = " x ".join(map(str, shape))
                 raise self._error(key, f"of light {name} must be {size} finite numbers, got {numbers!r:.100}")
+
             if key == "white_balance" and not (by_light[name] > 0).all():
                 raise self._error(key, f"of light {name} must be positive, got {numbers!r:.100}")
+
         if not by_light:
             raise self._error(key, "names no light")
         return by_light
@@ -348,10 +366,13 @@ class Camera:
         if self.matrix_is == "xyz_to_camera":
             under_light = adaptation(light_xyz(_REFERENCE), light_xyz(light))
             return camera_from_srgb(matrix @ under_light)
+
         if self.matrix_is == "camera_to_srgb":
             if float(torch.linalg.cond(matrix)) > 1e6:
                 raise self._error("matrix", f"of light {light} cannot be inverted")
+
             matrix = torch.linalg.inv(matrix)
+
         rows = matrix.sum(dim=1, keepdim=True)
         if not ((rows - 1.0).abs() < 0.05).all():
             sums = ", ".join(f"{value:.3f}" for value in rows.flatten().tolist())
@@ -362,6 +383,7 @@ class Camera:
         """The gains of a light by the matrix from XYZ."""
         if self.matrix_is != "xyz_to_camera":
             raise self._error("white_balance", f"needs the gains of light {light} as well")
+
         response = matrices[light] @ light_xyz(light)
         if not (response > 0).all():
             raise self._error("matrix", f"of light {light} makes white negative: {response.tolist()}")
@@ -390,16 +412,20 @@ class Camera:
         """Linear light ``(nodes,)`` over the values of the picture; None unless ``tone`` is points."""
         if self.tone is None or isinstance(self.tone, str):
             return None
+
         try:
             points = np.asarray(self.tone, dtype=np.float64)
         except (TypeError, ValueError):
             points = np.empty(0)
+
         if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
             points = np.zeros((2, 2))
+
         ascending = bool((np.diff(points, axis=0) > 0).all())
         if not ascending or tuple(points[0]) != (0.0, 0.0) or tuple(points[-1]) != (1.0, 1.0):
             wanted = "must be a name, or ascending points (linear, value) from (0, 0) to (1, 1)"
             raise self._error("tone", f"{wanted}, got {self.tone!r:.100}")
+
         values = np.linspace(0.0, 1.0, nodes)
         return torch.from_numpy(np.interp(values, points[:, 1], points[:, 0])).float()
 
@@ -424,12 +450,15 @@ class Camera:
         keys = [field.name for field in fields(cls)]
         if not isinstance(content, Mapping):
             raise ValueError(f"{where}: must hold keys and values, {', '.join(keys)}")
+
         for key in content:
             if key not in keys:
                 raise ValueError(f"{where}: unknown key {key!r:.80}; use {', '.join(keys)}{suggest(key, keys)}")
+
         for key in ("name", "matrix", "matrix_is"):
             if key not in content:
                 raise ValueError(f"{where}: has no {key}")
+
         try:
             return cls(**content)
         except ValueError as error:
@@ -473,14 +502,17 @@ def light_chromaticity(light: str) -> tuple[float, float]:
         return ILLUMINANTS[light]
     if light in LAMPS:
         return LAMPS[light]
+
     try:
         kelvin = float(light.removesuffix("K").strip())
     except ValueError:
         names = [*ILLUMINANTS, *LAMPS]
         listed = f"{', '.join(names)}{suggest(light, names)}"
         raise ValueError(f"light {light!r:.40} is unknown; use a number in kelvin, {listed}") from None
+
     if not 1000 <= kelvin <= 15000:
         raise ValueError(f"a light must be 1,000 to 15,000 kelvin, got {kelvin:g}")
+
     locus = planckian if kelvin < 4000 else daylight
     x, y = locus(np.array(kelvin)).tolist()
     return x, y
@@ -518,6 +550,7 @@ def weights_in_light(anchors: Sequence[float], mired: Array) -> Array:
     mireds = np.asarray(anchors, dtype=np.float64)
     if len(mireds) == 1:
         return np.ones((len(mired), 1))
+
     order = np.argsort(mireds)
     rows = np.eye(len(mireds))[order]
     columns = [np.interp(mired, mireds[order], rows[:, column]) for column in range(len(mireds))]
@@ -528,6 +561,7 @@ def _mix_by_light(matrices: Mapping[str, Tensor], light: str) -> Tensor:
     """The matrix of a light, or the mixture of those of the lights beside it."""
     if light in matrices:
         return matrices[light]
+
     mireds = [light_mired(name) for name in matrices]
     weights = torch.from_numpy(weights_in_light(mireds, np.array([light_mired(light)])))[0]
     return torch.einsum("n,nij->ij", weights, torch.stack(list(matrices.values())))

@@ -61,6 +61,7 @@ class OwnCameraSampler(CameraSampler):
             lights = LightRange()
         else:
             lights = light_range(light)
+
         super().__init__(atoms, tone_atoms, lights, consistent)
 
     def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Array, Array]:
@@ -76,6 +77,7 @@ class OwnCameraSampler(CameraSampler):
             rest = rest[~plausible.all(axis=1)]
             if not len(rest):
                 return weights, balance
+
         limits = f"{self._lowest:g} to {self._highest:g}"
         raise ValueError(f"no light of {self.lights.kelvin} K gives these cameras gains within {limits}")
 

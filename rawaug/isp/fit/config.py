@@ -97,6 +97,7 @@ class FitConfig:
         """The same configuration, with what its method sets."""
         if self.method == "staged":
             return self
+
         steps = PUBLISHED_STEPS if self.joint_steps is None else self.joint_steps
         return replace(
             self, shading="on", attention=True, encoders="on", tone="learned", encoder_steps=0, joint_steps=steps
@@ -112,10 +113,12 @@ class FitConfig:
         for key in ("atoms", "pixels", "batch", *steps):
             if getattr(self, key) is not None:
                 require_between(key, getattr(self, key), 0 if key in steps else 1, MOST)
+
         require_between("seed", self.seed, -(2**63), 2**63 - 1)
         require_between("reach", self.reach, 1.0, float(MOST))
         for key in ("learning_rate", "mse_floor", "intermediate", "consistency"):
             require_between(key, getattr(self, key), 0.0, float(MOST))
+
         choices = {
             "raw_loss": ("l2", "log"),
             "method": ("staged", "published"),
@@ -126,6 +129,7 @@ class FitConfig:
         for key, values in choices.items():
             if getattr(self, key) not in values:
                 raise ValueError(f"{key} must be {' or '.join(values)}, got {getattr(self, key)!r}")
+
         if unknown := set(self.isp) - {key.name for key in fields(ISPConfig)}:
             raise ValueError(f"isp: unknown keys {sorted(unknown)}; use {[key.name for key in fields(ISPConfig)]}")
         if not any(STAGES[name].makes <= 2 for name in self.isp.get("stages", POINTWISE_STAGES)):

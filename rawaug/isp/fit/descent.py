@@ -92,6 +92,7 @@ def mean_psnr(isp: DictionaryISP, frames: FitFrames, as_shot: bool = False) -> f
         given = shot.white_balance if as_shot else None
         params = with_white_balance(isp, isp.choose(shot.srgb), given, None)
         values.append(mean_square(isp, frames.some([k]).pixels, params))
+
     return float(-10.0 * torch.cat(values).log10().mean())
 
 
@@ -120,6 +121,7 @@ def adam(
         value.backward()
         if clip_norm is not None:
             torch.nn.utils.clip_grad_norm_(tensors, clip_norm)
+
         optimiser.step()
         step += 1
         yield value.detach()
@@ -185,6 +187,7 @@ class Descent:
             scores(0)
             for tensor in tensors.values():
                 tensor.requires_grad_()
+
             descent = adam(
                 list(tensors.values()),
                 learning_rate,
@@ -197,10 +200,12 @@ class Descent:
                 if done % self.report_steps == 0 or done == steps:
                     bar.set_postfix_str(f"loss {torch.stack(losses).mean():.2e} {scores(done)}", refresh=False)
                     losses.clear()
+
             if watch is None:
                 self._keep(stage, tensors)
             if self.path is not None:
                 write_tensors(self._ends, {"key": self.key, "watched": json.dumps(self.watched)}, self.path)
+
         for name, tensor in tensors.items():
             tensor.data.copy_(self._ends[f"{stage}/{name}"])
             tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
@@ -246,6 +251,7 @@ def gain_left_out(frames: FitFrames, folds: int, gain: Callable[[FitFrames, FitF
         out = every[fold::folds]
         kept = frames.some([k for k in every if k not in out])
         total += len(out) * gain(frames.some(out), kept, f" without part {fold + 1} of {folds}")
+
     return total / len(every)
 
 
@@ -290,6 +296,7 @@ def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, des
         gain = gain_left_out(frames, FOLDS, better)
         isp.info["encoders_gain_db"] = round(gain, 2)
         wanted = "on" if gain > 0 else "off"
+
     if wanted == "on":
         _train(isp, frames, config, descent, "encoders")
 
@@ -335,6 +342,7 @@ def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[
         height, width = (share * sides).long().clamp_min(1).tolist()
         piece = image[..., top : top + height, left : left + width]
         pieces.append(piece.flip(-1) if flip else piece)
+
     return pieces[0], pieces[1]
 
 
@@ -362,6 +370,7 @@ def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, desc
         return
     if count < 2:
         raise ValueError("joint_steps: end-to-end training holds frames out for validation; give two frames or more")
+
     held_out = range(0, count, 10)[: max(1, count // 2)]
     watched, trained = frames.some(held_out), frames.some([k for k in range(count) if k not in held_out])
 
@@ -375,7 +384,9 @@ def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, desc
             raw = isp.remove_shading(raw, None)
             if published:
                 srgb, raw = _same_piece(srgb, raw, generator)
+
             losses.append(len(srgb) * _joint_loss(isp, part, srgb, raw, config))
+
         return LOSS_SCALE * torch.stack(losses).sum() / chosen
 
     tensors = dict(isp.named_parameters())
@@ -384,6 +395,7 @@ def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, desc
     seen = descent.watched["end to end"]
     if seen.step > 0:
         measure_lights(isp, trained)
+
     isp.info["joint"] = {"steps": steps, "kept_step": seen.step, "gain_db": round(seen.best - seen.start, 2)}
 
 
@@ -397,11 +409,13 @@ def _draw_batches(
     for k in chosen:
         shot = frames.shots[k]
         groups.setdefault((shot.srgb.shape, shot.raw.shape), []).append(k)
+
     batches = []
     for members in groups.values():
         srgb = torch.cat([frames.shots[k].srgb for k in members])
         raw = torch.cat([frames.shots[k].raw for k in members])
         batches.append((frames.pixels.pick(index, torch.tensor(members)), srgb, raw))
+
     return batches
 
 

@@ -104,6 +104,7 @@ def fit_isp(
         train_encoders(fit.isp, frames, config, descent, refit)
         fit.forward()
         train_jointly(fit.isp, frames, config, descent)
+
     descent.finish()
     fit.isp.info |= {} if gain is None else {"curve_gain_db": round(gain, 2)}
     fit.isp.info["registered"] = sum(shot.registered for shot in frames.shots)
@@ -158,6 +159,7 @@ class _Fit:
         self.known_matrix: Tensor | None = None
         if camera is not None:
             self.known_matrix = torch.stack([camera.matrix_for(shot.white_balance) for shot in self.shots])
+
         self.config, self.descent, self.part = config, descent, part
         self.isp = new_isp(self.shots, config)
         self.tie = Tie(self.shots)
@@ -171,6 +173,7 @@ class _Fit:
             self._start_coarse(*curve)
             self.colour = FrameColour.from_product(self._least_squares())
             tried.append((self._error(), curve, self.colour))
+
         _, curve, colour = min(tried, key=lambda one: one[0])
         self._start_coarse(*curve)
         return colour
@@ -200,10 +203,12 @@ class _Fit:
         if shading is None or wanted == "off":
             self._remove(shading)
             return
+
         mean, precision = fit_fall_off(self._apply_curve(self.samples), self.samples, self.colour.product())
         if wanted == "auto" and not darkens_corners(mean, precision):
             self._remove(shading)
             return
+
         error = self._error()
         before = {name: tensor.detach().clone() for name, tensor in self._few_numbers(without=shading).items()}
         shading.mask.set(mean, precision)
@@ -246,8 +251,10 @@ class _Fit:
         """Run stage 2, the tone and each frame's colour; ``report`` is called with the ISP as it would be."""
         for stage in self.isp.ordered_stages:
             stage.start_fine()
+
         if self.config.start is not None:
             self._start_from(DictionaryISP.from_pretrained(self.config.start))
+
         tensors: dict[str, Tensor] = self._colours()
         for stage in self.isp.ordered_stages:
             tensors |= stage.parameters_of(forward=False)
@@ -260,6 +267,7 @@ class _Fit:
         def status() -> str:
             if report is None:
                 return ""
+
             isp = deepcopy(self.isp)  # as it would be if this stage ended now
             self.atoms(isp)
             return report(isp.eval())
@@ -275,6 +283,7 @@ class _Fit:
         for stage in self.isp.ordered_stages:
             if stage.makes <= 2:
                 tensors += stage.parameters_of(forward=False).values()
+
         before = [tensor.detach().clone() for tensor in tensors]
         colour, error = self.colour, self._tone_error(self.isp.linear)[0]
         best: tuple[float, Tensor] | None = None
@@ -284,11 +293,14 @@ class _Fit:
                 value, _ = self._tone_error(curve)
                 if best is None or value < best[0]:
                     best = value, curve(colours)
+
         if best is None or best[0] >= error:
             return
+
         wanted = best[1]
         for tensor in tensors:
             tensor.requires_grad_()
+
         descent = adam(
             tensors,
             START_RATE,
@@ -297,8 +309,10 @@ class _Fit:
         )
         for _ in descent:
             pass
+
         for tensor in tensors:
             tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
+
         started, self.colour = self._tone_error(self.isp.linear)
         if started >= error:
             self.colour = colour
@@ -312,6 +326,7 @@ class _Fit:
         x = linear(self.samples.srgb)
         if shading is not None:
             x = x * shading.mask(self.samples.coordinates)
+
         colour = FrameColour.from_product(least_squares(x, self.samples, self.known_matrix))
         return float(reading_error(stages.correct_colour(x, colour.product()), self.samples)), colour
 
@@ -329,6 +344,7 @@ class _Fit:
         frames: Tensor | slice = slice(None)
         if count > FRAMES_A_STEP:
             frames = torch.randperm(count, generator=generator)[:FRAMES_A_STEP]
+
         index = torch.randint(pixels, (min(self.config.batch, pixels),), generator=generator)
         return frames, self.samples.pick(index, frames)
 

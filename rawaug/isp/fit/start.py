@@ -85,6 +85,7 @@ class Tie:
         centre = torch.empty_like(values)
         for group in self.groups:
             centre[group] = values.detach()[group].quantile(0.5, dim=0)
+
         square = (values - centre) ** 2
         bounded: Tensor = TIE_RANGE**2 * square / (TIE_RANGE**2 + square)
         return TIE * bounded.sum(1).mean()
@@ -106,6 +107,7 @@ def least_squares(linear: Tensor, samples: PixelSamples, known_matrix: Tensor | 
     if (known.sum(2) < FEWEST_PIXELS).any():
         frame = int((known.sum(2) < FEWEST_PIXELS).any(1).nonzero()[0])
         raise ValueError(f"frame {frame}: too few unclipped pixels to fit; use a better exposed frame or more pixels")
+
     moments = torch.einsum("fip,fjp,fcp->fcij", x, x, known)
     cross = torch.einsum("fip,fcp,fcp->fci", x, y, known)
     power = moments.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
@@ -187,6 +189,7 @@ def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSumm
     if len(points) > count:
         plausible = plausible_matrices(params.matrix).nonzero()[:, 0]
         kept = plausible if len(plausible) >= count else kept
+
     groups = points.new_zeros(count, len(points))
     groups[:, kept] = _groups(points[kept], count, config.seed)
     isp.colour.matrices.copy_((groups @ params.matrix.flatten(1)).unflatten(1, (3, 3)))
@@ -224,11 +227,13 @@ def _groups(points: Tensor, count: int, seed: int) -> Tensor:
     """``(count, F)`` averaging matrix: the identity if there are as many points, else of k-means clusters."""
     if len(points) == count:
         return torch.eye(count)
+
     from scipy.cluster.vq import kmeans2
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of an empty cluster, which frames that are all alike leave
         _, labels = kmeans2(points.double().numpy(), count, minit="++", rng=derive_seed(seed, "atoms") % 2**32)
+
     member = torch.nn.functional.one_hot(torch.from_numpy(labels).long(), count).T.float()
     used = member.sum(1, keepdim=True)
     # An empty cluster becomes the mean of all points.
@@ -239,6 +244,7 @@ def _spread(colour: FrameColour, balance: Tensor) -> float:
     """Find the kernel width that best predicts each frame's colour from those of the others in similar light."""
     if len(balance) < 3:
         return torch.inf
+
     matrix, neutral = colour.neutral(balance)
     values = torch.cat([matrix.flatten(1), neutral], dim=1)
     distance = torch.cdist(log_light(balance), log_light(balance)) ** 2
@@ -248,6 +254,7 @@ def _spread(colour: FrameColour, balance: Tensor) -> float:
         logits = -distance / (2.0 * width**2) if width < torch.inf else torch.where(distance.isinf(), -torch.inf, 0.0)
         square = ((values - logits.softmax(1) @ values) ** 2).sum(1)
         errors[width] = float((square + SPREAD_EPS).log().sum())
+
     return min(errors, key=lambda width: errors[width])
 
 
@@ -260,6 +267,7 @@ def set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) -> 
         predicted = isp.reverse_pixels(samples.srgb, colour.params(), samples.coordinates).clamp(0.0, 1.0)
         square = (predicted - samples.target) ** 2 * samples.site
         errors[knee] = float((square.sum((1, 2, 3)) / samples.site.sum((1, 2, 3)) + 1e-6).log().sum())
+
     isp.configure(knee=min(errors, key=lambda knee: errors[knee]))
 
 
@@ -281,6 +289,7 @@ def measure_lights(isp: DictionaryISP, frames: FitFrames) -> None:
         chosen = torch.cat([isp.choose(shot.srgb).colour_weights for shot in frames.shots])
         share = chosen / chosen.sum(dim=0).clamp_min(1e-6)
         isp.colour.light.copy_(share.T @ log_light(balance))
+
     pixels = frames.pixels.pick(torch.arange(min(LIGHT_PIXELS, frames.pixels.srgb.shape[-1])))
     errors: dict[float, float] = {}
     neutrals: dict[float, Tensor] = {}
@@ -296,6 +305,7 @@ def measure_lights(isp: DictionaryISP, frames: FitFrames) -> None:
         inverse = 1.0 / isp.colour.gains_for(balance, weights)
         excess = (known * (inverse * a - b) ** 2 / a.clamp_min(1e-9)).sum(dim=1)
         errors[spread] = float((excess + SPREAD_EPS).log().sum())
+
     spread = min(errors, key=lambda width: errors[width])
     isp.colour.spread.fill_(spread)
     isp.colour.neutral.copy_(neutrals[spread])
@@ -314,6 +324,7 @@ def _second_moments(
         x = isp.reverse_pixels(part.srgb, params, part.coordinates)
         square, cross = (x * x * part.known).mean((2, 3)), (x * part.target * part.known).mean((2, 3))
         moments.append(torch.stack([square, cross]))
+
     a, b = torch.cat(moments, dim=1)
     return a, b, (a > 0).float()
 
@@ -333,6 +344,7 @@ def set_priors(isp: DictionaryISP, samples: PixelSamples, config: FitConfig) -> 
         plain = plain._replace(gains=torch.ones(1, 3))
         x = isp.reverse_pixels(samples.srgb, plain, samples.coordinates)
         a, b = ((samples.known * m).mean((2, 3)) for m in (x * x, x * samples.target))
+
     inverse = 1.0 / isp.gain.channel_gains().detach()
     weights = best_constants(a, b, inverse, config.prior_steps, config.mse_floor)
     for encoders in (isp.reverse_encoders, isp.forward_encoders):
@@ -360,4 +372,5 @@ def best_constants(a: Tensor, b: Tensor, inverse_atoms: Tensor, steps: int = 400
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
+
     return logits.detach().softmax(0)
