@@ -408,16 +408,16 @@ def _with_own_cameras(isp: DictionaryISP, cameras: Sequence[Camera]) -> Dictiona
 
     assert isinstance(own.colour, CameraDictionary)
     daylight = white_point(D65)
-    known = torch.zeros(len(cameras), count)
+    camera_weights = torch.zeros(len(cameras), count)
     atom = 0
     for row, in_lights in enumerate(anchors):
         by_day = weights_in_light([anchor.mired for anchor in in_lights], mired_of(daylight[None].numpy()))
-        known[row, atom : atom + len(in_lights)] = torch.from_numpy(by_day)[0].float()
+        camera_weights[row, atom : atom + len(in_lights)] = torch.from_numpy(by_day)[0].float()
         for anchor in in_lights:
             own.colour.matrices[atom] = anchor.matrix.float()
             own.colour.light[atom] = log_light(gains_in_light(anchor.from_xyz, daylight)[None])[0].float()
             atom += 1
-    own.colour.known.copy_(known)
+    own.colour.known.copy_(camera_weights)
 
     own.info = {**isp.info, "cameras": [camera.name for camera in cameras]}
     own.info["own_cameras"] = [camera.to_json() for camera in cameras]

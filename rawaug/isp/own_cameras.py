@@ -423,8 +423,8 @@ class Camera:
 
         ascending = bool((np.diff(points, axis=0) > 0).all())
         if not ascending or tuple(points[0]) != (0.0, 0.0) or tuple(points[-1]) != (1.0, 1.0):
-            wanted = "must be a name, or ascending points (linear, value) from (0, 0) to (1, 1)"
-            raise self._error("tone", f"{wanted}, got {self.tone!r:.100}")
+            rule = "must be a name, or ascending points (linear, value) from (0, 0) to (1, 1)"
+            raise self._error("tone", f"{rule}, got {self.tone!r:.100}")
 
         values = np.linspace(0.0, 1.0, nodes)
         return torch.from_numpy(np.interp(values, points[:, 1], points[:, 0])).float()

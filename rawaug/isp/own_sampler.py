@@ -104,5 +104,5 @@ class OwnCameraSampler(CameraSampler):
 
 def own_cameras(info: Mapping[str, Any]) -> list[Camera]:
     """The cameras of one's own that an ISP was made of, by its ``info``; none of other ISPs."""
-    stored: Sequence[Mapping[str, Any]] = info.get("own_cameras", [])
-    return [Camera.from_json(content, "the ISP's camera") for content in stored]
+    contents: Sequence[Mapping[str, Any]] = info.get("own_cameras", [])
+    return [Camera.from_json(content, "the ISP's camera") for content in contents]

@@ -89,8 +89,8 @@ def mean_psnr(isp: DictionaryISP, frames: FitFrames, as_shot: bool = False) -> f
     """Average the PSNR of the frames, each in the setting that the ISP chooses for it, or under as-shot gains."""
     values = []
     for k, shot in enumerate(frames.shots):
-        given = shot.white_balance if as_shot else None
-        params = with_white_balance(isp, isp.choose(shot.srgb), given, None)
+        balance = shot.white_balance if as_shot else None
+        params = with_white_balance(isp, isp.choose(shot.srgb), balance, None)
         values.append(mean_square(isp, frames.some([k]).pixels, params))
 
     return float(-10.0 * torch.cat(values).log10().mean())
@@ -249,8 +249,8 @@ def gain_left_out(frames: FitFrames, folds: int, gain: Callable[[FitFrames, FitF
     every, total = range(len(frames.shots)), 0.0
     for fold in range(folds):
         out = every[fold::folds]
-        kept = frames.some([k for k in every if k not in out])
-        total += len(out) * gain(frames.some(out), kept, f" without part {fold + 1} of {folds}")
+        rest = frames.some([k for k in every if k not in out])
+        total += len(out) * gain(frames.some(out), rest, f" without part {fold + 1} of {folds}")
 
     return total / len(every)
 
@@ -290,14 +290,14 @@ def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, des
         _train(other, kept, config, descent, f"encoders{part}")
         return mean_psnr(other, out) - constants
 
-    wanted = config.encoders
+    mode = config.encoders
     isp.use_encoders(False)
-    if wanted == "auto" and len(frames.shots) >= FEWEST_FRAMES:
+    if mode == "auto" and len(frames.shots) >= FEWEST_FRAMES:
         gain = gain_left_out(frames, FOLDS, better)
         isp.info["encoders_gain_db"] = round(gain, 2)
-        wanted = "on" if gain > 0 else "off"
+        mode = "on" if gain > 0 else "off"
 
-    if wanted == "on":
+    if mode == "on":
         _train(isp, frames, config, descent, "encoders")
 
 
@@ -306,8 +306,8 @@ def _train(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: De
     tensors = {name: p for name, p in isp.named_parameters() if "_encoders." in name and ".layers." in name}
 
     def loss(generator: torch.Generator) -> Tensor:
-        drawn = _draw_frames(frames, FRAMES_A_STEP, ENCODER_PIXELS, generator)
-        return torch.stack([_frame_loss(isp, part, shot, config, generator) for part, shot in drawn]).mean()
+        parts = _draw_frames(frames, FRAMES_A_STEP, ENCODER_PIXELS, generator)
+        return torch.stack([_frame_loss(isp, part, shot, config, generator) for part, shot in parts]).mean()
 
     descent.run(stage, loss, tensors, config.encoder_steps, ENCODER_RATE)
 
@@ -316,9 +316,9 @@ def _draw_frames(
     frames: FitFrames, count: int, pixels: int, generator: torch.Generator
 ) -> list[tuple[PixelSamples, FrameSummary]]:
     """Draw ``count`` of the frames, with replacement, each with the same random pixels."""
-    chosen = torch.randint(len(frames.shots), (count,), generator=generator).tolist()
+    numbers = torch.randint(len(frames.shots), (count,), generator=generator).tolist()
     index = torch.randint(frames.pixels.srgb.shape[-1], (pixels,), generator=generator)
-    return [(frames.pixels.pick(index, torch.tensor([k])), frames.shots[k]) for k in chosen]
+    return [(frames.pixels.pick(index, torch.tensor([k])), frames.shots[k]) for k in numbers]
 
 
 def _frame_loss(
@@ -375,19 +375,19 @@ def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, desc
     watched, trained = frames.some(held_out), frames.some([k for k in range(count) if k not in held_out])
 
     published = config.method == "published"
-    chosen = PUBLISHED_FRAMES if published else FRAMES_A_STEP
+    frames_a_step = PUBLISHED_FRAMES if published else FRAMES_A_STEP
     pixels = min(config.batch, PUBLISHED_PIXELS) if published else config.batch
 
     def loss(generator: torch.Generator) -> Tensor:
         losses = []
-        for part, srgb, raw in _draw_batches(trained, chosen, pixels, generator):
+        for part, srgb, raw in _draw_batches(trained, frames_a_step, pixels, generator):
             raw = isp.remove_shading(raw, None)
             if published:
                 srgb, raw = _same_piece(srgb, raw, generator)
 
             losses.append(len(srgb) * _joint_loss(isp, part, srgb, raw, config))
 
-        return LOSS_SCALE * torch.stack(losses).sum() / chosen
+        return LOSS_SCALE * torch.stack(losses).sum() / frames_a_step
 
     tensors = dict(isp.named_parameters())
     rate = PUBLISHED_RATE if published else LEARNING_RATE
@@ -403,10 +403,10 @@ def _draw_batches(
     frames: FitFrames, count: int, pixels: int, generator: torch.Generator
 ) -> list[tuple[PixelSamples, Tensor, Tensor]]:
     """Draw ``count`` frames, with replacement, in batches of one size: pixels, thumbnails of sRGB and of RAW."""
-    chosen = torch.randint(len(frames.shots), (count,), generator=generator).tolist()
+    numbers = torch.randint(len(frames.shots), (count,), generator=generator).tolist()
     index = torch.randint(frames.pixels.srgb.shape[-1], (pixels,), generator=generator)
     groups: dict[tuple[torch.Size, torch.Size], list[int]] = {}
-    for k in chosen:
+    for k in numbers:
         shot = frames.shots[k]
         groups.setdefault((shot.srgb.shape, shot.raw.shape), []).append(k)
 

@@ -114,17 +114,17 @@ def fit_isp(
 
 def _require_pixels(frames: FitFrames) -> None:
     """Raise ValueError if a frame has too few pixels that are not clipped, such as a black one."""
-    known = frames.pixels.known[:, :, 0].sum(2)
-    for shot, counts in zip(frames.shots, known, strict=True):
+    counts_by_frame = frames.pixels.known[:, :, 0].sum(2)
+    for shot, counts in zip(frames.shots, counts_by_frame, strict=True):
         if (counts < FEWEST_PIXELS).any():
             raise ValueError(f"{shot.name}: too few unclipped pixels to fit; use a better exposed frame or more pixels")
 
 
 def _key(config: FitConfig, frames: FitFrames, camera: Camera | None) -> str:
     """Hash the settings and pixels that a kept state belongs to."""
-    known = [(shot.name, shot.camera, shot.white_balance) for shot in frames.shots]
+    facts = [(shot.name, shot.camera, shot.white_balance) for shot in frames.shots]
     start = () if camera is None else (camera,)
-    settings = repr((__version__, config, known, *start)).encode()
+    settings = repr((__version__, config, facts, *start)).encode()
     return digest(settings, frames.pixels.srgb.numpy().tobytes(), frames.pixels.target.numpy().tobytes())
 
 
@@ -197,15 +197,15 @@ class _Fit:
     def curve(self) -> None:
         """Run stage 1 without the mask and, where the readings fall off towards the corners, with it as well."""
         shading = self.isp.find(LensShading)
-        wanted = self.config.shading if shading else "off"
-        if wanted != "on":
+        mode = self.config.shading if shading else "off"
+        if mode != "on":
             self._descend_on_curve("curve", without=shading)
-        if shading is None or wanted == "off":
+        if shading is None or mode == "off":
             self._remove(shading)
             return
 
         mean, precision = fit_fall_off(self._apply_curve(self.samples), self.samples, self.colour.product())
-        if wanted == "auto" and not darkens_corners(mean, precision):
+        if mode == "auto" and not darkens_corners(mean, precision):
             self._remove(shading)
             return
 
@@ -213,7 +213,7 @@ class _Fit:
         before = {name: tensor.detach().clone() for name, tensor in self._few_numbers(without=shading).items()}
         shading.mask.set(mean, precision)
         self._descend_on_curve("curve and shading")
-        if wanted == "auto" and self._error() > SHADING_PAYS * error:
+        if mode == "auto" and self._error() > SHADING_PAYS * error:
             self._remove(shading)
             for name, tensor in self._few_numbers().items():
                 tensor.data.copy_(before[name])
@@ -297,14 +297,14 @@ class _Fit:
         if best is None or best[0] >= error:
             return
 
-        wanted = best[1]
+        target = best[1]
         for tensor in tensors:
             tensor.requires_grad_()
 
         descent = adam(
             tensors,
             START_RATE,
-            lambda step: ((self.isp.linear(colours) - wanted) ** 2 / (wanted + 0.01)).mean(),
+            lambda step: ((self.isp.linear(colours) - target) ** 2 / (target + 0.01)).mean(),
             lambda step: step / START_STEPS,
         )
         for _ in descent:

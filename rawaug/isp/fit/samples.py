@@ -224,8 +224,8 @@ def _blocks(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.G
     pixel, reading = blocks.srgb.flatten(1)[:, index], blocks.raw.flatten(1)[:, index]
     inside = ~blocks.clipped.flatten()[index] & (pixel.amax(0) < CLIPPED_SRGB)
     coordinates = blocks.coordinates[0].flatten(1)[:, index]
-    known = inside.expand(3, -1).float()
-    return _samples(pixel, reading, torch.ones_like(known), known, coordinates, pixel, reading, inside.float())
+    usable = inside.expand(3, -1).float()
+    return _samples(pixel, reading, torch.ones_like(usable), usable, coordinates, pixel, reading, inside.float())
 
 
 class Blocks(NamedTuple):

@@ -185,13 +185,13 @@ def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSumm
     light, neutral = log_light(balance), -colour.neutral(balance)[1]
     count = isp.config.colour_atoms
     points = torch.cat([params.matrix.flatten(1), params.gains.log()], dim=1)
-    kept = torch.arange(len(points))
+    members = torch.arange(len(points))
     if len(points) > count:
         plausible = plausible_matrices(params.matrix).nonzero()[:, 0]
-        kept = plausible if len(plausible) >= count else kept
+        members = plausible if len(plausible) >= count else members
 
     groups = points.new_zeros(count, len(points))
-    groups[:, kept] = _groups(points[kept], count, config.seed)
+    groups[:, members] = _groups(points[members], count, config.seed)
     isp.colour.matrices.copy_((groups @ params.matrix.flatten(1)).unflatten(1, (3, 3)))
     isp.colour.light.copy_(groups @ light)
     isp.colour.neutral.copy_(groups @ neutral)
@@ -286,8 +286,8 @@ def measure_lights(isp: DictionaryISP, frames: FitFrames) -> None:
     """
     balance = torch.tensor([shot.white_balance for shot in frames.shots])
     if isp.config.encoders:
-        chosen = torch.cat([isp.choose(shot.srgb).colour_weights for shot in frames.shots])
-        share = chosen / chosen.sum(dim=0).clamp_min(1e-6)
+        frame_weights = torch.cat([isp.choose(shot.srgb).colour_weights for shot in frames.shots])
+        share = frame_weights / frame_weights.sum(dim=0).clamp_min(1e-6)
         isp.colour.light.copy_(share.T @ log_light(balance))
 
     pixels = frames.pixels.pick(torch.arange(min(LIGHT_PIXELS, frames.pixels.srgb.shape[-1])))
@@ -297,13 +297,13 @@ def measure_lights(isp: DictionaryISP, frames: FitFrames) -> None:
         isp.colour.spread.fill_(spread)
         weights = isp.colour.weights_for(balance)
         matrix = isp.colour.combine(weights)
-        a, b, known = _second_moments(isp, pixels, weights, matrix)
+        a, b, has_pixels = _second_moments(isp, pixels, weights, matrix)
         best = b.clamp_min(1e-9) / a.clamp_min(1e-9)
-        wanted = -best.log() - balance.log() - matrix.sum(2).clamp_min(1e-3).log()
-        neutrals[spread] = _solve_mixture(weights, wanted)
+        neutral = -best.log() - balance.log() - matrix.sum(2).clamp_min(1e-3).log()
+        neutrals[spread] = _solve_mixture(weights, neutral)
         isp.colour.neutral.copy_(neutrals[spread])
         inverse = 1.0 / isp.colour.gains_for(balance, weights)
-        excess = (known * (inverse * a - b) ** 2 / a.clamp_min(1e-9)).sum(dim=1)
+        excess = (has_pixels * (inverse * a - b) ** 2 / a.clamp_min(1e-9)).sum(dim=1)
         errors[spread] = float((excess + SPREAD_EPS).log().sum())
 
     spread = min(errors, key=lambda width: errors[width])
