@@ -110,8 +110,11 @@ class DslrFrames(LazyPairs):
     ) -> None:
         if camera not in CAMERAS:
             raise ValueError(f"dslr: no camera {camera}; use one of {', '.join(CAMERAS)}")
-        self.camera, self.split, self.seed = camera, split, seed
-        self.jpeg_quality, self.adjust_maximum_thr = jpeg_quality, adjust_maximum_thr
+        self.camera = camera
+        self.split = split
+        self.seed = seed
+        self.jpeg_quality = jpeg_quality
+        self.adjust_maximum_thr = adjust_maximum_thr
         self.files = scene_files(path, split)
         super().__init__([f"{camera}_{split}_{index:03d}" for index in range(FRAMES[split])])
 
@@ -125,10 +128,12 @@ class DslrFrames(LazyPairs):
         generator = keyed_generator(self.seed, "dslrs", self.names[index])
         scene = draw_window(self._file(index), FRAME, generator, self.max_pixels)
         shot = take(dslr, scene, generator, self.names[index])
+
         with TemporaryDirectory() as folder:
             file = Path(folder) / f"{self.names[index]}.dng"
             write_dng(file, shot)
             frame, srgb = read_raw_and_develop(file, self.adjust_maximum_thr)
+
         if self.jpeg_quality is not None:
             srgb = recode_jpeg(srgb, self.jpeg_quality)
         return Pair.of_frame(self.names[index], frame, srgb)
@@ -143,18 +148,23 @@ def take(dslr: Dslr, scene: Tensor, generator: torch.Generator, name: str) -> Ra
     """Take a RAW frame of a scene, linear sRGB ``(3, H, W)`` in [0, 1] with even sides, by daylight."""
     exposure = float(torch.rand((), generator=generator, dtype=torch.float64))
     light, red, blue = torch.randn(3, generator=generator, dtype=torch.float64).tolist()
+
     kelvin = 1e6 / max(_MIRED[0] + _MIRED[1] * light, 100.0)
     matrix = camera_in_light(dslr.xyz_to_camera, kelvin)
     response = matrix.sum(dim=1)
-    seen = torch.einsum("ij,jhw->ihw", (matrix / response.max()).float(), scene)
+    camera = torch.einsum("ij,jhw->ihw", (matrix / response.max()).float(), scene)
+
     stops = _STOPS[0] + exposure * (_STOPS[1] - _STOPS[0])
-    exposed = 2.0**-stops * _shading(dslr, *scene.shape[-2:]) * seen
+    exposed = 2.0**-stops * _shading(dslr, *scene.shape[-2:]) * camera
     clean = mosaic(exposed, dslr.cfa).clamp(min=0.0)
+
     shot_var, read_var = dslr.noise
     electrons = torch.poisson(clean / shot_var, generator=generator)
     noisy = shot_var * electrons + torch.randn(clean.shape, generator=generator) * read_var**0.5
+
     step = 1.0 / (dslr.white - dslr.black)
     least = -dslr.black * step
+
     gains = response[1] / response
     daylight = camera_in_light(dslr.xyz_to_camera, 6504.0)
     neutral = daylight.sum(dim=1)

@@ -38,14 +38,14 @@ def measure_noise(clean: np.ndarray, noisy: np.ndarray) -> tuple[float, float]:
 
     weight: np.ndarray = np.ones_like(x)
     for _ in range(_ROUNDS):
-        shot, read = _line(x, y, weight)
-        variance = shot * x + read
+        shot_var, read_var = _line(x, y, weight)
+        variance = shot_var * x + read_var
         reach = 3 * np.sqrt(variance)
         unclipped = (x > reach) & (x < 1 - reach)
         weight = 1 / variance**2
         if unclipped.sum() >= _MIN_BINS:
             weight = np.where(unclipped, weight, 0.0)
-    return shot, read
+    return shot_var, read_var
 
 
 def measure_levels(clean: Tensor, noisy: Tensor) -> tuple[float, float]:
@@ -64,6 +64,6 @@ def _line(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, floa
         slope = np.average((x - mean_x) * (y - mean_y), weights=weight) / spread
 
     steepest = max(mean_y / max(mean_x, _LEAST), _LEAST)
-    shot = float(np.clip(slope, _LEAST, steepest))
-    read = float(max(mean_y - shot * mean_x, _LEAST))
-    return shot, read
+    shot_var = float(np.clip(slope, _LEAST, steepest))
+    read_var = float(max(mean_y - shot_var * mean_x, _LEAST))
+    return shot_var, read_var

@@ -23,6 +23,7 @@ to it.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -210,19 +211,19 @@ GP Sony IMX219, IP Galaxy S7, N6 Galaxy S9, G4 OmniVision OV5647. Shading and re
 
 def noise_levels(phone: Phone, iso: int) -> tuple[float, float]:
     """Look up (shot_var, read_var) at an ISO: interpolated in logarithms, and held beyond the published ones."""
-    known = sorted(phone.noise)
-    if iso <= known[0]:
-        return phone.noise[known[0]]
-    if iso >= known[-1]:
-        return phone.noise[known[-1]]
-    above = next(place for place, value in enumerate(known) if value >= iso)
-    low, high = known[above - 1], known[above]
+    isos = sorted(phone.noise)
+    if iso <= isos[0]:
+        return phone.noise[isos[0]]
+    if iso >= isos[-1]:
+        return phone.noise[isos[-1]]
+
+    above = bisect_left(isos, iso)
+    low, high = isos[above - 1], isos[above]
     share = math.log(iso / low) / math.log(high / low)
-    shot, read = (
-        math.exp((1.0 - share) * math.log(first) + share * math.log(second))
-        for first, second in zip(phone.noise[low], phone.noise[high], strict=True)
-    )
-    return shot, read
+    levels = []
+    for first, second in zip(phone.noise[low], phone.noise[high], strict=True):
+        levels.append(math.exp((1.0 - share) * math.log(first) + share * math.log(second)))
+    return levels[0], levels[1]
 
 
 def tone_curve(linear: Tensor, brightness: float, contrast: float) -> Tensor:
@@ -264,16 +265,26 @@ class PhoneFrames(LazyPairs):
     def __init__(
         self, path: str | Path = "", split: str = "test", seed: int = 0, size: tuple[int, int] = FRAME
     ) -> None:
-        self.path, self.split, self.seed, self.size = str(path), split, seed, size
+        self.path = str(path)
+        self.split = split
+        self.seed = seed
+        self.size = size
         self.files = scene_files(path, split)
         self.instances = self._draw_instances()
+
         if split == "train":
             numbers: tuple[str, ...] = SHOTS
         else:
             numbers = SHOTS[:1] if split == "test" else SHOTS[1:]
-        self.shots = [(instance, number) for instance in self.instances for number in numbers]
-        self.labels = [label_of(instance.name) for instance, _ in self.shots]
-        super().__init__([f"{instance.name}_{number}" for instance, number in self.shots])
+        self.shots = []
+        labels, names = [], []
+        for instance in self.instances:
+            for number in numbers:
+                self.shots.append((instance, number))
+                labels.append(label_of(instance.name))
+                names.append(f"{instance.name}_{number}")
+        self.labels = labels
+        super().__init__(names)
 
     def _draw_instances(self) -> list[_Instance]:
         labels = _training_labels(self.seed) if self.split == "train" else _held_back_labels()
@@ -284,6 +295,7 @@ class PhoneFrames(LazyPairs):
             if not order:
                 turn = keyed_generator(self.seed, "phones", self.split, "photographs", len(instances))
                 order = torch.randperm(len(self.files), generator=turn).tolist()
+
             shot, brightness = _draw_shot(CAMERAS[code], generator)
             shutter = max(1, round(shot.iso * (1.0 if brightness == "N" else 1.0 / 3.0)))
             name = f"{number:04d}_{scene:03d}_{code}_{shot.iso:05d}_{shutter:05d}_{shot.kelvin}_{brightness}"
@@ -300,6 +312,7 @@ class PhoneFrames(LazyPairs):
         instance, _ = self.shots[index]
         code = label_of(instance.name).phone
         phone = CAMERAS[code]
+
         generator = keyed_generator(self.seed, "phones window", self.split, instance.name)
         scene = draw_window(instance.file, self.size, generator, self.max_pixels)
         noise = keyed_generator(self.seed, "phones noise", self.split, self.names[index])
@@ -311,6 +324,7 @@ def _training_labels(seed: int) -> list[tuple[int, int, str]]:
     held_back = {int(name[:4]) for name in HELD_BACK}
     numbers = [number for number in range(1, _SCENE_ENDS[-1] + 1) if number not in held_back]
     codes = list(CAMERAS)
+
     labels = []
     for place, number in enumerate(numbers):
         block, position = divmod(place, len(codes))
@@ -337,6 +351,7 @@ def _draw_shot(phone: Phone, generator: torch.Generator) -> tuple[Shot, str]:
     """Draw what an instance is taken with, and its brightness, N or L."""
     light, dim, exposure, level = torch.rand(4, generator=generator, dtype=torch.float64).tolist()
     errors = torch.randn(4, generator=generator, dtype=torch.float64).tolist()
+
     brightness = "N" if dim < 0.5 else "L"
     least, most = BRIGHTNESS[brightness]
     law = phone.rendering
@@ -372,10 +387,12 @@ def take(phone: Phone, scene: Tensor, shot: Shot, generator: torch.Generator, na
         (torch.Size([1, 64, 96]), torch.Size([3, 64, 96]), <CFA.RGGB: 'RGGB'>)
     """
     clean = expose(phone, scene, shot)
+
     shot_var, read_var = noise_levels(phone, shot.iso)
     electrons = torch.poisson(clean / shot_var, generator=generator)
     read_noise = torch.randn(clean.shape, generator=generator) * read_var**0.5
     noisy = _digitise(shot_var * electrons + read_noise, phone.black)
+
     gains = balance(phone, shot)
     lift = digital_gain(phone, clean, gains, shot)
     return Pair(
@@ -399,6 +416,7 @@ def expose(phone: Phone, scene: Tensor, shot: Shot) -> Tensor:
     matrix = camera_in_light(phone.xyz_to_camera, shot.kelvin)
     matrix = matrix / matrix.sum(dim=1).max()
     light = torch.einsum("ij,jhw->ihw", matrix.float(), scene)
+
     exposed = 2.0**-shot.stops * shading(phone.shading, *scene.shape[-2:]) * light
     return mosaic(exposed, phone.cfa).clamp(0.0, 1.0)
 
@@ -440,10 +458,12 @@ def render(phone: Phone, raw: Tensor, gains: Tensor, lift: float, shot: Shot) ->
     flat = raw / shading(phone.shading, *raw.shape[-2:]) ** law.shading_removed
     camera = demosaic(flat[None], phone.cfa, "malvar")[0]
     balanced = (camera * (lift * gains.float())[:, None, None]).clamp(0.0, 1.0)
+
     matrix = colour_matrix(phone, shot)
     luma = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
     saturated = law.saturation * matrix + (1.0 - law.saturation) * (luma @ matrix)
     linear = torch.einsum("ij,jhw->ihw", saturated.float(), balanced).clamp(0.0, 1.0)
+
     display = tone_curve(linear, law.brightness, law.contrast)
     return (display * 255.0).round().clamp(0, 255).to(torch.uint8)
 

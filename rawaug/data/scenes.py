@@ -61,11 +61,14 @@ def scene_files(path: str | Path, split: str) -> list[Path]:
     if not str(path):
         return _package_files(split)
     folder = Path(path)
+    files = []
     if (folder / "train").is_dir() and (folder / "test").is_dir():
         files = _subfolder_files(folder, split)
     else:
-        every = files_in(folder, "picture", PICTURE_EXTENSIONS)
-        files = [file for place, file in enumerate(every) if _SHARES[place % len(_SHARES)] == split]
+        for place, file in enumerate(files_in(folder, "picture", PICTURE_EXTENSIONS)):
+            if _SHARES[place % len(_SHARES)] == split:
+                files.append(file)
+
     if not files:
         raise ValueError(f"{path}: has no picture for {split}; give a folder with five pictures or more")
     return files
@@ -133,6 +136,7 @@ def white_point(kelvin: float) -> Tensor:
         x = -0.2661239 * t**3 - 0.2343589 * t**2 + 0.8776956 * t + 0.179910
     else:
         x = -3.0258469 * t**3 + 2.1070379 * t**2 + 0.2226347 * t + 0.240390
+
     if kelvin <= 2222.0:
         y = -1.1063814 * x**3 - 1.34811020 * x**2 + 2.18555832 * x - 0.20219683
     elif kelvin <= 4000.0:

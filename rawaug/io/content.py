@@ -113,6 +113,7 @@ def _by_bytes(file: BinaryIO) -> Content:
     for place, signature, content in _SIGNATURES:
         if head.startswith(signature, place):
             return content
+
     if head.startswith(_TIFF):
         return _of_tiff(file)
     if head[4:8] == b"ftyp":
@@ -137,6 +138,7 @@ def _of_boxes(head: bytes) -> Content:
     brands = [head[8:12]] + [head[place : place + 4] for place in range(16, min(size, len(head)), 4)]
     if b"crx " in brands:
         return Content("raw", "CR3")
+
     for brand in brands:
         if brand in _AVIF:
             return Content("picture", "AVIF")
@@ -194,15 +196,19 @@ class LeftOut:
         return self.extensions.total()
 
     def __str__(self) -> str:
-        shown = self.extensions.most_common(_SHOWN)
-        names = ", ".join(f"{escape(extension) or 'no extension'} {count}" for extension, count in shown)
-        if len(self.extensions) > _SHOWN:
-            names += f", {len(self.extensions) - _SHOWN} other extensions"
+        counts = []
+        for extension, count in self.extensions.most_common(_MAX_EXTENSIONS):
+            counts.append(f"{escape(extension) or 'no extension'} {count}")
+        names = ", ".join(counts)
+        if len(self.extensions) > _MAX_EXTENSIONS:
+            names += f", {len(self.extensions) - _MAX_EXTENSIONS} other extensions"
+
         plural = "s" if self.count > 1 else ""
         return f"{self.count} {self.what}{plural} left out ({names}): {self.advice}"
 
 
-_SHOWN = 6
+_MAX_EXTENSIONS = 6
+"""Maximum number of extensions that a line lists."""
 
 
 @dataclass
@@ -258,9 +264,10 @@ def list_pictures(path: str | Path) -> Listing:
 
     listing = list_files(path, picture_extensions(), "not a picture that is known")
     if not listing.files:
-        there = "; ".join(listing.lines())
-        known = f"supported extensions are {', '.join(picture_extensions())}"
-        raise ValueError(f"{path}: contains no picture file; {there or known}")
+        contents = "; ".join(listing.lines())
+        if not contents:
+            contents = f"supported extensions are {', '.join(picture_extensions())}"
+        raise ValueError(f"{path}: contains no picture file; {contents}")
     return listing
 
 

@@ -51,11 +51,14 @@ class Headers(NamedTuple):
     @property
     def orientation(self) -> int | None:
         """The orientation that EXIF states, else the one of XMP; None where neither does, or it is none of 1 to 8."""
-        stated = self.stated or orientation_of_exif(self.exif)
-        if stated is None and self.xmp is not None:
-            match = _XMP_ORIENTATION.search(self.xmp)
-            stated = int(match[1]) if match else None
-        return stated
+        orientation = self.stated or orientation_of_exif(self.exif)
+        if orientation is not None or self.xmp is None:
+            return orientation
+
+        match = _XMP_ORIENTATION.search(self.xmp)
+        if match is None:
+            return None
+        return int(match[1])
 
 
 def read_headers(path: Path, name: str) -> Headers:
@@ -69,6 +72,7 @@ def headers_of_opened(file: BinaryIO, name: str) -> Headers:
     reader = _READERS.get(name)
     if reader is None:
         return Headers()
+
     try:
         return reader(file)
     except (DamagedTags, struct.error, zlib.error, ValueError, IndexError):
@@ -81,10 +85,13 @@ def orientation_of_exif(exif: bytes | None) -> int | None:
         return None
     try:
         tiff = TiffFile(BytesIO(exif))
-        stated = tiff.number(tiff.directory(tiff.first), ORIENTATION)
+        orientation = tiff.number(tiff.directory(tiff.first), ORIENTATION)
     except DamagedTags:
         return None
-    return stated if 1 <= stated <= 8 else None
+
+    if not 1 <= orientation <= 8:
+        return None
+    return orientation
 
 
 # -- JPEG --------------------------------------------------------------------------------------------------------------
@@ -106,6 +113,7 @@ def jpeg_segments(file: BinaryIO) -> Iterator[Segment]:
             head = head[1:] + file.read(1)
         if len(head) < 4 or head[0] != 0xFF or head[1] in (_START_OF_SCAN, _END_OF_IMAGE):
             return
+
         length = int.from_bytes(head[2:], "big") - 2
         data = file.read(length)
         if len(data) < length or length < 0:
