@@ -68,7 +68,13 @@ def test_basicsr(trainer_file: Any) -> None:
     module = trainer_file("basicsr/data/rawaug_dataset.py")
     assert module.__name__.endswith("_dataset")  # by which BasicSR looks for the files of datasets
 
-    options = {"name": "mine", "type": "RawaugDataset", "dataroot_gt": "demo:", "gt_size": 32, "scale": 1}
+    options: dict[str, Any] = {
+        "name": "mine",
+        "type": "RawaugDataset",
+        "dataroot_gt": "demo:",
+        "gt_size": 32,
+        "scale": 1,
+    }
     train_set = getattr(module, options["type"])({**options, "phase": "train"})
     enlarged = [index % len(train_set) for index in range(2 * len(train_set))]
     train_data = next(iter(DataLoader(train_set, batch_size=2, sampler=enlarged, drop_last=True)))
