@@ -61,7 +61,10 @@ def test_other_errors_of_an_import_pass() -> None:
 def test_all_is_every_extra() -> None:
     extras = SETUP["options.extras_require"]
     wanted = {
-        line for name in ("raw", "train", "data", "explore", "export") for line in extras[name].split("\n") if line
+        line
+        for name in ("raw", "train", "data", "explore", "export", "ksvd")
+        for line in extras[name].split("\n")
+        if line
     }
     assert {line for line in extras["all"].split("\n") if line} == wanted
     assert not wanted & set(SETUP["options"]["install_requires"].split("\n"))
