@@ -204,6 +204,8 @@ class Denoiser(nn.Module, ABC):
 
     mixed: ClassVar[bool] = False
     """Whether bfloat16 costs it less than 0.05 dB, and dense convolutions gain by it."""
+    growing: ClassVar[frozenset[str]] = frozenset()
+    """Settings that may be larger than those of the network whose weights a training starts from."""
     upscale: ClassVar[int] = 1
     """Sides of the result over those of packed RAW: 2 where it is demosaiced, ``(B, 3, 2h, 2w)``."""
 
@@ -354,9 +356,22 @@ class Denoiser(nn.Module, ABC):
         if image.dtype != self._dtype and not torch.is_autocast_enabled(image.device.type):
             raise ValueError(f"{what} is {image.dtype} but the network is {self._dtype}; convert one of them")
 
+    def can_start_from(self, model: Denoiser) -> bool:
+        """Whether :meth:`start_from` can take a network's weights: its class and its settings fit this one's."""
+        if not isinstance(self, type(model)):
+            return False
+
+        for key in self.config.keys() & model.config.keys():
+            larger = key in self.growing and self.config[key] > model.config[key]
+            if self.config[key] != model.config[key] and not larger:
+                return False
+
+        return True
+
     def start_from(self, model: Denoiser) -> None:
         """Take the weights of a network of this class or of one of its bases; layers beyond those stay as they are."""
-        self.load_state_dict(model.state_dict(), strict=type(self) is type(model))
+        complete = type(self) is type(model) and self.config == model.config
+        self.load_state_dict(model.state_dict(), strict=complete)
 
     @torch.no_grad()
     def initialise(self, seed: int, *zeros: nn.Conv2d, gain: float = HE_GAIN) -> None:

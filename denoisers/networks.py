@@ -384,6 +384,7 @@ class DRUNet(Denoiser):
     """
 
     mixed: ClassVar[bool] = True
+    growing: ClassVar[frozenset[str]] = frozenset({"blocks"})  # a new block is the identity at first
 
     def __init__(
         self,

@@ -57,7 +57,7 @@ def first_network(config: DenoiserConfig, seed: int) -> Denoiser:
     if config == DenoiserConfig(start=config.start):
         return model.train()
     wanted = denoisers.build(config.name, **drawn)
-    if not isinstance(wanted, type(model)) or {**model.config, **wanted.config} != {**wanted.config, **model.config}:
+    if not wanted.can_start_from(model):
         raise ValueError(
             f"denoiser.start: {config.start} is a {type(model).__name__} with {model.config}, not a "
             f"{config.name} with {wanted.config}; leave denoiser.name and denoiser.settings out to take the file's"

@@ -50,6 +50,25 @@ def test_another_architecture_is_refused_in_one_line(weights: Path) -> None:
         first_network(DenoiserConfig(start="nothing"), seed=0)
 
 
+def test_a_network_grows_from_one_with_fewer_blocks_which_it_equals_at_first(tmp_path: Path) -> None:
+    small = denoisers.DRUNet(width=4, blocks=1, seed=3)
+    torch.nn.init.normal_(small.tail.weight, std=0.1)
+    path = tmp_path / "small.safetensors"
+    denoisers.save(small, path, {})
+    noisy = torch.rand(1, 4, 32, 32, generator=torch.Generator().manual_seed(0))
+    variance = torch.full_like(noisy, 1e-3)
+
+    grown = first_network(DenoiserConfig("DRUNet", {"width": 4, "blocks": 3}, str(path)), seed=0)
+    assert isinstance(grown, denoisers.DRUNet) and grown.config["blocks"] == 3
+    assert (grown(noisy, variance) - small(noisy, variance)).abs().max() < 1e-5
+
+    with pytest.raises(ValueError, match=r"denoiser\.start"):
+        first_network(DenoiserConfig("DRUNet", {"width": 8, "blocks": 1}, str(path)), seed=0)
+    denoisers.save(grown, path, {})
+    with pytest.raises(ValueError, match=r"denoiser\.start"):
+        first_network(DenoiserConfig("DRUNet", {"width": 4, "blocks": 1}, str(path)), seed=0)
+
+
 def test_without_a_start_the_seed_draws_the_weights() -> None:
     config = DenoiserConfig("UNet", {"width": 4, "scales": 2})
     first, again, other = (first_network(config, seed).state_dict() for seed in (1, 1, 2))
