@@ -4,16 +4,23 @@ Every one is called as ``model(noisy, variance=None) -> denoised``, all ``(B, 4,
 """
 
 from denoisers.classical import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
+from denoisers.cycleisp import CycleISPDenoiser
+from denoisers.dhdn import DHDN
+from denoisers.dncnn import DnCNN
+from denoisers.drunet import DRUNet
+from denoisers.ensemble import SelfEnsemble
+from denoisers.ffdnet import FFDNet
 from denoisers.files import build, from_pretrained, load, save
 from denoisers.glide import GLIDE
-from denoisers.inference import SelfEnsemble, denoise_tiles
 from denoisers.joint import JointDRUNet
 from denoisers.ksvd import KSVD
 from denoisers.mosaic import MosaicDRUNet
+from denoisers.nafnet import NAFNet
 from denoisers.network import DENOISERS, Denoiser
-from denoisers.networks import DHDN, DnCNN, DRUNet, FFDNet, NAFNet, UNet
-from denoisers.published import PMRID, CycleISPDenoiser
+from denoisers.pmrid import PMRID
+from denoisers.tiles import denoise_tiles
 from denoisers.tnrd import TNRD
+from denoisers.unet import UNet
 from denoisers.wnnm import WNNM
 
 __all__ = [

@@ -1,6 +1,6 @@
 """Classical denoisers of packed RAW, and :class:`Stabilised`, which fits them to shot noise.
 
-Each is made for white Gaussian noise of one level, ``y = x + sigma n``, and is given ``y / sigma`` here, with
+Each is made for white Gaussian noise of one level, ``y = x + sigma n``, and filters ``y / sigma`` here, with
 ``sigma = sqrt(mean variance)`` of the picture. RAW noise depends on the signal: wrapped in :class:`Stabilised`, the
 filter sees noise of one level everywhere; alone it works at the mean level. The work is done on the CPU.
 """
@@ -29,7 +29,7 @@ Planes = np.ndarray[Any, np.dtype[np.float32]]
 
 
 class Classical(ABC):
-    """Base: ``denoiser(noisy, variance) -> denoised``, ``(B, 4, h, w)``, picture by picture.
+    """Base of the filters: ``denoiser(noisy, variance) -> denoised``, ``(B, 4, h, w)``, picture by picture.
 
     Args:
         strength: multiplies the method's own default amount of smoothing.
@@ -47,8 +47,10 @@ class Classical(ABC):
     @classmethod
     def missing(cls) -> str | None:
         """Say in a line which library is missing and how to install it; None where all are there."""
-        name = next((name for name in cls.needs if find_spec(name) is None), None)
-        return name and f"{name} is not installed; {cls.licence}{how_to_install(cls.extra)}"
+        for name in cls.needs:
+            if find_spec(name) is None:
+                return f"{name} is not installed; {cls.licence}{how_to_install(cls.extra)}"
+        return None
 
     def __init__(self, strength: float = 1.0) -> None:
         if not strength > 0:
@@ -66,7 +68,8 @@ class Classical(ABC):
             ValueError: if ``variance`` is missing, or ``noisy`` is not packed RAW or too small for the method.
             ImportError: if a library that the method needs is not installed.
         """
-        name, least = type(self).__name__, self.smallest
+        name = type(self).__name__
+        least = self.smallest
         if noisy.ndim != 4 or noisy.shape[1] != 4 or min(noisy.shape[-2:]) < least:
             raise ValueError(f"{name} takes packed RAW (B, 4, h >= {least}, w >= {least}), got {tuple(noisy.shape)}")
         if not noisy.is_floating_point():
@@ -75,26 +78,33 @@ class Classical(ABC):
             raise ValueError(f"{name} needs the noise variance: pass it as the second argument")
         if not len(noisy):
             return noisy.clone()
-        sigmas = variance.expand_as(noisy).float().mean((1, 2, 3)).sqrt().tolist()
-        return torch.stack([self._one(image, sigma) for image, sigma in zip(noisy, sigmas, strict=True)])
 
-    def _one(self, image: Tensor, sigma: float) -> Tensor:
+        sigmas = variance.expand_as(noisy).float().mean((1, 2, 3)).sqrt().tolist()
+        denoised = []
+        for picture, sigma in zip(noisy, sigmas, strict=True):
+            denoised.append(self._denoise_picture(picture, sigma))
+        return torch.stack(denoised)
+
+    def _denoise_picture(self, picture: Tensor, sigma: float) -> Tensor:
+        """Denoise one picture ``(4, h, w)`` of white noise of a standard deviation, in units of that deviation."""
         if sigma == 0:
-            return image
-        planes = (image.detach().permute(1, 2, 0).to("cpu", torch.float32) / sigma).numpy()
+            return picture
+
+        planes = (picture.detach().permute(1, 2, 0).to("cpu", torch.float32) / sigma).numpy()
         clean = np.ascontiguousarray(self.denoise(planes), np.float32) * np.float32(sigma)
-        return torch.from_numpy(clean).permute(2, 0, 1).to(image)
+        return torch.from_numpy(clean).permute(2, 0, 1).to(picture)
 
     def library(self, name: str) -> Any:
         """The library ``name``, one of :attr:`needs` or a module of one; ImportError in one line if it is not there."""
-        if (reason := self.missing()) is not None:
+        reason = self.missing()
+        if reason is not None:
             raise ImportError(reason)
         return import_module(name)
 
 
 @FILTERS.register("NonLocalMeans")
 class NonLocalMeans(Classical):
-    """Non-local means (Buades et al., CVPR 2005; scikit-image, fast mode): patches of 5 x 5, sought 6 pixels around."""
+    """Non-local means (Buades et al., CVPR 2005; scikit-image, fast mode): patches of 5 x 5 within 6 pixels."""
 
     needs = ("skimage",)
 
@@ -115,11 +125,20 @@ class Wavelet(Classical):
         """Filter ``(h, w, 4)``, each plane by itself."""
         denoise_wavelet = self.library("skimage.restoration").denoise_wavelet
         height, width, channels = planes.shape
+
         # VisuShrink cuts at sigma sqrt(2 log n); the factor is taken out, since on photographs it smooths too much.
         sigma = 3 * self.strength / np.sqrt(2 * np.log(height * width))
-        settings: dict[str, Any] = {"wavelet": "haar", "method": "VisuShrink", "mode": "hard", "rescale_sigma": False}
-        settings |= {"sigma": [sigma] * channels, "channel_axis": -1}
-        settings["wavelet_levels"] = min(4, min(height, width).bit_length() - 1)
+        levels = min(4, min(height, width).bit_length() - 1)
+        settings: dict[str, Any] = {
+            "wavelet": "haar",
+            "method": "VisuShrink",
+            "mode": "hard",
+            "rescale_sigma": False,
+            "sigma": [sigma] * channels,
+            "wavelet_levels": levels,
+            "channel_axis": -1,
+        }
+
         mean = np.zeros_like(planes)
         for shift in product(range(4), repeat=2):
             shrunk = denoise_wavelet(np.roll(planes, shift, (0, 1)), **settings)
@@ -139,7 +158,7 @@ class TotalVariation(Classical):
         return denoise_tv_chambolle(planes, weight=0.4 * self.strength, channel_axis=-1)
 
 
-OPPONENT = {
+_OPPONENT = {
     4: 0.5 * np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]], np.float32),
     3: np.array([[2, 2, 2], [6**0.5, 0, -(6**0.5)], [2**0.5, -(8**0.5), 2**0.5]], np.float32) / 12**0.5,
 }
@@ -148,12 +167,12 @@ OPPONENT = {
 
 def to_opponent(planes: Planes) -> Planes:
     """Colours ``(h, w, 4)`` or ``(h, w, 3)`` to luminance, which comes first, and differences of the same shape."""
-    return planes @ OPPONENT[planes.shape[-1]].T
+    return planes @ _OPPONENT[planes.shape[-1]].T
 
 
 def from_opponent(planes: Planes) -> Planes:
     """Luminance and differences back to colours of the same shape."""
-    return planes @ OPPONENT[planes.shape[-1]]
+    return planes @ _OPPONENT[planes.shape[-1]]
 
 
 @FILTERS.register("BM3D")
@@ -168,9 +187,10 @@ class BM3D(Classical):
     def denoise(self, planes: Planes) -> Planes:
         """Filter ``(h, w, 4)``, or sRGB ``(h, w, 3)``, in luminance and differences of colour."""
         bm3d = self.library("bm3d")
-        # Blocks are matched on the first channel: let that be the luminance, whose noise is lowest.
         deviations = [self.strength] * planes.shape[-1]
-        return from_opponent(bm3d.bm3d(to_opponent(planes), sigma_psd=deviations))
+        # Blocks are matched on the first channel: let that be the luminance, whose noise is lowest.
+        cleaned = bm3d.bm3d(to_opponent(planes), sigma_psd=deviations)
+        return from_opponent(cleaned)
 
 
 class Transform(Protocol):
@@ -210,25 +230,40 @@ class Stabilised:
         shot_var: float | Tensor | None = None,
         read_var: float | Tensor | None = None,
     ) -> Tensor:
-        """Denoise ``(B, 4, h, w)``, given its map ``shot_var max(noisy, 0) + read_var``, or both numbers, or ``(B,)``.
+        """Denoise ``(B, 4, h, w)`` by its noise map or by its levels.
 
-        Without shot noise nothing is transformed. ValueError if neither is given, or the map is no such line.
+        Without shot noise nothing is transformed.
+
+        Args:
+            noisy: packed RAW.
+            variance: the map ``shot_var max(noisy, 0) + read_var``, of the shape of ``noisy``; not used where both
+                levels are passed.
+            shot_var, read_var: the levels, numbers or ``(B,)``.
+
+        Raises:
+            ValueError: if neither the map nor both levels are passed, or the map is no such line.
         """
         if shot_var is None or read_var is None:
-            shot_var, read_var = _line(noisy, variance)
-        shot, read = (torch.as_tensor(level).to(noisy).expand(len(noisy)) for level in (shot_var, read_var))
-        if not (shot > 0).all():
-            levels = (level.reshape(-1, 1, 1, 1) for level in (shot, read))
+            shot_var, read_var = _fit_line(noisy, variance)
+        shot_var = torch.as_tensor(shot_var).to(noisy).expand(len(noisy))
+        read_var = torch.as_tensor(read_var).to(noisy).expand(len(noisy))
+
+        if not (shot_var > 0).all():
+            levels = (shot_var.reshape(-1, 1, 1, 1), read_var.reshape(-1, 1, 1, 1))
             return self.denoiser(noisy, noise_variance(noisy, *levels))
-        stable = self.transform.forward(noisy, shot, read)
-        return self.transform.inverse(self.denoiser(stable, torch.ones_like(stable)), shot, read)
+
+        stable = self.transform.forward(noisy, shot_var, read_var)
+        denoised = self.denoiser(stable, torch.ones_like(stable))
+        return self.transform.inverse(denoised, shot_var, read_var)
 
 
-def _line(noisy: Tensor, variance: Tensor | None) -> tuple[Tensor, Tensor]:
+def _fit_line(noisy: Tensor, variance: Tensor | None) -> tuple[Tensor, Tensor]:
     """The levels of a map, each ``(B,)``, which must be a line in the signal."""
     if variance is None:
         raise ValueError("give the variance map, or shot_var and read_var")
-    shot, read = fit_levels(noisy.double(), variance.double())
-    if not torch.allclose(noise_variance(noisy, shot, read), variance.double(), rtol=1e-2, atol=1e-12):
+
+    shot_var, read_var = fit_levels(noisy.double(), variance.double())
+    line = noise_variance(noisy, shot_var, read_var)
+    if not torch.allclose(line, variance.double(), rtol=1e-2, atol=1e-12):
         raise ValueError("the variance map is not shot_var max(noisy, 0) + read_var; pass shot_var and read_var")
-    return shot.flatten(), read.flatten()
+    return shot_var.flatten(), read_var.flatten()

@@ -26,25 +26,37 @@ from torch import Tensor
 
 from rawaug.bayer import noise_variance
 
+Levels = tuple[Tensor, Tensor]
+"""shot_var and read_var, ``(B, 1, 1, 1)``, or of every pixel ``(B, 1, H, W)``."""
+
 _LEAST_RATIO = 1e-3
-"""Least shot_var as a multiple of sqrt(read_var): keeps r / s^2 within what float32 resolves."""
+"""Minimum of shot_var as a multiple of sqrt(read_var): keeps r / s^2 within what float32 resolves."""
+
+_PICTURE = (1, 2, 3)
+"""The axes of a picture in a batch ``(B, C, h, w)``."""
 
 
-def fit_levels(noisy: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+def fit_levels(noisy: Tensor, variance: Tensor) -> Levels:
     """Fit shot_var and read_var, each ``(B, 1, 1, 1)``, to a noise map ``(B, C, h, w)`` by least squares.
 
     Neither is negative. Channels that ``noisy`` has beyond the map's C, such as planes of colours, do not count.
     """
     if torch.onnx.is_in_onnx_export() and noisy.dtype is torch.float32:
         # ONNX Runtime adds up one value after the other: of a megapixel in float32 that is wrong by a thousandth.
-        shot, read = fit_levels(noisy.double(), variance.double())
-        return shot.float(), read.float()
-    light, axes = noisy[:, : variance.shape[1]].clamp_min(0.0), (1, 2, 3)
-    mean, level = light.mean(axes, keepdim=True), variance.mean(axes, keepdim=True)
-    spread = (light - mean).square().mean(axes, keepdim=True)
-    slope = ((light - mean) * (variance - level)).mean(axes, keepdim=True) / spread.clamp_min(1e-20)
-    shot = slope.clamp_min(0.0)
-    return shot, (level - shot * mean).clamp_min(0.0)
+        shot_var, read_var = fit_levels(noisy.double(), variance.double())
+        return shot_var.float(), read_var.float()
+
+    light = noisy[:, : variance.shape[1]].clamp_min(0.0)
+    mean_light = light.mean(_PICTURE, keepdim=True)
+    mean_variance = variance.mean(_PICTURE, keepdim=True)
+
+    spread = (light - mean_light).square().mean(_PICTURE, keepdim=True)
+    covariance = ((light - mean_light) * (variance - mean_variance)).mean(_PICTURE, keepdim=True)
+    slope = covariance / spread.clamp_min(1e-20)
+
+    shot_var = slope.clamp_min(0.0)
+    read_var = (mean_variance - shot_var * mean_light).clamp_min(0.0)
+    return shot_var, read_var
 
 
 class Domain(ABC):
@@ -52,21 +64,21 @@ class Domain(ABC):
 
     least_shot: ClassVar[float]
 
-    def forward(self, y: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+    def forward(self, y: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
         """Transform RAW ``(B, C, h, w)`` to the signal that the network sees."""
-        shot = self.bound(shot, read)
-        return self.encode(y / shot + read / shot.square())
+        shot_var = self.bound(shot_var, read_var)
+        return self.encode(y / shot_var + read_var / shot_var.square())
 
-    def inverse(self, z: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+    def inverse(self, z: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
         """Transform a network's clean signal ``(B, C, h, w)`` back to RAW."""
-        shot = self.bound(shot, read)
-        return shot * (self.decode(z) - read / shot.square())
+        shot_var = self.bound(shot_var, read_var)
+        return shot_var * (self.decode(z) - read_var / shot_var.square())
 
-    def bound(self, shot: Tensor, read: Tensor) -> Tensor:
+    def bound(self, shot_var: Tensor, read_var: Tensor) -> Tensor:
         """The shot_var ``(B, 1, 1, 1)`` that photons are counted with: at least :attr:`least_shot`."""
-        return torch.maximum(shot.clamp_min(self.least_shot), _LEAST_RATIO * read.sqrt())
+        return torch.maximum(shot_var.clamp_min(self.least_shot), _LEAST_RATIO * read_var.sqrt())
 
-    def relative_deviation(self, y: Tensor, variance: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+    def relative_deviation(self, y: Tensor, variance: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
         """Divide the noise's deviation by the one that the transform takes it for.
 
         The quotient, of the shape of ``y``, is 1, and below 1 where shot_var is below its bound.
@@ -74,9 +86,9 @@ class Domain(ABC):
         Args:
             y: RAW ``(B, C, h, w)``.
             variance: the noise variance of each value, of the same shape.
-            shot, read: the levels ``(B, 1, 1, 1)``.
+            shot_var, read_var: the levels ``(B, 1, 1, 1)``.
         """
-        expected = noise_variance(y, self.bound(shot, read), read)
+        expected = noise_variance(y, self.bound(shot_var, read_var), read_var)
         return (variance / expected.clamp_min(1e-20)).sqrt().clamp_max(1.0)
 
     @abstractmethod
@@ -92,17 +104,19 @@ class KSigma(Domain):
     """PMRID's domain: every noise becomes that of ISO 1600. White grows with 1 / s, so ``least_shot`` is high."""
 
     least_shot = 6e-4
-    shot = 5.995267e-4 * 1600 + 8.68861e-3
-    read = 7.11772e-7 * 1600**2 + 6.514934e-4 * 1600 + 0.11492713
+    gain = 5.995267e-4 * 1600 + 8.68861e-3
+    """Variance that a digital number of light adds at ISO 1600: the paper's k."""
+    floor = 7.11772e-7 * 1600**2 + 6.514934e-4 * 1600 + 0.11492713
+    """Variance at black at ISO 1600, in digital numbers: the paper's sigma squared."""
     scale = 256.0 / 959.0
 
     def encode(self, u: Tensor) -> Tensor:
         """Scale and shift counts ``(B, C, h, w)`` to PMRID's units."""
-        return (u * self.shot - self.read / self.shot) * self.scale
+        return (u * self.gain - self.floor / self.gain) * self.scale
 
     def decode(self, z: Tensor) -> Tensor:
         """Scale and shift PMRID's units ``(B, C, h, w)`` to counts."""
-        return (z / self.scale + self.read / self.shot) / self.shot
+        return (z / self.scale + self.floor / self.gain) / self.gain
 
 
 class Anscombe(Domain):
@@ -114,13 +128,15 @@ class Anscombe(Domain):
     def encode(self, u: Tensor) -> Tensor:
         """Take the root of u + 3/8 of counts ``(B, C, h, w)``; below u = 0 follow its tangent."""
         root = 2.0 * (u.clamp_min(0.0) + self.offset).sqrt()
-        return root + u.clamp_max(0.0) / math.sqrt(self.offset)
+        tangent = u.clamp_max(0.0) / math.sqrt(self.offset)
+        return root + tangent
 
     def decode(self, z: Tensor) -> Tensor:
         """Square a signal ``(B, C, h, w)``; below the root's value at 0 invert the tangent."""
         least = 2.0 * math.sqrt(self.offset)
         square = (z.clamp_min(least) / 2.0).square() - self.offset
-        return square + (z - least).clamp_max(0.0) * math.sqrt(self.offset)
+        tangent = (z - least).clamp_max(0.0) * math.sqrt(self.offset)
+        return square + tangent
 
 
 DOMAINS = MappingProxyType({"ksigma": KSigma(), "anscombe": Anscombe()})

@@ -2,7 +2,7 @@
 
 A file is safetensors with string metadata that say how to build the network again: ``{"format": "rawaug", "kind":
 "denoiser", "model": "UNet", "config": <JSON: the constructor's arguments>, "info": <JSON: anything else>}``. Nothing in
-it is code; only the classes in :data:`denoisers.network.DENOISERS` can be named. Shipped weights have a model card
+it is code; a file can only name the classes in :data:`denoisers.network.DENOISERS`. Shipped weights have a model card
 beside them, and ``recipes/base.yaml`` trained them.
 """
 
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from denoisers.network import DENOISERS, Denoiser
 from rawaug.bayer import canonical_cfa
@@ -21,13 +22,13 @@ from rawaug.files import parse_object, read_tensors, write_tensors
 
 FORMAT, KIND = "rawaug", "denoiser"
 MOST_WEIGHTS = 2**30
-"""The weights of a network of 4 GiB; larger ones are refused before they take memory."""
+"""Maximum number of weights, 4 GiB of them; a larger network is refused before it takes memory."""
 FOLDER = Path(__file__).parent / "weights"
 """The folder of the shipped weights and their cards."""
 DEFAULT = "rawaug-small"
-"""The denoiser where none is named."""
+"""The default denoiser."""
 JOINT = "rawaug-joint"
-"""The network that demosaics and denoises where none is named."""
+"""The default network that demosaics and denoises."""
 
 
 def build(name: str, **config: Any) -> Denoiser:
@@ -51,6 +52,7 @@ def outline(name: str, config: dict[str, Any]) -> Denoiser:
     DENOISERS[name]  # imports the module that has it, which may make tensors, while they are real
     with torch.device("meta"):
         network: Denoiser = DENOISERS.make({"name": name, "settings": config})
+
     size = sum(weight.numel() for weight in network.parameters())
     if size > MOST_WEIGHTS:
         raise ValueError(f"denoiser {name}: {config} has {size:.3g} weights; choose a smaller one")
@@ -72,13 +74,23 @@ def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) ->
         raise FileNotFoundError(f"{path}: its folder does not exist; create it first")
     if "cfa" in info:
         canonical_cfa(str(info["cfa"]))  # raises for an unknown pattern
+
     try:
-        texts = {"config": json.dumps(model.config), "info": json.dumps(info, allow_nan=False)}
+        metadata = {
+            "format": FORMAT,
+            "kind": KIND,
+            "model": name,
+            "config": json.dumps(model.config),
+            "info": json.dumps(info, allow_nan=False),
+        }
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: info must be JSON-serialisable, its numbers finite: {error}") from None
-    # A PReLU that is used all over stands under several keys, which share its memory: each is written.
-    tensors = {key: value.detach().cpu().clone() for key, value in model.state_dict().items()}
-    write_tensors(tensors, {"format": FORMAT, "kind": KIND, "model": name, **texts}, path)
+
+    tensors = {}
+    for key, value in model.state_dict().items():
+        # A PReLU that is used all over stands under several keys, which share its memory: each gets a copy.
+        tensors[key] = value.detach().cpu().clone()
+    write_tensors(tensors, metadata, path)
 
 
 def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
@@ -99,24 +111,40 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
+
     metadata, tensors = read_tensors(path, "give one written by rawaug run or denoisers.save, or copy it again")
     if (metadata.get("format"), metadata.get("kind")) != (FORMAT, KIND):
         raise ValueError(f"{path}: not a denoiser of rawaug (its metadata lack format={FORMAT}, kind={KIND})")
     try:
-        config, info = (parse_object(metadata.get(key, "")) for key in ("config", "info"))
-        # An outline: the file's tensors are not known to fit. Float32, whatever the default is.
+        config = parse_object(metadata.get("config", ""))
+        info = parse_object(metadata.get("info", ""))
+        # An outline, as the file's tensors may not fit it. Float32, whatever the default is.
         model = outline(metadata.get("model", ""), config).float()
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    tensors = {key: x.float() if x.dtype == torch.float16 else x for key, x in tensors.items()}  # half of the bytes
+
+    weights = {}
+    for key, value in tensors.items():
+        if value.dtype == torch.float16:  # half of the bytes in a file
+            value = value.float()
+        weights[key] = value
+
     expected = model.state_dict()
-    held, needed = ({key: f"{tuple(x.shape)} {x.dtype}" for key, x in of.items()} for of in (tensors, expected))
-    for key in sorted(held | needed):
-        if held.get(key) != needed.get(key):
-            text = f"{held.get(key, 'missing')}, the network needs {needed.get(key, 'no such tensor')}"
-            raise ValueError(f"{path}: tensor {key} is {text}")
-    model.load_state_dict(tensors, assign=True)
+    for key in sorted(weights | expected):
+        form = _form(weights.get(key), "missing")
+        expected_form = _form(expected.get(key), "no such tensor")
+        if form != expected_form:
+            raise ValueError(f"{path}: tensor {key} is {form}, the network needs {expected_form}")
+
+    model.load_state_dict(weights, assign=True)
     return model.eval(), info
+
+
+def _form(tensor: Tensor | None, absence: str) -> str:
+    """The shape and type of a tensor in words, or a word for its absence."""
+    if tensor is None:
+        return absence
+    return f"{tuple(tensor.shape)} {tensor.dtype}"
 
 
 def list_shipped() -> list[str]:
@@ -126,15 +154,17 @@ def list_shipped() -> list[str]:
 
 def find_denoiser(name: str | Path) -> Path:
     """Find the file of a denoiser by its path or by the name of a shipped one; FileNotFoundError if there is none."""
-    path = Path(name) if Path(name).suffix else FOLDER / f"{name}.safetensors"
-    if not path.is_file():
-        known = ", ".join(list_shipped()) or "none in this installation"
-        if (Path(__file__).parents[1] / "rawaug" / "weights" / f"{name}.safetensors").is_file():
-            raise ValueError(
-                f"{name}: is a camera's ISP, not a denoiser; load it by rawaug.DictionaryISP.from_pretrained"
-            )
-        raise FileNotFoundError(f"{name}: no such denoiser; give a .safetensors file or a shipped one ({known})")
-    return path
+    path = Path(name)
+    if not path.suffix:
+        path = FOLDER / f"{name}.safetensors"
+    if path.is_file():
+        return path
+
+    isp = Path(__file__).parents[1] / "rawaug" / "weights" / f"{name}.safetensors"
+    if isp.is_file():
+        raise ValueError(f"{name}: is a camera's ISP, not a denoiser; load it by rawaug.DictionaryISP.from_pretrained")
+    shipped = ", ".join(list_shipped()) or "none in this installation"
+    raise FileNotFoundError(f"{name}: no such denoiser; give a .safetensors file or a shipped one ({shipped})")
 
 
 def from_pretrained(name: str | Path = DEFAULT) -> Denoiser:

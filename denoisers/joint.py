@@ -8,15 +8,16 @@ et al., "Deep Joint Demosaicking and Denoising", SIGGRAPH Asia 2016.
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.network import DENOISERS, PACKED, conv, require_bounded
-from denoisers.networks import DRUNet, ResidualBlock
+from denoisers.drunet import ResidualBlock, ResidualUNet, Size
+from denoisers.layers import PACKED, conv, require_bounded
+from denoisers.network import DENOISERS
 from rawaug.bayer import CFA, demosaicing_stencils
 
 RGB = 3
@@ -24,23 +25,8 @@ REACH = 2
 """Pixels that D looks at beyond its own."""
 
 
-def _stencils() -> Tensor:
-    """For each colour and site of a cell, the weights that D gives the cell and its neighbours: ``(12, 1, 6, 6)``."""
-    found, kinds = demosaicing_stencils(CFA.RGGB, "malvar")
-    side = 2 * REACH + 1
-    own = torch.zeros(1, side, side, device="cpu")
-    own[0, REACH, REACH] = 1.0
-    found = torch.cat([own, found])
-    stencils = torch.zeros(RGB, 2, 2, side + 1, side + 1, device="cpu")
-    for colour, rows in enumerate(kinds):
-        for i, row in enumerate(rows):
-            for j, kind in enumerate(row):
-                stencils[colour, i, j, i : i + side, j : j + side] = found[kind]
-    return stencils.flatten(0, 2)[:, None]
-
-
 @DENOISERS.register("JointDRUNet")
-class JointDRUNet(DRUNet):
+class JointDRUNet(ResidualUNet):
     """:class:`denoisers.DRUNet` with a head for full colour: ``D(noisy + tail(x)) + detail(x)``.
 
     Its features x give a correction of packed RAW, as in DRUNet, which D makes full colour, and what D cannot know, as
@@ -71,26 +57,49 @@ class JointDRUNet(DRUNet):
         seed: int = 0,
     ) -> None:
         require_bounded(refine=refine)
-        super().__init__(width, scales, blocks, limits, mend, variance_map=False, domain=domain, seed=seed)
-        own = {"width": width, "scales": scales, "blocks": blocks, "limits": limits, "mend": mend}
-        self.config = {**own, "refine": refine, "domain": domain}
-        self.refine = nn.Sequential(*(ResidualBlock(width) for _ in range(refine)))
+        size = Size(width, scales, blocks)
+        super().__init__({"refine": refine}, size, limits, mend, variance_map=False, domain=domain, seed=seed)
+        self.light = not self.reads_variance
+
+        self.add_layers(self.inputs + self.light * PACKED, PACKED, PACKED)
+        self.refine = nn.Sequential(*[ResidualBlock(width) for _ in range(refine)])
         self.detail = conv(width, RGB * PACKED, bias=False)
         self.register_buffer("stencils", _stencils(), persistent=False)
-        self.initialise(seed, self.tail, self.detail, *self.block_ends(), gain=1.0)
+        self.initialise(self.seed, self.tail, self.detail, *self.block_ends(), gain=1.0)
 
     def residual(self, features: Tensor) -> Tensor:
         """Compute the correction of full colour ``(B, 3, 2h, 2w)`` from features ``(B, inputs, h, w)``."""
         x = self.body(features)
-        return self.base_image(self.tail(x)) + F.pixel_shuffle(self.detail(self.refine(x)), 2)
+        detail = F.pixel_shuffle(self.detail(self.refine(x)), 2)
+        return self.base_image(self.tail(x)) + detail
 
     def base_image(self, packed: Tensor) -> Tensor:
         """Demosaic packed RAW ``(B, 4, h, w)`` by D to ``(B, 3, 2h, 2w)``, as :func:`rawaug.bayer.demosaic` does."""
-        device = packed.device.type
-        # in bfloat16 the signal would lose the digits that hold its noise
-        full = torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
-        with full:
+        with _full_precision(packed.device.type):
             stencils = self.get_buffer("stencils")
             mosaic = F.pixel_shuffle(packed.to(stencils), 2)
             padded = F.pad(mosaic, (REACH,) * 4, mode="reflect")  # about the border sites: the pattern stays
             return F.pixel_shuffle(F.conv2d(padded, stencils, stride=2), 2)
+
+
+def _full_precision(device: str) -> AbstractContextManager[object]:
+    """No autocast: in bfloat16 the signal would lose the digits that hold its noise."""
+    if torch.is_autocast_enabled(device):
+        return torch.autocast(device, enabled=False)
+    return nullcontext()
+
+
+def _stencils() -> Tensor:
+    """For each colour and site of a cell, the weights that D gives the cell and its neighbours: ``(12, 1, 6, 6)``."""
+    interpolating, kinds = demosaicing_stencils(CFA.RGGB, "malvar")
+    side = 2 * REACH + 1
+    copying = torch.zeros(1, side, side, device="cpu")
+    copying[0, REACH, REACH] = 1.0
+    by_kind = torch.cat([copying, interpolating])
+
+    stencils = torch.zeros(RGB, 2, 2, side + 1, side + 1, device="cpu")
+    for colour, rows in enumerate(kinds):
+        for i, row in enumerate(rows):
+            for j, kind in enumerate(row):
+                stencils[colour, i, j, i : i + side, j : j + side] = by_kind[kind]
+    return stencils.flatten(0, 2)[:, None]

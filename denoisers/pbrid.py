@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.network import pad_to_multiple
+from denoisers.layers import pad_to_multiple
 
 STATES = 7
 """Channels of the state, the first of which is the estimate."""

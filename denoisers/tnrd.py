@@ -20,7 +20,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.network import DENOISERS, Denoiser, Shared, require_bounded
+from denoisers.layers import require_bounded
+from denoisers.network import DENOISERS, Denoiser, Shared
 from rawaug.registry import require_between
 
 GAUSSIANS = 63

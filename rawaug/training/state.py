@@ -33,50 +33,63 @@ class Start(NamedTuple):
 
 
 def start_of(config: DenoiserConfig) -> Start | None:
-    """The weights that ``config.start`` names; None if the training starts from random ones.
+    """Look up the weights that ``config.start`` names; None if the training starts from random ones.
 
     Raises:
         FileNotFoundError: if there are no such weights.
     """
     if config.start is None:
         return None
+
     path = find_denoiser(config.start)
-    return Start(sha256(path), CFA(denoisers.load(path)[1].get("cfa", "RGGB")))
+    _, info = denoisers.load(path)
+    return Start(sha256(path), CFA(info.get("cfa", "RGGB")))
 
 
 def first_network(config: DenoiserConfig, seed: int) -> Denoiser:
-    """The network before its first step, in train mode; layers that its start does not have are drawn from ``seed``.
+    """Make the network before its first step, in train mode; layers that its start lacks are drawn from ``seed``.
 
     Raises:
         ValueError: if the start is another network than the settings say.
     """
-    drawn = {"seed": derive_seed(seed, "network") % 2**31, **config.settings}
+    settings = {"seed": derive_seed(seed, "network") % 2**31, **config.settings}
     if config.start is None:
-        return denoisers.build(config.name, **drawn)
-    model, _ = denoisers.load(find_denoiser(config.start))
+        return denoisers.build(config.name, **settings)
+
+    start, _ = denoisers.load(find_denoiser(config.start))
     if config == DenoiserConfig(start=config.start):
-        return model.train()
-    wanted = denoisers.build(config.name, **drawn)
-    if not wanted.can_start_from(model):
+        return start.train()
+
+    network = denoisers.build(config.name, **settings)
+    if not network.can_start_from(start):
         raise ValueError(
-            f"denoiser.start: {config.start} is a {type(model).__name__} with {model.config}, not a "
-            f"{config.name} with {wanted.config}; leave denoiser.name and denoiser.settings out to take the file's"
+            f"denoiser.start: {config.start} is a {type(start).__name__} with {start.config}, not a "
+            f"{config.name} with {network.config}; leave denoiser.name and denoiser.settings out to take the file's"
         )
-    wanted.start_from(model)
-    return wanted.train()
+    network.start_from(start)
+    return network.train()
 
 
 class TrainingState:
     """A network in training, with the running average of its weights, Adam and the schedule of its rate."""
 
     def __init__(self, net: Denoiser, config: TrainConfig) -> None:
-        self.net, self.config, self.step = net, config, 0
-        self.average = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=running_average(config.ema))
-        self.optimiser: Any = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
-        self.schedule = torch.optim.lr_scheduler.LambdaLR(self.optimiser, lambda n: learning_rate_factor(n, config))
+        self.net = net
+        self.config = config
+        self.step = 0
         self.losses = torch.zeros(2)
         self.best: dict[str, Any] = {"psnr": float("-inf"), "step": 0}
-        self.layout = torch.channels_last if config.channels_last else torch.contiguous_format
+
+        def factor(step: int) -> float:
+            return learning_rate_factor(step, config)
+
+        self.average = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=running_average(config.ema))
+        self.optimiser: Any = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
+        self.schedule = torch.optim.lr_scheduler.LambdaLR(self.optimiser, factor)
+
+        self.layout = torch.contiguous_format
+        if config.channels_last:
+            self.layout = torch.channels_last
 
     @property
     def average_network(self) -> Any:
@@ -91,53 +104,68 @@ class TrainingState:
         """Resume from the checkpoint at ``path``, if there is one that was saved with the same ``key``."""
         if not path.is_file():
             return
+
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
             if state.get("key") != key:
                 return
+
             for name, part in self._parts.items():
                 part.load_state_dict(state[name])
-            self.step, self.best, self.losses = int(state["step"]), state["best"], state["losses"]
+            self.step = int(state["step"])
+            self.best = state["best"]
+            self.losses = state["losses"]
         except Exception as error:  # the unpickler raises nearly anything
             reason = " ".join(str(error).split())[:120]
             raise ValueError(f"{path}: damaged ({reason}); delete it to train this arm from its first step") from error
 
     def save(self, path: Path, key: str) -> None:
         """Write a checkpoint, whole or not at all: a kill or a full disk leaves the one before."""
-        state = {name: part.state_dict() for name, part in self._parts.items()}
-        state |= {"key": key, "step": self.step, "best": self.best, "losses": self.losses.cpu()}
+        state: dict[str, Any] = {name: part.state_dict() for name, part in self._parts.items()}
+        state["key"] = key
+        state["step"] = self.step
+        state["best"] = self.best
+        state["losses"] = self.losses.cpu()
+
         content = io.BytesIO()  # PyTorch's own writer does not say that a disk is full
         torch.save(state, content)
         with replacing(path) as partial:
             partial.write_bytes(content.getbuffer())
 
     def set_up(self, fabric: Any) -> Any:
-        """Move everything to Fabric's device; the model to train, compiled if the settings say so."""
+        """Move everything to Fabric's device, and return the model to train, compiled if the settings say so."""
+        self.fabric = fabric
         net = self.net.to(memory_format=self.layout)  # type: ignore[call-overload]
-        self.fabric, (self.model, self.optimiser) = fabric, fabric.setup(net, self.optimiser)
+        self.model, self.optimiser = fabric.setup(net, self.optimiser)
         self.average.to(fabric.device)
         self.losses = self.losses.to(fabric.device)
-        return torch.compile(self.model) if self.config.compile else self.model
+
+        if self.config.compile:
+            return torch.compile(self.model)
+        return self.model
 
     def update(self, loss: Tensor) -> float:
-        """One step down the gradient of ``loss``, a scalar; the learning rate of the step."""
+        """Step down the gradient of ``loss``, a scalar, and return the learning rate of the step."""
         self.optimiser.zero_grad(set_to_none=True)
         self.fabric.backward(loss)
         if self.config.clip_norm:
             self.fabric.clip_gradients(self.model, self.optimiser, max_norm=self.config.clip_norm)
         self.optimiser.step()
+
         learning_rate = float(self.schedule.get_last_lr()[0])
         self.schedule.step()
+
         if self.config.ema:
             self.average.update_parameters(self.net)
         else:
             self.average_network.load_state_dict(self.net.state_dict())
+
         self.losses += torch.stack([loss.detach().float(), self.losses.new_ones(())])
         self.step += 1
         return learning_rate
 
     def mean_loss(self) -> float:
-        """The mean loss since the last call."""
+        """Return the mean loss since the last call, and begin anew."""
         mean = float(self.losses[0] / self.losses[1])
         self.losses = torch.zeros_like(self.losses)
         return mean
@@ -145,12 +173,14 @@ class TrainingState:
     def keep_average(self, score: float, choose: bool) -> None:
         """Keep the running average as it is now if its ``score`` is the highest so far, or ``choose`` is off."""
         if score > self.best["psnr"] or not choose:
-            self.best = {"psnr": score, "step": self.step, "net": copy.deepcopy(self.average_network.state_dict())}
+            weights = copy.deepcopy(self.average_network.state_dict())
+            self.best = {"psnr": score, "step": self.step, "net": weights}
 
     def best_network(self, label: str) -> Any:
-        """The network with the weights that were kept, on the CPU; ValueError if no score was a number."""
+        """Return the network with the best weights, on the CPU; ValueError if no score was a number."""
         if not math.isfinite(self.best["psnr"]):
             raise ValueError(f"{label}: diverged, every validation score is NaN; lower train.learning_rate")
+
         self.average_network.load_state_dict(self.best["net"])
         return self.average_network.cpu().to(memory_format=torch.contiguous_format)
 
@@ -161,16 +191,23 @@ def running_average(decay: float) -> Any:
     @torch.no_grad()
     def update(averages: Sequence[Tensor], weights: Sequence[Tensor], steps: Tensor | int) -> None:
         n = int(steps)
-        torch._foreach_lerp_(list(averages), list(weights), 1.0 - min(decay, (1 + n) / (10 + n)))
+        current_decay = min(decay, (1 + n) / (10 + n))
+        torch._foreach_lerp_(list(averages), list(weights), 1.0 - current_decay)
 
     return update
 
 
 def learning_rate_factor(step: int, config: TrainConfig) -> float:
-    """Linear warm-up, then a cosine to 1% of the highest rate, or a halving every ``halve_every`` steps."""
+    """The share of the highest learning rate at a step.
+
+    It rises linearly during the warm-up; then it falls as a cosine to 1%, or by half every ``halve_every`` steps.
+    """
     if step < config.warmup:
         return (step + 1) / config.warmup
+
     if config.schedule == "step":
         return float(0.5 ** (step // config.halve_every))
+
     progress = (step - config.warmup) / max(1, config.steps - config.warmup)
-    return 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(1.0, progress)))
+    cosine = math.cos(math.pi * min(1.0, progress))
+    return 0.01 + 0.99 * 0.5 * (1.0 + cosine)

@@ -42,7 +42,7 @@ def test_noise_has_deviation_1_in_anscombe_s(level: float, levels: tuple[float, 
 def test_noise_is_that_of_iso_1600_in_ksigma_s(level: float, levels: tuple[float, float]) -> None:
     """In digital numbers z the variance is K z + sigma^2, whatever camera and ISO the picture is from."""
     seen = DOMAINS["ksigma"].forward(noisy_picture(level, *levels), *of(*levels)) / KSigma.scale
-    expected = KSigma.shot * seen.mean().item() + KSigma.read
+    expected = KSigma.gain * seen.mean().item() + KSigma.floor
     assert seen.var().item() == pytest.approx(expected, rel=0.02)
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from denoisers import DnCNN, SelfEnsemble, UNet, denoise_tiles
-from denoisers.inference import from_view, to_view
+from denoisers.ensemble import from_view, to_view
 from rawaug import bayer
 
 

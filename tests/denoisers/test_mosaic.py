@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from denoisers import DRUNet, MosaicDRUNet, denoise_tiles
-from denoisers.mosaic import BayerAdapter, denoise_mosaic, entry_pattern, mend_mosaic, with_planes
+from denoisers.defects import mend_mosaic
+from denoisers.mosaic import BayerAdapter, denoise_mosaic, entry_pattern, with_planes
 from rawaug import bayer
 from rawaug.bayer import pattern
 from rawaug.training.config import DenoiserConfig
@@ -68,6 +69,8 @@ def test_a_recipe_starts_it_from_shipped_weights_and_goes_on_from_its_own(tmp_pa
     save(started, tmp_path / "own.safetensors", {})
     again = first_network(DenoiserConfig(start=str(tmp_path / "own.safetensors")), seed=0)
     assert isinstance(again, MosaicDRUNet) and torch.equal(again.tail.weight, started.tail.weight)
+    grown = first_network(DenoiserConfig("MosaicDRUNet", {"pyramid": 2, "blocks": 2}, "rawaug-base"), seed=0)
+    assert isinstance(grown, MosaicDRUNet) and torch.equal(grown.tail.weight, started.tail.weight)
     with pytest.raises(ValueError, match="rawaug"):
         first_network(DenoiserConfig("MosaicDRUNet", {"width": 16}, "rawaug-base"), seed=0)
 

@@ -15,10 +15,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import denoisers
-from denoisers import DHDN, CycleISPDenoiser, Denoiser, DnCNN, UNet
-from denoisers.network import mend_planes, pad_to_multiple
-from denoisers.networks import DRUNet, NAFNet
-from denoisers.published import PMRID
+from denoisers import DHDN, PMRID, CycleISPDenoiser, Denoiser, DnCNN, DRUNet, NAFNet, UNet
+from denoisers.defects import mend_planes
+from denoisers.layers import pad_to_multiple
 
 Make = Callable[..., Any]
 
@@ -248,6 +247,20 @@ def test_dhdn_s_lowest_level_and_what_it_started_from_go_up_together() -> None:
     net(*pair(1, 4, 16, 16))
     assert not torch.equal(seen["started"], seen["worked"])
     assert torch.equal(seen["up"], torch.cat([seen["worked"], seen["started"]], dim=1))
+
+
+@pytest.mark.parametrize("domain", ["linear", "ksigma", "anscombe"])
+@pytest.mark.parametrize("name", ["PMRID", "DRUNet", "JointDRUNet"])
+def test_a_config_builds_the_same_network_again(name: str, domain: str) -> None:
+    """Also in a domain that is another than the network's default."""
+    size: dict[str, Any] = (
+        {"width": 4} if name == "PMRID" else {"width": 4, "scales": 2, "limits": False, "mend": False}
+    )
+    with torch.device("meta"):
+        net = denoisers.build(name, domain=domain, **size)
+        again = denoisers.build(name, **net.config)
+    assert again.domain == domain
+    assert again.config == net.config
 
 
 def size(model: Denoiser) -> int:

@@ -1,6 +1,6 @@
 r"""CycleISP: a network a direction, ``y = mosaic(N_rgb2raw(x))`` and ``x = N_raw2rgb(pack(y), a(x'))``.
 
-Either network has three groups of five dual-attention blocks (:mod:`denoisers.published`) of 96 features. RAW has no
+Either network has three groups of five dual-attention blocks (:mod:`denoisers.cycleisp`) of 96 features. RAW has no
 trace of how its picture was coloured, so a colour branch a guides the way to sRGB: a blurred sRGB picture x' becomes a
 map in (0, 1) that re-weights the features.
 
@@ -18,7 +18,7 @@ import os
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from denoisers import published
+from denoisers.cycleisp import Trunk, load_published
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.stages import as_float
@@ -35,7 +35,7 @@ RAW_SHARE = 0.5
 """Weight of the error of the RAW in the loss on the cycle; the rest is the weight of the picture that comes back."""
 
 
-class RGB2RAW(published.Trunk):
+class RGB2RAW(Trunk):
     """The network from sRGB to linear camera colour.
 
     Args:
@@ -54,7 +54,7 @@ class RGB2RAW(published.Trunk):
         return self.tail(self.body(self.head(srgb)))
 
 
-class RAW2RGB(published.Trunk):
+class RAW2RGB(Trunk):
     """The network from packed RAW and the colour branch's map to sRGB; the arguments are those of :class:`RGB2RAW`."""
 
     def __init__(self, features: int, groups: int, blocks: int, reduction: int) -> None:
@@ -70,7 +70,7 @@ class RAW2RGB(published.Trunk):
         return F.pixel_shuffle(self.tail_rgb(self.tail(guided)), 2)
 
 
-class ColourBranch(published.Trunk):
+class ColourBranch(Trunk):
     """The branch that guides the way to sRGB by the colours of a picture."""
 
     def __init__(self, features: int, reduction: int) -> None:
@@ -176,7 +176,7 @@ class CycleISP(CropTrainedISP):
     def load_published(self, path: str | os.PathLike[str], part: str = "rgb2raw") -> None:
         """Take the RGGB weights of a published checkpoint.
 
-        Nothing in the file is run as code; errors are those of :func:`denoisers.published.load_published`.
+        Nothing in the file is run as code; errors are those of :func:`denoisers.cycleisp.load_published`.
 
         Args:
             path: of the checkpoint.
@@ -185,4 +185,4 @@ class CycleISP(CropTrainedISP):
         networks = {"rgb2raw": self.reverse_network, "raw2rgb": self.raw2rgb, "ccm": self.colour_branch}
         if part not in networks:
             raise ValueError(f"part must be one of {', '.join(networks)}, got {part!r}")
-        published.load_published(networks[part], path, part)
+        load_published(networks[part], path, part)

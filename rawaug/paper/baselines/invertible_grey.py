@@ -18,7 +18,7 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from denoisers.network import pad_to_multiple
+from denoisers.layers import pad_to_multiple
 from rawaug.bayer import CFA
 from rawaug.paper.baselines.base import BASELINES, Crops
 from rawaug.paper.baselines.invisp import CompressedISP

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from denoisers.published import RENAMED, DualAttentionBlock
+from denoisers.cycleisp import RENAMED, DualAttentionBlock
 from rawaug import bayer
 from rawaug.paper.baselines.base import Crops
 from rawaug.paper.baselines.cycleisp import CycleISP

@@ -1,0 +1,90 @@
+"""Hot and dead pixels of a signal whose noise has deviation 1, which networks get repaired.
+
+A pixel is a defect if it lies beyond all its neighbours of the same colour while the pixels of the other colours beside
+it follow theirs: an edge or a small light moves several colours at once, a defect one alone. It becomes the mean of its
+neighbours without their lowest and highest.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+DEVIATIONS = 5.0
+"""How far a defect lies beyond its neighbours at least, in deviations of the noise."""
+SHARE = 0.15
+"""How far it lies beyond them besides, as a share of their value."""
+ALONE = 4.0
+"""Factor by which a defect departs more from its neighbours than the pixels of other colours depart from theirs."""
+
+
+def mend_planes(signal: Tensor) -> Tensor:
+    """Replace the hot and dead pixels of packed RAW ``(B, 4, h, w)``, whose noise has deviation 1.
+
+    A pixel is compared with the eight neighbours of its colour, and with the other colours of its cell.
+    """
+    neighbours = _neighbours(signal, 1)
+
+    low = high = total = neighbours[0]
+    for neighbour in neighbours[1:]:
+        low = torch.minimum(low, neighbour)
+        high = torch.maximum(high, neighbour)
+        total = total + neighbour
+    mean = (total - low - high) / (len(neighbours) - 2)
+
+    departure = (signal - mean).abs()
+    second_largest = departure.topk(2, dim=1).values[:, 1:]
+    is_alone = departure > ALONE * second_largest
+    return torch.where(_is_beyond(signal, low, high) & is_alone, mean, signal)
+
+
+def mend_mosaic(signal: Tensor, planes: Tensor) -> Tensor:
+    """Replace the hot and dead pixels of a mosaic ``(B, 1, H, W)``, whose noise has deviation 1.
+
+    A pixel is compared with the pixels of its colour within two of it, and with the pixels that touch it.
+
+    Args:
+        signal: the mosaic.
+        planes: which colour each pixel has, ``(B, 3, H, W)``, one-hot.
+    """
+    colour = planes.argmax(1, keepdim=True)
+    low = torch.full_like(signal, torch.inf)
+    high = -low
+    total = torch.zeros_like(signal)
+    count = torch.zeros_like(signal)
+
+    for neighbour in _neighbours(torch.cat([signal, colour.to(signal)], dim=1), 2):
+        value, colour_of_value = neighbour.split(1, dim=1)
+        is_same = colour_of_value == colour
+        low = torch.where(is_same, value.minimum(low), low)
+        high = torch.where(is_same, value.maximum(high), high)
+        total = total + value * is_same
+        count = count + is_same
+    mean = (total - low - high) / (count - 2).clamp_min(1)
+
+    departure = (signal - mean).abs()
+    largest_beside = torch.cat(_neighbours(departure, 1), dim=1).amax(1, keepdim=True)
+    is_alone = departure > ALONE * largest_beside
+    return torch.where(_is_beyond(signal, low, high) & (count > 2) & is_alone, mean, signal)
+
+
+def _is_beyond(signal: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Where a signal lies beyond the lowest and the highest of its neighbours by far, as a mask of its shape."""
+    above = signal > high + SHARE * high.abs() + DEVIATIONS
+    below = signal < low - SHARE * low.abs() - DEVIATIONS
+    return above | below
+
+
+def _neighbours(image: Tensor, reach: int) -> list[Tensor]:
+    """The pictures ``(B, C, H, W)`` of all neighbours within ``reach``, mirrored at the edges."""
+    height, width = image.shape[-2:]
+    padded = F.pad(image, (reach,) * 4, mode="reflect")
+
+    neighbours = []
+    for row, column in product(range(2 * reach + 1), repeat=2):
+        if (row, column) != (reach, reach):
+            neighbours.append(padded[..., row : row + height, column : column + width])
+    return neighbours

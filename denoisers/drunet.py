@@ -1,0 +1,235 @@
+"""DRUNet, a U-Net of residual blocks without biases (Zhang et al., TPAMI 2021), and the base of its relatives."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, NamedTuple, Unpack
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from denoisers.layers import MOST_SCALES, conv, require_bounded, require_width
+from denoisers.network import DENOISERS, Denoiser, Shared
+from rawaug.registry import require_between
+
+CONTEXT = 4
+"""Side of the squares, in cells, whose mean is subtracted from the signal of the last scale."""
+
+
+class Size(NamedTuple):
+    """The size of a residual U-Net.
+
+    Attributes:
+        width: features of the first scale, doubled at each further one.
+        scales: number of scales, 1 to 12.
+        blocks: residual blocks of each scale, going down and going up, at most 1000.
+    """
+
+    width: int
+    scales: int
+    blocks: int
+
+
+class ResidualBlock(nn.Module):
+    """``x + conv(ReLU(conv(x)))``."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv1 = conv(width, width, bias=False)
+        self.conv2 = conv(width, width, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Features ``(B, C, h, w)`` to features of the same shape."""
+        return x + self.conv2(self.conv1(x).relu_())
+
+
+class ResidualUNet(Denoiser):
+    """Base of :class:`DRUNet` and of the networks that start from its weights, for other inputs or other results.
+
+    Its subclasses choose what the first layer and the last scale see, and what the last layer gives: their constructors
+    call :meth:`add_layers`, add layers of their own, and draw all first weights by :meth:`initialise`, once.
+
+    A blind network, ``light``, gets the mean over a cell of the last scale as well, since noise depends on light.
+
+    Args:
+        config: the network's settings besides its size, ``limits``, ``mend`` and the shared ones.
+        size: features, scales and blocks.
+        limits, mend, pyramid, shared: see :class:`denoisers.Denoiser`.
+        multiple: pixels of the picture, along a side, that are one pixel of the first layer.
+    """
+
+    mixed: ClassVar[bool] = True
+    growing: ClassVar[frozenset[str]] = frozenset({"blocks"})  # a new block is the identity at first
+    light: bool = False
+
+    head: nn.Conv2d
+    coarse: nn.Conv2d
+    tail: nn.Conv2d
+
+    def __init__(
+        self,
+        config: dict[str, Any],
+        size: Size,
+        limits: bool = False,
+        mend: bool = False,
+        pyramid: int = 0,
+        multiple: int = 1,
+        **shared: Unpack[Shared],
+    ) -> None:
+        require_width(size.width)
+        require_between("scales", size.scales, 1, MOST_SCALES)
+        require_bounded(blocks=size.blocks)
+
+        config = {**size._asdict(), "limits": limits, "mend": mend, **config}
+        cell = 2 ** (size.scales - 1)
+        super().__init__(config, multiple * CONTEXT * cell, limits, mend, pyramid, **shared)
+        self.size = size
+        self.cell = cell
+
+    def add_layers(self, inputs: int, coarse: int, outputs: int) -> None:
+        """Add the layers of the U-Net, in the order in which their weights are drawn.
+
+        Args:
+            inputs: channels that enter the first layer.
+            coarse: channels that join at the last scale.
+            outputs: channels of the last layer.
+        """
+        width, scales, blocks = self.size
+        sizes = [width * 2**k for k in range(scales)]
+
+        self.head = conv(inputs, width, bias=False)
+        self.encoder = nn.ModuleList()
+        self.downs = nn.ModuleList()
+        self.ups = nn.ModuleList()
+        self.decoder = nn.ModuleList()
+        for size in sizes:
+            self.encoder.append(_residuals(size, blocks))
+        for size in sizes[:-1]:
+            self.downs.append(conv(size, 2 * size, 2, bias=False, stride=2, padding=0))
+        for size in reversed(sizes[:-1]):
+            self.ups.append(conv(2 * size, 4 * size, 1, bias=False))
+            self.decoder.append(_residuals(size, blocks))
+        self.coarse = conv(coarse, sizes[-1], bias=False)
+        self.tail = conv(width, outputs, bias=False)
+
+    def block_ends(self) -> list[nn.Conv2d]:
+        """The last layers of all blocks: as in DHDN, blocks stay tame when each starts as the identity."""
+        return [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
+
+    def is_relative(self, model: Denoiser) -> bool:
+        """Tell whether a network is of this class or of one of its bases, or a DRUNet."""
+        return isinstance(self, type(model)) or type(model) is DRUNet
+
+    def body(self, features: Tensor) -> Tensor:
+        """Run all layers but the last: the signal and its maps ``(B, C, h, w)`` to features ``(B, width, h, w)``."""
+        planes = self.coarse.in_channels
+        signal = features[:, :planes]
+        maps = features[:, planes:]
+
+        mean = F.avg_pool2d(signal, self.cell)
+        light = F.interpolate(mean, signal.shape[-2:], mode="bilinear")
+        inputs = [signal - light, maps]
+        if self.light:
+            inputs.append(light)
+        return self.trunk(self.head(torch.cat(inputs, dim=1)), self.coarse(self.wide_signal(mean)))
+
+    def wide_signal(self, mean: Tensor) -> Tensor:
+        """What the last scale sees of the mean over cells ``(B, C, h', w')``: the same less its own mean around.
+
+        A mean over a cell has noise of deviation 1 / cell, so it is scaled to 1.
+        """
+        around = F.interpolate(F.avg_pool2d(mean, CONTEXT), mean.shape[-2:], mode="bilinear")
+        return self.cell * (mean - around)
+
+    def trunk(self, x: Tensor, coarse: Tensor) -> Tensor:
+        """Run the U-Net.
+
+        Args:
+            x: features ``(B, width, h, w)`` of the first layer.
+            coarse: features ``(B, C, h', w')`` that join at the last scale, of its size.
+
+        Returns:
+            Features of the shape of ``x``.
+        """
+        skips = []
+        for blocks, down in zip(self.encoder, self.downs, strict=False):
+            x = blocks(x)
+            skips.append(x)
+            x = down(x)
+
+        lowest = self.encoder[-1]
+        x = lowest(x + coarse)
+        for up, blocks in zip(self.ups, self.decoder, strict=True):
+            finer = F.pixel_shuffle(up(x), 2)
+            x = blocks(finer + skips.pop())
+        return x
+
+
+@DENOISERS.register("DRUNet")
+class DRUNet(ResidualUNet):
+    """A U-Net of residual blocks without biases (Zhang et al., "Plug-and-Play Image Restoration", TPAMI 2021).
+
+    A block is ``x + conv(ReLU(conv(x)))``; convolutions 2 x 2 of stride 2 go down, a pointwise convolution and a pixel
+    shuffle up (the source has transposed convolutions), skips are added. Without biases a network that is trained at
+    some noise levels denoises at others too (Mohan et al., ICLR 2020). Here the first scale sees the signal less its
+    mean over a cell of the last scale (8 x 8 pixels), interpolated, and the last scale sees that mean less its own over
+    4 x 4 cells: light and shade are then the same problem, bfloat16 has digits for the noise, not for the brightness,
+    and noise wider than a cell is seen, too. A blind network is given the mean as well, since noise depends on light.
+
+    Args:
+        width: features of the first scale, doubled at each further one; 64 is published.
+        scales: of the pyramid, 1 to 12; 4 is published.
+        blocks: of each scale, going down and going up, at most 1000; 4 is published.
+        patch: side of the squares of pixels that enter as channels, 1 to 8. 2, as in FFDNet (Zhang et al., TIP 2018),
+            takes a quarter of the time, for pictures that were demosaiced.
+        light: give the network the mean over a cell besides, as blind ones have it: for developed pictures, whose noise
+            depends on light by a curve that a noise map of one level does not tell. A variance of 0 then stands for a
+            level that is not known.
+        limits, mend, pyramid, channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
+
+    Example:
+        >>> noisy = torch.rand(2, 4, 33, 50)
+        >>> DRUNet(width=4, blocks=1)(noisy, torch.full_like(noisy, 1e-4)).shape
+        torch.Size([2, 4, 33, 50])
+    """
+
+    def __init__(
+        self,
+        width: int = 64,
+        scales: int = 4,
+        blocks: int = 4,
+        limits: bool = False,
+        mend: bool = False,
+        patch: int = 1,
+        pyramid: int = 0,
+        light: bool = False,
+        **shared: Unpack[Shared],
+    ) -> None:
+        require_between("patch", patch, 1, 8)
+
+        # Files name these settings only where they differ from their defaults.
+        config: dict[str, Any] = {}
+        if patch != 1:
+            config["patch"] = patch
+        if pyramid:
+            config["pyramid"] = pyramid
+        if light:
+            config["light"] = True
+
+        super().__init__(config, Size(width, scales, blocks), limits, mend, pyramid, multiple=patch, **shared)
+        self.patch = patch
+        self.light = light or not self.reads_variance
+
+        planes = self.channels * patch**2
+        self.add_layers(self.inputs * patch**2 + self.light * planes, planes, planes)
+        self.initialise(self.seed, self.tail, *self.block_ends(), gain=1.0)
+
+    def residual(self, features: Tensor) -> Tensor:
+        """Compute the correction ``(B, channels, h, w)`` from features ``(B, inputs, h, w)``."""
+        squares = F.pixel_unshuffle(features, self.patch)
+        correction = self.tail(self.body(squares))
+        return F.pixel_shuffle(correction, self.patch)
+
+
+def _residuals(width: int, number: int) -> nn.Sequential:
+    return nn.Sequential(*[ResidualBlock(width) for _ in range(number)])

@@ -1,0 +1,93 @@
+"""What the networks are built of: convolutions whose weights are drawn later, padding, and limits of their size."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from rawaug.registry import require_between
+
+PACKED = 4
+"""Channels of packed RAW: R, Gr, Gb, B."""
+
+MOST_FEATURES = 2**16
+"""Maximum number of features of a layer: a few bytes of a file or a recipe can ask for any."""
+MOST_LAYERS = 1000
+"""Maximum number of layers or blocks that one setting may ask for."""
+MOST_SCALES = 12
+"""Maximum number of scales of a U-Net."""
+
+LEAK = 0.2
+"""Negative slope of the leaky ReLUs."""
+HE_GAIN = math.sqrt(2.0 / (1.0 + LEAK**2))
+"""Gain that keeps the deviation of features through a convolution and its leaky ReLU."""
+RESIDUAL_GAIN = math.sqrt(1.0 / 3.0)
+"""Gain of networks that add up dozens of residuals of separable convolutions, which HE_GAIN would let grow."""
+
+
+def conv(
+    inputs: int,
+    outputs: int,
+    size: int = 3,
+    bias: bool = True,
+    stride: int = 1,
+    groups: int = 1,
+    padding: int | None = None,
+) -> nn.Conv2d:
+    """A convolution that keeps the sides of a picture or divides them by ``stride``.
+
+    Its weights are left as they are in memory; :meth:`denoisers.Denoiser.initialise` draws those of the whole network.
+
+    Args:
+        inputs: channels that come in, a multiple of ``groups``.
+        outputs: channels that go out.
+        size: side of the square kernel.
+        bias: whether the layer adds a constant to each channel.
+        stride: step from one output pixel to the next.
+        groups: parts of the channels that do not see each other; as many as there are inputs for a depthwise layer.
+        padding: zeros around the picture, half of ``size`` by default.
+    """
+    if padding is None:
+        padding = size // 2
+
+    return nn.utils.skip_init(
+        nn.Conv2d,
+        inputs,
+        outputs,
+        size,
+        stride=stride,
+        padding=padding,
+        groups=groups,
+        bias=bias,
+        device=torch.get_default_device(),
+    )
+
+
+def pad_to_multiple(image: Tensor, stride: int) -> Tensor:
+    """Pad ``(B, C, h, w)`` below and on the right to multiples of ``stride``, by reflection without the edge."""
+    # An exported network pads any size, also where the picture that it is traced with needs no padding.
+    is_traced = torch.compiler.is_compiling() or torch.onnx.is_in_onnx_export()
+
+    for axis in (-2, -1):
+        size = image.shape[axis]
+        padding = -size % stride
+        if is_traced or padding:
+            period = 2 * (size - 1)
+            place = torch.remainder(torch.arange(size + padding, device=image.device), period)
+            image = image.index_select(axis, torch.minimum(place, period - place))
+    return image
+
+
+def require_width(width: int, multiple: int = 1) -> None:
+    """Refuse a number of features that no layer can have, or that no machine could hold."""
+    if width < 1 or width % multiple:
+        raise ValueError(f"width must be a positive multiple of {multiple}, got {width}")
+    require_between("width", width, 1, MOST_FEATURES)
+
+
+def require_bounded(**layers: int) -> None:
+    """Refuse more layers than :data:`MOST_LAYERS`, which no machine would build; each by the name of its setting."""
+    for key, number in layers.items():
+        require_between(key, number, 0, MOST_LAYERS)

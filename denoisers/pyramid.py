@@ -1,0 +1,72 @@
+"""A denoiser at half the sides of a picture, where wide noise is narrow: binning, interpolation, and what is corrected.
+
+The result of one scale, f, is corrected by what is denoised at half the sides,
+
+``g_n(y) = f(y) + U k(g_{n-1}(B y) - B f(y))`` and ``g_0 = f``,
+
+B binning by 2 and U interpolating. k smooths, and falls to 0 where :data:`BLIND` of the values are clipped: their mean
+does not tell the light.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from denoisers.layers import PACKED
+from rawaug import bayer
+
+MOST_HALVINGS = 4
+"""Maximum number of times that the sides are halved."""
+BLIND = 0.25
+"""Minimum share of clipped values for ignoring the picture at half the sides."""
+
+
+def halve(picture: Tensor) -> Tensor:
+    """Average a picture ``(B, C, h, w)``, sides even, to half its sides, ``(B, C, h/2, w/2)``.
+
+    Packed RAW, whose sites are those of RGGB, is binned around the places of the new sites.
+    """
+    if picture.shape[1] != PACKED:
+        return F.avg_pool2d(picture, 2)
+    return bayer.bin_packed(picture, 2)
+
+
+def halved_variance(variance: Tensor) -> Tensor:
+    """The variance ``(B, C, h/2, w/2)`` of the noise that :func:`halve` leaves of noise of a variance map."""
+    share = 0.25
+    if variance.shape[1] == PACKED:
+        share = bayer.bin_mosaic_variance(2)
+    return share * halve(variance)
+
+
+def double(picture: Tensor) -> Tensor:
+    """Interpolate a picture ``(B, C, h, w)`` linearly to twice its sides, ``(B, C, 2h, 2w)``.
+
+    The sites of packed RAW are where :func:`halve` puts them.
+    """
+    if picture.shape[1] != PACKED:
+        return F.interpolate(picture, scale_factor=2, mode="bilinear")
+
+    first_site = [3.0, 7.0, 5.0, 1.0]
+    second_site = first_site[::-1]
+    taps = torch.tensor([first_site, second_site], device=picture.device) / 8
+    kernels = [torch.outer(taps[row], taps[column]) for row, column in bayer.CFA.RGGB.sites]
+    weight = torch.stack(kernels)[:, None].to(picture.dtype)
+
+    padded = F.pad(picture, (1, 1, 1, 1), mode="replicate")
+    return F.conv_transpose2d(padded, weight, stride=2, padding=3, groups=PACKED)
+
+
+def smooth_correction(difference: Tensor, clipped: Tensor) -> Tensor:
+    """Smooth what a picture at half the sides corrects, ``(B, C, h, w)``, and fade it out where values are clipped.
+
+    ``clipped`` is the share of clipped values, of the same shape. Near its own limit of resolution the half picture
+    knows less than the whole one.
+    """
+    smooth = F.avg_pool2d(difference, 3, 1, 1, count_include_pad=False)
+    clipped_around = F.avg_pool2d(clipped, 3, 1, 1, count_include_pad=False)
+
+    weight = (1.0 - clipped_around / BLIND).clamp_min(0.0)
+    return weight * smooth
