@@ -75,8 +75,8 @@ def run(
     else:
         if json:
             require_writable(Path(json))
-        made = choose_denoiser(denoiser, classical, self_ensemble, device, linear, strength)
-        kind = RawFiles(_by_pattern(made, noise, Corrections(greens), self_ensemble, device, strength))
+        raw_denoiser = choose_denoiser(denoiser, classical, self_ensemble, device, linear, strength)
+        kind = RawFiles(_by_pattern(raw_denoiser, noise, Corrections(greens), self_ensemble, device, strength))
 
     if Path(source).is_dir():
         if Path(out).suffix.lower() in kind.formats and not Path(out).is_dir():
@@ -144,12 +144,12 @@ def choose_denoiser(
         return None
 
     views = 8 if self_ensemble else 1
-    made = RawDenoiser.of(spec, device, "auto", views=views, strength=strength)
-    if made.upscale > 1 and not linear:
+    chosen = RawDenoiser.of(spec, device, "auto", views=views, strength=strength)
+    if chosen.demosaics and not linear:
         raise ValueError(f"--denoiser {denoiser}: demosaics too, to a linear DNG; add --linear")
-    if linear and made.upscale == 1:
+    if linear and not chosen.demosaics:
         raise ValueError(f"--linear: {denoiser} denoises the mosaic and does not demosaic; use {JOINT}")
-    return made
+    return chosen
 
 
 def _by_pattern(

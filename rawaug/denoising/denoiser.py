@@ -111,7 +111,7 @@ class RawDenoiser:
             raise ValueError(f"views must be 1, 4 or 8, got {self.views!r}")
         if not 0.0 <= self.strength <= 1.0:
             raise ValueError(f"strength must be between 0 and 1, got {self.strength}; --noise takes higher levels")
-        if self.upscale > 1 and self.strength != 1.0:
+        if self.demosaics and self.strength != 1.0:
             raise ValueError("--strength does not support --linear: the noisy frame has no full colour to mix in")
 
     @classmethod
@@ -157,9 +157,14 @@ class RawDenoiser:
 
         return denoiser
 
+    @property
+    def demosaics(self) -> bool:
+        """Whether the result is linear camera RGB in place of a mosaic."""
+        return self.upscale > 1
+
     def require_mosaic(self) -> RawDenoiser:
         """This denoiser; ValueError if it gives full colour, which cannot be compared with a mosaic."""
-        if self.upscale > 1:
+        if self.demosaics:
             raise ValueError(f"{self.name}: demosaics, too; rawaug run demosaic --denoiser.start {self.name} scores it")
         return self
 
@@ -170,36 +175,54 @@ class RawDenoiser:
         A mosaic ``(1, 1, H, W)`` of another pattern than Bayer's remains one. ValueError if this denoiser takes none,
         the result has another shape, or is not finite where ``checked``.
         """
-        denoised = self._of_mosaic(given) if given.image.shape[1] == 1 else self._of_packed(given)
+        if given.image.shape[1] == 1:
+            denoised = self._of_mosaic(given)
+        else:
+            denoised = self._of_packed(given)
+
         if self.strength == 1.0:
             return denoised.to(given.image.dtype)
         return given.image.lerp(denoised.clamp(max=1.0), self.strength)
 
-    def _of_packed(self, given: Noisy) -> Tensor:
-        cfa = CFA(given.cfa)
+    def _of_packed(self, noisy: Noisy) -> Tensor:
+        cfa = CFA(noisy.cfa)
         own = self.cfa or cfa
-        image = _continue(given.image, cfa, own)
-        variance = None if given.variance is None else _continue(given.variance, cfa, own)
-        height, width = (self.upscale * side for side in image.shape[-2:])
-        expected = (1, PACKED if self.upscale == 1 else 3, height, width)
-        return _crop(self._run(self._whole(self.model(given.levels), own), image, variance, expected), own, cfa)
+        image = _continue(noisy.image, cfa, own)
+        variance = noisy.variance
+        if variance is not None:
+            variance = _continue(variance, cfa, own)
 
-    def _of_mosaic(self, given: Noisy) -> Tensor:
-        if self.of_any is None or self.views > 1 or self.tiles is None:
-            what = self.name if self.of_any is None else "the self-ensemble"
-            how = "give --denoiser rawaug-xtrans, or weights of rawaug run any"
-            raise ValueError(
-                f"{what}: is for Bayer mosaics, not {given.cfa}; {how if self.of_any is None else 'omit it'}"
-            )
-        if given.variance is None:
+        run = self._whole(self.model(noisy.levels), own)
+        denoised = self._run(run, image, variance, self._result_shape(image))
+        return _crop(denoised, own, cfa)
+
+    def _result_shape(self, packed: Tensor) -> tuple[int, ...]:
+        """The shape of the result for packed RAW: packed RAW again, or full colour if this denoiser demosaics."""
+        height, width = packed.shape[-2:]
+        if self.demosaics:
+            return 1, 3, self.upscale * height, self.upscale * width
+        return 1, PACKED, height, width
+
+    def _of_mosaic(self, noisy: Noisy) -> Tensor:
+        if self.of_any is None:
+            advice = "give --denoiser rawaug-xtrans, or weights of rawaug run any"
+            raise ValueError(f"{self.name}: is for Bayer mosaics, not {noisy.cfa}; {advice}")
+        if self.views > 1 or self.tiles is None:
+            raise ValueError(f"the self-ensemble: is for Bayer mosaics, not {noisy.cfa}; omit it")
+        if noisy.variance is None:
             raise ValueError(f"{self.name}: needs the variance of the noise")
+
         pieces = partial(denoisers.denoise_tiles, self.of_any, tile=2 * self.tiles[0], each=progress_by("tile"))
-        return self._run(partial(denoise_mosaic, pieces, cfa=given.cfa), given.image, given.variance, given.image.shape)
+        run = partial(denoise_mosaic, pieces, cfa=noisy.cfa)
+        return self._run(run, noisy.image, noisy.variance, noisy.image.shape)
 
     def _run(self, run: Model, image: Tensor, variance: Tensor | None, expected: Sequence[int]) -> Tensor:
         """``run`` on the device and in the precision of this denoiser, its result checked."""
+        if variance is not None:
+            variance = variance.to(self.device)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
-            denoised = run(image.to(self.device), None if variance is None else variance.to(self.device)).cpu()
+            denoised = run(image.to(self.device), variance).cpu()
+
         if tuple(denoised.shape) != tuple(expected) or (self.checked and not denoised.isfinite().all()):
             got = f"{tuple(denoised.shape)} for {tuple(image.shape)}"
             raise ValueError(f"{self.name}: the result is not finite, or of another shape: {got}")
@@ -221,10 +244,19 @@ class RawDenoiser:
         A denoiser that demosaics gives linear camera RGB ``(3, H, W)``. ``levels`` may be None where
         :attr:`reads_levels` is False.
         """
-        packs, mosaic = frame.cfa in CFA.__members__, frame.mosaic[None]
-        image = bayer.pack(mosaic, frame.cfa) if packs else mosaic
-        denoised = self(Noisy(image, cfa=frame.cfa) if levels is None else Noisy.of(image, levels, frame.cfa))
-        return (bayer.unpack(denoised, frame.cfa) if packs and self.upscale == 1 else denoised)[0].clamp(max=1.0)
+        is_bayer = frame.cfa in CFA.__members__
+        image = frame.mosaic[None]
+        if is_bayer:
+            image = bayer.pack(image, frame.cfa)
+
+        noisy = Noisy(image, cfa=frame.cfa)
+        if levels is not None:
+            noisy = Noisy.of(image, levels, frame.cfa)
+
+        denoised = self(noisy)
+        if is_bayer and not self.demosaics:
+            denoised = bayer.unpack(denoised, frame.cfa)
+        return denoised[0].clamp(max=1.0)
 
 
 def progress_by(unit: str) -> Callable[[Sequence[Any]], Iterable[Any]]:
@@ -245,9 +277,11 @@ def _crop(image: Tensor, own: CFA, cfa: CFA) -> Tensor:
     """A result without the lines that :func:`_continue` added, packed by ``cfa`` again."""
     if own == cfa:
         return image
-    packed = image.shape[1] == PACKED
-    upright = crop_to_cfa(bayer.unpack(image, own) if packed else image, own, cfa)
-    return bayer.pack(upright, cfa) if packed else upright
+    if image.shape[1] != PACKED:
+        return crop_to_cfa(image, own, cfa)
+
+    mosaic = crop_to_cfa(bayer.unpack(image, own), own, cfa)
+    return bayer.pack(mosaic, cfa)
 
 
 # -- by what it is made of ---------------------------------------------------------------------------------------------

@@ -33,27 +33,36 @@ class OnnxNetwork(nn.Module):
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        self.path, self.session = path, session_of(path)
+        self.path = path
+        self.session = session_of(path)
         self.names = [value.name for value in self.session.get_inputs()]
         if not 1 <= len(self.names) <= 2:
             names = ", ".join(self.names)
             raise ValueError(f"{path}: takes {names}; a denoiser takes noisy RAW, or noisy RAW and its variance")
         self.reads_variance = len(self.names) == 2
-        stated = dict(self.session.get_modelmeta().custom_metadata_map)
-        self.info: dict[str, Any] = parse_object(stated.get("info", "{}"))
-        stride = stated.get("stride", "")
-        self.stride = (int(stride) if stride.isdecimal() else 0) or STRIDE
-        self.upscale = 2 if stated.get("upscale") == "2" else 1
+
+        metadata = dict(self.session.get_modelmeta().custom_metadata_map)
+        self.info: dict[str, Any] = parse_object(metadata.get("info", "{}"))
+        self.stride = STRIDE
+        stride = metadata.get("stride", "")
+        if stride.isdecimal() and int(stride) > 0:
+            self.stride = int(stride)
+        self.upscale = 2 if metadata.get("upscale") == "2" else 1
 
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
         """RAW ``(B, 4, h, w)`` denoised, on the CPU; ValueError with ONNX Runtime's reason if it fails."""
-        images = (noisy,) if variance is None else (noisy, variance)
-        ones = zip(*(image.split(1) for image in images), strict=True)
+        results = []
         try:
-            found = [self.session.run(None, feeds(self.names, one))[0] for one in ones]
+            for index in range(len(noisy)):
+                inputs = [noisy[index : index + 1]]
+                if variance is not None:
+                    inputs.append(variance[index : index + 1])
+                result = self.session.run(None, feeds(self.names, inputs))[0]
+                results.append(torch.as_tensor(result))
         except Exception as error:  # ONNX Runtime has a class of its own for each reason
             raise ValueError(f"{self.path}: {' '.join(str(error).split())}") from None
-        denoised = torch.cat([torch.as_tensor(one) for one in found])
+
+        denoised = torch.cat(results)
         sides = [self.upscale * side for side in noisy.shape[-2:]]
         if denoised.ndim != 4 or list(denoised.shape[-2:]) != sides:
             got = f"{tuple(denoised.shape)} for {tuple(noisy.shape)}"
@@ -72,6 +81,7 @@ def session_of(path: Path) -> Any:
         raise FileNotFoundError(f"{path}: no such file")
     with extra("export"):
         import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 4  # its errors are raised, not written to the terminal as well
@@ -132,8 +142,11 @@ class BiasFreeDnCNN(nn.Module):
 
     def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
         """Packed RAW ``(B, 4, h, w)`` denoised; ``variance`` is a map ``shot_var max(noisy, 0) + read_var``."""
-        shot, read = (level.flatten() for level in fit_levels(noisy, variance))
-        black, white = (anscombe.forward(noisy.new_full((1, 1, 1, 1), y), shot, read) for y in (0.0, 1.0))
+        shot, read = fit_levels(noisy, variance)
+        shot, read = shot.flatten(), read.flatten()
+        black = anscombe.forward(noisy.new_full((1, 1, 1, 1), 0.0), shot, read)
+        white = anscombe.forward(noisy.new_full((1, 1, 1, 1), 1.0), shot, read)
+
         u = (anscombe.forward(noisy, shot, read) - black) / (white - black)
         planes = self._grey(u.flatten(0, 1)[:, None]).reshape(noisy.shape)
         return anscombe.inverse(planes * (white - black) + black, shot, read)

@@ -118,7 +118,7 @@ class FrameDenoiser:
         denoiser = self.denoiser_of(frame)
         is_monochrome = frame.cfa == MONOCHROME
         if is_monochrome:
-            if denoiser.upscale > 1:
+            if denoiser.demosaics:
                 raise ValueError(f"{frame.name}: is monochrome; there is nothing to demosaic, omit --linear")
             frame = replace(frame, cfa=CFA.RGGB)
 
@@ -130,11 +130,12 @@ class FrameDenoiser:
         if denoiser.reads_levels:
             shot_var, read_var, noise_source = find_levels(frame, self.noise if noise is None else noise)
             levels = shot_var, read_var
+
         image = denoiser.frame(frame, levels)
         if is_monochrome:
             frame = replace(frame, cfa=MONOCHROME)
 
-        if denoiser.upscale > 1:
+        if denoiser.demosaics:
             below_zero = (image < -0.5 / LINEAR_WHITE).float().mean().item()
             return DenoisedFrame(frame, image, levels, noise_source, below_zero, corrected)
         below_zero = _clip_below_zero(image, frame)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -78,18 +79,23 @@ class PictureDenoiser:
         Example:
             >>> denoiser = PictureDenoiser.of("rawaug-srgb@10")  # doctest: +SKIP
         """
-        path, at, told = str(spec).rpartition("@")
-        path = path if at else told
-        level = _level(str(spec), told) if at else None
+        path, level = _split_level(str(spec))
         if not 0.0 <= strength <= 10.0:
             raise ValueError(f"strength must be between 0 and 10, got {strength}")
         if path in FILTERS:
             return replace(cls.of_filter(path, level, strength), views=views or 1)
+
         name, network = _network(path)
-        made = cls.of_network(f"{name}, told {told}" if at else name, network, device, strength)
-        made = made if level is None else replace(made, run=lambda srgb: _denoise_at(network, srgb, level))
-        mixed = precision == "auto" and getattr(network, "mixed", False) and has_fast_bfloat16(made.device)
-        return replace(made, views=views or (2 if getattr(network, "light", False) else 1), mixed=mixed)
+        denoiser = cls.of_network(name, network, device, strength)
+        if level is not None:
+            _, _, stated_level = str(spec).rpartition("@")
+            run = partial(_denoise_at, network, level=level)
+            denoiser = replace(denoiser, name=f"{name}, told {stated_level}", run=run)
+
+        if not views:
+            views = 2 if getattr(network, "light", False) else 1
+        mixed = precision == "auto" and getattr(network, "mixed", False) and has_fast_bfloat16(denoiser.device)
+        return replace(denoiser, views=views, mixed=mixed)
 
     @classmethod
     def of_filter(cls, spec: Spec, level: float | None = None, strength: float = 1.0) -> PictureDenoiser:
@@ -132,14 +138,19 @@ class PictureDenoiser:
         return (total / self.views).cpu().clamp_(0.0, 1.0)
 
 
-def _level(spec: str, told: str) -> float:
+def _split_level(spec: str) -> tuple[str, float | None]:
+    """Split ``NAME@15`` into a name and a level, white at 1; the level is None where there is none."""
+    name, at, stated_level = spec.rpartition("@")
+    if not at:
+        return spec, None
+
     try:
-        level = float(told) / 255.0
+        level = float(stated_level) / 255.0
     except ValueError:
         level = -1.0
     if not 0.0 <= level <= 1.0:
-        raise ValueError(f"{spec}: the level after @ must be from 0 to 255, got {told}")
-    return level
+        raise ValueError(f"{spec}: the level after @ must be from 0 to 255, got {stated_level}")
+    return name, level
 
 
 def _network(spec: str) -> tuple[str, nn.Module]:

@@ -152,7 +152,7 @@ class RawFiles(Files[Denoised]):
         return file.with_suffix(".dng")
 
     def require_preview(self, preview: Path) -> None:
-        if self.denoiser.usual.upscale > 1:
+        if self.denoiser.usual.demosaics:
             raise ValueError(
                 f"--preview {preview}: --linear does not support it; open the linear DNG in a RAW developer"
             )
