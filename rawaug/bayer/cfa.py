@@ -16,6 +16,9 @@ from enum import StrEnum
 import torch
 from torch import Tensor
 
+_PLANES = 4
+"""Number of planes of packed RAW."""
+
 N_VIEWS = 8
 """The number of flips and quarter turns of a picture: the order of the square's dihedral group."""
 
@@ -106,6 +109,25 @@ def unpack(packed: Tensor, cfa: CFA | str) -> Tensor:
     for k, (i, j) in enumerate(CFA(cfa).sites):
         mosaic[..., 0, i::2, j::2] = packed[..., k, :, :]
     return mosaic
+
+
+def pack_if_bayer(mosaic: Tensor, cfa: CFA | str) -> Tensor:
+    """:func:`pack` a mosaic ``(..., 1, H, W)`` of one of Bayer's patterns; one of another pattern stays as it is."""
+    if cfa in CFA.__members__:
+        return pack(mosaic, cfa)
+    return mosaic
+
+
+def unpack_if_packed(image: Tensor, cfa: CFA | str) -> Tensor:
+    """:func:`unpack` packed RAW ``(..., 4, H/2, W/2)``; a mosaic or full colour stays as it is."""
+    if image.shape[-3] == _PLANES:
+        return unpack(image, cfa)
+    return image
+
+
+def sites_per_value(image: Tensor) -> int:
+    """How many sites of the mosaic a value stands for along each side of ``(..., C, H, W)``: 2 in packed RAW."""
+    return 2 if image.shape[-3] == _PLANES else 1
 
 
 def pack_rgb(rgb: Tensor, cfa: CFA | str) -> Tensor:

@@ -6,17 +6,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
-from denoisers.files import JOINT
 from rawaug.commands import YAML
-from rawaug.denoising.corrections import Correction, Corrections
-from rawaug.denoising.denoiser import RawDenoiser, require_classical
+from rawaug.denoising.corrections import Correction
 from rawaug.denoising.files import DenoisedFolder, denoise_file, denoise_folder
-from rawaug.denoising.frames import FrameDenoiser
-from rawaug.denoising.pictures import PICTURES, PictureDenoiser
-from rawaug.denoising.sources import PictureFiles, RawFiles
+from rawaug.denoising.sources import Options, kind_of
 from rawaug.errors import escape
-from rawaug.files import files_below, require_writable, write_json
-from rawaug.io.content import ALL_PICTURE_EXTENSIONS, RAW_EXTENSIONS, content_of
+from rawaug.files import require_writable, write_json
 from rawaug.registry import Spec
 
 
@@ -60,23 +55,13 @@ def run(
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         preview: also write the result, developed by LibRaw, as this .jpg or .png; of a folder, a JPEG of each result
             to this folder.
-        json: write to this file what was done to each RAW file: noise levels, corrections, seconds.
+        json: write to this file what was done to each file: noise levels and corrections of RAW, seconds.
         overwrite: replace existing results.
     """
-    kind: Any
-    if is_picture(source):
-        options = {"classical": classical, "linear": linear, "preview": preview, "json": json}
-        options |= {"greens": greens != "auto", "noise": noise != "auto"}
-        _require_none(source, options)
-        views = 8 if self_ensemble else None
-        kind = PictureFiles(
-            PictureDenoiser.of(PICTURES if denoiser is None else denoiser, device, strength, views, "auto")
-        )
-    else:
-        if json:
-            require_writable(Path(json))
-        raw_denoiser = choose_denoiser(denoiser, classical, self_ensemble, device, linear, strength)
-        kind = RawFiles(_by_pattern(raw_denoiser, noise, Corrections(greens), self_ensemble, device, strength))
+    options = Options(denoiser, classical, noise, strength, linear, self_ensemble, greens, device)
+    if json:
+        require_writable(Path(json))
+    kind = kind_of(source).of(source, options)
 
     if Path(source).is_dir():
         if Path(out).suffix.lower() in kind.formats and not Path(out).is_dir():
@@ -91,79 +76,6 @@ def run(
     print_denoised(result)
     if result.broken:
         raise ValueError(f"{source}: {len(result.broken)} of its files could not be denoised; they are listed above")
-
-
-def is_picture(source: str) -> bool:
-    """Whether a path is a developed picture by its content, or a folder with pictures and no RAW file.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is a file of neither kind.
-    """
-    path = Path(source)
-    if path.is_dir():
-        extensions = {file.suffix.lower() for file in files_below(path)}
-        return extensions.isdisjoint(RAW_EXTENSIONS) and not extensions.isdisjoint(ALL_PICTURE_EXTENSIONS)
-
-    content = content_of(path)
-    if content.kind == "other":
-        raise ValueError(f"{path}: is neither camera RAW nor a picture of a known format; check that it is complete")
-    return content.kind == "picture"
-
-
-def _require_none(source: str, options: dict[str, Any]) -> None:
-    """Raise ValueError if options for RAW are given for a picture."""
-    names = [f"--{name.replace('_', '-')}" for name, value in options.items() if value]
-    if names:
-        raise ValueError(f"{source}: is a developed picture; {', '.join(names)} is for RAW")
-
-
-def choose_denoiser(
-    denoiser: str | None,
-    classical: Spec | None,
-    self_ensemble: bool,
-    device: str,
-    linear: bool = False,
-    strength: float = 1.0,
-) -> RawDenoiser | None:
-    """The denoiser that these options name; None where they name none, and the frame's pattern decides.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if there is no such denoiser, or the options contradict one another.
-    """
-    if classical is not None and (denoiser is not None or self_ensemble or linear):
-        raise ValueError("classical: a filter takes no --denoiser, --self-ensemble or --linear; give one or the other")
-    if classical is not None:
-        require_classical([classical])
-
-    spec = classical if classical is not None else denoiser
-    if spec is None and linear:
-        spec = JOINT
-    if spec is None:
-        return None
-
-    views = 8 if self_ensemble else 1
-    chosen = RawDenoiser.of(spec, device, "auto", views=views, strength=strength)
-    if chosen.demosaics and not linear:
-        raise ValueError(f"--denoiser {denoiser}: demosaics too, to a linear DNG; add --linear")
-    if linear and not chosen.demosaics:
-        raise ValueError(f"--linear: {denoiser} denoises the mosaic and does not demosaic; use {JOINT}")
-    return chosen
-
-
-def _by_pattern(
-    denoiser: RawDenoiser | None,
-    noise: Any,
-    corrections: Corrections,
-    self_ensemble: bool,
-    device: str,
-    strength: float,
-) -> FrameDenoiser:
-    if denoiser is not None:
-        return FrameDenoiser(denoiser, noise, corrections)
-    views = 8 if self_ensemble else 1
-    return FrameDenoiser(None, noise, corrections, device, views=views, strength=strength)
 
 
 def print_denoised(result: DenoisedFolder[Any]) -> None:

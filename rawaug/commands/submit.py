@@ -13,12 +13,11 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from denoisers.files import DEFAULT
 from rawaug.commands import YAML
-from rawaug.commands.denoise import choose_denoiser
 from rawaug.data.dnd import Dnd, write_dnd_submission
 from rawaug.data.sidd import BLOCKS, SiddBenchmark, write_submission
 from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.denoising.sources import Options
 from rawaug.files import require_writable
 from rawaug.io import RawFrame
 from rawaug.noise import estimate_noise
@@ -55,10 +54,9 @@ def run(
         raise ValueError(f"{benchmark}: not a benchmark; use sidd:PATH or dnd:PATH")
     require_writable(Path(out), folder=kind == "dnd")
 
-    spec = DEFAULT if denoiser is None and classical is None else denoiser
-    model = choose_denoiser(spec, classical, self_ensemble, device)
-    assert model is not None
-    method = model.require_mosaic()
+    options = Options(denoiser, classical, self_ensemble=self_ensemble)
+    spec = RawDenoiser.default if options.spec is None else options.spec
+    method = RawDenoiser.of(spec, device, "auto", **options.changes).require_mosaic()
     if kind == "dnd":
         submit_dnd(path, out, method)
     else:

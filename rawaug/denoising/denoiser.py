@@ -1,4 +1,4 @@
-r"""Denoisers of RAW, whatever they are made of, and the one place where their names are looked up.
+r"""Denoisers of RAW, whatever they are made of.
 
     d = f(y, v),    v = shot_var max(y, 0) + read_var,    result = y + s (d - y)
 
@@ -10,11 +10,11 @@ continued by a mirrored line on the sides where the patterns differ, and the res
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -22,58 +22,40 @@ from torch.nn import functional as F
 
 import denoisers
 from denoisers.classical import FILTERS, Stabilised
-from denoisers.files import find_denoiser, list_shipped
+from denoisers.files import DEFAULT, find_denoiser, list_shipped
 from denoisers.mosaic import BayerAdapter, MosaicDRUNet, denoise_mosaic
 from denoisers.network import DENOISERS, PACKED
 from rawaug import bayer
-from rawaug.bayer import CFA, crop_to_cfa, noise_variance
+from rawaug.bayer import CFA, crop_to_cfa
+from rawaug.denoising.base import ImageDenoiser, progress_by, read_named
+from rawaug.denoising.base import Levels as Levels
+from rawaug.denoising.base import Noisy as Noisy
 from rawaug.denoising.foreign import STRIDE, OnnxNetwork
-from rawaug.denoising.weights import read_network
-from rawaug.files import parse_object, read_header, sha256
+from rawaug.denoising.weights import Image
+from rawaug.files import read_header, sha256
 from rawaug.io import RawFrame
-from rawaug.kernels.runtime import find_device, has_fast_bfloat16
 from rawaug.noise import anscombe
-from rawaug.progress import progress
-from rawaug.registry import Spec, spec_label, split_spec, suggest
+from rawaug.registry import Spec, spec_label, split_spec
 
-Levels = tuple[float, float]
-"""The levels of noise: (shot_var, read_var)."""
 Model = Callable[[Tensor, Tensor | None], Tensor]
 """``model(noisy, variance) -> denoised``, each ``(B, 4, h, w)``; it may have a ``stride`` and an ``upscale``."""
-CPU = torch.device("cpu")
 FILTER_TILES = (512, 32)
 """Side and overlap of a filter's tiles, in packed pixels; the filters have a reach of 8 pixels, and BM3D of 20."""
 
 
-class Noisy(NamedTuple):
-    """The input of a denoiser: an image, and what may be known of its noise.
-
-    Attributes:
-        image: packed RAW ``(1, 4, h, w)``, white at 1, not clipped at black; of other patterns than Bayer's the mosaic
-            ``(1, 1, H, W)``; or developed sRGB ``(1, 3, H, W)``.
-        variance: of the noise of each value, shape of ``image``; None if it is not known.
-        levels: (shot_var, read_var) if the variance is ``shot_var max(image, 0) + read_var``.
-        cfa: the pattern of packed RAW or of the mosaic.
-    """
-
-    image: Tensor
-    variance: Tensor | None = None
-    levels: Levels | None = None
-    cfa: str = CFA.RGGB
-
-    @classmethod
-    def of(cls, image: Tensor, levels: Levels, cfa: CFA | str) -> Noisy:
-        """Packed RAW ``(1, 4, h, w)``, or a mosaic ``(1, 1, H, W)``, with the variance of these levels."""
-        return cls(image, noise_variance(image, *levels), levels, bayer.canonical_cfa(cfa))
-
-
 @dataclass(frozen=True, kw_only=True)
-class RawDenoiser:
+class RawDenoiser(ImageDenoiser):
     """Anything that denoises RAW; made by :meth:`of`, and changed by :func:`dataclasses.replace`.
+
+    :meth:`of` takes the name of a shipped denoiser; a ``.safetensors`` of rawaug, or of PMRID, BF-DnCNN or PBRID as
+    published; an ``.onnx``; a classical filter by its name, or ``{"name": ..., "settings": {...}}``; a network
+    ``model(noisy, variance)`` or ``model(noisy)`` of packed RAW ``(B, 4, h, w)``; or a function of the same arguments,
+    which gets whole frames.
 
     Attributes:
         name: in tables.
         model: ``model(levels)`` is the function f that denoises a piece of packed RAW; levels may be None.
+        network: the network that computes, if it is one of PyTorch's.
         cfa: the pattern that it was trained for; None if it works on any of Bayer's.
         of_any: a network that takes mosaics of every pattern, with the planes of their colours.
         info: what its file says of its training.
@@ -87,24 +69,22 @@ class RawDenoiser:
         mixed: whether it computes in bfloat16.
         checked: whether a result that is not finite is an error; a training that diverged is scored as it is.
         settings: what its results depend on, as JSON.
+
+    Example:
+        >>> denoiser = RawDenoiser.of("NonLocalMeans")
+        >>> denoiser(Noisy.of(torch.rand(1, 4, 32, 48), (1e-3, 1e-5), "RGGB")).shape
+        torch.Size([1, 4, 32, 48])
     """
 
-    name: str
+    takes: ClassVar[Image] = "raw"
+    default: ClassVar[str] = DEFAULT
+    files: ClassVar[str] = "a .safetensors or an .onnx"
+
     model: Callable[[Levels | None], Model] = field(repr=False)
     cfa: CFA | None = None
     of_any: MosaicDRUNet | None = None
-    info: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    reads_levels: bool = True
     upscale: int = 1
     tiles: tuple[int, int | None] | None = (1536, None)
-    views: int = 1
-    strength: float = 1.0
-    device: torch.device = CPU
-    mixed: bool = False
-    checked: bool = True
-    settings: dict[str, Any] = field(default_factory=dict, repr=False)
-
-    takes: ClassVar[str] = "raw"
 
     def __post_init__(self) -> None:
         if self.views not in (1, 4, 8):
@@ -115,47 +95,14 @@ class RawDenoiser:
             raise ValueError("--strength does not support --linear: the noisy frame has no full colour to mix in")
 
     @classmethod
-    def of(
-        cls,
-        spec: RawDenoiser | Spec | Path | nn.Module | Callable[..., Tensor],
-        device: str | torch.device = "cpu",
-        precision: Literal["full", "auto"] = "full",
-        **changes: Any,
-    ) -> RawDenoiser:
-        """The denoiser that a name, a file or an object stands for. Nothing is imported by name.
-
-        Args:
-            spec: the name of a shipped denoiser; a ``.safetensors`` of rawaug, or of PMRID, BF-DnCNN or PBRID as
-                published; an ``.onnx``; a classical filter by its name, or ``{"name": ..., "settings": {...}}``; a
-                network ``model(noisy, variance)`` or ``model(noisy)`` of packed RAW ``(B, 4, h, w)``; or a function of
-                the same arguments, which gets whole frames.
-            device: auto, cpu, cuda, ...; where a network runs. Filters, functions and ONNX run on the CPU.
-            precision: ``"auto"`` computes in bfloat16 where that is fast and costs the network less than 0.05 dB.
-            changes: attributes in place of those found, such as ``name``, ``views``, ``strength``.
-
-        Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if there is no such denoiser, or its file is damaged.
-            ImportError: if a library that it needs is not installed.
-
-        Example:
-            >>> denoiser = RawDenoiser.of("NonLocalMeans")
-            >>> denoiser(Noisy.of(torch.rand(1, 4, 32, 48), (1e-3, 1e-5), "RGGB")).shape
-            torch.Size([1, 4, 32, 48])
-        """
-        denoiser = spec if isinstance(spec, cls) else _resolve(spec, changes.get("name"))
-        network = denoiser.model(None)
-        if isinstance(network, nn.Module) and not isinstance(network, OnnxNetwork):
-            where = find_device(str(device))
-            network.to(where, memory_format=torch.channels_last)  # type: ignore[call-overload]
-            mixed = precision == "auto" and getattr(network, "mixed", False) and has_fast_bfloat16(where)
-            changes = {"device": where, "mixed": mixed, **changes}
-
-        denoiser = replace(denoiser, **changes)
-        if denoiser.settings:
-            denoiser = replace(denoiser, settings={**denoiser.settings, "self_ensemble": denoiser.views > 1})
-
-        return denoiser
+    def _resolve(cls, spec: Any, name: str | None) -> RawDenoiser:
+        if isinstance(spec, nn.Module):
+            return _of_network(type(spec).__name__, spec, {}, CFA.RGGB)
+        if callable(spec):
+            return _of_function(spec, name)
+        if isinstance(spec, Mapping) or str(spec) in FILTERS:
+            return _of_filter(spec)
+        return _of_file(spec)
 
     @property
     def demosaics(self) -> bool:
@@ -169,20 +116,20 @@ class RawDenoiser:
         return self
 
     @torch.inference_mode()
-    def __call__(self, given: Noisy) -> Tensor:
+    def __call__(self, noisy: Noisy) -> Tensor:
         """Packed RAW ``(1, 4, h, w)`` denoised, on the CPU; linear camera RGB ``(1, 3, 2h, 2w)`` if it demosaics.
 
         A mosaic ``(1, 1, H, W)`` of another pattern than Bayer's remains one. ValueError if this denoiser takes none,
         the result has another shape, or is not finite where ``checked``.
         """
-        if given.image.shape[1] == 1:
-            denoised = self._of_mosaic(given)
+        if noisy.image.shape[1] == 1:
+            denoised = self._of_mosaic(noisy)
         else:
-            denoised = self._of_packed(given)
+            denoised = self._of_packed(noisy)
 
         if self.strength == 1.0:
-            return denoised.to(given.image.dtype)
-        return given.image.lerp(denoised.clamp(max=1.0), self.strength)
+            return denoised.to(noisy.image.dtype)
+        return noisy.image.lerp(denoised.clamp(max=1.0), self.strength)
 
     def _of_packed(self, noisy: Noisy) -> Tensor:
         cfa = CFA(noisy.cfa)
@@ -192,16 +139,13 @@ class RawDenoiser:
         if variance is not None:
             variance = _continue(variance, cfa, own)
 
-        run = self._whole(self.model(noisy.levels), own)
-        denoised = self._run(run, image, variance, self._result_shape(image))
-        return _crop(denoised, own, cfa)
-
-    def _result_shape(self, packed: Tensor) -> tuple[int, ...]:
-        """The shape of the result for packed RAW: packed RAW again, or full colour if this denoiser demosaics."""
-        height, width = packed.shape[-2:]
+        channels, height, width = image.shape[1:]
         if self.demosaics:
-            return 1, 3, self.upscale * height, self.upscale * width
-        return 1, PACKED, height, width
+            channels = 3
+
+        run = self._whole(self.model(noisy.levels), own)
+        denoised = self._run(run, image, variance, (1, channels, self.upscale * height, self.upscale * width))
+        return _crop(denoised, own, cfa)
 
     def _of_mosaic(self, noisy: Noisy) -> Tensor:
         if self.of_any is None:
@@ -220,13 +164,9 @@ class RawDenoiser:
         """``run`` on the device and in the precision of this denoiser, its result checked."""
         if variance is not None:
             variance = variance.to(self.device)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
+        with self._precision():
             denoised = run(image.to(self.device), variance).cpu()
-
-        if tuple(denoised.shape) != tuple(expected) or (self.checked and not denoised.isfinite().all()):
-            got = f"{tuple(denoised.shape)} for {tuple(image.shape)}"
-            raise ValueError(f"{self.name}: the result is not finite, or of another shape: {got}")
-        return denoised
+        return self._require_sound(denoised, image, expected)
 
     def _whole(self, model: Model, cfa: CFA) -> Model:
         """The model in tiles, within the self-ensemble."""
@@ -244,24 +184,13 @@ class RawDenoiser:
         A denoiser that demosaics gives linear camera RGB ``(3, H, W)``. ``levels`` may be None where
         :attr:`reads_levels` is False.
         """
-        is_bayer = frame.cfa in CFA.__members__
-        image = frame.mosaic[None]
-        if is_bayer:
-            image = bayer.pack(image, frame.cfa)
-
+        image = bayer.pack_if_bayer(frame.mosaic[None], frame.cfa)
         noisy = Noisy(image, cfa=frame.cfa)
         if levels is not None:
             noisy = Noisy.of(image, levels, frame.cfa)
 
-        denoised = self(noisy)
-        if is_bayer and not self.demosaics:
-            denoised = bayer.unpack(denoised, frame.cfa)
+        denoised = bayer.unpack_if_packed(self(noisy), frame.cfa)
         return denoised[0].clamp(max=1.0)
-
-
-def progress_by(unit: str) -> Callable[[Sequence[Any]], Iterable[Any]]:
-    """A function that iterates over the parts of a frame, such as its tiles, with progress if there are several."""
-    return lambda parts: progress(parts, label="frame", unit=unit) if len(parts) > 1 else iter(parts)
 
 
 def _continue(packed: Tensor, cfa: CFA, own: CFA) -> Tensor:
@@ -289,12 +218,12 @@ def _crop(image: Tensor, own: CFA, cfa: CFA) -> Tensor:
 
 def shipped_of_mosaics() -> list[str]:
     """Names of the shipped networks that denoise the mosaic and leave demosaicing to others."""
-    return [name for name in list_shipped() if _denoises_mosaics(read_header(find_denoiser(name)))]
-
-
-def _denoises_mosaics(header: Mapping[str, str]) -> bool:
-    channels = parse_object(header["config"]).get("channels", PACKED)
-    return channels == PACKED and DENOISERS[header["model"]].upscale == 1
+    names = []
+    for name in RawDenoiser.shipped():
+        model = read_header(find_denoiser(name))["model"]
+        if DENOISERS[model].upscale == 1:
+            names.append(name)
+    return names
 
 
 def require_classical(specs: Sequence[Spec]) -> None:
@@ -305,43 +234,23 @@ def require_classical(specs: Sequence[Spec]) -> None:
             raise ValueError(f"classical: {split_spec(spec)[0]}: {reason}")
 
 
-def _resolve(spec: Any, name: str | None) -> RawDenoiser:
-    """The denoiser of an object or of a name, on the CPU; arguments as of :meth:`RawDenoiser.of`."""
-    if isinstance(spec, nn.Module):
-        return _of_network(type(spec).__name__, spec, {}, CFA.RGGB)
-    if callable(spec):
-        return _of_function(spec, name)
-    if isinstance(spec, Mapping) or str(spec) in FILTERS:
-        return _of_filter(spec)
-
-    return _of_file(spec)
-
-
 def denoiser_file(spec: str | Path) -> Path | None:
     """The file of a network that a name or a path stands for; None for a filter or a function."""
-    is_file = Path(spec).suffix in (".safetensors", ".onnx") or str(spec) in list_shipped()
-    return find_denoiser(spec) if is_file else None
+    if Path(spec).suffix in (".safetensors", ".onnx") or str(spec) in list_shipped():
+        return find_denoiser(spec)
+    return None
 
 
 def _of_file(spec: str | Path) -> RawDenoiser:
     """The network of a file, or of a shipped denoiser by its name."""
-    suffix = Path(spec).suffix
-    if not suffix and str(spec) not in list_shipped():
-        known = [*list_shipped(), *FILTERS]
-        raise ValueError(
-            f"{spec}: no such denoiser{suggest(spec, known)}; give one of {', '.join(known)}, "
-            "a .safetensors or an .onnx"
-        )
-
-    if suffix == ".onnx":
-        path = Path(spec)
+    path = Path(spec)
+    if path.suffix == ".onnx":
         network = OnnxNetwork(path)
         denoiser = _of_network(path.stem, network, network.info, CFA(network.info.get("cfa", "RGGB")))
+        denoiser = replace(denoiser, network=None)  # ONNX Runtime computes on the CPU
     else:
-        path = find_denoiser(spec)
-        file = read_network(path)
-        if file.image != RawDenoiser.takes:
-            raise ValueError(f"{path}: denoises developed pictures, not RAW; give it a .jpg, .png or .tif")
+        file = read_named(spec, RawDenoiser)
+        path = file.path
         denoiser = _of_network(file.name, file.network, file.info, file.cfa)
 
     return replace(denoiser, settings={"denoiser": path.stem, "denoiser_sha256": sha256(path)})
@@ -363,6 +272,7 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any], cfa: CFA
     return RawDenoiser(
         name=name,
         model=lambda levels: evaluated,
+        network=evaluated,
         cfa=cfa,
         of_any=of_any,
         info=info,
@@ -376,11 +286,14 @@ class _Foreign(nn.Module):
 
     def __init__(self, network: nn.Module, reads: bool) -> None:
         super().__init__()
-        self.network, self.reads = network, reads
-        self.stride, self.upscale = getattr(network, "stride", STRIDE), getattr(network, "upscale", 1)
+        self.network = network
+        self.reads = reads
+        self.stride = getattr(network, "stride", STRIDE)
+        self.upscale = getattr(network, "upscale", 1)
 
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
-        denoised: Tensor = self.network(noisy, variance) if self.reads else self.network(noisy)
+        arguments = (noisy, variance) if self.reads else (noisy,)
+        denoised: Tensor = self.network(*arguments)
         return denoised
 
 
@@ -391,7 +304,10 @@ def _of_filter(spec: Spec) -> RawDenoiser:
 
     def model(levels: Levels | None) -> Model:
         """Noise of an unknown law is taken for white, at the mean level of its map."""
-        return denoiser if levels is None else partial(stabilised, shot_var=levels[0], read_var=levels[1])
+        if levels is None:
+            return denoiser
+        shot_var, read_var = levels
+        return partial(stabilised, shot_var=shot_var, read_var=read_var)
 
     return RawDenoiser(name=spec_label(spec), model=model, tiles=FILTER_TILES, settings={"classical": spec})
 
@@ -401,9 +317,11 @@ def _of_function(function: Callable[..., Any], name: str | None) -> RawDenoiser:
     reads = _takes_two(function)
 
     def run(noisy: Tensor, variance: Tensor | None) -> Tensor:
-        given = (noisy, variance) if reads else (noisy,)
+        arguments: list[Tensor | None] = [noisy.clone()]
+        if reads:
+            arguments.append(variance if variance is None else variance.clone())
         try:
-            return torch.as_tensor(function(*(x if x is None else x.clone() for x in given))).to(noisy)
+            return torch.as_tensor(function(*arguments)).to(noisy)
         except Exception as error:  # anybody's function
             raise ValueError(f"{name}: {type(error).__name__}: {' '.join(str(error).split())}") from error
 
@@ -412,6 +330,8 @@ def _of_function(function: Callable[..., Any], name: str | None) -> RawDenoiser:
 
 def _takes_two(function: Callable[..., Any]) -> bool:
     """Whether a function must be given the variance besides noisy RAW."""
-    parameters = inspect.signature(function).parameters.values()
-    placed = [one for one in parameters if one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD)]
-    return sum(one.default is one.empty for one in placed) > 1
+    count = 0
+    for parameter in inspect.signature(function).parameters.values():
+        is_positional = parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+        count += is_positional and parameter.default is parameter.empty
+    return count > 1

@@ -63,13 +63,14 @@ def denoise_file(
             there already.
     """
     source, out = Path(source), Path(out)
-    require_file(source, kind.what)
+    require_file(source, f"{kind.what} file")
     if out.resolve() == source.resolve():
         raise ValueError(f"{out}: is the input file; give another name")
     require_output(out, overwrite, kind.formats, kind.format_advice)
 
     if preview is None:
         return kind.denoise(source, out)
+
     preview = Path(preview)
     require_output(preview, overwrite, PREVIEWS, "the preview is a .jpg or .png")
     kind.require_preview(preview)
@@ -118,6 +119,7 @@ def denoise_folder(
         if target.exists() and not overwrite:
             result.existing += 1
             continue
+
         try:
             result.files.append(kind.denoise(file, target, previews_of.get(file), isolate=True))
         except UnknownNoise as error:
@@ -131,9 +133,10 @@ def denoise_folder(
     if informed is not None:
         for file in unknown:
             try:
-                result.files.append(informed.denoise(file, targets[file], previews_of.get(file), isolate=True))
+                done = informed.denoise(file, targets[file], previews_of.get(file), isolate=True)
             except UnknownNoise:
                 continue
+            result.files.append(done)
             del result.broken[str(file)]
 
     if len(result.broken) == len(targets):
@@ -146,15 +149,13 @@ def _targets(source: Path, out: Path, kind: Files[T], files: list[Path]) -> dict
     if out.resolve().is_relative_to(source.resolve()):
         raise ValueError(f"{out}: is inside the source folder {source}; choose an output folder outside it")
 
-    targets: dict[Path, Path] = {}
-    taken: set[Path] = set()
+    sources: dict[Path, Path] = {}
     for file in files:
         target = out / kind.target(file.relative_to(source))
-        if target in taken:
+        if target in sources:
             raise ValueError(f"{file}: another file of {file.parent} has this stem, and both would become {target}")
-        taken.add(target)
-        targets[file] = target
-    return targets
+        sources[target] = file
+    return {file: target for target, file in sources.items()}
 
 
 def _preview_targets(
@@ -163,6 +164,7 @@ def _preview_targets(
     """The preview of each file, in the subfolders of ``previews``; none without such a folder."""
     if previews is None:
         return {}
+
     folder = Path(previews)
     kind.require_preview(folder)
     if folder.suffix.lower() in PREVIEWS and not folder.is_dir():
@@ -176,10 +178,14 @@ def _raise_if_unwritable(error: Exception, *files: Path | None) -> None:
     """Raise an error of writing, such as to a full disk, which is no fault of the source."""
     if not isinstance(error, OSError):
         return
+
     for file in files:
         if file is not None and error.filename in (str(file), str(file.parent)):
             raise error
 
 
 def _with_name(error: Exception, file: Path) -> str:
-    return str(error) if file.stem in str(error) else f"{file}: {error}"
+    text = str(error)
+    if file.stem in text:
+        return text
+    return f"{file}: {text}"

@@ -93,11 +93,14 @@ def session_of(path: Path) -> Any:
 
 def feeds(names: Sequence[str], images: Sequence[Tensor]) -> dict[str, Any]:
     """The inputs of a session by name: of ``images``, each ``(1, 4, h, w)``, as many as it has ``names``."""
-    return {name: image.numpy() for name, image in zip(names, images, strict=False)}
+    inputs = {}
+    for name, image in zip(names, images, strict=False):
+        inputs[name] = image.numpy()
+    return inputs
 
 
 AGAIN = "download or convert it again"
-
+"""What to do about a damaged file of weights."""
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -142,14 +145,14 @@ class BiasFreeDnCNN(nn.Module):
 
     def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
         """Packed RAW ``(B, 4, h, w)`` denoised; ``variance`` is a map ``shot_var max(noisy, 0) + read_var``."""
-        shot, read = fit_levels(noisy, variance)
-        shot, read = shot.flatten(), read.flatten()
-        black = anscombe.forward(noisy.new_full((1, 1, 1, 1), 0.0), shot, read)
-        white = anscombe.forward(noisy.new_full((1, 1, 1, 1), 1.0), shot, read)
+        shot_var, read_var = fit_levels(noisy, variance)
+        levels = shot_var.flatten(), read_var.flatten()
+        black = anscombe.forward(noisy.new_full((1, 1, 1, 1), 0.0), *levels)
+        white = anscombe.forward(noisy.new_full((1, 1, 1, 1), 1.0), *levels)
 
-        u = (anscombe.forward(noisy, shot, read) - black) / (white - black)
+        u = (anscombe.forward(noisy, *levels) - black) / (white - black)
         planes = self._grey(u.flatten(0, 1)[:, None]).reshape(noisy.shape)
-        return anscombe.inverse(planes * (white - black) + black, shot, read)
+        return anscombe.inverse(planes * (white - black) + black, *levels)
 
     @torch.no_grad()
     def _grey(self, u: Tensor) -> Tensor:

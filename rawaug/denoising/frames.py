@@ -22,10 +22,11 @@ from typing import Any
 
 from torch import Tensor
 
-from denoisers.files import DEFAULT
+from denoisers.files import JOINT
 from rawaug.bayer import CFA
+from rawaug.denoising.base import Levels
 from rawaug.denoising.corrections import Corrected, Correction, Corrections
-from rawaug.denoising.denoiser import Levels, RawDenoiser
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.denoising.levels import Noise, as_json, find_levels, load_noise
 from rawaug.files import require_writable
 from rawaug.io import RawFrame, read_raw, write_dng
@@ -83,16 +84,22 @@ class FrameDenoiser:
     ) -> None:
         self._by_pattern = denoiser is None
         self._options: dict[str, Any] = {"device": device, "precision": "auto", **changes}
-        self.usual = denoiser
+        self.usual: RawDenoiser = denoiser
         if not isinstance(denoiser, RawDenoiser) or changes:
-            self.usual = RawDenoiser.of(DEFAULT if denoiser is None else denoiser, **self._options)
+            spec = RawDenoiser.default if denoiser is None else denoiser
+            self.usual = RawDenoiser.of(spec, **self._options)
+
         self.noise = load_noise(noise, self.usual)
         self.corrections = corrections or Corrections()
 
     @property
     def settings(self) -> dict[str, Any]:
         """What the results depend on, as JSON."""
-        settings = {**self.usual.settings, "noise": as_json(self.noise)}
+        settings = dict(self.usual.settings)
+        if settings:
+            settings["self_ensemble"] = self.usual.views > 1
+        settings["noise"] = as_json(self.noise)
+
         if self.corrections.greens != "auto":
             settings["greens"] = self.corrections.greens
         if self.usual.strength != 1.0:
@@ -116,31 +123,51 @@ class FrameDenoiser:
             ValueError: if the noise levels are unknown, or the denoiser is not for this pattern.
         """
         denoiser = self.denoiser_of(frame)
-        is_monochrome = frame.cfa == MONOCHROME
-        if is_monochrome:
-            if denoiser.demosaics:
-                raise ValueError(f"{frame.name}: is monochrome; there is nothing to demosaic, omit --linear")
-            frame = replace(frame, cfa=CFA.RGGB)
-
-        corrected = Corrected()
-        if denoiser.strength > 0 and not is_monochrome:
+        if denoiser.strength > 0:
             frame, corrected = self.corrections(frame)
+        else:
+            corrected = Corrected()
+
+        mosaic = _as_mosaic(frame, denoiser)
 
         levels, noise_source = None, "not needed"
         if denoiser.reads_levels:
-            shot_var, read_var, noise_source = find_levels(frame, self.noise if noise is None else noise)
+            shot_var, read_var, noise_source = find_levels(mosaic, self.noise if noise is None else noise)
             levels = shot_var, read_var
 
-        image = denoiser.frame(frame, levels)
-        if is_monochrome:
-            frame = replace(frame, cfa=MONOCHROME)
-
+        image = denoiser.frame(mosaic, levels)
         if denoiser.demosaics:
             below_zero = (image < -0.5 / LINEAR_WHITE).float().mean().item()
             return DenoisedFrame(frame, image, levels, noise_source, below_zero, corrected)
+
         below_zero = _clip_below_zero(image, frame)
-        frame = replace(frame, mosaic=image, noise_profile=_rest(levels or frame.noise_profile, denoiser.strength))
+        rest = _rest(levels or frame.noise_profile, denoiser.strength)
+        frame = replace(frame, mosaic=image, noise_profile=rest)
         return DenoisedFrame(frame, None, levels, noise_source, below_zero, corrected)
+
+    def require_linear(self, linear: bool) -> None:
+        """Raise ValueError if the denoiser demosaics and full colour is not wanted, or the other way round."""
+        name = self.usual.name
+        if self.usual.demosaics and not linear:
+            raise ValueError(f"--denoiser {name}: demosaics too, to a linear DNG; add --linear")
+        if linear and not self.usual.demosaics:
+            raise ValueError(f"--linear: {name} denoises the mosaic and does not demosaic; use {JOINT}")
+
+    def require_preview(self, preview: Path) -> None:
+        """Raise ValueError if LibRaw cannot develop the results to previews as it does a mosaic."""
+        if self.usual.demosaics:
+            raise ValueError(
+                f"--preview {preview}: --linear does not support it; open the linear DNG in a RAW developer"
+            )
+
+
+def _as_mosaic(frame: RawFrame, denoiser: RawDenoiser) -> RawFrame:
+    """The frame as a denoiser takes it: a monochrome one is the mosaic of a grey scene."""
+    if frame.cfa != MONOCHROME:
+        return frame
+    if denoiser.demosaics:
+        raise ValueError(f"{frame.name}: is monochrome; there is nothing to demosaic, omit --linear")
+    return replace(frame, cfa=CFA.RGGB)
 
 
 def _rest(levels: Levels | None, strength: float) -> Levels | None:
@@ -153,15 +180,18 @@ def _rest(levels: Levels | None, strength: float) -> Levels | None:
 
 def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
     """Clip, in place, what a digital number cannot hold; its share of the sites."""
-    below = 0
     cell = cell_of_planes(frame.cfa)
     size = len(cell)
+
+    below = 0
     for i, j in product(range(size), repeat=2):
         plane = mosaic[0, i::size, j::size]
         black = frame.black[cell[i, j]]
+        step = 1.0 / (frame.white - black)
         lowest = -black / (frame.white - black)
-        below += int((plane < lowest - 0.5 / (frame.white - black)).sum())
+        below += int((plane < lowest - 0.5 * step).sum())
         plane.clamp_(min=lowest)
+
     return below / mosaic.numel()
 
 
@@ -218,9 +248,13 @@ def denoise(
     if out is not None:
         require_output(Path(out), overwrite, (".dng",), DNG_ADVICE)
 
-    frame = source if isinstance(source, RawFrame) else read_raw(source, monochrome=True)
+    if isinstance(source, RawFrame):
+        frame, file = source, None
+    else:
+        frame, file = read_raw(source, monochrome=True), source
+
     denoised = denoise_frame(frame).frame
     if out is not None:
         Path(out).parent.mkdir(parents=True, exist_ok=True)
-        write_dng(out, denoised, None if isinstance(source, RawFrame) else source)
+        write_dng(out, denoised, file)
     return denoised

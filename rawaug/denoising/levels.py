@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.denoising.base import ImageDenoiser
 from rawaug.io import RawFrame
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import (
@@ -160,7 +160,7 @@ def _of_other_files(levels: Shots, frame: RawFrame) -> tuple[float, float, str]:
     return *levels[shot], f"other files of {frame.camera} at ISO {frame.iso:g}"
 
 
-def load_noise(noise: Noise, denoiser: RawDenoiser) -> Noise:
+def load_noise(noise: Noise, denoiser: ImageDenoiser) -> Noise:
     """``"camera"`` as the law in the denoiser's file, an ISP's file as the law in it; anything else as it is.
 
     Raises:
@@ -169,13 +169,13 @@ def load_noise(noise: Noise, denoiser: RawDenoiser) -> Noise:
     if not isinstance(noise, str):
         return noise
     if noise == "camera":
-        file, stored = denoiser.name, denoiser.info
+        file, info = denoiser.name, denoiser.info
     elif noise.endswith(".safetensors"):
-        file, stored = noise, DictionaryISP.from_pretrained(noise).info
+        file, info = noise, DictionaryISP.from_pretrained(noise).info
     else:
         return noise
 
-    law = stored.get("noise")
+    law = info.get("noise")
     if not isinstance(law, Mapping) or not ("shot_var" in law or law.get("name") == "MeasuredNoise"):
         raise ValueError(f"{file}: holds no camera's noise law; give an ISP's file that does, or --noise estimate")
     return camera_law(law)
@@ -185,4 +185,6 @@ def as_json(noise: Noise) -> Any:
     """The setting as JSON has it."""
     if isinstance(noise, MeasuredLevels):
         return noise.spec()
-    return noise if isinstance(noise, str) else list(noise)
+    if isinstance(noise, str):
+        return noise
+    return list(noise)

@@ -77,10 +77,11 @@ def white_level(srgb: Tensor) -> float:
 def _removed_deviations(network: Any, srgb: Tensor) -> Tensor:
     """The quartiles ``(3,)`` of the deviation, over small squares, of what the network removes at an unknown level."""
     side = min(_SQUARE, *srgb.shape[-2:])
+
     powers = []
     for part in _spread_parts(srgb):
-        removed = part - network(part, torch.zeros_like(part))
-        power = removed.float().square().mean(1)
+        correction = part - network(part, torch.zeros_like(part))
+        power = correction.float().square().mean(1)
         powers.append(F.avg_pool2d(power, side).flatten())
 
     deviations = torch.cat(powers).sqrt()
@@ -98,4 +99,5 @@ def _spread_parts(srgb: Tensor) -> Iterator[Tensor]:
 def _spread_places(length: int) -> list[int]:
     """Where parts begin along a side of ``length`` pixels."""
     room = max(0, length - _PART)
-    return sorted({room * k // (_PARTS - 1) for k in range(_PARTS)})
+    places = {room * k // (_PARTS - 1) for k in range(_PARTS)}
+    return sorted(places)

@@ -10,132 +10,146 @@ mean is taken: half of what the self-ensemble gains, the mean of eight turns as 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 import denoisers
 from denoisers.classical import FILTERS
-from denoisers.files import find_denoiser, list_shipped
 from rawaug import bayer
-from rawaug.denoising.denoiser import CPU, Noisy, progress_by
-from rawaug.denoising.picture_levels import estimate_level, white_level
-from rawaug.denoising.weights import read_network
-from rawaug.kernels.runtime import find_device, has_fast_bfloat16
-from rawaug.registry import Spec, spec_label, suggest
+from rawaug.denoising.base import ImageDenoiser, Noisy, progress_by, read_named
+from rawaug.denoising.picture_levels import PictureLevel, estimate_level, white_level
+from rawaug.denoising.weights import Image
+from rawaug.registry import Spec, spec_label
 
-PICTURES = "rawaug-srgb"
-"""The default picture denoiser."""
 _TILE = 1280
 """Side of a tile; the default denoiser needs more than 2 GB for 12 megapixels at once."""
+_LOWEST = 1e-4
+"""The lowest level that a filter is told, since it divides by it."""
 TURNS = {1: (0,), 2: (0, 5), 4: range(4), 8: range(bayer.N_VIEWS)}
 """The views that are averaged, by the number of views."""
 
 
-@dataclass(frozen=True)
-class PictureDenoiser:
-    """Anything that denoises pictures: ``run(srgb) -> srgb``, called on ``device``, for each of ``views`` turns.
+@dataclass(frozen=True, kw_only=True)
+class PictureDenoiser(ImageDenoiser):
+    """Anything that denoises pictures.
 
-    ``mixed`` says whether it computes in bfloat16.
+    :meth:`of` takes the name of a shipped denoiser of pictures or of a classical filter, ``{"name": ..., "settings":
+    {...}}``, a ``.safetensors`` of rawaug or of FFDNet's authors, or a network of sRGB; with ``@15`` behind a name, it
+    is told this level, in units of 1/255, every time.
+
+    Attributes:
+        run: ``run(srgb, level) -> srgb``, called on ``device``; the level is a standard deviation, white at 1.
+        estimate: estimates the level of a picture where none is told.
+        level: what it is told every time; None for the estimate.
+        views: 1, 2, 4 or 8 turns of the picture; by default 2 of a network that estimates the level, and 1 of others.
+        strength: factor on the estimated level, 0 to 10: 2 removes more, 0.5 less, 0 nothing.
+
+    The other attributes are those of :class:`rawaug.denoising.base.ImageDenoiser`.
+
+    Example:
+        >>> denoiser = PictureDenoiser.of("NonLocalMeans@10")
+        >>> denoiser(Noisy(torch.rand(1, 3, 32, 48))).shape
+        torch.Size([1, 3, 32, 48])
     """
 
-    name: str
-    run: Callable[[Tensor], Tensor]
-    device: torch.device = CPU
-    views: int = 1
-    mixed: bool = False
+    takes: ClassVar[Image] = "srgb"
+    default: ClassVar[str] = "rawaug-srgb"
+    files: ClassVar[str] = "or a .safetensors of rawaug run srgb or of FFDNet's authors"
 
-    takes: ClassVar[str] = "srgb"
+    run: Callable[[Tensor, float], Tensor] = field(repr=False)
+    estimate: Callable[[Tensor], PictureLevel] = field(repr=False)
+    level: float | None = None
 
-    @classmethod
-    def of(
-        cls,
-        spec: str | Path,
-        device: str = "cpu",
-        strength: float = 1.0,
-        views: int | None = None,
-        precision: Literal["full", "auto"] = "full",
-    ) -> PictureDenoiser:
-        """The denoiser that a name or a file stands for.
-
-        Args:
-            spec: the name of a shipped denoiser of pictures or of a classical filter, or a ``.safetensors`` of rawaug
-                or of FFDNet's authors; with ``@15`` behind it, it is told this level, in units of 1/255, every time.
-            device: auto, cpu, cuda, ...
-            strength: factor on the estimated level: 2 removes more, 0.5 less, 0 nothing.
-            views: 1, 2, 4 or 8 turns of the picture, at that many times the work; by default 2 of a network that
-                estimates the level, and 1 of others.
-            precision: ``"auto"`` computes in bfloat16 where that is fast and costs the network less than 0.05 dB.
-
-        Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if it is no denoiser of pictures, or strength or level is negative.
-
-        Example:
-            >>> denoiser = PictureDenoiser.of("rawaug-srgb@10")  # doctest: +SKIP
-        """
-        path, level = _split_level(str(spec))
-        if not 0.0 <= strength <= 10.0:
-            raise ValueError(f"strength must be between 0 and 10, got {strength}")
-        if path in FILTERS:
-            return replace(cls.of_filter(path, level, strength), views=views or 1)
-
-        name, network = _network(path)
-        denoiser = cls.of_network(name, network, device, strength)
-        if level is not None:
-            _, _, stated_level = str(spec).rpartition("@")
-            run = partial(_denoise_at, network, level=level)
-            denoiser = replace(denoiser, name=f"{name}, told {stated_level}", run=run)
-
-        if not views:
-            views = 2 if getattr(network, "light", False) else 1
-        mixed = precision == "auto" and getattr(network, "mixed", False) and has_fast_bfloat16(denoiser.device)
-        return replace(denoiser, views=views, mixed=mixed)
+    def __post_init__(self) -> None:
+        if self.views not in TURNS:
+            raise ValueError(f"views must be 1, 2, 4 or 8, got {self.views!r}")
+        if not 0.0 <= self.strength <= 10.0:
+            raise ValueError(f"strength must be between 0 and 10, got {self.strength}")
+        if self.level is not None and not self.reads_levels:
+            raise ValueError(f"{self.name}: is told no level; leave out what stands after @")
 
     @classmethod
-    def of_filter(cls, spec: Spec, level: float | None = None, strength: float = 1.0) -> PictureDenoiser:
-        """A classical filter of white noise on the three colours; without a level it is told scikit-image's."""
-        denoiser = FILTERS.make(spec)
+    def _resolve(cls, spec: Any, name: str | None) -> PictureDenoiser:
+        if isinstance(spec, nn.Module):
+            return _of_network(type(spec).__name__, spec, {})
+        if isinstance(spec, Mapping):
+            return _of_filter(spec)
 
-        def run(srgb: Tensor) -> Tensor:
-            deviation = max(1e-4, strength * white_level(srgb) if level is None else level)
-            planes = (srgb[0] / deviation).permute(1, 2, 0).contiguous().numpy()
-            return torch.from_numpy(deviation * denoiser.denoise(planes)).permute(2, 0, 1)[None].float()
+        stem, level = _split_level(str(spec))
+        if stem in FILTERS:
+            denoiser = _of_filter(stem)
+        else:
+            file = read_named(stem, cls)
+            denoiser = _of_network(file.name, file.network, file.info)
 
-        return cls(spec_label(spec) if level is None else f"{spec_label(spec)}, told {255.0 * level:.3g}", run)
-
-    @classmethod
-    def of_network(cls, name: str, network: nn.Module, device: str = "cpu", strength: float = 1.0) -> PictureDenoiser:
-        """A network of sRGB, which is moved to the device, in tiles; one that reads levels is told the picture's."""
-        where = find_device(device)
-        network = network.to(where, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
-
-        def run(srgb: Tensor) -> Tensor:
-            if not getattr(network, "reads_variance", False):
-                return denoisers.denoise_tiles(network, srgb, each=progress_by("tile"))
-            if strength == 0.0:
-                return srgb
-
-            noise = estimate_level(network, srgb)
-            denoised = _denoise_at(network, srgb, strength * noise.level)
-            return torch.lerp(srgb, denoised, noise.share)
-
-        return cls(name, run, where)
+        if level is None:
+            return denoiser
+        return replace(denoiser, name=f"{denoiser.name}, told {255.0 * level:g}", level=level)
 
     @torch.inference_mode()
-    def __call__(self, given: Noisy) -> Tensor:
+    def __call__(self, noisy: Noisy) -> Tensor:
         """sRGB ``(1, 3, H, W)`` denoised, on the CPU, cut to [0, 1]."""
-        image = given.image.to(self.device)
-        total = torch.zeros_like(image)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
-            for k in TURNS[self.views]:
-                total += bayer.turn_back(self.run(bayer.turn(image, k).contiguous()), k)
-        return (total / self.views).cpu().clamp_(0.0, 1.0)
+        srgb = noisy.image.to(self.device)
+        total = torch.zeros_like(srgb)
+        with self._precision():
+            for view in TURNS[self.views]:
+                denoised = self._denoise(bayer.turn(srgb, view).contiguous())
+                total += bayer.turn_back(denoised, view)
+
+        mean = (total / self.views).cpu().clamp_(0.0, 1.0)
+        return self._require_sound(mean, noisy.image, noisy.image.shape)
+
+    def _denoise(self, srgb: Tensor) -> Tensor:
+        """One turn of the picture at the level that is told, or at the one that is estimated."""
+        if not self.reads_levels:
+            return self.run(srgb, 0.0)
+        if self.level is not None:
+            return self.run(srgb, self.level)
+        if self.strength == 0.0:
+            return srgb
+
+        noise = self.estimate(srgb)
+        denoised = self.run(srgb, self.strength * noise.level)
+        return torch.lerp(srgb, denoised, noise.share)
+
+
+# -- by what it is made of ---------------------------------------------------------------------------------------------
+
+
+def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> PictureDenoiser:
+    """A network of sRGB in tiles; one that reads levels is told the picture's."""
+    network = network.eval()
+    reads_levels = bool(getattr(network, "reads_variance", False))
+    estimates = getattr(network, "light", False)
+    return PictureDenoiser(
+        name=name,
+        network=network,
+        info=info,
+        run=partial(_denoise_at if reads_levels else _denoise_blindly, network),
+        estimate=partial(estimate_level, network),
+        reads_levels=reads_levels,
+        views=2 if estimates else 1,
+    )
+
+
+def _of_filter(spec: Spec) -> PictureDenoiser:
+    """A classical filter of white noise on the three colours, which is told scikit-image's estimate of its level."""
+    denoiser = FILTERS.make(spec)
+
+    def run(srgb: Tensor, level: float) -> Tensor:
+        deviation = max(_LOWEST, level)
+        planes = (srgb[0] / deviation).permute(1, 2, 0).contiguous().numpy()
+        return torch.from_numpy(deviation * denoiser.denoise(planes)).permute(2, 0, 1)[None].float()
+
+    def estimate(srgb: Tensor) -> PictureLevel:
+        return PictureLevel(white_level(srgb), 1.0)
+
+    return PictureDenoiser(name=spec_label(spec), run=run, estimate=estimate)
 
 
 def _split_level(spec: str) -> tuple[str, float | None]:
@@ -153,21 +167,12 @@ def _split_level(spec: str) -> tuple[str, float | None]:
     return name, level
 
 
-def _network(spec: str) -> tuple[str, nn.Module]:
-    """The name and the network of a file, which has three channels."""
-    if not Path(spec).suffix and spec not in list_shipped():
-        raise ValueError(
-            f"{spec}: no such denoiser of pictures{suggest(spec, list_shipped())}; give one of {PICTURES}, or "
-            "a .safetensors of rawaug run srgb or of FFDNet's authors"
-        )
-    file = read_network(find_denoiser(spec))
-    if file.image != PictureDenoiser.takes:
-        raise ValueError(f"{spec}: denoises RAW, not pictures; use {PICTURES}")
-
-    return file.name, file.network
+def _denoise_blindly(network: nn.Module, srgb: Tensor, level: float) -> Tensor:
+    """The picture denoised by a network that reads no level."""
+    return denoisers.denoise_tiles(network, srgb, each=progress_by("tile"))
 
 
-def _denoise_at(network: Any, srgb: Tensor, level: float) -> Tensor:
+def _denoise_at(network: nn.Module, srgb: Tensor, level: float) -> Tensor:
     """The picture denoised by a network that is told the deviation of its noise, 0 for unknown."""
     variance = srgb.new_full((1, 1, 1, 1), level**2).expand_as(srgb)
     return denoisers.denoise_tiles(network, srgb, variance, tile=_TILE, each=progress_by("tile")).float()

@@ -1,30 +1,35 @@
 """Kinds of files that are denoised: RAW to DNG, and pictures to pictures.
 
 A kind says which files of a folder are its own, what their results are called, and how one file is read, denoised and
-written. :mod:`rawaug.denoising.files` does the rest, and is the same for all.
+written. :mod:`rawaug.denoising.files` does the rest, and is the same for all; :func:`kind_of` says of which kind a file
+or a folder is.
 """
 
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
+from denoisers.files import JOINT
 from rawaug import bayer
-from rawaug.denoising.corrections import Corrected
-from rawaug.denoising.denoiser import Noisy
+from rawaug.denoising.base import Noisy
+from rawaug.denoising.corrections import Corrected, Correction, Corrections
 from rawaug.denoising.frames import DNG_ADVICE, FrameDenoiser
-from rawaug.denoising.levels import Shots
+from rawaug.denoising.levels import Noise, Shots
 from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.errors import escape
+from rawaug.files import files_below
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
-from rawaug.io.content import RAW_EXTENSIONS, Listing, list_files
+from rawaug.io.content import ALL_PICTURE_EXTENSIONS, RAW_EXTENSIONS, Listing, content_of, list_files
 from rawaug.io.isolated import isolated
 from rawaug.io.raw import develop
-from rawaug.io.stored import PICTURE_FORMATS, read_stored, write_stored
+from rawaug.io.stored import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
+from rawaug.registry import Spec
 
 PREVIEWS = (".jpg", ".jpeg", ".png")
 """Extensions of the previews of RAW files."""
@@ -65,46 +70,118 @@ class Denoised:
 
 @dataclass(frozen=True)
 class DenoisedPicture:
-    """What was done to a picture; ``removed`` is the deviation of what was taken away, in units of 1/255."""
+    """What was done to a picture; ``deviation`` is that of the noise that was removed, in units of 1/255."""
 
     source: Path
     out: Path
-    removed: float
+    deviation: float
     seconds: float
 
     def __str__(self) -> str:
-        return f"{escape(self.out)}: noise of {self.removed:.1f} in 255 removed, {self.seconds:.1f} s"
+        return f"{escape(self.out)}: noise of {self.deviation:.1f} in 255 removed, {self.seconds:.1f} s"
+
+
+@dataclass(frozen=True)
+class Options:
+    """How files are to be denoised, whatever their kind.
+
+    Attributes:
+        denoiser: a name or a file; None for the shipped denoiser of the kind of files.
+        classical: a filter in place of a network.
+        noise: where the noise levels of RAW come from, see :data:`rawaug.denoising.levels.Noise`.
+        strength: 1 removes the noise.
+        linear: whether RAW is demosaiced, too.
+        self_ensemble: whether eight views are averaged.
+        greens: whether greens of RAW that differ are balanced.
+        device: where a network runs.
+
+    Raises:
+        ValueError: if they contradict one another.
+    """
+
+    denoiser: str | Path | None = None
+    classical: Spec | None = None
+    noise: Noise = "auto"
+    strength: float = 1.0
+    linear: bool = False
+    self_ensemble: bool = False
+    greens: Correction = "auto"
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        if self.classical is not None and (self.denoiser is not None or self.self_ensemble or self.linear):
+            raise ValueError(
+                "classical: a filter takes no --denoiser, --self-ensemble or --linear; give one or the other"
+            )
+
+    @property
+    def spec(self) -> Any:
+        """What denoises: the filter or the denoiser; None for the shipped one."""
+        return self.denoiser if self.classical is None else self.classical
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """The attributes of a denoiser that they set."""
+        changes: dict[str, Any] = {"strength": self.strength}
+        if self.self_ensemble:
+            changes["views"] = 8
+        return changes
 
 
 T = TypeVar("T", bound=Denoised | DenoisedPicture)
+K = TypeVar("K", bound="Files[Any]")
 
 
-class Files(Protocol[T]):
-    """One kind of files.
+class Files(ABC, Generic[T]):
+    """One kind of files."""
 
-    Attributes:
-        what: what a file of this kind is called.
-        formats: extensions of the results.
-        format_advice: what is said of other extensions.
-        settings: what the results depend on, as JSON; None if a folder's results may be of several settings.
-    """
+    what: ClassVar[str]
+    """What a file of this kind is called."""
 
-    what: str
-    formats: tuple[str, ...]
-    format_advice: str
+    formats: ClassVar[tuple[str, ...]]
+    """Extensions of the results."""
+
+    format_advice: ClassVar[str]
+    """What is said of other extensions."""
+
+    sources: ClassVar[tuple[str, ...]]
+    """Extensions of the files of a folder that are of this kind."""
+
+    others: ClassVar[str]
+    """What is said of files of a folder that are of no kind."""
+
+    @classmethod
+    @abstractmethod
+    def of(cls: type[K], source: str | Path, options: Options) -> K:
+        """The files of this kind, denoised as the options say; ValueError if one does not apply to ``source``."""
 
     @property
-    def settings(self) -> dict[str, Any] | None: ...
+    def settings(self) -> dict[str, Any] | None:
+        """What the results depend on, as JSON; None if a folder's results may be of several settings."""
+        return None
 
     def listing(self, folder: Path) -> Listing:
         """The files of a folder that are of this kind; ValueError if there is none."""
+        listing = list_files(folder, self.sources, self.others)
+        self._advise(listing)
+        if not listing.files:
+            contents = "; ".join(listing.lines()) or f"supported extensions are {', '.join(self.sources)}"
+            raise ValueError(f"{folder}: contains no {self.what} file; {contents}")
+        return listing
 
+    @abstractmethod
+    def _advise(self, listing: Listing) -> None:
+        """Say what to do with files that are left out, where this kind knows better."""
+
+    @abstractmethod
     def target(self, file: Path) -> Path:
         """The name of the result of a file, both below their folders."""
 
+    @abstractmethod
     def require_preview(self, preview: Path) -> None:
         """Raise ValueError if this kind writes no previews."""
 
+    @abstractmethod
     def denoise(self, source: Path, out: Path, preview: Path | None = None, isolate: bool = False) -> T:
         """Read, denoise and write a file, in a helper process if a file from a stranger is to be isolated.
 
@@ -115,6 +192,7 @@ class Files(Protocol[T]):
 
     def informed_by(self, results: Sequence[T]) -> Files[T] | None:
         """This kind with what the results tell of files whose noise is unknown; None if they tell nothing."""
+        return None
 
 
 class RawFiles(Files[Denoised]):
@@ -128,43 +206,57 @@ class RawFiles(Files[Denoised]):
         >>> denoise_file("in.dng", "out.dng", RawFiles("rawaug-base", noise="estimate"))  # doctest: +SKIP
     """
 
-    what, formats = "RAW file", (".dng",)
+    what = "RAW"
+    formats = (".dng",)
     format_advice = DNG_ADVICE
+    sources = RAW_EXTENSIONS
+    others = "neither RAW nor a picture that is known"
 
     def __init__(self, denoiser: Any = None, *, levels: Shots | None = None, **options: Any) -> None:
-        self.denoiser = denoiser if isinstance(denoiser, FrameDenoiser) else FrameDenoiser(denoiser, **options)
+        if not isinstance(denoiser, FrameDenoiser):
+            denoiser = FrameDenoiser(denoiser, **options)
+        self.denoiser = denoiser
         self._levels = levels
+
+    @classmethod
+    def of(cls, source: str | Path, options: Options) -> RawFiles:
+        spec = options.spec
+        if spec is None and options.linear:
+            spec = JOINT
+
+        corrections = Corrections(options.greens)
+        denoiser = FrameDenoiser(spec, options.noise, corrections, options.device, **options.changes)
+        denoiser.require_linear(options.linear)
+        return cls(denoiser)
 
     @property
     def settings(self) -> dict[str, Any]:
         return self.denoiser.settings
 
-    def listing(self, folder: Path) -> Listing:
-        listing = list_files(folder, RAW_EXTENSIONS, "neither RAW nor a picture that is known")
+    def _advise(self, listing: Listing) -> None:
         if "RAW file" in listing.left_out:
             listing.left_out["RAW file"].advice = "there is no decoder for these kinds of RAW"
-        if not listing.files:
-            there = "; ".join(listing.lines()) or f"supported extensions are {', '.join(RAW_EXTENSIONS)}"
-            raise ValueError(f"{folder}: contains no RAW file; {there}")
-        return listing
 
     def target(self, file: Path) -> Path:
         return file.with_suffix(".dng")
 
     def require_preview(self, preview: Path) -> None:
-        if self.denoiser.usual.demosaics:
-            raise ValueError(
-                f"--preview {preview}: --linear does not support it; open the linear DNG in a RAW developer"
-            )
+        self.denoiser.require_preview(preview)
 
     def denoise(self, source: Path, out: Path, preview: Path | None = None, isolate: bool = False) -> Denoised:
         start = time.perf_counter()
-        frame: RawFrame = isolated(read_raw, source, True) if isolate else read_raw(source, monochrome=True)
+        frame: RawFrame
+        if isolate:
+            frame = isolated(read_raw, source, True)
+        else:
+            frame = read_raw(source, monochrome=True)
+
         denoised = self.denoiser(frame, self._levels)
 
         out.parent.mkdir(parents=True, exist_ok=True)
         write_dng(out, denoised.frame, source, rgb=denoised.rgb)
         seconds = time.perf_counter() - start
+
         if preview is not None:
             preview.parent.mkdir(parents=True, exist_ok=True)
             write_picture(preview, bayer.turn(develop(out), denoised.frame.upright_view))
@@ -186,6 +278,7 @@ class RawFiles(Files[Denoised]):
     def informed_by(self, results: Sequence[Denoised]) -> RawFiles | None:
         if self.denoiser.noise != "auto":
             return None
+
         by_shot: dict[tuple[str, float | None], list[Denoised]] = {}
         for done in results:
             if done.iso is not None:
@@ -193,32 +286,38 @@ class RawFiles(Files[Denoised]):
 
         levels = {}
         for shot, files in by_shot.items():
-            levels[shot] = fmean(done.shot_var for done in files), fmean(done.read_var for done in files)
+            shot_var = fmean(done.shot_var for done in files)
+            read_var = fmean(done.read_var for done in files)
+            levels[shot] = shot_var, read_var
         return RawFiles(self.denoiser, levels=levels)
 
 
 class PictureFiles(Files[DenoisedPicture]):
     """Developed pictures, denoised to pictures with their EXIF, ICC profile and orientation."""
 
-    what, formats = "picture", PICTURE_FORMATS
+    what = "picture"
+    formats = PICTURE_FORMATS
     format_advice = f"the source is a developed picture; its output is one of {', '.join(PICTURE_FORMATS)}"
+    sources = PICTURE_FORMATS
+    others = "not a picture that is known"
 
     def __init__(self, denoiser: PictureDenoiser) -> None:
         self.denoiser = denoiser
 
-    @property
-    def settings(self) -> None:
-        return None
+    @classmethod
+    def of(cls, source: str | Path, options: Options) -> PictureFiles:
+        of_raw = {"--linear": options.linear, "--greens": options.greens != "auto", "--noise": options.noise != "auto"}
+        for option, is_set in of_raw.items():
+            if is_set:
+                raise ValueError(f"{source}: is a developed picture; {option} is for RAW")
 
-    def listing(self, folder: Path) -> Listing:
-        listing = list_files(folder, PICTURE_FORMATS, "not a picture that is known")
+        spec = PictureDenoiser.default if options.spec is None else options.spec
+        return cls(PictureDenoiser.of(spec, options.device, "auto", **options.changes))
+
+    def _advise(self, listing: Listing) -> None:
         for what in ("picture", "HEIC picture", "AVIF picture"):
             if what in listing.left_out:
                 listing.left_out[what].advice = f"not written; denoise each to one of {', '.join(PICTURE_FORMATS)}"
-        if not listing.files:
-            there = "; ".join(listing.lines()) or f"supported extensions are {', '.join(PICTURE_FORMATS)}"
-            raise ValueError(f"{folder}: contains no picture file; {there}")
-        return listing
 
     def target(self, file: Path) -> Path:
         return file
@@ -228,16 +327,40 @@ class PictureFiles(Files[DenoisedPicture]):
 
     def denoise(self, source: Path, out: Path, preview: Path | None = None, isolate: bool = True) -> DenoisedPicture:
         start = time.perf_counter()
-        stored = isolated(read_stored, source)
-        height, width = stored.srgb.shape[-2:]
+        picture: StoredPicture = isolated(read_stored, source)
+        srgb = picture.srgb
+        height, width = srgb.shape[-2:]
         if min(height, width) < 2:
             raise ValueError(f"{source}: is {width} x {height} pixels; at least 2 x 2 needed")
 
-        denoised = self.denoiser(Noisy(stored.srgb[None]))[0]
-        removed = 255.0 * (denoised - stored.srgb).square().mean().sqrt().item()
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_stored(out, denoised, stored)
-        return DenoisedPicture(source, out, removed, time.perf_counter() - start)
+        denoised = self.denoiser(Noisy(srgb[None]))[0]
+        deviation = 255.0 * (denoised - srgb).square().mean().sqrt().item()
 
-    def informed_by(self, results: Sequence[DenoisedPicture]) -> None:
-        return None
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_stored(out, denoised, picture)
+        return DenoisedPicture(source, out, deviation, time.perf_counter() - start)
+
+
+KINDS: dict[str, type[Files[Any]]] = {"raw": RawFiles, "picture": PictureFiles}
+"""The kinds by what the content of a file is."""
+
+
+def kind_of(source: str | Path) -> type[Files[Any]]:
+    """The kind of a file by its content; of a folder, pictures if it has some and no RAW file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is a file of no kind.
+    """
+    path = Path(source)
+    if path.is_dir():
+        extensions = {file.suffix.lower() for file in files_below(path)}
+        has_pictures = not extensions.isdisjoint(ALL_PICTURE_EXTENSIONS)
+        if has_pictures and extensions.isdisjoint(RAW_EXTENSIONS):
+            return PictureFiles
+        return RawFiles
+
+    content = content_of(path)
+    if content.kind not in KINDS:
+        raise ValueError(f"{path}: is neither camera RAW nor a picture of a known format; check that it is complete")
+    return KINDS[content.kind]

@@ -11,10 +11,11 @@ from typing import Any, Literal, NamedTuple
 from torch import Tensor, nn
 
 import denoisers
+from denoisers.network import PACKED
 from denoisers.pbrid import PBRID
 from rawaug.bayer import CFA
 from rawaug.denoising.foreign import AGAIN, BiasFreeDnCNN, load_published
-from rawaug.files import read_tensors
+from rawaug.files import parse_object, read_tensors
 
 Image = Literal["raw", "srgb"]
 """The kind of image that a denoiser takes: packed RAW, or developed pictures."""
@@ -60,6 +61,7 @@ class NetworkFile(NamedTuple):
     """A network that was read of a file.
 
     Attributes:
+        path: the file.
         name: in tables: of the file, or of the arm whose weights it has.
         network: in eval mode, on the CPU.
         info: what the file says of its training.
@@ -67,6 +69,7 @@ class NetworkFile(NamedTuple):
         cfa: the pattern that it was trained for; None if it works on any of Bayer's.
     """
 
+    path: Path
     name: str
     network: nn.Module
     info: Mapping[str, Any]
@@ -83,13 +86,22 @@ def read_network(path: Path) -> NetworkFile:
     metadata, tensors = read_tensors(path, AGAIN)
     if metadata.get("format") == "rawaug":
         network, info = denoisers.load(path)
-        arm = path.resolve().parent.name  # rawaug run writes ARM/denoiser.safetensors
-        name = arm if path.stem == "denoiser" else path.stem
-        image: Image = "srgb" if network.channels == 3 else "raw"
-        return NetworkFile(name, network, info, image, CFA(info.get("cfa", "RGGB")))
+        name = path.stem
+        if name == "denoiser":  # rawaug run writes ARM/denoiser.safetensors
+            name = path.resolve().parent.name
+        return NetworkFile(path, name, network, info, _image_of(network.channels), CFA(info.get("cfa", "RGGB")))
 
     for one in PUBLISHED:
         if one.tensor in tensors:
-            return NetworkFile(one.name, one.build(path, tensors).eval(), {}, one.image, one.cfa)
+            return NetworkFile(path, one.name, one.build(path, tensors).eval(), {}, one.image, one.cfa)
 
     raise ValueError(f"{path}: weights of no known denoiser; give a network or a function from Python")
+
+
+def image_of_header(header: Mapping[str, str]) -> Image:
+    """The kind of image that the network of a file of rawaug takes, by the file's metadata."""
+    return _image_of(parse_object(header["config"]).get("channels", PACKED))
+
+
+def _image_of(channels: int) -> Image:
+    return "srgb" if channels == 3 else "raw"

@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from denoisers.network import PACKED
+from rawaug import bayer
 from rawaug.data.pairs import centre
 from rawaug.errors import escape, extra
 from rawaug.evaluation.scores import NOISY, Denoiser, as_compared, to_domain
@@ -126,7 +126,7 @@ def save_picture(rows: Sequence[Panels], path: Path) -> Path:
     first = 0
     for row, height in zip(rows, heights, strict=True):
         for axis, (title, image) in zip(axes[first:].flat, row.images.items(), strict=False):
-            side = PANEL // 2 if image.shape[1] == PACKED else PANEL
+            side = PANEL // bayer.sites_per_value(image)
             panel = row.show(centre(image, side, side, step=1))
             axis.imshow(panel.permute(1, 2, 0).numpy(), interpolation="nearest")
             caption = f"{escape(title)}\n{escape(row.captions.get(title, ''))}"

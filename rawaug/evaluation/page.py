@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import torch.nn.functional as F
 
-from denoisers.network import PACKED
+from rawaug import bayer
 from rawaug.evaluation.figures import WINDOW, Panels, find_detail
 from rawaug.evaluation.table_files import write_tables
 from rawaug.evaluation.tables import (
@@ -150,7 +150,7 @@ class Page:
             crop: the side in pixels of the middle to which larger frames were cut; None if none was.
         """
         clean = row.trial.clean
-        side = WINDOW if clean.shape[1] == PACKED else 2 * WINDOW
+        side = 2 * WINDOW // bayer.sites_per_value(clean)
         top, left = find_detail(clean, side)
         window = (..., slice(top, top + side), slice(left, left + side))
 

@@ -98,7 +98,7 @@ def evaluate_pictures(asked: Evaluation) -> dict[str, Any]:
         raise ValueError(f"{asked.data}: has developed pictures; --noise, --bin and --report are for RAW")
 
     plain = PictureDenoiser.of(asked.denoiser, asked.device)
-    filters = [PictureDenoiser.of(str(spec)) for spec in asked.classical]
+    filters = [PictureDenoiser.of(spec) for spec in asked.classical]
     denoisers = [plain, *filters]
     main = plain
     if asked.views > 1:

@@ -47,7 +47,7 @@ class Denoiser(Protocol):
     def takes(self) -> str:
         """The kind of image that it takes."""
 
-    def __call__(self, given: Noisy) -> Tensor: ...
+    def __call__(self, noisy: Noisy, /) -> Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class NoisyInput:
     name: str = "noisy input"
     takes: str = ""
 
-    def __call__(self, given: Noisy) -> Tensor:
-        return given.image
+    def __call__(self, noisy: Noisy) -> Tensor:
+        return noisy.image
 
 
 NOISY = NoisyInput()
@@ -175,7 +175,7 @@ def compare(image: Tensor, trial: Trial) -> tuple[float, float, float | None, fl
 def as_compared(image: Tensor, trial: Trial) -> Tensor:
     """An image of the trial's domain as its scores see it: RAW as the mosaic, sRGB cut to [0, 1]."""
     if trial.domain == "raw":
-        return image if image.shape[1] == 1 else bayer.unpack(image, trial.cfa)
+        return bayer.unpack_if_packed(image, trial.cfa)
 
     return image.clamp(0.0, 1.0) if trial.domain == "srgb" else image
 

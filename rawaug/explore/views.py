@@ -20,11 +20,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from denoisers.files import DEFAULT
-from denoisers.network import PACKED
+from rawaug import bayer
 from rawaug.bayer import CFA, pattern
-from rawaug.denoising.denoiser import Noisy, RawDenoiser
-from rawaug.denoising.pictures import PICTURES, PictureDenoiser
+from rawaug.denoising.base import ImageDenoiser, Noisy
+from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.explore import figures
 from rawaug.explore.figures import Example
 from rawaug.io import encode_srgb, read_picture
@@ -343,15 +343,15 @@ def denoise(look: Look) -> list[Panel]:
     """Noisy on the left, denoised by the shipped network on the right, both developed."""
     example = make_example(look)
     if example.augment.pattern is not None:
-        raise ValueError(f"{DEFAULT} denoises Bayer RAW, not {example.augment.cfa}; choose a Bayer CFA")
+        raise ValueError(f"{RawDenoiser.default} denoises Bayer RAW, not {example.augment.cfa}; choose a Bayer CFA")
 
     pair = example.pair
     noisy, clean, variance = _crop(pair.noisy)[None], _crop(pair.clean)[None], _crop(pair.variance)[None]
-    denoised = _network()(Noisy(noisy, variance, cfa=CFA(example.augment.cfa))).clamp(max=1.0)
+    denoised = _shipped(RawDenoiser)(Noisy(noisy, variance, cfa=CFA(example.augment.cfa))).clamp(max=1.0)
     before, after = psnr(noisy, clean).item(), psnr(denoised, clean).item()
     return [
         Panel(f"noisy, {before:.1f} dB", _develop(example, noisy[0])),
-        Panel(f"denoised by {DEFAULT}, {after:.1f} dB", _develop(example, denoised[0])),
+        Panel(f"denoised by {RawDenoiser.default}, {after:.1f} dB", _develop(example, denoised[0])),
     ]
 
 
@@ -363,11 +363,11 @@ def srgb(look: Look) -> list[Panel]:
     assert example.augment.srgb is not None
     method = example.augment.srgb.methods[int(example.pair.params.extras["demosaicing"])]
 
-    denoised = _picture_network()(Noisy(noisy[None]))[0]
+    denoised = _shipped(PictureDenoiser)(Noisy(noisy[None]))[0]
     after = psnr(denoised[None], clean[None]).item()
     return [
         Panel(f"noisy: {_levels(example)}, demosaicing {method}; {quality:.1f} dB", _to_uint8(noisy)),
-        Panel(f"denoised by {PICTURES} without a level; {after:.1f} dB", _to_uint8(denoised)),
+        Panel(f"denoised by {PictureDenoiser.default} without a level; {after:.1f} dB", _to_uint8(denoised)),
         Panel("clean: developed and finished alike", _to_uint8(clean)),
     ]
 
@@ -403,14 +403,10 @@ def with_tab(tab: str, look: Look) -> Look:
     return replace(look, config=replace(look.config, **FORMS.get(tab, {})))
 
 
-@lru_cache(maxsize=1)
-def _network() -> RawDenoiser:
-    return RawDenoiser.of(DEFAULT)
-
-
-@lru_cache(maxsize=1)
-def _picture_network() -> PictureDenoiser:
-    return PictureDenoiser.of(PICTURES)
+@lru_cache(maxsize=2)
+def _shipped(kind: type[ImageDenoiser]) -> ImageDenoiser:
+    """The shipped denoiser of a kind of image."""
+    return kind.of(kind.default)
 
 
 def _half(example: Example) -> Tensor:
@@ -456,7 +452,7 @@ def _as_batch(setting: ISPParams) -> ISPParams:
 
 def _centre(image: Tensor, size: tuple[int, int] = (HEIGHT, WIDTH)) -> tuple[int, int, int, int]:
     """Top, left, height and width of the central part of at most this size, in pixels of the mosaic."""
-    scale = _sites_per_value(image)
+    scale = bayer.sites_per_value(image)
     full_height, full_width = scale * image.shape[-2], scale * image.shape[-1]
     height, width = min(full_height, size[0]), min(full_width, size[1])
 
@@ -468,18 +464,11 @@ def _centre(image: Tensor, size: tuple[int, int] = (HEIGHT, WIDTH)) -> tuple[int
 
 def _crop(image: Tensor, size: tuple[int, int] = (HEIGHT, WIDTH)) -> Tensor:
     """Take the central part of an image."""
-    scale = _sites_per_value(image)
+    scale = bayer.sites_per_value(image)
     top, left, height, width = _centre(image, size)
     rows = slice(top // scale, (top + height) // scale)
     columns = slice(left // scale, (left + width) // scale)
     return image[..., rows, columns]
-
-
-def _sites_per_value(image: Tensor) -> int:
-    """How many sites of the mosaic a value stands for along each side: 2 in packed RAW."""
-    if image.shape[-3] == PACKED:
-        return 2
-    return 1
 
 
 def _to_uint8(image: Tensor) -> np.ndarray:

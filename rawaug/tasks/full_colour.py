@@ -91,8 +91,7 @@ def in_pattern(squares: Tensor, cfa: str) -> Tensor:
     if cfa == CFA.RGGB:
         return squares
 
-    mosaic = bayer.unpack(squares, CFA.RGGB)
-    return bayer.pack(mosaic, cfa) if cfa in CFA.__members__ else mosaic
+    return bayer.pack_if_bayer(bayer.unpack(squares, CFA.RGGB), cfa)
 
 
 def develop(image: Tensor, pair: Pair, exposure: float) -> Tensor:

@@ -184,7 +184,7 @@ class SrgbTask(Task):
 
     def denoiser(self, name: str, network: nn.Module, pattern: CFA, views: int = 1) -> PictureDenoiser:
         """The network in tiles; one that reads a level estimates it."""
-        return PictureDenoiser.of_network(name, network, self.recipe.device)
+        return PictureDenoiser.of(network, self.recipe.device, name=name, views=1, checked=False)
 
     def open_methods(self, classical: Sequence[Spec], untouched: Sequence[Path]) -> list[Any]:
         """The rivals, denoisers of RAW; filters are made for each level, see :meth:`methods_for`."""
@@ -295,7 +295,7 @@ def best_filter(spec: Spec, trials: Sequence[Trial]) -> PictureDenoiser:
     """The filter of the deviation with the highest mean PSNR on these trials."""
     best, best_psnr = None, float("-inf")
     for deviation in DEVIATIONS:
-        denoiser = replace(PictureDenoiser.of_filter(spec, deviation), name=spec_label(spec))
+        denoiser = PictureDenoiser.of(spec, name=spec_label(spec), level=deviation)
         psnr = fmean(row.psnr for row in score([denoiser], trials))
         if best is None or psnr > best_psnr:
             best, best_psnr = denoiser, psnr

@@ -205,7 +205,7 @@ def test_a_strength_below_1_leaves_that_much_of_the_noise(
 def test_in_bfloat16_a_network_of_dense_convolutions_does_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     frame, results = gradient(), []
     for fast in (False, True):
-        monkeypatch.setattr("rawaug.denoising.denoiser.has_fast_bfloat16", lambda device, fast=fast: fast)
+        monkeypatch.setattr("rawaug.denoising.base.has_fast_bfloat16", lambda device, fast=fast: fast)
         results.append(RawDenoiser.of("rawaug-base", "cpu", "auto").frame(frame, (1e-3, 1e-5)))
     assert results[1].dtype == torch.float32 and not torch.equal(*results)
     assert (results[0] - results[1]).std() < 0.03 * (results[0] - frame.mosaic).std()

@@ -98,9 +98,9 @@ def test_the_filter_is_as_strong_as_the_noise_of_its_shots(trials: list[Trial]) 
     weak, strong, spec = trials[::2], trials[1::2], "NonLocalMeans"
     chosen = [row.psnr for row in score([best_filter(spec, strong)], strong)]
     for deviation in (0.01, 0.16):
-        assert sum(row.psnr for row in score([PictureDenoiser.of_filter(spec, deviation)], strong)) < sum(chosen)
+        assert sum(row.psnr for row in score([PictureDenoiser.of(spec, level=deviation)], strong)) < sum(chosen)
     gentle = best_filter(spec, weak)
-    assert torch.equal(gentle(weak[0].input), PictureDenoiser.of_filter(spec, 0.01)(weak[0].input))
+    assert torch.equal(gentle(weak[0].input), PictureDenoiser.of(spec, level=0.01)(weak[0].input))
 
 
 @pytest.mark.usefixtures("tiny")
