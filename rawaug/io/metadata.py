@@ -14,7 +14,7 @@ import re
 import struct
 import warnings
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
@@ -51,6 +51,7 @@ from rawaug.io.headers import (
 )
 
 ICC_TAG, IPTC_TAG, PHOTOSHOP_TAG = 34675, 33723, 34377
+_STRIP_OFFSETS, _STRIP_BYTES = 273, 279
 _ICC_PREFIX = b"ICC_PROFILE\0"
 _MPF_PREFIX = b"MPF\0"
 _JFXX_PREFIX = b"JFXX\0"
@@ -118,32 +119,45 @@ def _exif_of_tiff(path: Path) -> bytes:
     with path.open("rb") as file:
         tiff = TiffFile(file)
         first = tiff.directory(tiff.first)
-        entries = [entry for code, entry in first.entries.items() if code not in _NOT_IN_EXIF]
-        return _pack_block(tiff, tiff.tags(_without_layout(entries)), first)
+        entries = _without(_NOT_IN_EXIF, _without_layout(first.entries.values()))
+        return _pack_block(tiff, tiff.tags(entries), first)
 
 
 def _without_layout(entries: Iterable[Entry]) -> list[Entry]:
-    return [entry for entry in entries if entry.code not in _LAYOUT and entry.code not in POINTERS]
+    """Tags that neither describe how pixels are stored nor point at other directories."""
+    return _without(POINTERS, _without(_LAYOUT, entries))
+
+
+def _without(codes: Container[int], entries: Iterable[Entry]) -> list[Entry]:
+    return [entry for entry in entries if entry.code not in codes]
 
 
 def _pack_block(tiff: TiffFile, tags: list[Tag], first: Directory) -> bytes:
     """A block of ``tags`` and of the directories that ``first`` points at."""
-    head = (b"II*\0" if tiff.order == "<" else b"MM\0*") + struct.pack(tiff.order + "I", 8)
-    pointed = [code for code in (EXIF, GPS) if code in first.entries]
-    size = len(pack_directory(tiff.order, tags + [pointer_tag(tiff.order, code, 0) for code in pointed], 8))
+    codes = [code for code in (EXIF, GPS) if code in first.entries]
+    placeholders = [pointer_tag(tiff.order, code, 0) for code in codes]
+    size = len(pack_directory(tiff.order, tags + placeholders, 8))
 
-    behind, pointers = b"", []
-    for code in pointed:
+    behind = b""
+    pointers = []
+    for code in codes:
         place = 8 + size + len(behind)
         pointers.append(pointer_tag(tiff.order, code, place))
         behind += _pack_pointed(tiff, tiff.number(first, code), place)
-    return head + pack_directory(tiff.order, tags + pointers, 8) + behind
+
+    return _tiff_head(tiff.order) + pack_directory(tiff.order, tags + pointers, 8) + behind
+
+
+def _tiff_head(order: str) -> bytes:
+    """The first eight bytes of a TIFF whose first directory follows."""
+    signature = b"II*\0" if order == "<" else b"MM\0*"
+    return signature + struct.pack(order + "I", 8)
 
 
 def _pack_pointed(tiff: TiffFile, source: int, place: int) -> bytes:
     """The directory at ``source`` of a file for ``place`` of a block, with that of interoperability behind it."""
     directory = tiff.directory(source)
-    tags = tiff.tags(entry for code, entry in directory.entries.items() if code not in POINTERS)
+    tags = tiff.tags(_without(POINTERS, directory.entries.values()))
     if INTEROPERABILITY not in directory.entries:
         return pack_directory(tiff.order, tags, place)
 
@@ -165,7 +179,8 @@ def mend_exif(exif: bytes, thumbnail: Thumbnail | None, upright: bool) -> bytes:
         first = tiff.directory(tiff.first)
         entry = first.entries.get(ORIENTATION)
         if upright and entry is not None and entry.dtype == 3:
-            block[entry.place : entry.place + 2] = struct.pack(tiff.order + "H", 1)
+            struct.pack_into(tiff.order + "H", block, entry.place, 1)
+
         if thumbnail is not None and first.following:
             _mend_thumbnail(block, tiff, tiff.directory(first.following), thumbnail)
     except (DamagedTags, struct.error):
@@ -180,6 +195,7 @@ def _mend_thumbnail(block: bytearray, tiff: TiffFile, second: Directory, render:
     start, size = tiff.number(second, THUMBNAIL), tiff.number(second, THUMBNAIL_BYTES)
     if not size or start + size > len(block):
         return
+
     try:
         with Image.open(BytesIO(block[start : start + size]), formats=("JPEG",)) as old:
             width, height = old.size
@@ -188,16 +204,27 @@ def _mend_thumbnail(block: bytearray, tiff: TiffFile, second: Directory, render:
     if width * height > _LARGEST_THUMBNAIL:
         return
 
-    picture = Image.fromarray(render(height, width))
+    jpeg = _small_jpeg(render(height, width), size)
+    if jpeg is None:
+        return
+
+    block[start : start + size] = jpeg.ljust(size, b"\0")
+    entry = second.entries[THUMBNAIL_BYTES]
+    letter = "H" if entry.dtype == 3 else "I"
+    struct.pack_into(tiff.order + letter, block, entry.place, len(jpeg))
+
+
+def _small_jpeg(pixels: np.ndarray, size: int) -> bytes | None:
+    """A JPEG of the best quality that takes at most ``size`` bytes; None if none does."""
+    from PIL import Image
+
+    picture = Image.fromarray(pixels)
     for quality in (95, 90, 85, 80, 70, 60, 50, 40, 30, 20, 10):
-        new = BytesIO()
-        picture.save(new, "JPEG", quality=quality)
-        if new.tell() <= size:
-            block[start : start + size] = new.getvalue().ljust(size, b"\0")
-            entry = second.entries[THUMBNAIL_BYTES]
-            letter = "H" if entry.dtype == 3 else "I"
-            struct.pack_into(tiff.order + letter, block, entry.place, new.tell())
-            return
+        file = BytesIO()
+        picture.save(file, "JPEG", quality=quality)
+        if file.tell() <= size:
+            return file.getvalue()
+    return None
 
 
 # -- JPEG --------------------------------------------------------------------------------------------------------------
@@ -207,14 +234,16 @@ def dress_jpeg(plain: bytes, metadata: Metadata, thumbnail: Thumbnail | None, up
     """A JPEG as an encoder writes it, with the metadata of the source in place of the encoder's."""
     coding = _without_application_segments(plain)
     if metadata.format != "JPEG":
-        return b"\xff\xd8" + b"".join(_new_segments(metadata, thumbnail, upright)) + coding
+        return b"\xff\xd8" + _new_segments(metadata, thumbnail, upright) + coding
 
     with metadata.source.open("rb") as file:
         segments = [segment for segment in jpeg_segments(file) if _is_kept(segment)]
         file.seek(0)
         source = file.read()
-    packed = [_pack_segment(_mended(segment, thumbnail, upright)) for segment in segments]
-    head = b"\xff\xd8" + b"".join(packed)
+
+    head = b"\xff\xd8"
+    for segment in segments:
+        head += _pack_segment(_mended(segment, thumbnail, upright))
 
     end = _end_of_picture(source)
     trailer = source[end:]
@@ -245,23 +274,37 @@ def _pack_segment(segment: Segment) -> bytes:
     return struct.pack(">BBH", 0xFF, segment.marker, len(segment.data) + 2) + segment.data
 
 
-def _new_segments(metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -> list[bytes]:
+def _new_segments(metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -> bytes:
     """EXIF, XMP and the profile of another kind of file; a warning of what is too long for a segment."""
-    parts = []
+    packed = b""
     if metadata.exif is not None:
-        parts.append((_APP1, EXIF_PREFIX + mend_exif(metadata.exif, thumbnail, upright)))
+        exif = EXIF_PREFIX + mend_exif(metadata.exif, thumbnail, upright)
+        packed += _pack_if_short("EXIF", exif, metadata.source)
     if metadata.xmp is not None:
-        parts.append((_APP1, XMP_PREFIX + metadata.xmp))
-    for _, data in parts:
-        if len(data) > _MOST_IN_SEGMENT:
-            what = "EXIF" if data.startswith(EXIF_PREFIX) else "XMP"
-            warnings.warn(f"{metadata.source}: its {what} of {len(data)} bytes is left out of a JPEG", stacklevel=2)
+        packed += _pack_if_short("XMP", XMP_PREFIX + metadata.xmp, metadata.source)
     if metadata.profile is not None:
-        step = _MOST_IN_SEGMENT - len(_ICC_PREFIX) - 2
-        pieces = [metadata.profile[start : start + step] for start in range(0, len(metadata.profile), step)]
-        for number, piece in enumerate(pieces, 1):
-            parts.append((_APP2, _ICC_PREFIX + bytes((number, len(pieces))) + piece))
-    return [_pack_segment(Segment(*part)) for part in parts if len(part[1]) <= _MOST_IN_SEGMENT]
+        packed += _profile_segments(metadata.profile)
+    return packed
+
+
+def _pack_if_short(what: str, data: bytes, source: Path) -> bytes:
+    """A segment of metadata; nothing, and a warning, if it does not fit into one."""
+    if len(data) > _MOST_IN_SEGMENT:
+        warnings.warn(f"{source}: its {what} of {len(data)} bytes is left out of a JPEG", stacklevel=2)
+        return b""
+    return _pack_segment(Segment(_APP1, data))
+
+
+def _profile_segments(profile: bytes) -> bytes:
+    """An ICC profile in as many segments as it needs, each with its number and their count."""
+    step = _MOST_IN_SEGMENT - len(_ICC_PREFIX) - 2
+    starts = range(0, len(profile), step)
+
+    packed = b""
+    for number, start in enumerate(starts, 1):
+        head = _ICC_PREFIX + bytes((number, len(starts)))
+        packed += _pack_segment(Segment(_APP2, head + profile[start : start + step]))
+    return packed
 
 
 def _without_application_segments(plain: bytes) -> bytes:
@@ -288,18 +331,19 @@ def _end_of_picture(source: bytes) -> int:
             break
         (length,) = struct.unpack_from(">H", source, match.end())
         place = match.end() + length
+
     return len(source)
 
 
 def _with_places(new: bytes, segments: list[Segment], source: bytes, end: int) -> bytes:
     """The new first picture, whose list of pictures (MPF), if it has one, says where the others now stand."""
-    listing = next((segment for segment in segments if _is_listing(segment)), None)
+    listing = _listing_of(segments)
     if listing is None:
         return new
-    old_place = source.index(listing.data) + len(_MPF_PREFIX)
-    new_place = new.index(listing.data) + len(_MPF_PREFIX)
 
-    block = bytearray(listing.data[len(_MPF_PREFIX) :])
+    old_place = source.index(listing) + len(_MPF_PREFIX)
+    new_place = new.index(listing) + len(_MPF_PREFIX)
+    block = bytearray(listing[len(_MPF_PREFIX) :])
     try:
         tiff = TiffFile(BytesIO(block))
         entry = tiff.directory(tiff.first).entries.get(_MP_ENTRIES)
@@ -315,11 +359,16 @@ def _with_places(new: bytes, segments: list[Segment], source: bytes, end: int) -
         elif old_place + offset >= end:
             moved = old_place + offset - end + len(new) - new_place
             struct.pack_into(tiff.order + "II", block, at + 4, size, moved)
+
     return new[:new_place] + bytes(block) + new[new_place + len(block) :]
 
 
-def _is_listing(segment: Segment) -> bool:
-    return segment.marker == _APP2 and segment.data.startswith(_MPF_PREFIX)
+def _listing_of(segments: Iterable[Segment]) -> bytes | None:
+    """The list of pictures of a JPEG of several."""
+    for segment in segments:
+        if segment.marker == _APP2 and segment.data.startswith(_MPF_PREFIX):
+            return segment.data
+    return None
 
 
 # -- PNG ---------------------------------------------------------------------------------------------------------------
@@ -336,6 +385,7 @@ def dress_png(plain: bytes, metadata: Metadata, thumbnail: Thumbnail | None, upr
             header.append(pack_chunk(chunk.name, chunk_data(file, chunk)))
         elif chunk.name == b"IDAT":
             pixels.append(pack_chunk(chunk.name, chunk_data(file, chunk)))
+
     return b"".join((PNG_SIGNATURE, *header, *before, *pixels, *behind, pack_chunk(b"IEND", b"")))
 
 
@@ -346,17 +396,11 @@ def pack_chunk(name: bytes, data: bytes) -> bytes:
 
 def _png_parts(metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -> tuple[list[bytes], list[bytes]]:
     """The chunks of metadata before and behind the pixels."""
+    if metadata.format != "PNG":
+        return _new_chunks(metadata, thumbnail, upright), []
+
     before: list[bytes] = []
     behind: list[bytes] = []
-    if metadata.format != "PNG":
-        if metadata.profile is not None:
-            before.append(pack_chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(metadata.profile)))
-        if metadata.exif is not None:
-            before.append(pack_chunk(b"eXIf", mend_exif(metadata.exif, thumbnail, upright)))
-        if metadata.xmp is not None:
-            before.append(pack_chunk(b"iTXt", XMP_KEYWORD + b"\0\0\0\0\0" + metadata.xmp))
-        return before, behind
-
     side = before
     with metadata.source.open("rb") as file:
         for chunk in png_chunks(file):
@@ -369,6 +413,18 @@ def _png_parts(metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -
                 data = mend_exif(data, thumbnail, upright)
             side.append(pack_chunk(chunk.name, data))
     return before, behind
+
+
+def _new_chunks(metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -> list[bytes]:
+    """The profile, EXIF and XMP of another kind of file."""
+    chunks = []
+    if metadata.profile is not None:
+        chunks.append(pack_chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(metadata.profile)))
+    if metadata.exif is not None:
+        chunks.append(pack_chunk(b"eXIf", mend_exif(metadata.exif, thumbnail, upright)))
+    if metadata.xmp is not None:
+        chunks.append(pack_chunk(b"iTXt", XMP_KEYWORD + b"\0\0\0\0\0" + metadata.xmp))
+    return chunks
 
 
 def _is_copied(name: bytes) -> bool:
@@ -387,34 +443,38 @@ def dress_tiff(plain: bytes, metadata: Metadata, upright: bool) -> bytes:
     The block of EXIF comes first, at the offsets that it has: makers' notes may hold such. Its thumbnail is not
     linked, since readers would take it for a second page.
     """
-    written = TiffFile(BytesIO(plain))
-    layout = [written.tag(entry) for entry in written.directory(written.first).entries.values()]
-    order = written.order
-
+    tiff = TiffFile(BytesIO(plain))
+    order = tiff.order
     block = _block_of(metadata, order, upright)
-    tags = _tags_of_block(block) + _tags_of_parts(metadata, order)
 
     start = len(block) + len(block) % 2
     place = start
-    strips, places = [], []
-    for strip in _strips(written):
+    strips: list[bytes] = []
+    places: list[int] = []
+    for strip in _strips(tiff):
+        even = strip + bytes(len(strip) % 2)
         places.append(place)
-        strips.append(strip + bytes(len(strip) % 2))
-        place += len(strips[-1])
+        strips.append(even)
+        place += len(even)
 
-    own = [tag for tag in layout if tag.code in _LAYOUT and tag.code != 273]
-    own.append(Tag(273, 4, len(places), struct.pack(f"{order}{len(places)}I", *places)))
-    codes = {tag.code for tag in own}
-    tags = own + [tag for tag in tags if tag.code not in codes]
+    tags: dict[int, Tag] = {}
+    for tag in (*_tags_of_parts(metadata, order), *_tags_of_block(block)):
+        tags.setdefault(tag.code, tag)
+    for entry in tiff.directory(tiff.first).entries.values():
+        if entry.code in _LAYOUT:
+            tags[entry.code] = tiff.tag(entry)
+    tags[_STRIP_OFFSETS] = Tag(_STRIP_OFFSETS, 4, len(places), struct.pack(f"{order}{len(places)}I", *places))
 
-    directory = pack_directory(order, {tag.code: tag for tag in tags}.values(), place)
+    directory = pack_directory(order, tags.values(), place)
     head = block[:4] + struct.pack(order + "I", place)
     return b"".join((head, block[8:].ljust(start - 8, b"\0"), *strips, directory))
 
 
 def byte_order(metadata: Metadata) -> str:
     """The byte order of the metadata, ``<`` or ``>``, which a TIFF that holds them must have."""
-    return ">" if metadata.exif is not None and metadata.exif.startswith(b"MM") else "<"
+    if metadata.exif is not None and metadata.exif.startswith(b"MM"):
+        return ">"
+    return "<"
 
 
 def _tags_of_block(block: bytes) -> list[Tag]:
@@ -433,18 +493,19 @@ def _block_of(metadata: Metadata, order: str, upright: bool) -> bytes:
             return mend_exif(metadata.exif, None, upright)
         except DamagedTags as error:
             warnings.warn(f"{metadata.source}: its EXIF is damaged ({error}) and left out", stacklevel=2)
-    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8)
-    return head + pack_directory(order, [], 8)
+
+    return _tiff_head(order) + pack_directory(order, [], 8)
 
 
 def _tags_of_parts(metadata: Metadata, order: str) -> list[Tag]:
     """XMP, the profile, and of a TIFF its IPTC and Photoshop's resources."""
-    tags = []
     if metadata.format == "TIFF":
         with metadata.source.open("rb") as file:
             tiff = TiffFile(file)
             entries = tiff.directory(tiff.first).entries
-            return tiff.tags(entries[code] for code in _NOT_IN_EXIF if code in entries)
+            return tiff.tags([entries[code] for code in _NOT_IN_EXIF if code in entries])
+
+    tags = []
     if metadata.xmp is not None:
         tags.append(Tag(XMP_TAG, 1, len(metadata.xmp), metadata.xmp))
     if metadata.profile is not None:
@@ -454,5 +515,6 @@ def _tags_of_parts(metadata: Metadata, order: str) -> list[Tag]:
 
 def _strips(tiff: TiffFile) -> list[bytes]:
     first = tiff.directory(tiff.first)
-    places, sizes = tiff.numbers(first.entries.get(273)), tiff.numbers(first.entries.get(279))
+    places = tiff.numbers(first.entries.get(_STRIP_OFFSETS))
+    sizes = tiff.numbers(first.entries.get(_STRIP_BYTES))
     return [tiff.read(place, size) for place, size in zip(places, sizes, strict=True)]

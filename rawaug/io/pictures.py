@@ -52,7 +52,9 @@ def decode_srgb(display: Tensor) -> Tensor:
 
 def view_of_orientation(orientation: int) -> int:
     """The view of :func:`rawaug.bayer.turn` that shows a picture of this EXIF orientation upright; 0 if unknown."""
-    return _VIEW_OF_EXIF_ORIENTATION[orientation - 1] if 1 <= orientation <= 8 else 0
+    if not 1 <= orientation <= 8:
+        return 0
+    return _VIEW_OF_EXIF_ORIENTATION[orientation - 1]
 
 
 def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
@@ -78,8 +80,11 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
     pixels = _as_srgb(_over_black(picture), picture, path)
     # NumPy puts the planes apart several times faster than PyTorch
     planes = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
+
     view = view_of_orientation(picture.orientation)
-    return turn(planes, view).contiguous() if view else planes
+    if view:
+        planes = turn(planes, view).contiguous()
+    return planes
 
 
 def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
@@ -87,11 +92,14 @@ def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
     picture = decode(Path(path), max_pixels)
     numbers = picture.colours
     if numbers.shape[-1] != 1 or picture.alpha is not None or numbers.dtype not in (np.uint8, np.uint16):
-        names = "R, G, B" if numbers.shape[-1] == 3 else "Y"
-        names += "" if picture.alpha is None else ", A"
-        raise ValueError(
-            f"{path}: has {numbers.dtype} channels {names}; a mosaic must have one channel of 8 or 16 bits"
-        )
+        names = ["Y"]
+        if numbers.shape[-1] == 3:
+            names = ["R", "G", "B"]
+        if picture.alpha is not None:
+            names.append("A")
+        channels = f"{numbers.dtype} channels {', '.join(names)}"
+        raise ValueError(f"{path}: has {channels}; a mosaic must have one channel of 8 or 16 bits")
+
     return numbers[..., 0]
 
 
@@ -109,7 +117,10 @@ def _over_black(picture: Decoded) -> np.ndarray:
 
 def _as_srgb(colours: np.ndarray, picture: Decoded, path: Path) -> np.ndarray:
     """Colours of a picture as sRGB, uint8 ``(H, W, 3)``."""
-    pixels = colours if colours.shape[-1] == 3 else np.repeat(colours, 3, axis=-1)
+    pixels = colours
+    if pixels.shape[-1] == 1:
+        pixels = np.repeat(pixels, 3, axis=-1)
+
     if pixels.dtype.kind == "f":
         pixels = require_unit_range(pixels, path)
     if picture.linear:
@@ -142,20 +153,22 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
     oiio = load_oiio()
     if srgb.ndim != 3 or srgb.shape[0] != 3:
         raise ValueError(f"{path}: the picture must have shape (3, H, W), got {tuple(srgb.shape)}")
+
     pixels = srgb.detach().cpu().permute(1, 2, 0).numpy()
     if pixels.dtype != np.uint8:
         pixels = np.rint(require_unit_range(pixels, path) * 255).astype(np.uint8)
+
     output = oiio.ImageOutput.create(str(path))
     if output is None:
         raise ValueError(f"{path}: unsupported extension; use .png, .tif or .jpg ({oiio.geterror()})")
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
-    written = output.open(str(path), spec) and output.write_image(np.ascontiguousarray(pixels))
-    require_written(output, written, path)
+    success = output.open(str(path), spec) and output.write_image(np.ascontiguousarray(pixels))
+    require_written(output, success, path)
 
 
-def require_written(output: Any, written: bool, path: str | Path) -> None:
-    """Close OpenImageIO's ``output``; OSError if it, or what was ``written`` to it, failed."""
-    if not (output.close() and written):
+def require_written(output: Any, success: bool, path: str | Path) -> None:
+    """Close OpenImageIO's ``output``; OSError if that fails, or writing to it was no ``success``."""
+    if not (output.close() and success):
         raise OSError(f"{path}: cannot be written (OpenImageIO: {reason(output) or 'no reason given'})")
 
 
@@ -164,8 +177,9 @@ def encode_png(srgb: Tensor) -> bytes:
     with extra("raw"):
         from PIL import Image
 
+    codes = (srgb * 255.0).round().to(torch.uint8)
     file = BytesIO()
-    Image.fromarray((srgb * 255.0).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()).save(file, "PNG")
+    Image.fromarray(codes.permute(1, 2, 0).contiguous().numpy()).save(file, "PNG")
     return file.getvalue()
 
 
@@ -182,11 +196,12 @@ def read_exposure(path: str | Path) -> float:
         ValueError: if the EXIF lacks one of the three.
     """
     require_file(path, "picture file")
-    stated = _exposure_of(Path(path))
-    missing = [name for name, value in stated.items() if not 0 < value < math.inf]
+    exposure = _exposure_of(Path(path))
+    missing = [name for name, value in exposure.items() if not 0 < value < math.inf]
     if missing:
         raise ValueError(f"{path}: its EXIF has no {' or '.join(missing)}; give the exposures with --ev")
-    seconds, f_number, speed = stated.values()
+
+    seconds, f_number, speed = exposure.values()
     return math.log2(seconds * speed / (100.0 * f_number**2))
 
 
@@ -200,12 +215,16 @@ def _exposure_of(path: Path) -> dict[str, float]:
     try:
         tiff = TiffFile(BytesIO(exif))
         place = tiff.number(tiff.directory(tiff.first), EXIF)
-        entries = tiff.directory(place).entries if place else {}
+        if not place:
+            return values
+
+        entries = tiff.directory(place).entries
         values["exposure time"] = tiff.rational(entries.get(_EXPOSURE_TIME))
         values["f-number"] = tiff.rational(entries.get(_F_NUMBER))
-        iso = tiff.numbers(entries.get(_ISO)) or (0,)
-        index = tiff.numbers(entries.get(_EXPOSURE_INDEX)) or (0,)
-        values["ISO"] = float(index[0] if iso[0] in (0, 65535) else iso[0])
+        iso, *_ = tiff.numbers(entries.get(_ISO)) or (0,)
+        if iso in (0, 65535):  # too high for 16 bits
+            iso, *_ = tiff.numbers(entries.get(_EXPOSURE_INDEX)) or (0,)
+        values["ISO"] = float(iso)
     except DamagedTags:
         pass
     return values
@@ -216,7 +235,9 @@ def recode_jpeg(srgb: Tensor, quality: int, chroma: str = "4:2:2") -> Tensor:
     with extra("raw"):
         from PIL import Image
 
-    stored = BytesIO()
+    file = BytesIO()
     picture = Image.fromarray(srgb.permute(1, 2, 0).contiguous().numpy())
-    picture.save(stored, "JPEG", quality=quality, subsampling=chroma)
-    return torch.from_numpy(np.array(Image.open(stored))).permute(2, 0, 1).contiguous()
+    picture.save(file, "JPEG", quality=quality, subsampling=chroma)
+
+    pixels = torch.from_numpy(np.array(Image.open(file)))
+    return pixels.permute(2, 0, 1).contiguous()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -60,10 +60,16 @@ class StoredPicture(NamedTuple):
     @property
     def srgb(self) -> Tensor:
         """float32 ``(3, H, W)`` in [0, 1]; grey has three equal channels."""
-        planes = torch.from_numpy(np.ascontiguousarray(self.colours.transpose(2, 0, 1)).astype(np.float32))
+        pixels = np.ascontiguousarray(self.colours.transpose(2, 0, 1))
+        planes = torch.from_numpy(pixels.astype(np.float32))
         if self.colours.dtype.kind == "u":
             planes *= 1.0 / np.iinfo(self.colours.dtype).max
         return planes.expand(3, -1, -1).contiguous()
+
+    @property
+    def is_grey(self) -> bool:
+        """Whether the file has one channel."""
+        return self.colours.shape[-1] == 1
 
 
 def read_stored(path: str | Path, max_pixels: int = MAX_PIXELS) -> StoredPicture:
@@ -91,6 +97,7 @@ def read_stored(path: str | Path, max_pixels: int = MAX_PIXELS) -> StoredPicture
     exif = picture.headers.exif
     if picture.format == "TIFF":
         exif = read_exif(path, "TIFF")
+
     metadata = Metadata(path, picture.format, exif, picture.headers.xmp, picture.profile)
     return StoredPicture(np.ascontiguousarray(colours), alpha, metadata)
 
@@ -107,8 +114,11 @@ def write_stored(path: str | Path, srgb: Tensor, like: StoredPicture) -> None:
     if extension not in PICTURE_FORMATS:
         raise ValueError(f"{path}: cannot be written; use one of {', '.join(PICTURE_FORMATS)}")
 
-    planes = srgb if like.colours.shape[-1] == 3 else srgb.mean(0, keepdim=True)
-    planes = planes.detach().cpu().clamp(0.0, 1.0)
+    planes = srgb.detach().cpu()
+    if like.is_grey:
+        planes = planes.mean(0, keepdim=True)
+    planes = planes.clamp(0.0, 1.0)
+
     upright = like.metadata.format in _TURNED_BY_DECODER
     if extension in (".jpg", ".jpeg"):
         data = _jpeg(planes, like, upright)
@@ -118,6 +128,7 @@ def write_stored(path: str | Path, srgb: Tensor, like: StoredPicture) -> None:
         data = _webp(path, planes, like, upright)
     else:
         data = _tiff(planes, like, upright)
+
     with replacing(path) as partial:
         partial.write_bytes(data)
 
@@ -125,27 +136,44 @@ def write_stored(path: str | Path, srgb: Tensor, like: StoredPicture) -> None:
 def _numbers(planes: Tensor, dtype: np.dtype) -> np.ndarray:
     """Planes in [0, 1] as ``(H, W, C)`` of a type."""
     pixels = planes.permute(1, 2, 0).numpy()
+    if dtype.kind != "f":
+        pixels = np.rint(pixels * np.iinfo(dtype).max)
+    return np.ascontiguousarray(pixels.astype(dtype))
+
+
+def _white(dtype: np.dtype) -> float:
+    """The number that stands for white."""
     if dtype.kind == "f":
-        return np.ascontiguousarray(pixels.astype(dtype))
-    return np.ascontiguousarray(np.rint(pixels * np.iinfo(dtype).max).astype(dtype))
+        return 1.0
+    return float(np.iinfo(dtype).max)
 
 
 def _with_alpha(pixels: np.ndarray, alpha: np.ndarray | None) -> np.ndarray:
     """Colours with alpha behind them, in the type of the colours."""
     if alpha is None:
         return pixels
+
     if alpha.dtype != pixels.dtype:
-        least, most = np.iinfo(pixels.dtype).max, 1.0 if alpha.dtype.kind == "f" else np.iinfo(alpha.dtype).max
-        alpha = np.rint(alpha.astype(np.float64) * (least / most)).astype(pixels.dtype)
+        scale = _white(pixels.dtype) / _white(alpha.dtype)
+        alpha = np.rint(alpha.astype(np.float64) * scale).astype(pixels.dtype)
     return np.ascontiguousarray(np.concatenate([pixels, alpha], axis=-1))
 
 
 def _divided(colours: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Colours that were multiplied by alpha, without it; black where alpha is 0."""
-    most = 1.0 if colours.dtype.kind == "f" else float(np.iinfo(colours.dtype).max)
-    quotient = colours * (most / np.maximum(alpha.astype(np.float64), most * 1e-6))
-    quotient = np.clip(quotient, 0.0, most)
-    return quotient.astype(colours.dtype) if colours.dtype.kind == "f" else np.rint(quotient).astype(colours.dtype)
+    white = _white(colours.dtype)
+    quotient = colours * (white / np.maximum(alpha.astype(np.float64), white * 1e-6))
+    quotient = np.clip(quotient, 0.0, white)
+    if colours.dtype.kind != "f":
+        quotient = np.rint(quotient)
+    return quotient.astype(colours.dtype)
+
+
+def _without_last_axis(pixels: np.ndarray) -> np.ndarray:
+    """Pixels ``(H, W, C)`` as encoders take them: ``(H, W)`` of one channel."""
+    if pixels.shape[-1] == 1:
+        return pixels[..., 0]
+    return pixels
 
 
 def _renderer(planes: Tensor) -> Thumbnail:
@@ -162,11 +190,9 @@ def _jpeg(planes: Tensor, like: StoredPicture, upright: bool) -> bytes:
     with extra("raw"):
         from PIL import Image
 
-    pixels = _numbers(planes, np.dtype(np.uint8))
+    pixels = _without_last_axis(_numbers(planes, np.dtype(np.uint8)))
     file = BytesIO()
-    Image.fromarray(pixels if pixels.shape[-1] == 3 else pixels[..., 0]).save(
-        file, "JPEG", quality=QUALITY, subsampling="4:4:4"
-    )
+    Image.fromarray(pixels).save(file, "JPEG", quality=QUALITY, subsampling="4:4:4")
     return dress_jpeg(file.getvalue(), like.metadata, _renderer(planes), upright)
 
 
@@ -174,11 +200,12 @@ def _png(planes: Tensor, like: StoredPicture, upright: bool) -> bytes:
     with extra("raw"):
         import imagecodecs
 
-    dtype = np.dtype(np.uint8) if like.colours.dtype == np.uint8 else np.dtype(np.uint16)
-    pixels = _with_alpha(_numbers(planes, dtype), like.alpha)
-    if pixels.shape[-1] == 1:
-        pixels = pixels[..., 0]
-    return dress_png(bytes(imagecodecs.png_encode(pixels)), like.metadata, _renderer(planes), upright)
+    dtype = like.colours.dtype
+    if dtype != np.uint8:
+        dtype = np.dtype(np.uint16)
+    pixels = _without_last_axis(_with_alpha(_numbers(planes, dtype), like.alpha))
+    plain = bytes(imagecodecs.png_encode(pixels))
+    return dress_png(plain, like.metadata, _renderer(planes), upright)
 
 
 def _webp(path: Path, planes: Tensor, like: StoredPicture, upright: bool) -> bytes:
@@ -190,12 +217,16 @@ def _webp(path: Path, planes: Tensor, like: StoredPicture, upright: bool) -> byt
         raise ValueError(f"{path}: WebP holds at most {_LARGEST_WEBP} pixels a side; use .png or .jpg")
 
     pixels = _with_alpha(_numbers(planes.expand(3, -1, -1), np.dtype(np.uint8)), like.alpha)
-    known = {"icc_profile": like.metadata.profile, "xmp": like.metadata.xmp}
-    if like.metadata.exif is not None:
-        known["exif"] = mend_exif(like.metadata.exif, _renderer(planes), upright)
+    settings: dict[str, Any] = {"quality": QUALITY, "lossless": _is_lossless(like.metadata), "exact": True}
+    if like.metadata.profile:
+        settings["icc_profile"] = like.metadata.profile
+    if like.metadata.xmp:
+        settings["xmp"] = like.metadata.xmp
+    if like.metadata.exif:
+        settings["exif"] = mend_exif(like.metadata.exif, _renderer(planes), upright)
+
     file = BytesIO()
-    settings = {"quality": QUALITY, "lossless": _is_lossless(like.metadata), "exact": True}
-    Image.fromarray(pixels).save(file, "WEBP", **settings, **{key: value for key, value in known.items() if value})
+    Image.fromarray(pixels).save(file, "WEBP", **settings)
     return file.getvalue()
 
 
@@ -205,27 +236,31 @@ def _is_lossless(metadata: Metadata) -> bool:
         return False
     if metadata.format != "WebP":
         return True
+
     with metadata.source.open("rb") as file:
-        return any(chunk.name == b"VP8L" for chunk in webp_chunks(file))
+        names = [chunk.name for chunk in webp_chunks(file)]
+    return b"VP8L" in names
 
 
 def _tiff(planes: Tensor, like: StoredPicture, upright: bool) -> bytes:
     with extra("raw"):
         import tifffile
 
-    order = byte_order(like.metadata)
     pixels = _with_alpha(_numbers(planes, like.colours.dtype), like.alpha)
-    photometric = "rgb" if planes.shape[0] == 3 else "minisblack"
+    layout: dict[str, Any] = {"photometric": "minisblack" if like.is_grey else "rgb"}
+    if pixels.shape[-1] > 1:
+        layout["planarconfig"] = "contig"
+    if like.alpha is not None:
+        layout["extrasamples"] = ["unassalpha"]
+
     file = BytesIO()
     tifffile.imwrite(
         file,
-        pixels if pixels.shape[-1] > 1 else pixels[..., 0],
-        photometric=photometric,
-        planarconfig="contig" if pixels.shape[-1] > 1 else None,
-        extrasamples=["unassalpha"] if like.alpha is not None else None,
+        _without_last_axis(pixels),
         compression=_compression(like.metadata),
-        byteorder=order,
+        byteorder=byte_order(like.metadata),
         metadata=None,
+        **layout,
     )
     return dress_tiff(file.getvalue(), like.metadata, upright)
 
@@ -234,9 +269,11 @@ def _compression(metadata: Metadata) -> str | None:
     """That of the source where it is a TIFF; none of other pictures."""
     if metadata.format != "TIFF":
         return None
+
     with metadata.source.open("rb") as file:
         tiff = TiffFile(file)
-        return _TIFF_COMPRESSIONS.get(tiff.number(tiff.directory(tiff.first), 259, 1), "deflate")
+        number = tiff.number(tiff.directory(tiff.first), 259, 1)
+    return _TIFF_COMPRESSIONS.get(number, "deflate")
 
 
 def _require_one_page(path: Path) -> None:
