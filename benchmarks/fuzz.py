@@ -39,9 +39,10 @@ from benchmarks.measure import parser
 from rawaug import DictionaryISP
 from rawaug.commands.info import describe
 from rawaug.commands.run import with_values
-from rawaug.data.formats import read_mosaic, read_value
+from rawaug.data.formats import read_mosaic
+from rawaug.data.mat import read_value
 from rawaug.data.published import read_packed
-from rawaug.data.sidd import colour_of, mosaic_of
+from rawaug.data.sidd_scenes import colour_of, mosaic_of
 from rawaug.evaluation.tables import print_rows
 from rawaug.experiment.recipe import kind_of, read_recipe, settings_of
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from rawaug.commands import YAML
 from rawaug.data.dnd import Dnd, write_dnd_submission
-from rawaug.data.sidd import BLOCKS, SiddBenchmark, write_submission
+from rawaug.data.sidd_benchmark import SiddBenchmark, write_submission
+from rawaug.data.sidd_blocks import BLOCKS
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.denoising.sources import Options
 from rawaug.files import require_writable

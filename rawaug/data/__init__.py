@@ -14,7 +14,7 @@ from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder
 from rawaug.data.pairs import DATASETS, PICTURES, Binned, Pair
-from rawaug.data.sidd import SiddBenchmark, write_submission
+from rawaug.data.sidd_benchmark import SiddBenchmark, write_submission
 
 __all__ = [
     "DATASETS", "PICTURES", "Binned", "DemoCamera", "Dnd", "Pair", "PairFolder", "PictureFolder", "RawFolder", "Shapes",

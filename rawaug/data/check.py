@@ -25,7 +25,10 @@ from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import DATASETS, PICTURES, Lazy, Pair
 from rawaug.data.published import RAWIR_FOLDERS, Rawir, Zurich
-from rawaug.data.sidd import SiddBenchmark, SiddBlocks, SiddFrames, SiddPlusBlocks, is_scene
+from rawaug.data.sidd import SiddFrames
+from rawaug.data.sidd_benchmark import SiddBenchmark
+from rawaug.data.sidd_blocks import SiddBlocks, SiddPlusBlocks
+from rawaug.data.sidd_scenes import is_scene
 from rawaug.errors import escape
 from rawaug.files import files_below, files_in
 from rawaug.io import RawFrame, read_raw

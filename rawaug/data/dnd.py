@@ -19,7 +19,7 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.data.development import gains_from_neutral, srgb_from_camera
-from rawaug.data.formats import read_array, read_value, to_raw
+from rawaug.data.mat import read_array, read_value, to_raw
 from rawaug.data.pairs import DATASETS, Lazy, Pair
 from rawaug.io import RawFrame
 

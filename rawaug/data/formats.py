@@ -19,10 +19,7 @@ tiff    the first page                                  its description, as JSON
 png     16 bits, one channel                            none                                           no
 ======  ==============================================  =============================================  ===============
 
-SciPy reads MATLAB files of version 5, and h5py those of version 7.3 (HDF5 after 512 bytes of header). A 7.3 file stores
-the axes of a matrix in reverse, since MATLAB stores column by column and HDF5 row by row: without correction a picture
-is transposed, and a GRBG mosaic looks like GBRG. All axes here are those of MATLAB. Source: MathWorks, "MAT-File
-Format".
+MATLAB files are read by :mod:`rawaug.data.mat`, metadata parsed by :mod:`rawaug.data.mosaic_metadata`.
 """
 
 from __future__ import annotations
@@ -39,272 +36,15 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
+from rawaug.data.mat import MAX_BYTES, read_array, read_value, require_size, variables
+from rawaug.data.mosaic_metadata import KINDS, Metadata, complete_metadata, format_value, levels, parse_metadata
 from rawaug.errors import extra
 from rawaug.files import replacing, require_file
 from rawaug.io import RawFrame, read_raw
-from rawaug.io.isolated import damage_as_os_error, isolated
+from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import MAX_PIXELS, read_plane
 from rawaug.io.raw import RAW_EXTENSIONS
 from rawaug.io.tiff import opened_tiff
-
-# -- MATLAB files ------------------------------------------------------------------------------------------------------
-
-_HDF5 = b"\x89HDF\r\n\x1a\n"
-_TEXT = b"MATLAB 5.0"
-_UNREADABLE = "cannot be read as a MATLAB file"
-MAX_BYTES = 2**30
-"""Maximum size of a variable in a file. Variables of the published datasets have at most 0.5 GiB."""
-
-
-def mat_version(path: str | Path) -> str:
-    """``"5"`` or ``"7.3"``, by the header."""
-    require_file(path, "MATLAB file")
-    with Path(path).open("rb") as file:
-        header = file.read(512 + len(_HDF5))
-
-    if header.startswith(_HDF5) or header[512:] == _HDF5:
-        return "7.3"
-    if header.startswith(_TEXT) and header[126:128] in (b"IM", b"MI"):
-        return "5"
-    raise ValueError(f"{path}: is not a MATLAB file of version 5 or 7.3; copy it again, or save it with -v7.3")
-
-
-def variables(path: str | Path) -> list[str]:
-    """The names of the variables in a MATLAB file."""
-    return list(isolated(_shapes, Path(path)))
-
-
-def read_array(path: str | Path, name: str) -> np.ndarray:
-    """The numeric array ``name``, axes and type as in MATLAB."""
-    value = isolated(_read, Path(path), name, False)
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
-        raise ValueError(f"{path}: {name} is not a numeric array but {type(value).__name__}")
-    return value
-
-
-def read_value(path: str | Path, name: str) -> Any:
-    """The variable ``name`` as plain values.
-
-    Structs are dicts, struct arrays lists of dicts, cells lists (row by row), characters strings, and numbers arrays
-    without axes of length 1.
-    """
-    return isolated(_read, Path(path), name, True)
-
-
-def to_raw(values: np.ndarray, axes: int, file: Path) -> Tensor:
-    """Convert an array of normalised RAW with ``axes`` axes to float32, with a channel axis before the last two."""
-    if values.ndim != axes or values.dtype.kind != "f" or not values.size:
-        raise ValueError(f"{file}: holds {values.dtype} {values.shape}; normalised RAW is floats with {axes} axes")
-
-    low, high = float(values.min()), float(values.max())
-    if not (low > -1 and high <= 1):
-        raise ValueError(f"{file}: has values from {low:.4g} to {high:.4g}; normalised RAW has black at 0, white at 1")
-    return torch.from_numpy(np.ascontiguousarray(values, np.float32)).unsqueeze(-3)
-
-
-def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """The shape of each variable; empty in version 7.3, where HDF5 states the shapes with the values."""
-    version = mat_version(path)
-    shapes: dict[str, tuple[int, ...]] = {}
-    with damage_as_os_error(path, _UNREADABLE):
-        if version == "5":
-            from scipy.io import whosmat
-
-            for name, shape, _ in whosmat(path):
-                shapes[name] = shape
-        else:
-            with _hdf5(path) as file:
-                for name in file:
-                    if not name.startswith("#"):  # MATLAB's own references
-                        shapes[name] = ()
-    return shapes
-
-
-def _hdf5(path: Path) -> Any:
-    with extra("data"):
-        import h5py
-
-    return h5py.File(path, "r")
-
-
-def _read(path: Path, name: str, plain: bool) -> Any:
-    shapes = _shapes(path)
-    version = mat_version(path)
-    if name not in shapes:
-        raise ValueError(f"{path}: has no variable {name}; its variables are: {', '.join(shapes) or 'none'}")
-
-    with damage_as_os_error(path, _UNREADABLE):
-        if version == "5":
-            from scipy.io import loadmat
-
-            _require_size(8 * math.prod(shapes[name]), name)
-            return loadmat(path, variable_names=[name], simplify_cells=plain)[name]
-
-        with _hdf5(path) as file:
-            node = _member(file, name)
-            if plain:
-                return _plain(node, file)
-            return np.ascontiguousarray(_values(node).T)
-
-
-def _require_size(size: int, name: str) -> None:
-    if not 0 <= size <= MAX_BYTES:
-        raise ValueError(f"{name} declares {size} bytes, above the limit of {MAX_BYTES}")
-
-
-def _member(group: Any, name: str) -> Any:
-    """A member of a group. Links are refused, since they can point to any file on this machine."""
-    import h5py
-
-    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-        raise ValueError(f"{name} is a link, not a variable")
-    return group[name]
-
-
-def _values(node: Any) -> Any:
-    """The values of an HDF5 dataset. External storage and datasets above the size limit are refused."""
-    if node.external or node.is_virtual:
-        raise ValueError(f"{node.name} is stored in another file")
-    _require_size(node.size * node.dtype.itemsize, node.name)
-    return node[()]
-
-
-def _plain(node: Any, file: Any) -> Any:
-    """The value of an HDF5 node as :func:`read_value` returns it."""
-    import h5py
-
-    if isinstance(node, h5py.Group):
-        fields = {}
-        for key in node:
-            fields[key] = _plain(_member(node, key), file)
-        if _is_struct_array(node):
-            return _struct_array(fields)
-        return fields
-
-    value = _values(node)
-    if h5py.check_ref_dtype(node.dtype) is not None:
-        return [_plain(file[reference], file) for reference in np.ravel(value, order="F")]
-    if node.attrs.get("MATLAB_class") == b"char":
-        return "".join(map(chr, np.ravel(value)))
-    if node.attrs.get("MATLAB_empty", 0):
-        return np.zeros(0)
-    return np.array(np.asarray(value).T.squeeze(), order="C")
-
-
-def _is_struct_array(group: Any) -> bool:
-    """Whether a struct has several elements. Its fields then hold references, but, unlike cells, have no class."""
-    import h5py
-
-    for field in group.values():
-        has_references = isinstance(field, h5py.Dataset) and h5py.check_ref_dtype(field.dtype) is not None
-        if not has_references or "MATLAB_class" in field.attrs:
-            return False
-    return len(group) > 0
-
-
-def _struct_array(fields: Mapping[str, list[Any]]) -> list[dict[str, Any]]:
-    """The elements of a struct array, given the values of each field."""
-    elements = []
-    for values in zip(*fields.values(), strict=True):
-        elements.append(dict(zip(fields, values, strict=True)))
-    return elements
-
-
-# -- metadata ---------------------------------------------------------------------------------------------------------
-
-
-Metadata = dict[str, Any]
-"""The metadata of a mosaic, by the keys of :data:`KINDS`."""
-
-
-def parse_metadata(values: Mapping[str, Any], where: str | Path) -> Metadata:
-    """Parse metadata from plain values or arrays; other keys, and values of None, are ignored."""
-    metadata: Metadata = {}
-    for key, value in values.items():
-        if key not in KINDS or value is None:
-            continue
-        try:
-            metadata[key] = KINDS[key](value)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise ValueError(f"{where}: {key} is not valid: {' '.join(str(error).split())}") from error
-    return metadata
-
-
-def complete_metadata(stated: Metadata, given: Metadata, file: Path) -> Metadata:
-    """Add the metadata of the caller (``given``) to those of a file; ValueError if they contradict each other."""
-    for key, value in given.items():
-        own = stated.get(key, value)
-        if own != value:
-            raise ValueError(f"{file}: states {key} {_format(own)}, not {_format(value)} as given; leave {key} out")
-    return given | stated
-
-
-def levels(value: Any) -> tuple[float, ...]:
-    """Parse one level, or the levels of R, Gr, Gb, B; four equal levels become one."""
-    numbers = _floats(value)
-    if len(set(numbers)) == 1:
-        numbers = numbers[:1]
-    if len(numbers) not in (1, 4):
-        raise ValueError(f"{len(numbers)} levels; use one, or those of R, Gr, Gb, B")
-    return numbers
-
-
-def _floats(value: Any) -> tuple[float, ...]:
-    floats = tuple(map(float, np.ravel(value)))
-    if not floats or not np.isfinite(floats).all():
-        raise ValueError(f"{np.ravel(value).tolist()} must be finite numbers")
-    return floats
-
-
-def _one(value: Any) -> float:
-    (number,) = _floats(value)
-    return number
-
-
-def _variance(value: Any) -> float:
-    variance = _one(value)
-    if variance < 0:
-        raise ValueError(f"{variance:g} is negative")
-    return variance
-
-
-def _gains(value: Any) -> tuple[float, float, float]:
-    red, green, blue = _floats(value)
-    if min(red, green, blue) <= 0:
-        raise ValueError(f"{red:g}, {green:g}, {blue:g} must be positive")
-    return red / green, 1.0, blue / green
-
-
-def _cfa(value: Any) -> CFA:
-    names = np.ravel(value)
-    if len(names) != 1:
-        raise ValueError(f"{len(names)} names; use one of {', '.join(CFA)}")
-    return CFA(str(names[0]).strip().upper())
-
-
-def _matrix(value: Any) -> Tensor:
-    return torch.tensor(_floats(value)).reshape(3, 3)
-
-
-KINDS: dict[str, Callable[[Any], Any]] = {
-    "cfa": _cfa,
-    "black": levels,
-    "white": _one,
-    "white_balance": _gains,
-    "color_matrix": _matrix,
-    "shot_var": _variance,
-    "read_var": _variance,
-}
-"""The keys of metadata, each with the function that parses its value."""
-
-
-def _format(value: Any) -> str:
-    if isinstance(value, tuple):
-        return "/".join(f"{level:g}" for level in value)
-    return str(value)
-
-
-# -- files, by extension ----------------------------------------------------------------------------------------------
 
 Contents = tuple[np.ndarray, Mapping[str, Any]]
 """The numbers of a file, and its metadata."""
@@ -357,7 +97,7 @@ def _read_npy(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
             shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
         else:
             raise ValueError(f"version {version[0]}.{version[1]} of the format")
-        _require_size(math.prod(shape) * dtype.itemsize, "its array")
+        require_size(math.prod(shape) * dtype.itemsize, "its array")
 
         stream.seek(0)
         return np.load(stream, allow_pickle=False), {}
@@ -438,13 +178,15 @@ TWO_IN_ONE = (".npz", ".mat")
 # -- one mosaic -------------------------------------------------------------------------------------------------------
 
 
-def read_mosaic(file: Path, which: str, given: Metadata, alone: bool = False, max_pixels: int = MAX_PIXELS) -> RawFrame:
+def read_mosaic(
+    file: Path, which: str, others: Metadata, alone: bool = False, max_pixels: int = MAX_PIXELS
+) -> RawFrame:
     """Read a mosaic.
 
     Args:
         file: the file.
         which: ``noisy`` or ``clean``, the name of the array.
-        given: metadata that the file does not state.
+        others: metadata that the file does not state.
         alone: whether the file holds both mosaics of a pair, so that its only array is not enough.
         max_pixels: the limit of a PNG.
 
@@ -454,14 +196,14 @@ def read_mosaic(file: Path, which: str, given: Metadata, alone: bool = False, ma
     suffix = file.suffix.lower()
     if suffix in RAW_EXTENSIONS:
         frame = read_raw(file)
-        complete_metadata({"cfa": frame.cfa, "black": levels(frame.black), "white": frame.white}, given, file)
+        complete_metadata({"cfa": frame.cfa, "black": levels(frame.black), "white": frame.white}, others, file)
         return frame
     if suffix not in READERS:
         raise ValueError(f"{file}: cannot hold a mosaic; use {', '.join(READERS)} or a RAW format")
 
     require_file(file)
     numbers, values = READERS[suffix](file, which, alone, max_pixels)
-    metadata = complete_metadata(parse_metadata(values, file), given, file)
+    metadata = complete_metadata(parse_metadata(values, file), others, file)
     if "cfa" not in metadata:
         raise ValueError(f"{file}: does not state its CFA; give cfa, such as RGGB")
 
@@ -499,10 +241,10 @@ def _scale_to_raw(file: Path, numbers: np.ndarray, metadata: Metadata) -> Tensor
 
     black, white, cfa = metadata["black"], metadata["white"], metadata["cfa"]
     if white <= max(black):
-        raise ValueError(f"{file}: white level {white:g} is not above black level {_format(black)}")
+        raise ValueError(f"{file}: white level {white:g} is not above black level {format_value(black)}")
     low, high = float(numbers.min()), float(numbers.max())
     if not (high <= white and low > 2 * min(black) - white):
-        expected = f"black {_format(black)} and white {white:g}; give the right black and white"
+        expected = f"black {format_value(black)} and white {white:g}; give the right black and white"
         raise ValueError(f"{file}: has values from {low:.4g} to {high:.4g}, outside {expected}")
 
     packed = _packed(file, torch.from_numpy(np.ascontiguousarray(numbers, np.float32)), cfa)

@@ -18,7 +18,8 @@ from typing import NamedTuple
 from rawaug.bayer import CFA
 from rawaug.data.development import UNKNOWN_COLOUR, develop_pair
 from rawaug.data.folders import RawFolder
-from rawaug.data.formats import READABLE, TWO_IN_ONE, parse_metadata, read_mosaic
+from rawaug.data.formats import READABLE, TWO_IN_ONE, read_mosaic
+from rawaug.data.mosaic_metadata import parse_metadata
 from rawaug.data.pairs import DATASETS, LazyPairs, Pair
 from rawaug.files import files_below
 

@@ -35,7 +35,7 @@ from torch import Tensor
 from rawaug.bayer import CFA, demosaic, mosaic
 from rawaug.data.pairs import DATASETS, LazyPairs, Pair
 from rawaug.data.scenes import camera_in_light, draw_window, scene_files
-from rawaug.data.sidd import HELD_BACK, PHONES, label_of
+from rawaug.data.sidd_scenes import HELD_BACK, PHONES, label_of
 from rawaug.io import encode_srgb
 from rawaug.seeding import keyed_generator
 

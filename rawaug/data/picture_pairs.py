@@ -18,10 +18,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from rawaug.data.formats import read_array
+from rawaug.data.mat import read_array
 from rawaug.data.pair_folder import clean_pattern, pairs_by_pattern
 from rawaug.data.pairs import LazyPairs, centre
-from rawaug.data.sidd import find_file
+from rawaug.data.sidd_scenes import find_file
 from rawaug.files import files_below
 from rawaug.io.pictures import read_picture
 from rawaug.registry import Registry

@@ -10,7 +10,7 @@ from threading import Thread
 import pytest
 import torch
 
-from rawaug.data.formats import mat_version
+from rawaug.data.mat import mat_version
 from rawaug.experiment.recipe import read_recipe
 from rawaug.files import (
     MOST_BYTES,

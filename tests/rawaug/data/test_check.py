@@ -12,7 +12,7 @@ from scipy.io import savemat
 
 from rawaug.cli import main
 from rawaug.data import PictureFolder, RawFolder, check
-from rawaug.data.sidd import HELD_BACK
+from rawaug.data.sidd_scenes import HELD_BACK
 from rawaug.files import files_below
 from rawaug.io import write_picture
 

@@ -13,7 +13,7 @@ import torch
 from rawaug.bayer import CFA
 from rawaug.commands.submit import submit_dnd
 from rawaug.data import Dnd, open_pairs, write_dnd_submission
-from rawaug.data.formats import read_value
+from rawaug.data.mat import read_value
 from rawaug.denoising.denoiser import RawDenoiser
 
 Writer = Callable[[Path, dict[str, Any]], Path]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from rawaug.data.formats import MAX_BYTES, mat_version, read_array, read_value
+from rawaug.data.mat import MAX_BYTES, mat_version, read_array, read_value
 
 Writer = Callable[[Path, dict[str, Any]], Path]
 ARRAY = np.random.default_rng(0).random((3, 4, 5)).astype(np.float32)
@@ -93,7 +93,7 @@ def _crash(path: Path, name: str, plain: bool) -> None:
 
 def test_a_reader_that_crashes_is_contained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     savemat(tmp_path / "a.mat", {"x": ARRAY})
-    monkeypatch.setattr("rawaug.data.formats._read", _crash)
+    monkeypatch.setattr("rawaug.data.mat._read", _crash)
     monkeypatch.setenv("RAWAUG_READ_SECONDS", "60")
     with pytest.raises(OSError, match=r"a\.mat: .*SIGSEGV"):
         read_array(tmp_path / "a.mat", "x")

@@ -26,7 +26,7 @@ from rawaug.data.phones import (
 )
 from rawaug.data.scenes import camera_in_light, scene_files, white_point
 from rawaug.data.selection import select_pairs
-from rawaug.data.sidd import HELD_BACK, label_of
+from rawaug.data.sidd_scenes import HELD_BACK, label_of
 from rawaug.io.pictures import write_picture
 
 PLAIN = Shot(kelvin=5500, stops=0.5, iso=100, balance_error=0.0, tint_error=(0.0, 0.0), lift_error=0.0)

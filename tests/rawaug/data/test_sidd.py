@@ -26,8 +26,10 @@ from rawaug.data import (
     sidd,
     write_submission,
 )
-from rawaug.data.formats import read_array
-from rawaug.data.sidd import HELD_BACK, PHONES, SiddBlocks, SiddFrames, SiddPlusBlocks, phone_of
+from rawaug.data.mat import read_array
+from rawaug.data.sidd import SiddFrames
+from rawaug.data.sidd_blocks import SiddBlocks, SiddPlusBlocks
+from rawaug.data.sidd_scenes import HELD_BACK, PHONES, phone_of
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.io import RawFrame, write_picture
