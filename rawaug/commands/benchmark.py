@@ -48,5 +48,5 @@ def run(
         if path is not None:
             require_writable(path, option)
 
-    asked = Comparison(denoisers, data, bin, count, crop, noise, iso, seed, device, json, report)
-    task_of(data).benchmark(asked)
+    comparison = Comparison(denoisers, data, bin, count, crop, noise, iso, seed, device, json, report)
+    task_of(data).benchmark(comparison)

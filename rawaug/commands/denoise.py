@@ -84,5 +84,5 @@ def print_denoised(result: DenoisedFolder[Any]) -> None:
         print(done)
     if result.existing or result.broken:
         print(f"Denoised {len(result.files)} files; {result.existing} already existed, {len(result.broken)} failed.")
-    for line in (*result.broken.values(), *result.left_out):
+    for line in (*result.broken.values(), *result.left_out, *result.remarks):
         print(escape(line))

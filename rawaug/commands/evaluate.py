@@ -70,7 +70,7 @@ def run(
             require_writable(path, option)
     require_classical(classical or ())
 
-    asked = Evaluation(
+    evaluation = Evaluation(
         denoiser=weights,
         data=data,
         views=views or (8 if self_ensemble else 1),
@@ -84,11 +84,11 @@ def run(
         settings=settings or PairSettings(),
     )
     if is_isp(weights):
-        result = evaluate_isp(asked, as_shot, tone)
+        result = evaluate_isp(evaluation, as_shot, tone)
     elif as_shot or tone is not None:
         raise ValueError(f"{weights}: is a denoiser; --as-shot and --tone are for ISPs")
     else:
-        result = task_of(data).evaluate(asked)
+        result = task_of(data).evaluate(evaluation)
     require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
     return result
 
@@ -106,30 +106,36 @@ def is_isp(weights: str) -> bool:
     return read_metadata(file).get("kind") == "isp"
 
 
-def evaluate_isp(asked: Evaluation, as_shot: bool = False, tone: str | None = None) -> dict[str, Any]:
+def evaluate_isp(evaluation: Evaluation, as_shot: bool = False, tone: str | None = None) -> dict[str, Any]:
     """PSNR_r of an ISP on the frames of a test set, printed and written; the result, as in the JSON.
 
     ``as_shot`` gives the ISP the gains of each frame, and ``tone`` the tone curve of all.
     """
-    for_denoisers = asked.views > 1 or asked.noise is not None or asked.bin != 1 or asked.classical or asked.report
+    for_denoisers = (
+        evaluation.views > 1
+        or evaluation.noise is not None
+        or evaluation.bin != 1
+        or evaluation.classical
+        or evaluation.report
+    )
     if for_denoisers:
         options = "--self-ensemble, --views, --noise, --bin, --classical and --report"
-        raise ValueError(f"{asked.denoiser}: is an ISP; {options} are for denoisers")
+        raise ValueError(f"{evaluation.denoiser}: is an ISP; {options} are for denoisers")
 
-    file = find_weights(asked.denoiser)
+    file = find_weights(evaluation.denoiser)
     isp = DictionaryISP.from_pretrained(file)
-    pairs = Readable(open_pairs(asked.data, split="test", **vars(asked.settings)))
+    pairs = Readable(open_pairs(evaluation.data, split="test", **vars(evaluation.settings)))
 
     rows = []
     for pair in progress(pairs, label="evaluate", unit="image"):
         psnr = require_finite(pair.name, psnr_r(isp, pair, as_shot, tone=tone))
         rows.append(Row("ISP", pair.name, "", "", "raw", psnr))
 
-    result = {**asked.facts("isp", file), **summary(rows)}
+    result = {**evaluation.facts("isp", file), **summary(rows)}
     if as_shot or tone is not None:
         result |= {"as_shot": as_shot, "tone": tone}
     if pairs.broken:
         result["broken"] = pairs.reasons()
     print_scores(result)
-    asked.write(result)
+    evaluation.write(result)
     return result

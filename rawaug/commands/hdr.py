@@ -24,6 +24,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.registry import require_between
 
 MOST_STOPS = 30.0
+"""Largest exposure that can be given, in stops."""
 
 
 def run(
@@ -51,6 +52,7 @@ def run(
     require_writable(target)
     if target.exists() and not overwrite:
         raise FileExistsError(f"{out}: exists; choose another name, or add --overwrite")
+
     srgb = hdr(pictures, ev, exposure, isp)
     target.parent.mkdir(parents=True, exist_ok=True)
     write_picture(target, srgb)
@@ -67,9 +69,11 @@ def hdr(
     if not pictures:
         raise ValueError("hdr: no picture is given")
     _require_one_kind(pictures)
+
     stops = exposures(pictures, ev)
     for value in (*stops, exposure):
         require_between("an exposure", value, -MOST_STOPS, MOST_STOPS)
+
     camera = DictionaryISP.from_pretrained(isp)
     merged = merge_exposures(camera, [srgb[None] for srgb in _read(pictures)], stops)
     return render_exposure(camera, merged.image, merged.params, exposure)[0]
@@ -83,9 +87,10 @@ def exposures(pictures: Sequence[str | Path], ev: Sequence[float] | None) -> lis
         return list(ev)
     if len(pictures) == 1:
         return [0.0]
-    stated = [isolated(read_shot_exposure, path) for path in pictures]
-    median = sorted(stated)[(len(stated) - 1) // 2]
-    return [stops - median for stops in stated]
+
+    absolute = [isolated(read_shot_exposure, path) for path in pictures]
+    median = sorted(absolute)[(len(absolute) - 1) // 2]
+    return [stops - median for stops in absolute]
 
 
 def _read(paths: Sequence[str | Path]) -> list[Tensor]:

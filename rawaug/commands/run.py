@@ -143,12 +143,13 @@ def keep_arms(arms: Mapping[str, Any], names: str | Sequence[str]) -> dict[str, 
     Raises:
         ValueError: if a name is none of the recipe's arms.
     """
-    wanted = [names] if isinstance(names, str) else list(names)
-    for name in wanted:
+    if isinstance(names, str):
+        names = [names]
+    for name in names:
         if name not in arms:
             raise ValueError(f"arms: {name} is not an arm; use one of {', '.join(arms)}{suggest(name, arms)}")
 
-    return {name: arm for name, arm in arms.items() if name in wanted}
+    return {name: arm for name, arm in arms.items() if name in names}
 
 
 def drop_old_settings(content: dict[str, Any], key: str, name: Any) -> None:
@@ -203,7 +204,7 @@ def with_values(settings: type[Any], content: Mapping[str, Any], source: object)
         values.pop("experiment", None)
 
     try:
-        _require_known(settings, values, [key.name for key in keys_of(settings)])
+        _require_keys(settings, values, [key.name for key in keys_of(settings)])
         return TypeAdapter(settings).validate_python(values)
     except ValidationError as error:
         raise ValueError(f"{source}: {_reason(error.errors()[0], values)}") from None
@@ -281,7 +282,7 @@ def _part(hint: Any) -> tuple[type[Any] | None, bool]:
     return None, False
 
 
-def _require_known(settings: Any, content: Any, known: Iterable[str], above: str = "") -> None:
+def _require_keys(settings: Any, content: Any, names: Iterable[str], above: str = "") -> None:
     """Raise ValueError, with the nearest name, if a key is none of a dataclass or of those in it."""
     if not isinstance(content, Mapping):
         return  # pydantic says what it should be
@@ -289,16 +290,16 @@ def _require_known(settings: Any, content: Any, known: Iterable[str], above: str
     hints = get_type_hints(settings)
     for key, value in content.items():
         if key not in hints:
-            raise ValueError(f"{above}{key}: no such key{suggest(f'{above}{key}', known)}")
+            raise ValueError(f"{above}{key}: no such key{suggest(f'{above}{key}', names)}")
 
         part, by_name = _part(hints[key])
         if part is None:
             continue
         if not by_name:
-            _require_known(part, value, known, f"{above}{key}.")
+            _require_keys(part, value, names, f"{above}{key}.")
         elif isinstance(value, Mapping):
             for name, one in value.items():
-                _require_known(part, one, known, f"{above}{key}.{name}.")
+                _require_keys(part, one, names, f"{above}{key}.{name}.")
 
 
 def _reason(error: Any, content: Any) -> str:
@@ -315,4 +316,6 @@ def _reason(error: Any, content: Any) -> str:
         return f"{name}: {error['msg'][0].lower()}{error['msg'][1:]}, got {content!r:.80}"
 
     text = str(error["ctx"]["error"])
-    return text if not keys or text.startswith(keys[0]) else f"{name}: {text}"
+    if not keys or text.startswith(keys[0]):
+        return text
+    return f"{name}: {text}"

@@ -29,12 +29,14 @@ class DenoisedFolder(Generic[T]):
         existing: how many results were there already.
         broken: the reason for each file that failed, by its path.
         left_out: a line for each kind of file that was not denoised.
+        remarks: other lines, such as on formats that are not written.
     """
 
     files: list[T] = field(default_factory=list)
     existing: int = 0
     broken: dict[str, str] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
 
 
 def denoise_file(
@@ -112,7 +114,7 @@ def denoise_folder(
     if kind.settings is not None:
         require_same_settings(out / SETTINGS, kind.settings, overwrite)
 
-    result: DenoisedFolder[T] = DenoisedFolder(left_out=listing.lines())
+    result: DenoisedFolder[T] = DenoisedFolder(left_out=listing.lines(), remarks=kind.remarks(listing.files))
     unknown = []
     for file in progress(listing.files, label="denoise", unit="file", leave=True):
         target = targets[file]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,12 +26,23 @@ from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.errors import escape
 from rawaug.files import files_below
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
-from rawaug.io.content import ALL_PICTURE_EXTENSIONS, RAW_EXTENSIONS, Listing, content_of, list_files
+from rawaug.io.content import (
+    ALL_PICTURE_EXTENSIONS,
+    RAW_EXTENSIONS,
+    Listing,
+    content_of,
+    list_files,
+    picture_extensions,
+)
 from rawaug.io.isolated import isolated
 from rawaug.io.raw import develop
 from rawaug.io.stored import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
 from rawaug.registry import Spec
 
+_LINEAR = (".exr",)
+"""Extensions of pictures of linear light."""
+_SUBSTITUTE = ".png"
+"""The format of the results of pictures whose own format is read but not written; it loses nothing."""
 PREVIEWS = (".jpg", ".jpeg", ".png")
 """Extensions of the previews of RAW files."""
 
@@ -144,9 +156,6 @@ class Files(ABC, Generic[T]):
     format_advice: ClassVar[str]
     """What is said of other extensions."""
 
-    sources: ClassVar[tuple[str, ...]]
-    """Extensions of the files of a folder that are of this kind."""
-
     others: ClassVar[str]
     """What is said of files of a folder that are of no kind."""
 
@@ -160,18 +169,27 @@ class Files(ABC, Generic[T]):
         """What the results depend on, as JSON; None if a folder's results may be of several settings."""
         return None
 
+    @abstractmethod
+    def extensions(self) -> tuple[str, ...]:
+        """Extensions of the files of a folder that are of this kind."""
+
     def listing(self, folder: Path) -> Listing:
         """The files of a folder that are of this kind; ValueError if there is none."""
-        listing = list_files(folder, self.sources, self.others)
+        extensions = self.extensions()
+        listing = list_files(folder, extensions, self.others)
         self._advise(listing)
         if not listing.files:
-            contents = "; ".join(listing.lines()) or f"supported extensions are {', '.join(self.sources)}"
+            contents = "; ".join(listing.lines()) or f"supported extensions are {', '.join(extensions)}"
             raise ValueError(f"{folder}: contains no {self.what} file; {contents}")
         return listing
 
     @abstractmethod
     def _advise(self, listing: Listing) -> None:
         """Say what to do with files that are left out, where this kind knows better."""
+
+    def remarks(self, files: Sequence[Path]) -> list[str]:
+        """Lines on the results of a folder's files."""
+        return []
 
     @abstractmethod
     def target(self, file: Path) -> Path:
@@ -209,7 +227,6 @@ class RawFiles(Files[Denoised]):
     what = "RAW"
     formats = (".dng",)
     format_advice = DNG_ADVICE
-    sources = RAW_EXTENSIONS
     others = "neither RAW nor a picture that is known"
 
     def __init__(self, denoiser: Any = None, *, levels: Shots | None = None, **options: Any) -> None:
@@ -232,6 +249,9 @@ class RawFiles(Files[Denoised]):
     @property
     def settings(self) -> dict[str, Any]:
         return self.denoiser.settings
+
+    def extensions(self) -> tuple[str, ...]:
+        return RAW_EXTENSIONS
 
     def _advise(self, listing: Listing) -> None:
         if "RAW file" in listing.left_out:
@@ -298,7 +318,6 @@ class PictureFiles(Files[DenoisedPicture]):
     what = "picture"
     formats = PICTURE_FORMATS
     format_advice = f"the source is a developed picture; its output is one of {', '.join(PICTURE_FORMATS)}"
-    sources = PICTURE_FORMATS
     others = "not a picture that is known"
 
     def __init__(self, denoiser: PictureDenoiser) -> None:
@@ -314,13 +333,27 @@ class PictureFiles(Files[DenoisedPicture]):
         spec = PictureDenoiser.default if options.spec is None else options.spec
         return cls(PictureDenoiser.of(spec, options.device, "auto", **options.changes))
 
+    def extensions(self) -> tuple[str, ...]:
+        return tuple(extension for extension in picture_extensions() if extension not in _LINEAR)
+
     def _advise(self, listing: Listing) -> None:
-        for what in ("picture", "HEIC picture", "AVIF picture"):
-            if what in listing.left_out:
-                listing.left_out[what].advice = f"not written; denoise each to one of {', '.join(PICTURE_FORMATS)}"
+        if "picture" in listing.left_out:
+            listing.left_out["picture"].advice = "linear light; save it as a developed picture"
 
     def target(self, file: Path) -> Path:
-        return file
+        """The name of the file; of a format that is read but not written, with ``.png`` behind it."""
+        if file.suffix.lower() in PICTURE_FORMATS:
+            return file
+        return file.with_name(file.name + _SUBSTITUTE)
+
+    def remarks(self, files: Sequence[Path]) -> list[str]:
+        counts = Counter(file.suffix.lower() for file in files if self.target(file) != file)
+        if not counts:
+            return []
+
+        listed = ", ".join(f"{extension} {count}" for extension, count in counts.most_common())
+        plural = "s have" if counts.total() > 1 else " has"
+        return [f"{counts.total()} result{plural} another format than the source, {_SUBSTITUTE}: {listed}"]
 
     def require_preview(self, preview: Path) -> None:
         raise ValueError(f"--preview {preview}: is for RAW files")
