@@ -22,7 +22,7 @@ from torch.nn import functional as F
 
 import denoisers
 from denoisers.classical import FILTERS, Stabilised
-from denoisers.files import DEFAULT, find_denoiser, list_shipped
+from denoisers.files import DEFAULT, JOINT, find_denoiser, list_shipped
 from denoisers.mosaic import BayerAdapter, MosaicDRUNet, denoise_mosaic
 from denoisers.network import DENOISERS, PACKED
 from rawaug import bayer
@@ -60,7 +60,6 @@ class RawDenoiser(ImageDenoiser):
         of_any: a network that takes mosaics of every pattern, with the planes of their colours.
         info: what its file says of its training.
         reads_levels: whether noise levels make a difference.
-        upscale: 2 if it demosaics as well: the result is linear camera RGB ``(1, 3, 2h, 2w)``.
         tiles: side and overlap of the pieces, in packed pixels, None being the default of
             :func:`denoisers.denoise_tiles`; None alone denoises a frame in one piece.
         views: 1, or 4 or 8 of a self-ensemble, at that many times the work.
@@ -79,11 +78,12 @@ class RawDenoiser(ImageDenoiser):
     takes: ClassVar[Image] = "raw"
     default: ClassVar[str] = DEFAULT
     files: ClassVar[str] = "a .safetensors or an .onnx"
+    demosaics: ClassVar[bool] = False
+    """Whether the result is linear camera RGB in place of a mosaic."""
 
     model: Callable[[Levels | None], Model] = field(repr=False)
     cfa: CFA | None = None
     of_any: MosaicDRUNet | None = None
-    upscale: int = 1
     tiles: tuple[int, int | None] | None = (1536, None)
 
     def __post_init__(self) -> None:
@@ -91,8 +91,6 @@ class RawDenoiser(ImageDenoiser):
             raise ValueError(f"views must be 1, 4 or 8, got {self.views!r}")
         if not 0.0 <= self.strength <= 1.0:
             raise ValueError(f"strength must be between 0 and 1, got {self.strength}; --noise takes higher levels")
-        if self.demosaics and self.strength != 1.0:
-            raise ValueError("--strength does not support --linear: the noisy frame has no full colour to mix in")
 
     @classmethod
     def _resolve(cls, spec: Any, name: str | None) -> RawDenoiser:
@@ -104,20 +102,18 @@ class RawDenoiser(ImageDenoiser):
             return _of_filter(spec)
         return _of_file(spec)
 
-    @property
-    def demosaics(self) -> bool:
-        """Whether the result is linear camera RGB in place of a mosaic."""
-        return self.upscale > 1
-
     def require_mosaic(self) -> RawDenoiser:
         """This denoiser; ValueError if it gives full colour, which cannot be compared with a mosaic."""
-        if self.demosaics:
-            raise ValueError(f"{self.name}: demosaics, too; rawaug run demosaic --denoiser.start {self.name} scores it")
         return self
+
+    def require_linear(self, linear: bool) -> None:
+        """Raise ValueError if full colour is wanted and this denoiser gives a mosaic, or the other way round."""
+        if linear:
+            raise ValueError(f"--linear: {self.name} denoises the mosaic and does not demosaic; use {JOINT}")
 
     @torch.inference_mode()
     def __call__(self, noisy: Noisy) -> Tensor:
-        """Packed RAW ``(1, 4, h, w)`` denoised, on the CPU; linear camera RGB ``(1, 3, 2h, 2w)`` if it demosaics.
+        """Packed RAW ``(1, 4, h, w)`` denoised, on the CPU; a :class:`JointDenoiser` gives full colour.
 
         A mosaic ``(1, 1, H, W)`` of another pattern than Bayer's remains one. ValueError if this denoiser takes none,
         the result has another shape, or is not finite where ``checked``.
@@ -139,13 +135,13 @@ class RawDenoiser(ImageDenoiser):
         if variance is not None:
             variance = _continue(variance, cfa, own)
 
-        channels, height, width = image.shape[1:]
-        if self.demosaics:
-            channels = 3
-
         run = self._whole(self.model(noisy.levels), own)
-        denoised = self._run(run, image, variance, (1, channels, self.upscale * height, self.upscale * width))
+        denoised = self._run(run, image, variance, self._result_shape(image))
         return _crop(denoised, own, cfa)
+
+    def _result_shape(self, packed: Tensor) -> tuple[int, ...]:
+        """The shape of the result for packed RAW."""
+        return tuple(packed.shape)
 
     def _of_mosaic(self, noisy: Noisy) -> Tensor:
         if self.of_any is None:
@@ -179,10 +175,9 @@ class RawDenoiser(ImageDenoiser):
         return run
 
     def frame(self, frame: RawFrame, levels: Levels | None) -> Tensor:
-        """The mosaic ``(1, H, W)`` of a camera's frame denoised, at most 1.
+        """The mosaic ``(1, H, W)`` of a camera's frame denoised, at most 1; a :class:`JointDenoiser` gives full colour.
 
-        A denoiser that demosaics gives linear camera RGB ``(3, H, W)``. ``levels`` may be None where
-        :attr:`reads_levels` is False.
+        ``levels`` may be None where :attr:`reads_levels` is False.
         """
         image = bayer.pack_if_bayer(frame.mosaic[None], frame.cfa)
         noisy = Noisy(image, cfa=frame.cfa)
@@ -191,6 +186,34 @@ class RawDenoiser(ImageDenoiser):
 
         denoised = bayer.unpack_if_packed(self(noisy), frame.cfa)
         return denoised[0].clamp(max=1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointDenoiser(RawDenoiser):
+    """A denoiser that demosaics, too: packed RAW ``(1, 4, h, w)`` to linear camera RGB ``(1, 3, 2h, 2w)``.
+
+    The attributes are those of :class:`RawDenoiser`, by whose ``of`` it is made.
+    """
+
+    demosaics: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.strength != 1.0:
+            raise ValueError("--strength does not support --linear: the noisy frame has no full colour to mix in")
+
+    def require_mosaic(self) -> RawDenoiser:
+        """ValueError: its results cannot be compared with a mosaic."""
+        raise ValueError(f"{self.name}: demosaics, too; rawaug run demosaic --denoiser.start {self.name} scores it")
+
+    def require_linear(self, linear: bool) -> None:
+        """Raise ValueError if a mosaic is wanted."""
+        if not linear:
+            raise ValueError(f"--denoiser {self.name}: demosaics too, to a linear DNG; add --linear")
+
+    def _result_shape(self, packed: Tensor) -> tuple[int, ...]:
+        height, width = packed.shape[-2:]
+        return 1, 3, 2 * height, 2 * width
 
 
 def _continue(packed: Tensor, cfa: CFA, own: CFA) -> Tensor:
@@ -269,7 +292,8 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any], cfa: CFA
         network = _Foreign(network, reads)
 
     evaluated = network.eval()
-    return RawDenoiser(
+    kind = RawDenoiser if getattr(evaluated, "upscale", 1) == 1 else JointDenoiser
+    return kind(
         name=name,
         model=lambda levels: evaluated,
         network=evaluated,
@@ -277,7 +301,6 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any], cfa: CFA
         of_any=of_any,
         info=info,
         reads_levels=bool(reads),
-        upscale=getattr(evaluated, "upscale", 1),
     )
 
 

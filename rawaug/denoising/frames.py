@@ -22,7 +22,6 @@ from typing import Any
 
 from torch import Tensor
 
-from denoisers.files import JOINT
 from rawaug.bayer import CFA
 from rawaug.denoising.base import Levels
 from rawaug.denoising.corrections import Corrected, Correction, Corrections
@@ -144,14 +143,6 @@ class FrameDenoiser:
         rest = _rest(levels or frame.noise_profile, denoiser.strength)
         frame = replace(frame, mosaic=image, noise_profile=rest)
         return DenoisedFrame(frame, None, levels, noise_source, below_zero, corrected)
-
-    def require_linear(self, linear: bool) -> None:
-        """Raise ValueError if the denoiser demosaics and full colour is not wanted, or the other way round."""
-        name = self.usual.name
-        if self.usual.demosaics and not linear:
-            raise ValueError(f"--denoiser {name}: demosaics too, to a linear DNG; add --linear")
-        if linear and not self.usual.demosaics:
-            raise ValueError(f"--linear: {name} denoises the mosaic and does not demosaic; use {JOINT}")
 
     def require_preview(self, preview: Path) -> None:
         """Raise ValueError if LibRaw cannot develop the results to previews as it does a mosaic."""

@@ -243,7 +243,7 @@ class RawFiles(Files[Denoised]):
 
         corrections = Corrections(options.greens)
         denoiser = FrameDenoiser(spec, options.noise, corrections, options.device, **options.changes)
-        denoiser.require_linear(options.linear)
+        denoiser.usual.require_linear(options.linear)
         return cls(denoiser)
 
     @property

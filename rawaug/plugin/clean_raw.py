@@ -143,7 +143,7 @@ class RawNoise(nn.Module):
             mosaic = mosaic[..., : region[0], : region[1]]
         else:
             mosaic = bayer.crop(mosaic, top, left, *region)
-        return _pack(mosaic, name).contiguous()
+        return bayer.pack_if_bayer(mosaic, name).contiguous()
 
     def _draw_place(
         self, mosaic: Tensor, name: str, size: tuple[int, int] | None, turns: bool, generator: torch.Generator
@@ -189,7 +189,7 @@ class RawNoise(nn.Module):
 
     def _sample(self, batch: Tensor, generator: torch.Generator, crop: Tensor | None) -> AugmentParams:
         if crop is None:
-            scale = 2 if batch.shape[1] == 4 else 1
+            scale = bayer.sites_per_value(batch)
             height, width = (scale * side for side in batch.shape[-2:])
             crop = torch.tensor([0, 0, height, width, 0]).repeat(len(batch), 1)
         none = torch.empty(len(batch), 0)
@@ -282,7 +282,7 @@ class RawNoise(nn.Module):
 
     def _planes(self, frame: Any) -> tuple[Tensor, str]:
         mosaic, name = self.read(frame)
-        return _pack(mosaic, name), name
+        return bayer.pack_if_bayer(mosaic, name), name
 
     def _own_generator(self) -> torch.Generator:
         """A new generator for each call, worker and process."""
@@ -293,10 +293,6 @@ class RawNoise(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_rank": rank_key() or self._rank}  # a spawned worker has no process group
-
-
-def _pack(mosaic: Tensor, name: str) -> Tensor:
-    return bayer.pack(mosaic, name) if name in CFA.__members__ else mosaic
 
 
 def _region(size: tuple[int, int], period: int) -> tuple[int, int]:

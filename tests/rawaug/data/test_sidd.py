@@ -23,7 +23,7 @@ from rawaug.data import (
     SiddBenchmark,
     check,
     open_pairs,
-    sidd,
+    sidd_blocks,
     write_submission,
 )
 from rawaug.data.mat import read_array
@@ -303,7 +303,7 @@ def test_a_file_of_blocks_found_wrong_is_not_read_for_every_block(
         reads.append(file)
         return read_array(file, name)
 
-    monkeypatch.setattr(sidd, "read_array", counted)
+    monkeypatch.setattr(sidd_blocks, "read_array", counted)
     (part,) = check(tmp_path).parts
     assert part.items == 1024 and len(reads) == 2
     assert len(part.unfit) == 1 and "64 blocks" in part.unfit[0]
@@ -330,7 +330,7 @@ def camera() -> DictionaryISP:
 @pytest.fixture
 def pictures(monkeypatch: pytest.MonkeyPatch) -> Tensor:
     """uint8 ``(2, 32, 3, SIDE, SIDE)`` of two frames: SIDD would have forty."""
-    monkeypatch.setattr(sidd, "HELD_BACK", SCENES)
+    monkeypatch.setattr(sidd_blocks, "HELD_BACK", SCENES)
     coarse = torch.rand(64, 3, 4, 4, generator=torch.Generator().manual_seed(0))
     smooth = torch.nn.functional.interpolate(coarse, (SIDE, SIDE), mode="bilinear").mul(0.7).add(0.1)
     return (255 * smooth).round().to(torch.uint8).unflatten(0, (2, 32))

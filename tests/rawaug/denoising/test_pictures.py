@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -157,3 +159,34 @@ def test_a_cmyk_picture_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"print.jpg: .*CMYK"):
         denoise(str(tmp_path / "print.jpg"), str(tmp_path / "out.jpg"))
     assert not (tmp_path / "out.jpg").exists()
+
+
+def test_a_folder_s_pictures_of_formats_that_are_not_written_become_pngs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pillow = pytest.importorskip("PIL.Image")
+    source, out = tmp_path / "in", tmp_path / "out"
+    source.mkdir()
+    write_picture(source / "a.png", noisy())
+    pixels = (noisy() * 255.0).round().byte().permute(1, 2, 0).numpy()
+    for name in ("a.bmp", "b.gif", "c.ppm"):
+        pillow.fromarray(pixels).save(source / name)
+    (source / "d.exr").write_bytes(b"\x76\x2f\x31\x01")
+
+    denoise(str(source), str(out), denoiser="NonLocalMeans@10")
+    assert sorted(file.name for file in out.iterdir()) == ["a.bmp.png", "a.png", "b.gif.png", "c.ppm.png"]
+    assert torch.equal(read_picture(out / "a.bmp.png"), read_picture(out / "a.png"))
+    assert error(read_picture(out / "b.gif.png") / 255.0) < error(read_picture(source / "b.gif") / 255.0)
+
+    *_, linear, formats = capsys.readouterr().out.splitlines()
+    assert "1 picture left out (.exr 1)" in linear
+    assert formats.startswith("3 results") and ".png" in formats and ".gif 1" in formats
+
+
+def test_filters_and_the_list_of_what_was_done_are_for_pictures_too(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.png", noisy())
+    filtering: Any = {"name": "TotalVariation", "settings": {}}
+    denoise(str(tmp_path / "a.png"), str(tmp_path / "b.png"), classical=filtering, json=str(tmp_path / "done.json"))
+    (done,) = json.loads((tmp_path / "done.json").read_text())["files"]
+    assert done["deviation"] > 1.0 and done["out"].endswith("b.png")
+    assert error(read_picture(tmp_path / "b.png") / 255.0) < error(noisy())
