@@ -33,7 +33,8 @@ from rawaug.noise.models import NOISE
 from rawaug.paper.baselines.base import BASELINES
 from rawaug.registry import Registry
 from rawaug.tasks.base import TASKS
-from rawaug.training.estimators import ESTIMATORS, LOSSES
+from rawaug.training.estimators import ESTIMATORS
+from rawaug.training.losses import LOSSES
 
 torch.set_num_threads(1)
 settings.register_profile("rawaug", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])

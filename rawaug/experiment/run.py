@@ -30,7 +30,7 @@ from rawaug.registry import Spec, split_spec
 from rawaug.tasks.base import TASKS
 from rawaug.tasks.settings import Recipe
 from rawaug.training.estimators import ESTIMATORS
-from rawaug.training.loop import require_trainable
+from rawaug.training.launch import require_trainable
 from rawaug.training.noisy_frames import drop_clean, faintness_note
 from rawaug.training.state import first_network, start_of
 

@@ -49,7 +49,7 @@ from rawaug.plugin.pictures import trim_to_even
 from rawaug.progress import progress
 from rawaug.registry import check_settings
 from rawaug.training.config import weights_key
-from rawaug.training.loop import require_trainable
+from rawaug.training.launch import require_trainable
 
 COLUMNS = {
     "psnr_r": "PSNR_r", "worst25": "worst 25%", "best25": "best 25%", "balanced": "balanced", "forward": "RAW to sRGB",

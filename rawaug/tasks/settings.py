@@ -18,7 +18,8 @@ from rawaug.plugin.targets import Srgb, Target
 from rawaug.registry import require_between, split_spec
 from rawaug.training.config import MOST, DenoiserConfig, TrainConfig, Weighing
 from rawaug.training.estimators import ESTIMATORS
-from rawaug.training.srgb_noise import Told, noise_on_srgb
+from rawaug.training.srgb_noise import noise_on_srgb
+from rawaug.training.srgb_samples import Told
 
 SHORT_CROP = 256
 """Side in pixels of the middles of frames that a dry run uses."""

@@ -8,16 +8,16 @@ from typing import Any, Literal
 from denoisers.network import DENOISERS
 from rawaug.files import fingerprint
 from rawaug.registry import require_between
-from rawaug.training.estimators import LOSSES
+from rawaug.training.losses import LOSSES
 
 MOST = 2**31
-"""The largest number of steps, samples or processes that a setting may have."""
+"""Maximum of the settings that are numbers of steps, samples or processes."""
 
 VALIDATIONS = 5
 """Number of validations of a short training, which are the points of its curves."""
 
 Weighing = Literal["linear", "normalised", "stabilised", "mixed", "relative"]
-"""How the loss weighs light and shade; :mod:`rawaug.training.estimators` has the formulas."""
+"""How the loss weighs light and shade; :mod:`rawaug.training.weighing` has the formulas."""
 
 
 @dataclass
@@ -53,7 +53,7 @@ class TrainConfig:
         halve_every: steps between halvings.
         loss: l1, l2 or rms, or {name, settings}.
         weigh: loss weighting of light and shade: linear, normalised, stabilised, mixed or relative,
-            see :mod:`rawaug.training.estimators`.
+            see :mod:`rawaug.training.weighing`.
         ema: decay of the running average of the weights, which are validated and saved; 0 disables it.
         clip_norm: gradient norm limit; 0 disables it.
         validate_every: steps between validations; the best weights are kept. A training of no more steps than that is
@@ -92,10 +92,12 @@ class TrainConfig:
             require_between(f"train.{key}", getattr(self, key), 0, MOST)
         for key in ("learning_rate", "clip_norm"):
             require_between(f"train.{key}", getattr(self, key), 0.0, float(MOST))
+
         try:
             LOSSES.make(self.loss)
         except ValueError as error:
             raise ValueError(f"train.loss: {error}") from None
+
         if self.crop < 8 or self.crop % 2:
             raise ValueError(f"train.crop must be even and at least 8, got {self.crop}")
         if not 0.0 <= self.ema < 1.0:
@@ -125,7 +127,10 @@ def weights_key(network: DenoiserConfig, config: TrainConfig, samples: Any, vali
         samples: what the training samples depend on, as JSON.
         validation: what the validation samples depend on; None if the weights of the last step are kept.
     """
-    left_out = SAME_WEIGHTS if validation is not None else SAME_WEIGHTS | {"validate_every"}
-    settings = {key: value for key, value in asdict(config).items() if key not in left_out}
+    irrelevant = SAME_WEIGHTS
+    if validation is None:
+        irrelevant = SAME_WEIGHTS | {"validate_every"}
+
+    settings = {key: value for key, value in asdict(config).items() if key not in irrelevant}
     architecture = {key: value for key, value in asdict(network).items() if value is not None}
     return fingerprint("weights", architecture, settings, samples, validation)

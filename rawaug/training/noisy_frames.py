@@ -1,4 +1,4 @@
-r"""Frames of which only a noisy RAW is known: real ones, and those made once and for all from sRGB pictures.
+r"""Frames without a clean RAW: real noisy ones, and those made once and for all from sRGB pictures.
 
 Noise that is drawn anew whenever a picture comes up is averaged out over the epochs: the network would in effect be
 shown clean RAW. So the camera setting and the noise of a picture are keyed by (seed, index) for good; only crops, turns
@@ -39,7 +39,7 @@ from rawaug.training.stream import packed_crop
 
 
 def signal_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) -> Tensor:
-    """An estimate of the signal of a noisy mosaic, ``(1, H, W)``, by non-local means.
+    """Estimate the signal of a noisy mosaic, ``(1, H, W)``, by non-local means.
 
     Without shot noise the signal does not matter, and the mosaic comes back as it is.
 
@@ -51,17 +51,19 @@ def signal_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) -
     """
     if not shot_var > 0:
         return noisy
+
     packed = bayer.pack(noisy[None], cfa)
     denoised = Stabilised(NonLocalMeans(), anscombe)(packed, shot_var=shot_var, read_var=read_var)
     return bayer.unpack(denoised, cfa)[0]
 
 
 CACHED = 64
+"""Maximum number of frames made of pictures that stay in memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class NoisyFrame:
-    """One scene, of which noisy RAW is known.
+    """Noisy RAW of one scene.
 
     Attributes:
         name: of the frame.
@@ -84,11 +86,12 @@ class NoisyFrame:
         """The scene without noise ``(1, H, W)``: for a real frame an estimate, which takes 0.5 s a megapixel."""
         if self.clean is not None:
             return self.clean
+
         return signal_estimate(self.shots[:1], self.shot_var, self.read_var, self.cfa)
 
 
 def drop_clean(pair: Pair) -> Pair:
-    """The pair without anything that was derived from a clean frame.
+    """Return the pair without anything that was derived from a clean frame.
 
     If there is a noisy capture, it takes the place of ``raw``, and the camera's picture of it that of ``srgb``; without
     such a picture the capture is developed (bilinear demosaic, the camera's white balance and matrix, the sRGB curve).
@@ -98,23 +101,28 @@ def drop_clean(pair: Pair) -> Pair:
         return pair
     if pair.noisy_srgb is not None:
         return replace(pair, raw=pair.noisy, srgb=pair.noisy_srgb)
-    srgb = develop_packed(bayer.pack(pair.noisy[None], pair.cfa), pair.cfa, pair)
-    return replace(pair, raw=pair.noisy, srgb=(srgb * 255.0).round().to(torch.uint8), registered=True)
+
+    packed = bayer.pack(pair.noisy[None], pair.cfa)
+    developed = develop_packed(packed, pair.cfa, pair)
+    srgb = (developed * 255.0).round().to(torch.uint8)
+    return replace(pair, raw=pair.noisy, srgb=srgb, registered=True)
 
 
 def noise_of(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float]:
-    """(shot_var, read_var) of a real noisy frame: its own levels, or those of its camera's law at its ISO.
+    """Look up (shot_var, read_var) of a real noisy frame: its own levels, or those of its camera's law at its ISO.
 
     Raises:
-        ValueError: if neither is known.
+        ValueError: if it has neither.
     """
     if pair.shot_var is not None and pair.read_var is not None:
         return pair.shot_var, pair.read_var
+
     if camera is None:
         raise ValueError(
             f"{pair.name}: has no noise levels, and those of noise are the pictures'; "
             "add --noise camera to measure them on the frames that the ISP is fitted to"
         )
+
     try:
         return camera_law(camera).at(pair.iso)
     except ValueError as error:
@@ -122,8 +130,9 @@ def noise_of(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float
 
 
 def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
-    """A real noisy frame with its levels; ``camera`` is a noise law as an ISP's file holds it."""
-    return NoisyFrame(pair.name, pair.raw, *noise_of(pair, camera), pair.cfa)
+    """Make a real noisy frame with its levels; ``camera`` is a noise law as an ISP's file holds it."""
+    shot_var, read_var = noise_of(pair, camera)
+    return NoisyFrame(pair.name, pair.raw, shot_var, read_var, pair.cfa)
 
 
 FAINT = 45.0
@@ -131,10 +140,17 @@ FAINT = 45.0
 
 
 def faintness_note(frames: Sequence[NoisyFrame]) -> str:
-    """A line that warns of frames with next to no noise, by their levels; empty if there is enough."""
-    variances = [bayer.noise_variance(frame.shots, frame.shot_var, frame.read_var) for frame in frames]
-    found = [-10.0 * math.log10(max(float(variance.mean()), 1e-12)) for variance in variances]
-    if not found or (typical := median(found)) < FAINT:
+    """Write a line that warns of frames with next to no noise, by their levels; empty if there is enough."""
+    if not frames:
+        return ""
+
+    decibels = []
+    for frame in frames:
+        variance = float(bayer.noise_variance(frame.shots, frame.shot_var, frame.read_var).mean())
+        decibels.append(-10.0 * math.log10(max(variance, 1e-12)))
+    typical = median(decibels)
+
+    if typical < FAINT:
         return ""
     return (
         f"note: these frames have next to no noise ({typical:.1f} dB PSNR): a denoiser can learn little from them; "
@@ -155,28 +171,42 @@ class FrozenPictures(Lazy[NoisyFrame]):
     def __init__(self, pictures: Any, augment: RawAugment, seed: int, shots: int = 1) -> None:
         if not isinstance(augment.noise, ShotReadModel):
             raise ValueError("self-supervised training needs noise with known shot_var and read_var, such as a preset")
-        self.pictures, self.augment, self.seed, self.shots = pictures, augment, seed, shots
-        self._kept: dict[int, NoisyFrame] = {}
         super().__init__([f"picture {index}" for index in range(len(pictures))])
+        self.pictures = pictures
+        self.augment = augment
+        self.seed = seed
+        self.shots = shots
+        self._cache: dict[int, NoisyFrame] = {}
 
     def read(self, index: int) -> NoisyFrame:
-        """The frame of a picture, the same at every call."""
-        frame = self._kept.get(index) or self._make(index)
-        if len(self._kept) < CACHED:
-            self._kept[index] = frame
+        """Return the frame of a picture, the same at every call."""
+        if index in self._cache:
+            return self._cache[index]
+
+        frame = self._make(index)
+        if len(self._cache) < CACHED:
+            self._cache[index] = frame
         return frame
 
     def _make(self, index: int) -> NoisyFrame:
         srgb = trim_to_even(to_rgb_tensor(self.pictures[index]))[None]
         params = self.augment.sample(srgb, keyed_generator(self.seed, "frozen", index))
+        cfa = self.augment.isp.cfa
+
         shots = []
         for shot in range(self.shots):
             seed = torch.randint(2**62, (1,), generator=keyed_generator(self.seed, "shot", index, shot))
             pair = self.augment.apply(srgb, params._replace(noise={**params.noise, "seed": seed}))
-            shots.append(bayer.unpack(pair.noisy, self.augment.isp.cfa)[0])
-        clean = bayer.unpack(pair.clean, self.augment.isp.cfa)[0]
-        shot_var, read_var = (params.noise[name].item() for name in ("shot_var", "read_var"))
-        return NoisyFrame(self.names[index], torch.cat(shots), shot_var, read_var, self.augment.isp.cfa, clean)
+            shots.append(bayer.unpack(pair.noisy, cfa)[0])
+
+        return NoisyFrame(
+            self.names[index],
+            torch.cat(shots),
+            shot_var=params.noise["shot_var"].item(),
+            read_var=params.noise["read_var"].item(),
+            cfa=cfa,
+            clean=bayer.unpack(pair.clean, cfa)[0],
+        )
 
 
 class NoisyCrops:
@@ -190,35 +220,48 @@ class NoisyCrops:
     """
 
     def __init__(self, frames: Sequence[NoisyFrame], estimator: SelfSupervised, crop: int, cfa: CFA) -> None:
-        self.frames, self.estimator, self.crop, self.cfa = frames, estimator, crop, cfa
+        self.frames = frames
+        self.estimator = estimator
+        self.crop = crop
+        self.cfa = cfa
+
         if estimator.adds_noise and not isinstance(frames, FrozenPictures):  # before processes share them
             for frame in progress(frames, label="signal of noisy frames", unit="frame"):
                 _ = frame.signal
 
     def draw(self, generator: torch.Generator) -> Any:
-        """A sample of packed RAW ``(4, crop / 2, crop / 2)``; ValueError if the frame has too few shots."""
+        """Draw a sample of packed RAW ``(4, crop / 2, crop / 2)``; ValueError if the frame has too few shots."""
         frame = self.frames[int(torch.randint(len(self.frames), (), generator=generator))]
         if len(frame.shots) < self.estimator.shots:
-            name, count = type(self.estimator).__name__, len(frame.shots)
+            name = type(self.estimator).__name__
+            count = len(frame.shots)
             raise ValueError(f"{frame.name}: {name} needs {self.estimator.shots} shots of a scene, got {count}")
-        mosaics = [frame.shots, frame.signal if self.estimator.adds_noise else frame.shots[:1]]
-        packed = packed_crop(frame.name, mosaics, frame.cfa, self.crop, self.cfa, generator)
-        drawn = self.estimator.sample(packed.shape[1:], generator)
-        return self.estimator.apply(NoisyCrop(packed[:-1], packed[-1], frame.shot_var, frame.read_var), drawn)
+
+        signal = frame.shots[:1]
+        if self.estimator.adds_noise:
+            signal = frame.signal
+        packed = packed_crop(frame.name, [frame.shots, signal], frame.cfa, self.crop, self.cfa, generator)
+
+        crop = NoisyCrop(packed[:-1], packed[-1], frame.shot_var, frame.read_var)
+        params = self.estimator.sample(packed.shape[1:], generator)
+        return self.estimator.apply(crop, params)
 
 
 def r2r_trials(frames: Sequence[NoisyFrame], cfa: CFA) -> list[Trial]:
-    """Whole noisy frames as r2r pairs ``(1, 4, h, w)``, whose score needs no clean frame.
+    """Make r2r pairs ``(1, 4, h, w)`` of whole noisy frames, whose score needs no clean frame.
 
     The error against a target of independent noise is the error against the clean frame plus that noise's variance, a
     constant: the weights that score best are the best, as far as the estimate of the signal is right, though the
     decibels are lower than against a clean frame.
     """
-    trials, estimator = [], R2R()
+    estimator = R2R()
+    trials = []
     for frame in frames:
         images = torch.cat([frame.shots[:1], frame.signal])
         packed = bayer.pack(crop_to_cfa(images, frame.cfa, cfa)[:, None], cfa)
-        drawn = estimator.sample(packed.shape[1:], keyed_generator(0, "held out", frame.name))
-        sample = estimator.apply(NoisyCrop(packed[:1], packed[1], frame.shot_var, frame.read_var), drawn)
+
+        crop = NoisyCrop(packed[:1], packed[1], frame.shot_var, frame.read_var)
+        params = estimator.sample(packed.shape[1:], keyed_generator(0, "held out", frame.name))
+        sample = estimator.apply(crop, params)
         trials.append(Trial(sample.noisy[None], sample.clean[None], sample.variance[None]))
     return trials

@@ -1,7 +1,7 @@
 """The stream of training samples: sample i depends on (seed, i) alone, so any step can be repeated.
 
 A batch is part real crops (clean RAW of the few pairs with its captured noise, or with drawn noise where none was
-captured; or of frames that are only known noisy), part RAW made from sRGB pictures.
+captured; or of frames without a clean RAW), part RAW made from sRGB pictures.
 """
 
 from __future__ import annotations
@@ -32,18 +32,21 @@ class Source(Protocol):
     """A source of samples; one with a ``draw_batch(generators)`` makes those of a step together."""
 
     def draw(self, generator: torch.Generator) -> Any:
-        """A training sample, a named tuple of tensors ``(C, h, w)``, that depends on ``generator`` alone."""
+        """Draw a training sample, a named tuple of tensors ``(C, h, w)``, that depends on ``generator`` alone."""
         ...
 
 
 def freeze_samples(source: Source, key: str) -> list[Trial]:
-    """:data:`WATCHED` samples of a source as trials, the same for the same ``key``."""
-    samples = (source.draw(keyed_generator(key, k)) for k in range(WATCHED))
-    return [Trial(sample.noisy[None], sample.clean[None], sample.variance[None]) for sample in samples]
+    """Draw :data:`WATCHED` samples of a source as trials, the same for the same ``key``."""
+    trials = []
+    for k in range(WATCHED):
+        sample = source.draw(keyed_generator(key, k))
+        trials.append(Trial(sample.noisy[None], sample.clean[None], sample.variance[None]))
+    return trials
 
 
 def add_noise(clean: Tensor, noise: NoiseModel, generator: torch.Generator) -> Sample:
-    """Clean packed RAW ``(1, 4, h, w)`` and drawn noise as a sample of ``(4, h, w)``."""
+    """Draw noise for clean packed RAW ``(1, 4, h, w)``: a sample of ``(4, h, w)``."""
     params = noise.sample(1, generator)
     noisy = noise.apply(clean, params)
     return Sample(noisy[0], clean[0], noise.variance(noisy, params)[0])
@@ -61,18 +64,20 @@ class RealCrops:
 
     def __init__(self, pairs: Sequence[Pair], noise: NoiseModel, crop: int, cfa: CFA) -> None:
         self.pairs = [pair.with_levels() for pair in pairs]
-        self.noise, self.crop, self.cfa = noise, crop, cfa
+        self.noise = noise
+        self.crop = crop
+        self.cfa = cfa
 
     def draw(self, generator: torch.Generator) -> Sample:
-        """A sample of packed RAW ``(4, crop / 2, crop / 2)``."""
+        """Draw a sample of packed RAW ``(4, crop / 2, crop / 2)``."""
         pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
-        mosaics = [pair.raw] if pair.noisy is None else [pair.raw, pair.noisy]
-        packed = packed_crop(pair.name, mosaics, pair.cfa, self.crop, self.cfa, generator)
         if pair.noisy is None:
+            packed = packed_crop(pair.name, [pair.raw], pair.cfa, self.crop, self.cfa, generator)
             return add_noise(packed, self.noise, generator)
-        clean, noisy = packed
-        levels = torch.tensor(pair.shot_var), torch.tensor(pair.read_var)
-        return Sample(noisy, clean, bayer.noise_variance(noisy, *levels))
+
+        clean, noisy = packed_crop(pair.name, [pair.raw, pair.noisy], pair.cfa, self.crop, self.cfa, generator)
+        variance = bayer.noise_variance(noisy, torch.tensor(pair.shot_var), torch.tensor(pair.read_var))
+        return Sample(noisy, clean, variance)
 
 
 class PictureCrops:
@@ -82,15 +87,18 @@ class PictureCrops:
         self.pairs = pairs
 
     def draw(self, generator: torch.Generator) -> Sample:
-        """A sample of one crop, ``(C, h, w)`` as the target has it."""
+        """Draw a sample of one crop, ``(C, h, w)`` as the target has it."""
         return self.draw_batch([generator])[0]
 
     def draw_batch(self, generators: Sequence[torch.Generator]) -> list[Sample]:
-        """One crop for each generator, all made together."""
+        """Draw one crop for each generator, all made together."""
         indices = [int(torch.randint(len(self.pairs), (), generator=generator)) for generator in generators]
         pair = self.pairs.draw_batch(indices, generators)
-        variance = pair.variance if pair.variance.numel() else torch.zeros_like(pair.noisy)
-        return [Sample(*tensors) for tensors in zip(pair.noisy, pair.clean, variance, strict=True)]
+
+        variance = pair.variance
+        if not variance.numel():
+            variance = torch.zeros_like(pair.noisy)
+        return list(map(Sample, pair.noisy, pair.clean, variance))
 
 
 class MosaicCrops:
@@ -107,22 +115,28 @@ class MosaicCrops:
     def __init__(
         self, pictures: Any, augment: RawAugment, crop: int, zoom: float, patterns: Mapping[str, float]
     ) -> None:
-        self.crop, self.patterns = crop, [entry_pattern(bayer.pattern(name)) for name in patterns]
-        self.shares = torch.tensor([*patterns.values()])
-        room = max(pattern.period for pattern in self.patterns)
+        self.crop = crop
+        self.patterns = [entry_pattern(bayer.pattern(name)) for name in patterns]
+        self.shares = torch.tensor(list(patterns.values()))
+
+        margin = max(pattern.period for pattern in self.patterns)
         self.pairs = []
         for pattern in self.patterns:
             of_pattern = copy(augment)
             of_pattern.pattern = pattern
-            self.pairs.append(RawPairs(pictures, of_pattern, crop + room, zoom=zoom))
+            self.pairs.append(RawPairs(pictures, of_pattern, crop + margin, zoom=zoom))
 
     def draw(self, generator: torch.Generator) -> Sample:
-        """A sample: noisy RAW and three planes ``(4, crop, crop)``, clean RAW and variance ``(1, crop, crop)``."""
+        """Draw a sample: noisy RAW and planes ``(4, crop, crop)``, clean RAW and variance ``(1, crop, crop)``."""
         kind = int(torch.multinomial(self.shares, 1, generator=generator))
-        pairs, pattern = self.pairs[kind], self.patterns[kind]
+        pairs = self.pairs[kind]
+        pattern = self.patterns[kind]
         pair = pairs.draw(int(torch.randint(len(pairs), (), generator=generator)), generator)
-        top, left = (2 * torch.randint(pattern.period // 2, (2,), generator=generator)).tolist()
-        window = (..., slice(top, top + self.crop), slice(left, left + self.crop))
+
+        cell = 2 * torch.randint(pattern.period // 2, (2,), generator=generator)
+        row, column = cell.tolist()
+        window = (..., slice(row, row + self.crop), slice(column, column + self.crop))
+
         noisy = with_planes(pair.noisy[None], pattern)[0]
         return Sample(noisy[window], pair.clean[window], pair.variance[window])
 
@@ -130,7 +144,7 @@ class MosaicCrops:
 def packed_crop(
     name: str, mosaics: Sequence[Tensor], own: CFA, crop: int, cfa: CFA, generator: torch.Generator
 ) -> Tensor:
-    """One random part of all mosaics of a frame, in one of eight turns, packed.
+    """Cut one random part out of all mosaics of a frame, in one of eight turns, and pack it.
 
     Args:
         name: of the frame.
@@ -149,12 +163,17 @@ def packed_crop(
     height, width = mosaics[0].shape[-2:]
     if min(height, width) < crop + 6:
         raise ValueError(f"{name}: a frame of {height} x {width} is too small for train.crop={crop}")
+
     mosaics = [bayer.crop_to_cfa(mosaic, own, cfa) for mosaic in mosaics]
+    height, width = mosaics[0].shape[-2:]
+
     side = crop + 4  # turned, then cut to size, so that lines lost to the CFA do not show
-    top, left = (2 * int(torch.randint((n - side) // 2 + 1, (), generator=generator)) for n in mosaics[0].shape[-2:])
+    row = 2 * int(torch.randint((height - side) // 2 + 1, (), generator=generator))
+    column = 2 * int(torch.randint((width - side) // 2 + 1, (), generator=generator))
     view = int(torch.randint(bayer.N_VIEWS, (), generator=generator))
-    images = torch.cat([bayer.crop(mosaic, top, left, side, side) for mosaic in mosaics])
-    turned = bayer.pattern(cfa).turn_keeping(images, view)
+
+    parts = torch.cat([bayer.crop(mosaic, row, column, side, side) for mosaic in mosaics])
+    turned = bayer.pattern(cfa).turn_keeping(parts, view)
     return bayer.pack(bayer.crop(turned, 0, 0, crop, crop)[:, None], cfa)
 
 
@@ -172,27 +191,42 @@ class TrainingStream(Dataset[Any]):
     def __init__(
         self, real: Source | None, pictures: Source | RawPairs | None, batch: int, augmented: float, seed: int
     ) -> None:
-        self.real, self.batch, self.seed = real, batch, seed
-        self.pictures = PictureCrops(pictures) if isinstance(pictures, RawPairs) else pictures
+        if isinstance(pictures, RawPairs):
+            pictures = PictureCrops(pictures)
+        self.real = real
+        self.pictures = pictures
+        self.batch = batch
+        self.seed = seed
         self.from_pictures = round(augmented * batch)
+
         if self.from_pictures and pictures is None:
             raise ValueError("an augmented arm needs sRGB pictures; set data.pictures")
         if self.from_pictures < batch and real is None:
             raise ValueError("this arm needs real pairs; set data.pairs")
 
     def __getitem__(self, index: int) -> Any:
-        source = self.pictures if self._is_made(index) else self.real
+        source = self.real
+        if self._is_of_picture(index):
+            source = self.pictures
         assert source is not None
         return source.draw(self._generator(index))
 
     def __getitems__(self, indices: Sequence[int]) -> list[Any]:
-        made: dict[int, Any] = {}
-        together = getattr(self.pictures, "draw_batch", None)
-        if together is not None and (numbers := [*filter(self._is_made, indices)]):
-            made = dict(zip(numbers, together([*map(self._generator, numbers)]), strict=True))
-        return [made[index] if index in made else self[index] for index in indices]
+        """The samples of a step; those of pictures are made together where their source can."""
+        of_pictures = list(filter(self._is_of_picture, indices))
+        draw_batch = getattr(self.pictures, "draw_batch", None)
 
-    def _is_made(self, index: int) -> bool:
+        samples: dict[int, Any] = {}
+        if draw_batch is not None and of_pictures:
+            batch = draw_batch(list(map(self._generator, of_pictures)))
+            samples.update(zip(of_pictures, batch, strict=True))
+
+        for index in indices:
+            if index not in samples:
+                samples[index] = self[index]
+        return [samples[index] for index in indices]
+
+    def _is_of_picture(self, index: int) -> bool:
         return index % self.batch < self.from_pictures
 
     def _generator(self, index: int) -> torch.Generator:
@@ -213,11 +247,16 @@ class StepSampler(Sampler[list[int]]):
     def __init__(self, start: int, steps: int, batch: int, rank: int = 0, world: int = 1) -> None:
         if batch % world:
             raise ValueError(f"train.batch={batch} must be a multiple of the number of processes, {world}")
-        self.start, self.steps, self.batch, self.rank, self.world = start, steps, batch, rank, world
+        self.start = start
+        self.steps = steps
+        self.batch = batch
+        self.rank = rank
+        self.world = world
 
     def __len__(self) -> int:
         return self.steps - self.start
 
     def __iter__(self) -> Iterator[list[int]]:
         for step in range(self.start, self.steps):
-            yield [step * self.batch + position for position in range(self.rank, self.batch, self.world)]
+            first = step * self.batch
+            yield list(range(first + self.rank, first + self.batch, self.world))

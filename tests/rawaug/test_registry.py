@@ -10,7 +10,8 @@ from rawaug.noise import EldNoise, SensorNoise, noise_model
 from rawaug.paper.baselines.base import BASELINES
 from rawaug.registry import Registry, split_spec
 from rawaug.tasks.settings import ArmConfig
-from rawaug.training.estimators import ESTIMATORS, LOSSES, R2R, Noisier
+from rawaug.training.estimators import ESTIMATORS, R2R, Noisier
+from rawaug.training.losses import LOSSES
 
 
 def test_every_kind_finds_the_things_in_its_package() -> None:

@@ -13,7 +13,7 @@ from rawaug.errors import MissingExtra
 from rawaug.experiment.run import run
 from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.config import TrainConfig
-from rawaug.training.loop import require_trainable
+from rawaug.training.launch import require_trainable
 
 
 @pytest.fixture

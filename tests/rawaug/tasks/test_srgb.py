@@ -24,7 +24,7 @@ from rawaug.metrics import psnr
 from rawaug.tasks.settings import ArmConfig, DataConfig
 from rawaug.tasks.srgb import REAL, SrgbRecipe, best_filter, developed, srgb_trials
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.srgb_noise import Told
+from rawaug.training.srgb_samples import Told
 
 LEVELS = [(1e-9, 1e-12), (2e-3, 1e-5)]
 SMALL = [

@@ -9,7 +9,8 @@ from torch.nn import L1Loss, MSELoss
 
 from denoisers.domains import Anscombe
 from rawaug.data.pairs import Sample
-from rawaug.training.estimators import RootMeanSquare, weigh_loss
+from rawaug.training.losses import RootMeanSquare
+from rawaug.training.weighing import weigh_loss
 
 SHOT, READ = 2e-3, 1e-5
 NOISY = torch.rand(2, 4, 8, 8, generator=torch.Generator().manual_seed(0)) * 0.8

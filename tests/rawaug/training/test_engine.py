@@ -26,7 +26,8 @@ torch.set_num_threads(1)
 from safetensors.torch import save_file
 from rawaug.bayer import CFA
 from rawaug.training.noisy_frames import NoisyCrops, NoisyFrame, r2r_trials
-from rawaug.training.estimators import Noisier, Neighbor2Neighbor
+from rawaug.training.estimators import Noisier
+from rawaug.training.neighbor2neighbor import Neighbor2Neighbor
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.stream import TrainingStream
 from rawaug.training.loop import train

@@ -12,16 +12,14 @@ from torch.nn import functional as F
 import denoisers
 from rawaug.bayer import noise_variance
 from rawaug.training.estimators import (
-    NEIGHBOURS,
     R2R,
-    Neighbor2Neighbor,
     Noise2Noise,
     Noisier,
     NoisyCrop,
     SelfSupervised,
     Supervised,
-    neighbours,
 )
+from rawaug.training.neighbor2neighbor import NEIGHBOURS, Neighbor2Neighbor, neighbours
 
 SHOT_VAR, READ_VAR = 2e-3, 1e-4
 SIGNAL_VAR = 4e-4

@@ -22,7 +22,7 @@ from rawaug.noise import noise_model
 from rawaug.training import loop
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.estimators import Supervised
-from rawaug.training.loop import Journal
+from rawaug.training.journal import Journal
 from rawaug.training.state import TrainingState, first_network, learning_rate_factor
 from rawaug.training.stream import RealCrops, TrainingStream
 
@@ -156,7 +156,7 @@ def test_a_diverged_training_says_so(stream: TrainingStream, validation: list[Tr
 
 
 MEET = """
-from rawaug.training.loop import launch
+from rawaug.training.launch import launch
 fabric = launch("cpu", 1, "32-true")
 (where / str(fabric.global_rank)).write_text(str(fabric.world_size))
 """

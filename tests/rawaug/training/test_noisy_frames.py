@@ -21,8 +21,9 @@ from rawaug.plugin.augment import RawAugment
 from rawaug.tasks.raw import RawTask
 from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, NoisyCrop, SelfSupervised
+from rawaug.training.estimators import R2R, Noise2Noise, Noisier, NoisyCrop, SelfSupervised
 from rawaug.training.loop import train, validate
+from rawaug.training.neighbor2neighbor import Neighbor2Neighbor
 from rawaug.training.noisy_frames import (
     FrozenPictures,
     NoisyCrops,

@@ -16,13 +16,11 @@ from rawaug.training.srgb_noise import (
     MODELS,
     BsrganNoise,
     ColouredNoise,
-    NoisyPictures,
     SrgbNoise,
-    SrgbSamples,
-    Told,
     WhiteNoise,
     noise_on_srgb,
 )
+from rawaug.training.srgb_samples import NoisyPictures, SrgbSamples, Told
 
 GREY = torch.full((6, 3, 128, 128), 0.5)
 
