@@ -1,71 +1,124 @@
 """The ISP ``phones``: ``python -m benchmarks.phones PHOTOGRAPHS --out phones.safetensors``.
 
 Frames of the five simulated phones (:mod:`rawaug.data.phones`), one of each training instance, are drawn anew for
-several seeds; the published fit learns dictionaries, encoders and both masks on them end to end.
+several seeds; the published fit learns dictionaries, encoders and both masks on them end to end. It is watched on
+frames of other photographs, drawn with a seed of their own.
+
+``--score FILE`` measures an ISP instead: PSNR_r on frames of test or validation, blind and with as-shot gains.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from statistics import fmean
 
-from rawaug.data.pairs import LazyPairs, Pair, SomePairs
+import torch
+from torch import Tensor
+
+from rawaug.data.pairs import Pair
 from rawaug.data.phones import PhoneFrames
+from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
+from rawaug.isp.fit.start import plausible_matrices
+from rawaug.isp.model import DictionaryISP
+from rawaug.metrics import worst_and_best_quarter
 
 SIZE = (256, 256)
+WATCH_SEED = 11
+"""Seed of the validation frames that the training is watched on."""
 FEWEST_BRIGHT = 0.1
-"""Frames with a smaller share of unclipped pixels say nothing of their colour."""
+"""Minimum share of pixels that are not clipped."""
+FEWEST_COLOURS = 1e-3
+"""Minimum of the smallest principal variance of a frame's colours, relative to their power.
+
+A frame of fewer colours leaves its matrix open, and the matrix would become an atom that is no camera's.
+"""
 
 
-class Draws(LazyPairs):
-    """The first frames of the training instances of several seeds, without frames that are nearly black or white."""
+def draw_frames(path: str, split: str, seeds: Sequence[int], step: int = 1) -> Iterator[Pair]:
+    """Draw the frames of a split for several seeds, every ``step``-th of them, without those that say too little."""
+    for seed in seeds:
+        frames = PhoneFrames(path, split, seed, SIZE)
+        for index in range(0, len(frames), step):
+            pair = frames[index]
+            if says_its_colour(pair.srgb):
+                yield replace(pair, name=f"{pair.name} of seed {seed}")
 
-    def __init__(self, path: str, seeds: Sequence[int]) -> None:
-        parts = [PhoneFrames(path, "train", seed, SIZE) for seed in seeds]
-        self.parts = [SomePairs(part, range(0, len(part), 2)) for part in parts]
-        places = [
-            (seed, part, index) for seed, part in zip(seeds, self.parts, strict=True) for index in range(len(part))
-        ]
-        self.places = []
-        for seed, part, index in places:
-            srgb = part[index].srgb
-            unclipped = (srgb.amax(0) < 250) & (srgb.amin(0) > 0)
-            if unclipped.float().mean() >= FEWEST_BRIGHT:
-                self.places.append((seed, part, index))
-        super().__init__([f"{part.names[index]} of seed {seed}" for seed, part, index in self.places])
 
-    def read(self, index: int) -> Pair:
-        _, part, place = self.places[index]
-        return part[place]
+def says_its_colour(srgb: Tensor) -> bool:
+    """Whether a picture ``(3, H, W)``, uint8, has enough pixels that are not clipped, of enough colours."""
+    unclipped = (srgb.amax(0) < 250) & (srgb.amin(0) > 0)
+    if unclipped.float().mean() < FEWEST_BRIGHT:
+        return False
+
+    colours = (srgb[:, unclipped].double() / 255.0) ** 2.2
+    moments = colours @ colours.T
+    variances = torch.linalg.eigvalsh(moments)
+    return bool(variances[0] > FEWEST_COLOURS * variances.sum())
+
+
+def score(path: str, file: str, split: str, seeds: Sequence[int]) -> None:
+    """Print PSNR_r in dB of an ISP on frames of 256 x 256: mean, worst and best quarter."""
+    isp = DictionaryISP.from_pretrained(file)
+    for seed in seeds:
+        frames = PhoneFrames(path, split, seed, SIZE)
+        pairs = [frames[index].in_pattern(isp.cfa) for index in range(len(frames))]
+        for label, as_shot in (("blind", False), ("as-shot gains", True)):
+            values = [psnr_r(isp, pair, as_shot) for pair in pairs]
+            worst, best = worst_and_best_quarter(values)
+            print(f"{split}, seed {seed}, {label}: {fmean(values):.2f} ({worst:.2f}, {best:.2f})")
 
 
 def main(
-    photographs: str, /, *, out: str, seeds: int = 3, steps: int = 2000, pixels: int = 4096, raw_loss: str = "log"
+    photographs: str,
+    /,
+    *,
+    out: str = "phones.safetensors",
+    seeds: int = 6,
+    start_steps: int = 100,
+    steps: int = 12000,
+    pixels: int = 4096,
+    raw_loss: str = "log",
+    score_file: str | None = None,
+    split: str = "validation",
 ) -> None:
-    """Fit the ISP and print what held-out frames gained.
+    """Fit the ISP and print how its training went, or score one.
 
     Args:
-        photographs: folder with a subfolder ``train``.
+        photographs: folder with subfolders ``train`` and ``test``.
         out: the .safetensors file to write.
         seeds: how often the 160 instances are drawn.
+        start_steps: of each direction, before the training end to end.
         steps: of the training end to end.
         pixels: kept of each frame.
         raw_loss: l2 or log.
+        score_file: an ISP to score in place of a fit, on seeds 0 and 7.
+        split: of the frames that it is scored on.
     """
-    frames = Draws(photographs, range(1, seeds + 1))
+    torch.set_num_threads(1)
+    if score_file is not None:
+        score(photographs, score_file, split, (0, 7))
+        return
+
     config = FitConfig(
         method="published",
-        steps=100,
+        steps=start_steps,
         joint_steps=steps,
         pixels=pixels,
         batch=512,
         raw_loss=raw_loss,  # type: ignore[arg-type]
     )
-    isp = fit_isp(frames, config)
+    frames = draw_frames(photographs, "train", range(1, seeds + 1), step=2)
+    watched = draw_frames(photographs, "validation", [WATCH_SEED])
+    isp = fit_isp(frames, config, state=f"{out}.state", watched=watched)
+
+    count = len(isp.info["frames"])
     isp.info["rendering"] = "phones: (simulated)"
-    isp.info["frames"] = [f"phones: of seeds 1 to {seeds}, {len(frames)} training instances"]
+    isp.info["frames"] = [f"phones: of seeds 1 to {seeds}, {count} training instances"]
     isp.save(out)
     print(isp.info["joint"])
+    print(f"{int(plausible_matrices(isp.colour.atoms()).sum())} of {isp.config.colour_atoms} colour atoms plausible")
 
 
 if __name__ == "__main__":

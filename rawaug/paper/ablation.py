@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,6 +42,8 @@ SPACES = ("RGB", "Y", "UV")
 LEFT_OUT = ("tone", "colour", "gains", "shading")
 STRIDE = 4
 """Step between the pixels of a registered frame that are compared, in both directions."""
+CLIPPED = 0.98
+"""Pixels of a registered frame with a value from here on are left out."""
 
 
 @dataclass
@@ -82,57 +84,108 @@ def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
         ValueError: if there are fewer than two frames.
     """
     require_free(ablation, overwrite)
-    readable = skip_broken(open_pairs(ablation.data, split="train"), "data")
-    pairs = list(islice(readable, ablation.count))
-    if len(pairs) < 2:
-        raise ValueError(f"data: {ablation.data} has {len(pairs)} frame; leave-one-out needs two or more")
-    config, folder = replace(ablation.fit, seed=ablation.seed), claim(ablation, overwrite)
-    every = [
-        measure([pair for pair in pairs if pair is not left_out], left_out, config)
-        for left_out in progress(pairs, label="ablation", unit="frame")
-    ]
-    means = {given: torch.tensor([curves[given] for curves, _ in every]).mean(0).tolist() for given in every[0][0]}
-    without = {stage: fmean(values[stage] for _, values in every) for stage in every[0][1]}
-    result = {"settings": asdict(ablation), "stages": means, "without": without}
+    pairs = _first_pairs(ablation)
+    config = replace(ablation.fit, seed=ablation.seed)
+    folder = claim(ablation, overwrite)
+
+    frames = []
+    for test_pair in progress(pairs, label="ablation", unit="frame"):
+        others = [pair for pair in pairs if pair is not test_pair]
+        frames.append(measure(others, test_pair, config))
+
+    result = {"settings": asdict(ablation), "stages": mean_curves(frames), "without": mean_without(frames)}
     write_json(result, folder / "ablation.json")
     picture = folder / "ablation.png"
     _draw(result, picture, f"{ablation.data}: {len(pairs)} frames, each left out")
-    sections = [
-        [[f"{given}, {space}", *(f"{row[k]:.2f}" for row in rows)] for k, space in enumerate(SPACES)]
-        for given, rows in means.items()
-    ]
-    print_rows("PSNR against RAW after each stage (dB), frames left out", ["given, space", *TITLES], *sections)
-    print("PSNR_r without a stage:", ", ".join(f"{stage} {value:.2f}" for stage, value in without.items()))
+
+    _print(result)
     print(f"picture: {picture}")
     return result
 
 
-def measure(
-    others: Sequence[Pair], left_out: Pair, config: FitConfig
-) -> tuple[dict[str, list[list[float]]], dict[str, float]]:
-    """Measure one frame by fits on the others: :func:`stage_psnr`, blind and with its gains, and PSNR_r by stage."""
+def _first_pairs(ablation: Ablation) -> list[Pair]:
+    """The pairs to use; ValueError if there are fewer than two."""
+    readable = skip_broken(open_pairs(ablation.data, split="train"), "data")
+    pairs = list(islice(readable, ablation.count))
+    if len(pairs) < 2:
+        raise ValueError(f"data: {ablation.data} has {len(pairs)} frame; leave-one-out needs two or more")
+    return pairs
+
+
+class FrameFigures(NamedTuple):
+    """What is measured of a frame.
+
+    Args:
+        curves: by setting, ``blind`` or ``as-shot gains``, the PSNR in dB of 6 stages in 3 spaces.
+        without: PSNR_r in dB of fits without a stage, by the stage; ``none`` lacks nothing.
+    """
+
+    curves: dict[str, list[list[float]]]
+    without: dict[str, float]
+
+
+def measure(others: Sequence[Pair], test_pair: Pair, config: FitConfig) -> FrameFigures:
+    """Measure one frame by fits to the others."""
     isp = fit_isp(others, config, progress=False)
-    curves = {given: stage_psnr(isp, left_out, given != "blind") for given in ("blind", "as-shot gains")}
-    without = {"none": psnr_r(isp, left_out, white_balance=True)}
+    curves = {
+        "blind": stage_psnr(isp, test_pair, white_balance=False),
+        "as-shot gains": stage_psnr(isp, test_pair, white_balance=True),
+    }
+
+    without = {"none": psnr_r(isp, test_pair, white_balance=True)}
     for stage in LEFT_OUT:
-        kept = tuple(s for s in config.isp.get("stages", POINTWISE_STAGES) if s != stage)
-        lacking = fit_isp(others, replace(config, isp={**config.isp, "stages": kept}), progress=False)
-        without[stage] = psnr_r(lacking, left_out, white_balance=stage != "gains")
-    return curves, without
+        stages = [name for name in config.isp.get("stages", POINTWISE_STAGES) if name != stage]
+        lacking = fit_isp(others, replace(config, isp={**config.isp, "stages": tuple(stages)}), progress=False)
+        without[stage] = psnr_r(lacking, test_pair, white_balance=stage != "gains")
+    return FrameFigures(curves, without)
+
+
+def mean_curves(frames: Sequence[FrameFigures]) -> dict[str, list[list[float]]]:
+    """The mean of the frames' curves, by setting."""
+    means = {}
+    for setting in frames[0].curves:
+        curves = torch.tensor([frame.curves[setting] for frame in frames])
+        means[setting] = curves.mean(0).tolist()
+    return means
+
+
+def mean_without(frames: Sequence[FrameFigures]) -> dict[str, float]:
+    """The mean PSNR_r in dB without a stage, by stage."""
+    means = {}
+    for stage in frames[0].without:
+        means[stage] = fmean(frame.without[stage] for frame in frames)
+    return means
+
+
+def _print(result: dict[str, Any]) -> None:
+    sections = []
+    for setting, rows in result["stages"].items():
+        section = []
+        for k, space in enumerate(SPACES):
+            section.append([f"{setting}, {space}", *(f"{row[k]:.2f}" for row in rows)])
+        sections.append(section)
+
+    print_rows("PSNR against RAW after each stage (dB), frames left out", ["setting, space", *TITLES], *sections)
+    without = ", ".join(f"{stage} {value:.2f}" for stage, value in result["without"].items())
+    print(f"PSNR_r without a stage: {without}")
 
 
 @torch.no_grad()
 def stage_psnr(isp: DictionaryISP, pair: Pair, white_balance: bool) -> list[list[float]]:
     """PSNR in dB of x, x1 ... x5 in RGB, Y and UV: 6 rows of 3; a stage that is left out repeats the one before."""
-    srgb, raw, coordinates, known = _comparable_pixels(pair)
-    given = pair.white_balance if white_balance else None
-    params = staged.with_white_balance(isp, isp.choose(pair.srgb[None]), given, None)
-    seen: dict[str, Tensor] = {}
-    isp.reverse_pixels(srgb, params, coordinates, seen)
-    rows, image = [], srgb
+    srgb, raw, coordinates, unclipped = _comparable_pixels(pair)
+    params = isp.choose(pair.srgb[None])
+    if white_balance:
+        params = staged.with_white_balance(isp, params, pair.white_balance, None)
+
+    images: dict[str, Tensor] = {}
+    isp.reverse_pixels(srgb, params, coordinates, images)
+
+    rows = []
+    image = srgb
     for title in TITLES:
-        image = seen.get(title[:2].rstrip(), image)
-        difference = (image - raw).permute(1, 0, 2, 3)[:, known[:, 0]]
+        image = images.get(title[:2].rstrip(), image)
+        difference = (image - raw).permute(1, 0, 2, 3)[:, unclipped[:, 0]]
         yuv = torch.tensor(YUV) @ difference
         rows.append([_decibels(difference), _decibels(yuv[:1]), _decibels(yuv[1:])])
     return rows
@@ -143,11 +196,14 @@ def _comparable_pixels(pair: Pair) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     if not pair.registered:
         blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
         return blocks.srgb[None], blocks.raw[None], blocks.coordinates, (~blocks.clipped)[None, None]
-    picked = (..., slice(None, None, STRIDE), slice(None, None, STRIDE))
-    raw = bayer.demosaic(pair.raw[None], pair.cfa)[picked]
-    coordinates = frame_coordinates(*pair.raw.shape[-2:])[picked]
-    srgb = as_float(pair.srgb[None])[picked]
-    return srgb, raw, coordinates, (srgb.amax(1, keepdim=True) < 0.98) & (raw.amax(1, keepdim=True) < 0.98)
+
+    every_fourth = (..., slice(None, None, STRIDE), slice(None, None, STRIDE))
+    raw = bayer.demosaic(pair.raw[None], pair.cfa)[every_fourth]
+    coordinates = frame_coordinates(*pair.raw.shape[-2:])[every_fourth]
+    srgb = as_float(pair.srgb[None])[every_fourth]
+
+    unclipped = (srgb.amax(1, keepdim=True) < CLIPPED) & (raw.amax(1, keepdim=True) < CLIPPED)
+    return srgb, raw, coordinates, unclipped
 
 
 def _decibels(difference: Tensor) -> float:
@@ -157,16 +213,21 @@ def _decibels(difference: Tensor) -> float:
 def _draw(result: dict[str, Any], path: Path, title: str) -> None:
     figure = new_figure(13, 4)
     axes = figure.subplots(1, 3, width_ratios=(2, 2, 1.3))
-    for axis, (given, rows) in zip(axes, result["stages"].items(), strict=False):
+    ticks = [stage.replace(" ", "\n") for stage in TITLES]
+
+    for axis, (setting, rows) in zip(axes, result["stages"].items(), strict=False):
+        curves = torch.tensor(rows)
         for k, space in enumerate(SPACES):
-            axis.plot(range(len(TITLES)), [row[k] for row in rows], marker="o", label=space)
-        axis.set_xticks(range(len(TITLES)), [t.replace(" ", "\n") for t in TITLES])
-        axis.set_title(given)
+            axis.plot(range(len(TITLES)), curves[:, k], marker="o", label=space)
+
+        axis.set_xticks(range(len(TITLES)), ticks)
+        axis.set_title(setting)
         axis.set_ylabel("PSNR against RAW (dB)")
         axis.grid(alpha=0.3)
         axis.legend()
-    without = {"all stages" if k == "none" else f"without {k}": value for k, value in result["without"].items()}
-    axes[-1].barh(list(without), list(without.values()))
+
+    labels = ["all stages", *(f"without {stage}" for stage in LEFT_OUT)]
+    axes[-1].barh(labels, list(result["without"].values()))
     axes[-1].set_xlabel("PSNR_r, as-shot gains (dB)")
     axes[-1].invert_yaxis()
     figure.suptitle(title)

@@ -38,9 +38,9 @@ def balanced_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair) -> float
     height, width = pair.raw.shape[-2:]
     values = []
     for top, bottom in pairwise(even_edges(height)):
-        for left, right in pairwise(even_edges(width)):
-            piece = (None, slice(None), slice(top, bottom), slice(left, right))
-            coordinates = frame_coordinates(bottom - top, right - left, (top, left), (height, width))
+        for begin, end in pairwise(even_edges(width)):
+            piece = (None, slice(None), slice(top, bottom), slice(begin, end))
+            coordinates = frame_coordinates(bottom - top, end - begin, (top, begin), (height, width))
             raw = make(pair.srgb[piece], coordinates).clamp(0.0, 1.0)
             values.append(psnr(balanced(raw, pair), balanced(pair.raw[piece], pair)).item())
     return fmean(values)

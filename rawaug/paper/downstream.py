@@ -29,7 +29,7 @@ from rawaug.noise import NoiseModel, noise_model
 from rawaug.paper.baselines.base import BaselineISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
-from rawaug.plugin.draw import Draw
+from rawaug.plugin.draw import Draw, Sampling
 from rawaug.seeding import derive_seed
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.loop import train
@@ -49,6 +49,7 @@ class DownstreamConfig:
         test_crop: side of the central crop scored of each test frame; null for the whole frame.
         test_count: number of frames of each of ``test``; null for all.
         bin: K bins these frames K x K by colour site: clean references of real photographs.
+        sampling: how the camera settings of a fitted ISP are drawn, see :class:`rawaug.plugin.draw.Draw`.
         exposure: lowest and highest exposure in stops at which the RAW of a fitted ISP is drawn, for the test cameras'
             headroom is not known; ISPs of published cameras and UPI's published distributions have their own.
         noise: preset, in training and on the test frames.
@@ -61,6 +62,7 @@ class DownstreamConfig:
     test_crop: int | None = 1024
     test_count: int | None = None
     bin: int = 1
+    sampling: Sampling = "convex"
     exposure: tuple[float, float] | None = (-1.5, 0.0)
     noise: str = "cycleisp_sidd"
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
@@ -112,8 +114,9 @@ def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> list[Row]:
         every = open_pairs(spec, split="test", bin=config.bin)
         frames = SomePairs(every, range(len(every))[: config.test_count])
         for pair in skip_broken(frames, spec):
-            part = pair.middle(config.test_crop) if config.test_crop else pair
-            trials.append(trial_of(part, noise, cfa))
+            if config.test_crop is not None:
+                pair = pair.middle(config.test_crop)
+            trials.append(trial_of(pair, noise, cfa))
     return list(score([denoiser], trials, "PSNR_d"))
 
 
@@ -125,7 +128,9 @@ def crops_of(
         return MadeCrops(pictures, model.draw, model.cfa, noise, config.train.crop)
 
     # The plugin keeps each crop's place in its frame.
-    draw = Draw(exposure=None if model.config.cameras else config.exposure)
+    draw = Draw(config.sampling)
+    if not model.config.cameras:
+        draw = replace(draw, exposure=config.exposure)
     return PictureCrops(RawPairs(pictures, RawAugment(model, noise, draw=draw), config.train.crop))
 
 

@@ -125,6 +125,20 @@ def fit_family(
     return Fitted(model, time.perf_counter() - start, reverse_parameters(model))
 
 
+def end_to_end(info: Mapping[str, Any]) -> dict[str, Any]:
+    """The steps and the curve of an ISP's end-to-end training, from the record of its fit; empty without one.
+
+    The curve has the squared error on held-out frames, as the curves of networks have their losses.
+    """
+    if "joint" not in info:
+        return {}
+
+    curve = []
+    for decibels in info["joint"]["curve"]:
+        curve.append(10.0 ** (-decibels / 10.0))
+    return {"steps": info["joint"]["steps"], "curve": curve}
+
+
 def reverse_parameters(model: Method) -> int:
     """Number of parameters of the reverse pass."""
     counted = getattr(model, "reverse_network", model)
@@ -155,9 +169,10 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None, balanced: bool =
     """
     pair.require_rendered()
     model = fitted.model
-    known = isinstance(model, DictionaryISP) and pair.name in model.info.get("frames", ())
+    seen_before = isinstance(model, DictionaryISP) and pair.name in model.info.get("frames", ())
     if not pair.registered:
-        return {"rows": _block_rows(model, pair), "balanced": {}, "mpix_s": None, "forward": None, "known": known}
+        rows = _block_rows(model, pair)
+        return {"rows": rows, "balanced": {}, "mpix_s": None, "forward": None, "known": seen_before}
 
     makers = {}
     for row, setting in settings(model, pair).items():
@@ -179,14 +194,16 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None, balanced: bool =
     figures = {}
     if balanced:
         for row, make in makers.items():
-            figures[row] = balanced_psnr(make, own if own is not None and row == "own" else pair)
+            figures[row] = balanced_psnr(make, pair)
+        if own is not None:
+            figures["own"] = balanced_psnr(makers["own"], own)
 
     return {
         "rows": rows,
         "balanced": figures,
         "mpix_s": pixels / seconds / 1e6,
         "forward": forward_psnr(model, pair),
-        "known": known,
+        "known": seen_before,
     }
 
 
@@ -219,8 +236,8 @@ def own_rendering(model: Method, pair: Pair) -> Pair | None:
     if not isinstance(model, CompressedISP):
         return None
     picture = model(pair.raw[None], model.setting_of(pair.white_balance))
-    stored = (255.0 * jpeg(picture, JPEG_QUALITY)[0]).round().to(torch.uint8)
-    return replace(pair, srgb=stored)
+    compressed = (255.0 * jpeg(picture, JPEG_QUALITY)[0]).round().to(torch.uint8)
+    return replace(pair, srgb=compressed)
 
 
 def _block_rows(model: Method, pair: Pair) -> dict[str, float]:
@@ -278,7 +295,9 @@ def forward_psnr(model: Method, pair: Pair) -> float | None:
     if not can_render(model):
         return None
     srgb = as_float(pair.srgb[None])
-    setting = srgb if isinstance(model, CycleISP) else model.setting_of(pair.white_balance)
+    setting = model.setting_of(pair.white_balance)
+    if isinstance(model, CycleISP):
+        setting = srgb
     return psnr(model(pair.raw[None], setting), srgb).item()
 
 
@@ -309,7 +328,9 @@ def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
 def _cycles(model: Method, x: Tensor) -> dict[str, Tensor]:
     """By way the pictures ``(B, 3, H, W)`` that come back of ``x``, of the same shape."""
     if not isinstance(model, DictionaryISP):
-        return {"cycle": model.cycle(x)} if can_render(model) else {}
+        if not can_render(model):
+            return {}
+        return {"cycle": model.cycle(x)}
 
     there = model.reverse(x)
     raw = there.raw.clamp(0.0, 1.0)

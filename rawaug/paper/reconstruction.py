@@ -21,7 +21,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.folders import Readable, skip_broken
-from rawaug.data.pairs import Pair, SomePairs, names_of, shared_frame
+from rawaug.data.pairs import Pair, SomePairs, centre, names_of, shared_frame
 from rawaug.data.selection import select_pairs
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.evaluation.trials import trial_of
@@ -38,6 +38,7 @@ from rawaug.paper.methods import (
     ROWS,
     Fitted,
     cycle_psnr,
+    end_to_end,
     fit_family,
     is_method,
     learns_by_descent,
@@ -56,6 +57,8 @@ COLUMNS = {
     "cycle": "cycle", "cycle_same_setting": "same setting", "cycle_without_mosaic": "no mosaic", "psnr_d": "PSNR_d",
 }  # fmt: skip
 """Keys of a row and the headings of their columns."""
+SHORTEST_SIDE = 128
+"""Side in pixels of the frames and pictures that a dry run scores."""
 
 
 def print_methods(title: str, rows: Mapping[str, Mapping[str, Any]], ceiling: float) -> None:
@@ -89,10 +92,13 @@ def cells_of(row: Mapping[str, Any], columns: Sequence[str]) -> list[str]:
         if value is None:
             cells.append("")
         else:
-            cells.append(mean_and_spread(value if isinstance(value, list) else [value], 2))
+            figures = value if isinstance(value, list) else [value]
+            cells.append(mean_and_spread(figures, 2))
 
-    speed = "" if row["mpix_s"] is None else f"{row['mpix_s']:.3g}"
-    return [*cells, f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}", speed]
+    cells += [f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}"]
+    if row["mpix_s"] is None:
+        return [*cells, ""]
+    return [*cells, f"{row['mpix_s']:.3g}"]
 
 
 @dataclass
@@ -117,10 +123,13 @@ class Comparison:
         crop: side of the crops that these methods train on: small ones give more steps to a short budget.
         batch: crops in a step of them.
         patches: random patches of each left-out frame that are scored; null scores all.
+        test_crop: score only the middle of this side of each test frame; null for all of it. A lens shading is then
+            measured as if the middle were the frame, so this is for trying a recipe.
         balanced: whether there is a column with InvISP's figure, on whole frames: PSNR of demosaiced, white-balanced
             and gamma-compressed RAW.
         pictures: sRGB pictures for the cycle and for PSNR_d.
         picture_count: number of pictures to use; null for all, which are kept in memory.
+        cycle_crop: side of the middle of each picture on which the cycle is measured; null for all of it.
         fit: of the dictionary ISP.
         downstream: how PSNR_d is measured; null skips it.
         seed: of the first run.
@@ -142,9 +151,11 @@ class Comparison:
     crop: int = 64
     batch: int = 2
     patches: int | None = 8
+    test_crop: int | None = None
     balanced: bool = False
     pictures: str = "demo:"
     picture_count: int | None = None
+    cycle_crop: int | None = None
     fit: FitConfig = field(default_factory=FitConfig)
     downstream: DownstreamConfig | None = None
     seed: int = 0
@@ -162,7 +173,7 @@ class Comparison:
             raise ValueError(f"patches must be at least 1, or null for all, got {self.patches}")
         if self.noise and any(not method.startswith("dictionary") for method in self.methods):
             raise ValueError("noise: only the dictionary ISP can be fitted to noisy frames; remove the other methods")
-        if any(learns_by_descent(method) for method in self.methods):
+        if self.trains_networks:
             Training(self.seconds, self.steps).require_budget()
 
         for family, size in self.sizes.items():
@@ -170,10 +181,15 @@ class Comparison:
                 raise ValueError(f"sizes: {family} is no baseline; use {', '.join(BASELINES)}")
             check_settings(f"sizes: {family}", BASELINES[family], size)
 
+    @property
+    def trains_networks(self) -> bool:
+        """Whether a method learns on crops by gradient descent."""
+        return any(learns_by_descent(method) for method in self.methods)
+
     def shortest(self) -> Comparison:
-        """The comparison with one step of every method, on the first frames."""
+        """The comparison with one step of every method, on the middles of the first frames."""
         few: dict[str, Any] = {"count": 2, "test_count": 1, "patches": 1, "seeds": 1, "seconds": 0.1, "steps": 1}
-        few["picture_count"] = 2
+        few |= {"picture_count": 2, "test_crop": SHORTEST_SIDE, "cycle_crop": SHORTEST_SIDE}
         downstream = self.downstream and self.downstream.shortest()
         return replace(self, **few, select="first", fit=self.fit.shortest(), downstream=downstream)
 
@@ -200,13 +216,24 @@ class ComparisonRun:
         self._whole_fits: dict[str, Fitted] = {}
 
         every = open_pairs(settings.data, split="train")
-        self.pairs = _fitted_frames(settings, every)
-        self.scored = _test_frames(settings, every) if settings.test else self.pairs
+        self.pairs = _training_frames(settings, every)
+        self.scored: Sequence[Pair] = self.pairs
+        if settings.test:
+            self.scored = _test_frames(settings, every)
 
-        side = settings.downstream.train.crop if settings.downstream else 2
+        side = 2
+        if settings.downstream is not None:
+            side = settings.downstream.train.crop
         pictures = open_pictures(settings.pictures, min_side=side)
         used = range(len(pictures))[: settings.picture_count]
-        self.pictures = [trim_to_even(pictures[k]) for k in used]
+        self.pictures = []
+        self.cycle_pictures = []
+        for index in used:
+            picture = trim_to_even(pictures[index])
+            self.pictures.append(picture)
+            if settings.cycle_crop is not None:
+                picture = centre(picture, settings.cycle_crop, settings.cycle_crop)
+            self.cycle_pictures.append(picture)
 
     def all_rows(self) -> dict[str, dict[str, Any]]:
         """All rows by name, which are printed, and written with every single figure."""
@@ -215,55 +242,68 @@ class ComparisonRun:
         for family in settings.methods:
             rows |= self._rows(family)
 
-        ceiling = mosaic_only_psnr(self.pictures, CFA(self.pairs[0].cfa))
+        ceiling = mosaic_only_psnr(self.cycle_pictures, CFA(self.pairs[0].cfa))
         write_json({"settings": asdict(settings), "rows": rows, "mosaic_only_psnr": ceiling}, self._path("table"))
 
-        frames = len(self.scored)
-        on = f"one of {frames} frames left out" if settings.test is None else f"{frames} frames of {settings.test}"
-        print_methods(f"{settings.name}: {on}, seeds: {settings.seeds}, {settings.data}", rows, ceiling)
+        tested_on = f"one of {len(self.scored)} frames left out"
+        if settings.test is not None:
+            tested_on = f"{len(self.scored)} frames of {settings.test}"
+        print_methods(f"{settings.name}: {tested_on}, seeds: {settings.seeds}, {settings.data}", rows, ceiling)
         return rows
 
     def _rows(self, family: str) -> dict[str, dict[str, Any]]:
         self._whole_fits = {}
+        folds = []
         fits = list(product(self.seeds, range(len(self.scored))))
-        folds = [self._fold(family, seed, frame) for seed, frame in progress(fits, label=family, unit="fit")]
-        whole = self._all_frames(family)
+        for seed, frame in progress(fits, label=family, unit="fit"):
+            folds.append(self._fold(family, seed, frame))
 
+        whole = self._all_frames(family)
         forward = [fold.get("forward") for fold in folds]
         if None not in forward:
-            whole["forward"] = [fmean(of_seed) for of_seed in self._by_seed(forward)]
+            whole["forward"] = means_of(self._by_seed(forward))
 
         rows = {}
         for row in folds[0]["rows"]:
-            name = family if row == "blind" else f"{family}, {ROWS[row]}"
-            rows[name] = self._row(folds, row)
             if row == "blind":
-                rows[name] |= whole
+                rows[family] = {**self._row(folds, row), **whole}
+            else:
+                rows[f"{family}, {ROWS[row]}"] = self._row(folds, row)
         return rows
 
     def _row(self, folds: Sequence[dict[str, Any]], row: str) -> dict[str, Any]:
         """The figures of one row of a family."""
         names = names_of(self.scored)
         values = self._by_seed([fold["rows"][row] for fold in folds])
-        quarters = [worst_and_best_quarter(of_seed) for of_seed in values]
-        speeds = [fold["mpix_s"] for fold in folds if fold["mpix_s"] is not None]
+        worst, best = [], []
+        for of_seed in values:
+            low, high = worst_and_best_quarter(of_seed)
+            worst.append(low)
+            best.append(high)
+
+        frames = {}
+        for k, name in enumerate(names):
+            frames[name] = [of_seed[k] for of_seed in values]
 
         figures: dict[str, Any] = {
-            "psnr_r": [fmean(of_seed) for of_seed in values],
-            "frames": {name: [of_seed[k] for of_seed in values] for k, name in enumerate(names)},
-            "worst25": [worst for worst, _ in quarters],
-            "best25": [best for _, best in quarters],
+            "psnr_r": means_of(values),
+            "frames": frames,
+            "worst25": worst,
+            "best25": best,
             "seconds": fmean(fold["seconds"] for fold in folds),
-            "mpix_s": median(speeds) if speeds else None,
+            "mpix_s": None,
             "parameters": folds[0]["parameters"],
         }
+        speeds = [fold["mpix_s"] for fold in folds if fold["mpix_s"] is not None]
+        if speeds:
+            figures["mpix_s"] = median(speeds)
         if row in folds[0].get("balanced", {}):
-            balanced = self._by_seed([fold["balanced"][row] for fold in folds])
-            figures["balanced"] = [fmean(of_seed) for of_seed in balanced]
+            balanced = [fold["balanced"][row] for fold in folds]
+            figures["balanced"] = means_of(self._by_seed(balanced))
 
-        known = sum(bool(fold.get("known")) for fold in folds[: len(names)])
-        if known:
-            figures["known"] = known
+        seen_before = [fold for fold in folds[: len(names)] if fold.get("known")]
+        if seen_before:
+            figures["known"] = len(seen_before)
         for key in ("steps", "curve"):
             if key in folds[0]:
                 figures[key] = folds[0][key]
@@ -272,27 +312,39 @@ class ComparisonRun:
     def _by_seed(self, values: Sequence[Any]) -> list[list[Any]]:
         """The figures of all fits, a list of frames a seed."""
         frames = len(self.scored)
-        return [list(values[k : k + frames]) for k in range(0, len(values), frames)]
+        by_seed = []
+        for first in range(0, len(values), frames):
+            by_seed.append(list(values[first : first + frames]))
+        return by_seed
 
     def _fold(self, family: str, seed: int, frame: int) -> dict[str, Any]:
         """The figures of a fit without one frame, scored on it; or of a fit to all, scored on a test frame."""
         settings = self.settings
-        samples = (*self._fit_key(family, seed), settings.patches)
-        key = fingerprint(*samples, "balanced") if settings.balanced else fingerprint(*samples)
+        facts = [*self._fit_key(family, seed), settings.patches]
+        if settings.test_crop is not None:
+            facts.append(("middle", settings.test_crop))
+        if settings.balanced:
+            facts.append("balanced")
+        key = fingerprint(*facts)
+
+        relation = "on" if settings.test else "without"
         name = names_of(self.scored)[frame]
-        path = self._path(f"{family}-{'on' if settings.test else 'without'}-{name}-seed{seed}")
+        path = self._path(f"{family}-{relation}-{name}-seed{seed}")
 
         def measure() -> dict[str, Any]:
             pair = self.scored[frame]
             if settings.test:
-                fitted = self._fit_to_all(family, seed)
+                method = self._fit_to_all(family, seed)
                 pair = pair.in_pattern(self.pairs[0].cfa)
+                if settings.test_crop is not None:
+                    pair = pair.middle(settings.test_crop)
             else:
                 others = [other for other in self.pairs if other is not pair]
-                fitted = self._fit(family, others, seed)
+                method = self._fit(family, others, seed)
 
-            figures = score_rows(fitted, pair, settings.patches, settings.balanced)
-            return {**fitted.model.info, **figures, "seconds": fitted.seconds, "parameters": fitted.parameters}
+            figures = score_rows(method, pair, settings.patches, settings.balanced)
+            figures |= {"seconds": method.seconds, "parameters": method.parameters}
+            return {**method.model.info, **end_to_end(method.model.info), **figures}
 
         return resume(path, key, measure)
 
@@ -303,24 +355,27 @@ class ComparisonRun:
         if settings.downstream and family in settings.downstream.methods:
             downstream = settings.downstream
         samples = (*self._fit_key(family, settings.seed), settings.pictures, settings.picture_count)
+        if settings.cycle_crop is not None:
+            samples = (*samples, "middle", settings.cycle_crop)
 
         def measure() -> dict[str, Any]:
-            fitted = self._fit_to_all(family, settings.seed)
-            result: dict[str, Any] = cycle_psnr(fitted, self.pictures)
+            method = self._fit_to_all(family, settings.seed)
+            result: dict[str, Any] = cycle_psnr(method, self.cycle_pictures)
             if downstream is None:
                 return result
 
-            drawn = (*samples, downstream.noise, downstream.exposure)
-            trained = weights_key(downstream.denoiser, downstream.train, drawn, validation="watched")
-            folder = self.folder / f"{family.replace('/', '_')}-denoisers-{trained}"
+            draws = (*samples, downstream.noise, downstream.exposure, downstream.sampling)
+            weights = weights_key(downstream.denoiser, downstream.train, draws, validation="watched")
+            folder = self.folder / f"{family.replace('/', '_')}-denoisers-{weights}"
             result["psnr_d"] = []
             for seed in self.seeds:
-                result["psnr_d"].append(psnr_d(fitted.model, self.pictures, downstream, folder, seed))
+                result["psnr_d"].append(psnr_d(method.model, self.pictures, downstream, folder, seed))
             return result
 
         key = fingerprint(*samples, list(self.seeds), downstream and asdict(downstream))
         figures = resume(self._path(f"{family}-all-frames"), key, measure)
-        return {name: value for name, value in figures.items() if name != "key"}
+        figures.pop("key")
+        return figures
 
     def _fit_to_all(self, family: str, seed: int) -> Fitted:
         """The fit to all pairs, which serves the test frames, the cycle and PSNR_d."""
@@ -347,26 +402,30 @@ class ComparisonRun:
         return self.folder / f"{stem.replace('/', '_')}.json"
 
 
-def _fitted_frames(settings: Comparison, every: Sequence[Pair]) -> list[Pair]:
-    """The chosen frames, all of one pattern, and registered where a method needs that."""
-    chosen = SomePairs(every, select_pairs(every, len(every), settings.count, settings.select))
-    names = names_of(chosen)
+def means_of(by_seed: Sequence[Sequence[float]]) -> list[float]:
+    """The mean over the frames of each seed."""
+    return [fmean(values) for values in by_seed]
+
+
+def _training_frames(settings: Comparison, every: Sequence[Pair]) -> list[Pair]:
+    """The selected frames, all of one pattern, and registered where a method needs that."""
+    selection = SomePairs(every, select_pairs(every, len(every), settings.count, settings.select))
+    names = names_of(selection)
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"data: several frames are named {name}; rename the files")
 
-    pairs = list(skip_broken(chosen, "data"))
+    pairs = list(skip_broken(selection, "data"))
     if settings.test:
         pairs = [pair.in_pattern(pairs[0].cfa) for pair in pairs]
     elif len(pairs) < 2:
         raise ValueError(f"data: {settings.data} has {len(pairs)} frame; leave-one-out needs two or more")
 
-    exact = any(learns_by_descent(method) for method in settings.methods)
     for pair in pairs:
         reason = ""
         if pair.cfa != pairs[0].cfa:
             reason = "has a different CFA"
-        elif exact and not pair.registered:
+        elif settings.trains_networks and not pair.registered:
             reason = "is not registered pixel by pixel"
         if reason:
             raise ValueError(f"data: {pair.name} {reason}; {', '.join(settings.methods)} cannot share a table on it")

@@ -21,7 +21,8 @@ from rawaug.experiment.recipe import EXPERIMENTS
 from rawaug.experiment.run import find_classical, run
 from rawaug.files import write_json
 from rawaug.paper import published
-from rawaug.paper.ablation import Ablation, ablate
+from rawaug.paper.ablation import SPACES, Ablation, ablate
+from rawaug.paper.ablation import TITLES as STAGES
 from rawaug.paper.reconstruction import Comparison, compare
 from rawaug.tasks.settings import Recipe
 
@@ -100,7 +101,7 @@ class Paper:
         if isinstance(settings, Recipe):
             return replace(settings, data=replace(settings.data, **self._own(pairs=self.data)))
         if isinstance(settings, Ablation):
-            return settings if self.data is None else replace(settings, data=self.data)
+            return replace(settings, data=self.data or settings.data)
         if name != "table1":
             return settings
 
@@ -110,8 +111,11 @@ class Paper:
         return settings
 
     def _own(self, **data: str | None) -> dict[str, Any]:
-        keys = {**data, "test": self.test, "pictures": self.pictures}
-        return {key: value for key, value in keys.items() if value is not None}
+        own = {}
+        for key, value in {**data, "test": self.test, "pictures": self.pictures}.items():
+            if value is not None:
+                own[key] = value
+        return own
 
 
 @EXPERIMENTS.register("paper")
@@ -162,9 +166,13 @@ def read_tables(folder: Path) -> dict[str, Table]:
     if nikon is not None or canon is not None:
         tables["table2"] = dslr_table((nikon or {}).get("rows", {}), (canon or {}).get("rows", {}))
 
-    runs = [read_part(folder, part, "results") for part in ("table3", "few", "unsupervised")]
-    if any(runs):
-        tables["table3"] = denoising_table([one for one in runs if one is not None])
+    runs = []
+    for part in ("table3", "few", "unsupervised"):
+        results = read_part(folder, part, "results")
+        if results is not None:
+            runs.append(results)
+    if runs:
+        tables["table3"] = denoising_table(runs)
 
     stages = read_part(folder, "ablation", "ablation")
     if stages is not None:
@@ -175,25 +183,33 @@ def read_tables(folder: Path) -> dict[str, Table]:
 def read_part(folder: Path, part: str, stem: str) -> Any:
     """The figures that a part left in its folder; None if it was not run to its end."""
     path = folder / part / f"{stem}.json"
-    return json.loads(path.read_text()) if path.is_file() else None
+    if not path.is_file():
+        return None
+    return json.loads(path.read_text())
 
 
 def reconstruction_table(rows: Mapping[str, Mapping[str, Any]]) -> Table:
     """Table 1 from the rows of a comparison."""
-    columns = ("PSNR_r", "worst 25%", "best 25%", "PSNR_d", "M parameters")
-    keys = ("psnr_r", "worst25", "best25", "psnr_d")
+    none = (None, None, None, None, None)
+    cycles = {"dictionary-encoders": published.CYCLE}
     table: Table = {}
 
     for name, row in rows.items():
-        paper = published.TABLE_1.get(published.ISP_NAMES.get(name, ""))
-        figures = [*(row.get(key) for key in keys), row["parameters"] / 1e6]
+        figures = {
+            "PSNR_r": row.get("psnr_r"),
+            "worst 25%": row.get("worst25"),
+            "best 25%": row.get("best25"),
+            "PSNR_d": row.get("psnr_d"),
+            "M parameters": row["parameters"] / 1e6,
+        }
+        paper = published.TABLE_1.get(published.ISP_NAMES.get(name, ""), none)
         cells: dict[str, Any] = {}
-        for k, column in enumerate(columns):
-            cells[column] = figures[k]
-            cells[f"{column}, paper"] = None if paper is None else paper[k]
+        for (column, ours), theirs in zip(figures.items(), paper, strict=True):
+            cells[column] = ours
+            cells[f"{column}, paper"] = theirs
 
         cells["cycle"] = row.get("cycle")
-        cells["cycle, paper"] = published.CYCLE if name == "dictionary-encoders" else None
+        cells["cycle, paper"] = cycles.get(name)
         cells["steps"] = row.get("steps")
         cells["loss still falling"] = still_falling(row.get("curve"))
         table[row_name(name)] = cells
@@ -220,9 +236,13 @@ def denoising_table(runs: Sequence[Mapping[str, Any]]) -> Table:
     table: Table = {}
     for results in runs:
         for arm, seeds in results["results"].items():
-            kind = "self_ensemble" if "self_ensemble" in seeds[0] else "plain"
-            scores = [one[kind] for one in seeds]
-            add_denoiser(table, arm, [one.get("psnr") for one in scores], [one.get("ssim") for one in scores])
+            psnr, ssim = [], []
+            for scores in seeds:
+                summary = scores.get("self_ensemble", scores["plain"])
+                psnr.append(summary.get("psnr"))
+                ssim.append(summary.get("ssim"))
+            add_denoiser(table, arm, psnr, ssim)
+
             noisy = seeds[0]["plain"]
             if "Noisy" not in table:
                 add_denoiser(table, "noisy", [noisy.get("psnr_noisy")], [noisy.get("ssim_noisy")])
@@ -230,15 +250,17 @@ def denoising_table(runs: Sequence[Mapping[str, Any]]) -> Table:
         for name, scores in results["others"].items():
             add_denoiser(table, name, [scores.get("psnr")], [scores.get("ssim")])
 
-    order = list(published.TABLE_3)
-    ranked = sorted(table, key=lambda name: order.index(name) if name in order else len(order))
-    return {name: table[name] for name in ranked}
+    ordered: Table = {}
+    for name in (*published.TABLE_3, *table):
+        if name in table:
+            ordered[name] = table[name]
+    return ordered
 
 
 def add_denoiser(table: Table, name: str, psnr: Sequence[float], ssim: Sequence[float]) -> None:
     """Add a row of table 3 under the paper's name, if it has one; the first figures of a name stay."""
-    known = {**published.DENOISER_NAMES, "noisy": "Noisy"}
-    label = known.get(name, name)
+    names = {**published.DENOISER_NAMES, "noisy": "Noisy"}
+    label = names.get(name, name)
     paper = published.TABLE_3.get(label, (None, None))
     figures = {"PSNR": list(psnr), "PSNR, paper": paper[0], "SSIM": list(ssim), "SSIM, paper": paper[1]}
     table.setdefault(label, figures)
@@ -246,24 +268,21 @@ def add_denoiser(table: Table, name: str, psnr: Sequence[float], ssim: Sequence[
 
 def ablation_table(stages: Mapping[str, Sequence[Sequence[float]]]) -> Table:
     """The ablation's curves by what is known of a frame and space, blind and with as-shot gains."""
-    from rawaug.paper.ablation import SPACES
-    from rawaug.paper.ablation import TITLES as STAGES
-
     table: Table = {}
     for setting, rows in stages.items():
-        for k, space in enumerate(SPACES):
-            curve = {stage: row[k] for stage, row in zip(STAGES, rows, strict=True)}
-            table[f"{space}, {setting}"] = curve
+        for space, curve in zip(SPACES, zip(*rows, strict=True), strict=True):
+            table[f"{space}, {setting}"] = dict(zip(STAGES, curve, strict=True))
 
     for space, figures in published.ABLATION.items():
-        table[f"{space}, paper"] = {stage: figures.get(stage) for stage in STAGES}
+        table[f"{space}, paper"] = {**dict.fromkeys(STAGES), **figures}
     return table
 
 
 def row_name(name: str) -> str:
     """A row's own name, with the paper's behind it."""
-    paper = published.ISP_NAMES.get(name)
-    return name if paper is None else f"{name} ({paper})"
+    if name not in published.ISP_NAMES:
+        return name
+    return f"{name} ({published.ISP_NAMES[name]})"
 
 
 def still_falling(curve: Sequence[float] | None) -> float | None:
@@ -305,30 +324,37 @@ def compare_order(table: Table, column: str) -> Order:
     for (first, (a, b)), (second, (c, d)) in combinations(figures.items(), 2):
         if (a - c) * (b - d) > 0:
             same += 1
+        elif b > d:
+            wrong.append(f"{first} above {second}")
         else:
-            better, worse = (first, second) if b > d else (second, first)
-            wrong.append(f"{better} above {worse}")
+            wrong.append(f"{second} above {first}")
     return Order(same, wrong)
 
 
 def mean_of(value: Any) -> float | None:
     """The mean of a figure, which may be one a seed; None without it."""
-    if isinstance(value, list):
-        numbers = [one for one in value if one is not None]
-        return fmean(numbers) if numbers else None
-    return value
+    if not isinstance(value, list):
+        return value
+
+    numbers = [number for number in value if number is not None]
+    if not numbers:
+        return None
+    return fmean(numbers)
 
 
 def cell(column: str, value: Any) -> str:
     """A figure as text."""
-    digits = 3 if "SSIM" in column else 2
     if value is None or value == [None]:
         return ""
     if column == "steps":
         return str(value)
     if column == "loss still falling":
         return f"{value:.1f} %"
-    return mean_and_spread(value if isinstance(value, list) else [value], digits)
+
+    figures = value
+    if not isinstance(figures, list):
+        figures = [figures]
+    return mean_and_spread(figures, 3 if "SSIM" in column else 2)
 
 
 def columns_of(table: Table) -> list[str]:
@@ -344,12 +370,17 @@ def columns_of(table: Table) -> list[str]:
 def text_rows(table: Table) -> dict[str, list[str]]:
     """The cells of a table as text, by row."""
     columns = columns_of(table)
-    return {name: [cell(column, cells.get(column)) for column in columns] for name, cells in table.items()}
+    rows = {}
+    for name, cells in table.items():
+        rows[name] = [cell(column, cells.get(column)) for column in columns]
+    return rows
 
 
 def print_table(title: str, table: Table) -> None:
     """Print a table with the paper's figures."""
-    rows = [[name, *cells] for name, cells in text_rows(table).items()]
+    rows = []
+    for name, cells in text_rows(table).items():
+        rows.append([name, *cells])
     print_rows(title, ["", *columns_of(table)], rows)
 
 
@@ -367,7 +398,8 @@ ORDERED_BY = {"table1": ["PSNR_r", "PSNR_d"], "table2": ["Nikon PSNR_r", "Canon 
 def write_page(folder: Path, tables: Mapping[str, Table], settings: Mapping[str, Any]) -> Path:
     """Write ``report.html``; its path."""
     page = Page("The paper's tables", "The figures of Conde et al., AAAI 2022, beside those of this run.")
-    page.add(terms={"Command": command_line()} if command_line() else {})
+    if command_line():
+        page.add(terms={"Command": command_line()})
 
     for name, table in tables.items():
         texts = [NOTES[name]]

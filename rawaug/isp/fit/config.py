@@ -25,8 +25,8 @@ class FitConfig:
         method: "staged" fits stage by stage and keeps encoders and masks where held-out frames gain, for a handful of
             frames. "published" is the fit of the paper: encoders and both masks, learned end to end after a short
             start, by l2 losses on RAW and on every image between the stages of both passes and by the consistency of
-            the weights (``joint_steps``, 3,000 by default). It sets ``shading``, ``attention`` and ``encoders`` to on
-            and ``tone`` to learned, and needs two frames or more; the paper has 5 to 320.
+            the weights (``joint_steps``, 3,000 by default). It sets ``shading`` and ``attention`` to on, ``tone`` to
+            learned, and ``encoders`` to on unless they are off. It needs two frames or more; the paper has 5 to 320.
         start: an ISP, by the name of a shipped one or its file, from whose tone the fit starts wherever that makes the
             frames better than the curves of the standards.
         size: "small" has at most 8 atoms a dictionary and narrow encoders: with encoders 0.12 M parameters instead
@@ -99,8 +99,11 @@ class FitConfig:
             return self
 
         steps = PUBLISHED_STEPS if self.joint_steps is None else self.joint_steps
+        encoders: Literal["on", "off"] = "on"
+        if self.encoders == "off":
+            encoders = "off"
         return replace(
-            self, shading="on", attention=True, encoders="on", tone="learned", encoder_steps=0, joint_steps=steps
+            self, shading="on", attention=True, encoders=encoders, tone="learned", encoder_steps=0, joint_steps=steps
         )
 
     def shortest(self) -> FitConfig:

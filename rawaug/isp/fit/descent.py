@@ -128,11 +128,19 @@ def adam(
 
 
 class BestScore(NamedTuple):
-    """The score of a watched stage at its start, and the best one with the step at which it was reached."""
+    """The score of a watched stage at its start, the best one with its step, and every score so far."""
 
     start: float
     step: int
     best: float
+    scores: Sequence[float] = ()
+
+    def curve(self) -> list[float]:
+        """At most :data:`CURVE_POINTS` of the scores, the first and the last among them, to two decimals."""
+        last = len(self.scores) - 1
+        count = min(CURVE_POINTS, last + 1)
+        places = [round(k * last / max(1, count - 1)) for k in range(count)]
+        return [round(self.scores[place], 2) for place in places]
 
 
 class Descent:
@@ -221,9 +229,11 @@ class Descent:
     def _note(self, stage: str, step: int, score: float, tensors: Mapping[str, Tensor]) -> str:
         """Note a score, and the tensors if it is the best so far."""
         before = self.watched.get(stage, BestScore(score, step, -math.inf))
+        after = before._replace(scores=[*before.scores, score])
         if stage not in self.watched or score > before.best:
-            self.watched[stage] = BestScore(before.start, step, score)
+            after = after._replace(step=step, best=score)
             self._keep(stage, tensors)
+        self.watched[stage] = after
         return f"held out {score:.2f} dB"
 
 
@@ -237,6 +247,8 @@ PUBLISHED_RATE, PUBLISHED_FRAMES, PUBLISHED_PIXELS = 2e-3, 8, 256
 """The published fit learns nearly all of it end to end: its rate, and frames and pixels of a step."""
 LOG_WEIGHT = 0.02
 """Weight of the logarithm of an error beside the squared errors of the other pass."""
+CURVE_POINTS = 13
+"""Number of scores of a watched training that an ISP's record has."""
 LOSS_SCALE = 1e4
 """Squared errors are near 1e-4, and what encoders get of them would vanish beside the epsilon of Adam, 1e-8."""
 
@@ -353,26 +365,32 @@ def joint_steps(config: FitConfig, frames: int) -> int:
     return STEPS if frames >= MANY_FRAMES else 0
 
 
-def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent) -> None:
+def train_jointly(
+    isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent, watched: FitFrames | None = None
+) -> None:
     """Refine everything at once, if ``config.joint_steps`` says so; the gain goes to ``isp.info``.
 
     What as-shot gains need to know of the atoms is measured anew afterwards.
 
     Args:
         isp: the fitted ISP.
-        frames: all frames of the fit, of which a tenth is held out.
+        frames: all frames of the fit.
         config: the settings of the fit.
         descent: runs the training.
+        watched: frames that choose the best step; by default a tenth of the others, which is held out.
     """
     count = len(frames.shots)
     steps = joint_steps(config, count)
     if steps == 0:
         return
-    if count < 2:
+    if watched is None and count < 2:
         raise ValueError("joint_steps: end-to-end training holds frames out for validation; give two frames or more")
 
-    held_out = range(0, count, 10)[: max(1, count // 2)]
-    watched, trained = frames.some(held_out), frames.some([k for k in range(count) if k not in held_out])
+    trained = frames
+    if watched is None:
+        held_out = range(0, count, 10)[: max(1, count // 2)]
+        watched = frames.some(held_out)
+        trained = frames.some([k for k in range(count) if k not in held_out])
 
     published = config.method == "published"
     frames_a_step = PUBLISHED_FRAMES if published else FRAMES_A_STEP
@@ -396,7 +414,12 @@ def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, desc
     if seen.step > 0:
         measure_lights(isp, trained)
 
-    isp.info["joint"] = {"steps": steps, "kept_step": seen.step, "gain_db": round(seen.best - seen.start, 2)}
+    isp.info["joint"] = {
+        "steps": steps,
+        "kept_step": seen.step,
+        "gain_db": round(seen.best - seen.start, 2),
+        "curve": seen.curve(),
+    }
 
 
 def _draw_batches(

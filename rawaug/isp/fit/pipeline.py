@@ -73,6 +73,7 @@ def fit_isp(
     state: str | Path | None = None,
     report: Callable[[DictionaryISP], str] | None = None,
     camera: Camera | None = None,
+    watched: Iterable[FramePair] | None = None,
 ) -> DictionaryISP:
     """Fit a dictionary ISP to pairs of RAW and sRGB.
 
@@ -83,6 +84,7 @@ def fit_isp(
         state: file with the state of the fit, to resume it; removed at the end.
         report: called with the ISP as it would be now, every 50 steps of stage 2; its text goes to the progress bar.
         camera: figures of the camera, from which the frames' matrices start.
+        watched: frames on which end-to-end training is watched; by default a tenth of the pairs, which is held out.
 
     Raises:
         ValueError: if there is no pair, a frame has too few unclipped pixels, or ``state`` cannot be read.
@@ -91,6 +93,7 @@ def fit_isp(
     reading = progress_of(pairs, label="read", unit="frame", shown=progress)
     frames = sample_pixels(reading, config.pixels, config.seed, config.noisy)
     _require_pixels(frames)
+    held_out = None if watched is None else sample_pixels(watched, config.pixels, config.seed, config.noisy)
     path = None if state is None else Path(state)
     descent = Descent(path, _key(config, frames, camera), config.seed, progress)
 
@@ -103,7 +106,7 @@ def fit_isp(
         fit.fit_reverse(report)
         train_encoders(fit.isp, frames, config, descent, refit)
         fit.forward()
-        train_jointly(fit.isp, frames, config, descent)
+        train_jointly(fit.isp, frames, config, descent, held_out)
 
     descent.finish()
     fit.isp.info |= {} if gain is None else {"curve_gain_db": round(gain, 2)}

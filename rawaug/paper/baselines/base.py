@@ -73,9 +73,12 @@ class Training:
         if steps == 0:  # one step is done in any case
             return 0.0
 
-        by_time = 0.0 if self.seconds is None else seconds / self.seconds
-        by_steps = 0.0 if self.steps is None else steps / self.steps
-        return max(by_time, by_steps)
+        share = 0.0
+        if self.seconds is not None:
+            share = seconds / self.seconds
+        if self.steps is not None:
+            share = max(share, steps / self.steps)
+        return share
 
 
 class BaselineISP(nn.Module, ABC):
@@ -226,10 +229,10 @@ def random_crops(
     """
     generator = keyed_generator(training.seed, "baseline crops", step)
     random_crop = bayer.RandomCrop(training.crop)
-    chosen = torch.randint(len(pairs), (training.batch,), generator=generator).tolist()
+    indices = torch.randint(len(pairs), (training.batch,), generator=generator).tolist()
 
     crops = []
-    for index in chosen:
+    for index in indices:
         pair = pairs[index]
         srgb = bayer.crop_to_cfa(pair.srgb, CFA(pair.cfa), cfa)
         raw = bayer.crop_to_cfa(pair.raw, CFA(pair.cfa), cfa)

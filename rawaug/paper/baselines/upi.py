@@ -107,7 +107,8 @@ class UPI(SmoothstepISP):
         normal = torch.randn(batch, generator=generator, device=generator.device)
         digital = 1.0 / (INVERSE_DIGITAL[0] + INVERSE_DIGITAL[1] * normal)
         uniform = torch.rand(2, batch, generator=generator, device=generator.device)
-        red, blue = (low + (high - low) * u for (low, high), u in zip((RED, BLUE), uniform, strict=True))
+        red = RED[0] + (RED[1] - RED[0]) * uniform[0]
+        blue = BLUE[0] + (BLUE[1] - BLUE[0]) * uniform[1]
         return UPIParams(camera_matrix(weights), torch.stack([digital * red, digital, digital * blue], dim=1))
 
 
@@ -158,10 +159,13 @@ class Moments(NamedTuple):
     def of(cls, samples: PixelSamples) -> Moments:
         """Moments of the pixels below the highlights, where the inverse gains are plain divisions."""
         linear = stages.gamma_expand(inverse_smoothstep(samples.srgb), GAMMA)
-        known = samples.known * (linear.mean(1, keepdim=True) < HIGHLIGHT_KNEE)
-        x, y, weight = (value[:, :, 0].double() for value in (linear, samples.target, known))
+        below = samples.known * (linear.mean(1, keepdim=True) < HIGHLIGHT_KNEE)
+        x = linear[:, :, 0].double()
+        y = samples.target[:, :, 0].double()
+        weight = below[:, :, 0].double()
         if (weight.sum(2) < 32).any():
             raise ValueError("a frame has too few pixels below the highlights; use better exposed frames")
+
         weight = weight / weight.sum((1, 2), keepdim=True)
         a = torch.einsum("fip,fjp,fcp->fcij", x, x, weight)
         return cls(a, torch.einsum("fip,fcp,fcp->fci", x, y, weight), (weight * y * y).sum((1, 2)))
