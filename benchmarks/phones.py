@@ -29,7 +29,7 @@ WATCH_SEED = 11
 """Seed of the validation frames that the training is watched on."""
 FEWEST_BRIGHT = 0.1
 """Minimum share of pixels that are not clipped."""
-FEWEST_COLOURS = 1e-3
+FEWEST_COLOURS = 5e-4
 """Minimum of the smallest principal variance of a frame's colours, relative to their power.
 
 A frame of fewer colours leaves its matrix open, and the matrix would become an atom that is no camera's.
@@ -75,10 +75,10 @@ def main(
     /,
     *,
     out: str = "phones.safetensors",
-    seeds: int = 6,
-    start_steps: int = 100,
-    steps: int = 12000,
-    pixels: int = 4096,
+    seeds: int = 4,
+    start_steps: int = 60,
+    steps: int = 4000,
+    pixels: int = 2048,
     raw_loss: str = "log",
     score_file: str | None = None,
     split: str = "validation",
