@@ -14,12 +14,13 @@ from dataclasses import replace
 from statistics import fmean
 
 import torch
-from torch import Tensor
 
+from rawaug.bayer import pack
 from rawaug.data.pairs import Pair
 from rawaug.data.phones import PhoneFrames
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
+from rawaug.isp.fit.samples import CLIPPED_RAW
 from rawaug.isp.fit.start import plausible_matrices
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import worst_and_best_quarter
@@ -27,8 +28,8 @@ from rawaug.metrics import worst_and_best_quarter
 SIZE = (256, 256)
 WATCH_SEED = 11
 """Seed of the validation frames that the training is watched on."""
-FEWEST_BRIGHT = 0.1
-"""Minimum share of pixels that are not clipped."""
+FEWEST_UNCLIPPED = 0.15
+"""Minimum share of the sites of each colour that are clipped neither in RAW nor in the picture."""
 FEWEST_COLOURS = 5e-4
 """Minimum of the smallest principal variance of a frame's colours, relative to their power.
 
@@ -42,17 +43,18 @@ def draw_frames(path: str, split: str, seeds: Sequence[int], step: int = 1) -> I
         frames = PhoneFrames(path, split, seed, SIZE)
         for index in range(0, len(frames), step):
             pair = frames[index]
-            if says_its_colour(pair.srgb):
+            if says_its_colour(pair):
                 yield replace(pair, name=f"{pair.name} of seed {seed}")
 
 
-def says_its_colour(srgb: Tensor) -> bool:
-    """Whether a picture ``(3, H, W)``, uint8, has enough pixels that are not clipped, of enough colours."""
-    unclipped = (srgb.amax(0) < 250) & (srgb.amin(0) > 0)
-    if unclipped.float().mean() < FEWEST_BRIGHT:
+def says_its_colour(pair: Pair) -> bool:
+    """Whether a frame has enough sites of each colour that are not clipped, and enough colours in its picture."""
+    unclipped = (pair.srgb.amax(0) < 250) & (pair.srgb.amin(0) > 0) & (pair.raw[0] < CLIPPED_RAW)
+    shares = pack(unclipped[None].float(), pair.cfa).mean(dim=(1, 2))
+    if shares.min() < FEWEST_UNCLIPPED:
         return False
 
-    colours = (srgb[:, unclipped].double() / 255.0) ** 2.2
+    colours = (pair.srgb[:, unclipped].double() / 255.0) ** 2.2
     moments = colours @ colours.T
     variances = torch.linalg.eigvalsh(moments)
     return bool(variances[0] > FEWEST_COLOURS * variances.sum())

@@ -15,7 +15,7 @@ from torch import Tensor
 from rawaug.data.pairs import Pair
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig, descent, fit_isp, pipeline
-from rawaug.isp.fit.descent import Descent, cycle_error, reading_error
+from rawaug.isp.fit.descent import CURVE_POINTS, Descent, cycle_error, reading_error
 from rawaug.isp.fit.samples import FitFrames, PixelSamples, sample_pixels
 from rawaug.isp.model import DictionaryISP
 
@@ -58,8 +58,11 @@ def test_watched_tensors_come_back_from_their_best_step() -> None:
     x = torch.zeros(3)
     worker = Descent(None, "key", 0, False)
     worker.run("down", lambda g: x.sum(), {"x": x}, 20, 0.1, watch=lambda: -abs(float(x.detach().sum()) + 1.5))
-    start, step, best = worker.watched["down"]
+    start, step, best, scores = worker.watched["down"]
     assert (start, step) == (-1.5, 5) and best > -0.2  # 5 steps of 0.1 by Adam, three times
+    assert scores[0] == -1.5 and max(scores) == best
+    curve = worker.watched["down"].curve()
+    assert (curve[0], curve[-1]) == (-1.5, round(scores[-1], 2)) and len(curve) <= CURVE_POINTS
     assert -abs(float(x.sum()) + 1.5) == pytest.approx(best)
 
 
