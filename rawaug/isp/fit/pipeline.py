@@ -64,6 +64,8 @@ SHADING_PAYS = 0.5
 FRAMES_A_STEP = 16
 START_STEPS, START_RATE = 1000, 3e-3
 """Steps and rate of the descent that brings the tone near that of the ISP that a fit starts from."""
+MOST_LEFT_OUT = 0.1
+"""Share of the frames that may be left out because too few of their pixels are not clipped."""
 
 
 def fit_isp(
@@ -87,13 +89,16 @@ def fit_isp(
         watched: frames on which end-to-end training is watched; by default a tenth of the pairs, which is held out.
 
     Raises:
-        ValueError: if there is no pair, a frame has too few unclipped pixels, or ``state`` cannot be read.
+        ValueError: if there is no pair, more than a tenth of the frames have too few unclipped pixels (fewer are left
+            out, with a note), or ``state`` cannot be read.
     """
     config = (config or FitConfig()).settled()
     reading = progress_of(pairs, label="read", unit="frame", shown=progress)
     frames = sample_pixels(reading, config.pixels, config.seed, config.noisy)
-    _require_pixels(frames)
-    held_out = None if watched is None else sample_pixels(watched, config.pixels, config.seed, config.noisy)
+    frames = _with_enough_pixels(frames)
+    held_out: FitFrames | None = None
+    if watched is not None:
+        held_out = sample_pixels(watched, config.pixels, config.seed, config.noisy)
     path = None if state is None else Path(state)
     descent = Descent(path, _key(config, frames, camera), config.seed, progress)
 
@@ -115,12 +120,30 @@ def fit_isp(
     return fit.isp.eval()
 
 
-def _require_pixels(frames: FitFrames) -> None:
-    """Raise ValueError if a frame has too few pixels that are not clipped, such as a black one."""
-    counts_by_frame = frames.pixels.known[:, :, 0].sum(2)
-    for shot, counts in zip(frames.shots, counts_by_frame, strict=True):
-        if (counts < FEWEST_PIXELS).any():
-            raise ValueError(f"{shot.name}: too few unclipped pixels to fit; use a better exposed frame or more pixels")
+def _with_enough_pixels(frames: FitFrames) -> FitFrames:
+    """Leave out frames with too few pixels that are not clipped, such as black ones, and report them.
+
+    Raises:
+        ValueError: if they are more than a tenth of the frames.
+    """
+    counts = frames.pixels.known[:, :, 0].sum(2).amin(1)
+    good: list[int] = []
+    bad: list[int] = []
+    for k, count in enumerate(counts.tolist()):
+        if count < FEWEST_PIXELS:
+            bad.append(k)
+        else:
+            good.append(k)
+
+    if not bad:
+        return frames
+
+    first = frames.shots[bad[0]].name
+    if len(bad) > MOST_LEFT_OUT * len(counts):
+        raise ValueError(f"{first}: too few unclipped pixels to fit; use a better exposed frame or more pixels")
+
+    print(f"note: {len(bad)} of {len(counts)} frames have too few unclipped pixels to fit, such as {first}: left out")
+    return frames.some(good)
 
 
 def _key(config: FitConfig, frames: FitFrames, camera: Camera | None) -> str:

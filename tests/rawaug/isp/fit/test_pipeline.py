@@ -100,6 +100,19 @@ def test_no_frame_and_a_white_frame_are_refused(exact_pairs: list[Pair], camera_
         fit_isp([white], TINY, progress=False)
 
 
+def test_one_white_frame_of_ten_is_left_out_with_a_note(
+    exact_pairs: list[Pair], capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = exact_pairs[0]
+    white = replace(first, name="white", srgb=torch.full_like(first.srgb, 255), raw=torch.ones_like(first.raw))
+    others = [replace(first, name=f"copy {k}") for k in range(9)]
+    isp = fit_isp([*others, white], TINY, progress=False)
+    assert len(isp.info["frames"]) == 9 and "white" not in isp.info["frames"]
+    assert "1 of 10 frames" in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"white: .*unclipped"):
+        fit_isp([*others[:8], white], TINY, progress=False)
+
+
 def test_settings_that_cannot_be_are_refused(exact_pairs: list[Pair]) -> None:
     settings: dict[str, Any]
     for settings in ({"atoms": 0}, {"pixels": 0}, {"steps": -1}, {"reach": 0.9}):
