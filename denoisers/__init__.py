@@ -3,6 +3,7 @@
 Every one is called as ``model(noisy, variance=None) -> denoised``, all ``(B, 4, h, w)`` packed RAW (R, Gr, Gb, B).
 """
 
+from denoisers.cascade import CascadeDRUNet
 from denoisers.classical import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
 from denoisers.cycleisp import CycleISPDenoiser
 from denoisers.dhdn import DHDN
@@ -24,7 +25,7 @@ from denoisers.unet import UNet
 from denoisers.wnnm import WNNM
 
 __all__ = [
-    "BM3D", "DENOISERS", "DHDN", "GLIDE", "KSVD", "PMRID", "TNRD", "WNNM", "CycleISPDenoiser", "DRUNet", "Denoiser",
-    "DnCNN", "FFDNet", "JointDRUNet", "MosaicDRUNet", "NAFNet", "NonLocalMeans", "SelfEnsemble", "Stabilised",
-    "TotalVariation", "UNet", "Wavelet", "build", "denoise_tiles", "from_pretrained", "load", "save",
+    "BM3D", "DENOISERS", "DHDN", "GLIDE", "KSVD", "PMRID", "TNRD", "WNNM", "CascadeDRUNet", "CycleISPDenoiser",
+    "DRUNet", "Denoiser", "DnCNN", "FFDNet", "JointDRUNet", "MosaicDRUNet", "NAFNet", "NonLocalMeans", "SelfEnsemble",
+    "Stabilised", "TotalVariation", "UNet", "Wavelet", "build", "denoise_tiles", "from_pretrained", "load", "save",
 ]  # fmt: skip

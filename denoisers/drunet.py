@@ -122,6 +122,15 @@ class ResidualUNet(Denoiser):
 
     def body(self, features: Tensor) -> Tensor:
         """Run all layers but the last: the signal and its maps ``(B, C, h, w)`` to features ``(B, width, h, w)``."""
+        fine, coarse = self.first_layers(features)
+        return self.trunk(fine, coarse)
+
+    def first_layers(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Run the layers that see the signal and its maps ``(B, C, h, w)``.
+
+        Returns:
+            Features ``(B, width, h, w)`` of the first layer, and those of the last scale, see :meth:`trunk`.
+        """
         planes = self.coarse.in_channels
         signal = features[:, :planes]
         maps = features[:, planes:]
@@ -131,7 +140,7 @@ class ResidualUNet(Denoiser):
         inputs = [signal - light, maps]
         if self.light:
             inputs.append(light)
-        return self.trunk(self.head(torch.cat(inputs, dim=1)), self.coarse(self.wide_signal(mean)))
+        return self.head(torch.cat(inputs, dim=1)), self.coarse(self.wide_signal(mean))
 
     def wide_signal(self, mean: Tensor) -> Tensor:
         """What the last scale sees of the mean over cells ``(B, C, h', w')``: the same less its own mean around.

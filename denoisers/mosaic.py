@@ -211,7 +211,7 @@ class MosaicDRUNet(ResidualUNet):
         """Denoise without the pyramid: f."""
         domain = DOMAINS[self.domain]
         signal = domain.forward(raw.float(), *levels)
-        maps = [planes, signal, *self._distances(signal, levels)]
+        maps = [planes, signal, *self.distances(signal, levels)]
         features = pad_to_multiple(torch.cat(maps, dim=1).to(self._dtype), self.multiple)
 
         height, width = raw.shape[-2:]

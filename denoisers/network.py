@@ -182,12 +182,7 @@ class Denoiser(nn.Module, ABC):
         ``variance``, the noise variance of each value, has the shape of ``noisy``. ValueError if a shape or type is
         wrong, or the network needs ``variance`` and it is missing.
         """
-        name = type(self).__name__
-        if noisy.ndim != 4 or noisy.shape[1] != self.channels or min(noisy.shape[-2:]) < 2:
-            raise ValueError(f"{name} takes (B, {self.channels}, h >= 2, w >= 2), got {tuple(noisy.shape)}")
-        self._require_type(noisy, "noisy")
-        if self.reads_variance:
-            variance = self._require_variance(noisy, variance)
+        variance = self._require_input(noisy, variance)
 
         whole = noisy
         if variance is not None and self.mend:
@@ -238,7 +233,7 @@ class Denoiser(nn.Module, ABC):
         domain = DOMAINS[self.domain]
         levels = fit_levels(noisy.float(), variance.float())
         signal = domain.forward(noisy.float(), *levels)
-        distances = self._distances(signal, levels)
+        distances = self.distances(signal, levels)
 
         if self.variance_map:
             deviation = domain.relative_deviation(noisy.float(), variance.float(), *levels)
@@ -249,7 +244,7 @@ class Denoiser(nn.Module, ABC):
         denoised = domain.inverse(self.base_image(signal) + correction, *levels)
         return denoised.to(noisy.dtype)
 
-    def _distances(self, signal: Tensor, levels: Levels) -> list[Tensor]:
+    def distances(self, signal: Tensor, levels: Levels) -> list[Tensor]:
         """The distances of a signal from black and from white, up to :data:`NEAR`, if the network takes them."""
         if not self.limits:
             return []
@@ -280,6 +275,17 @@ class Denoiser(nn.Module, ABC):
         if parameter is None:
             return torch.get_default_dtype()
         return parameter.dtype
+
+    def _require_input(self, noisy: Tensor, variance: Tensor | None) -> Tensor | None:
+        """Return the noise map; ValueError if the picture or, where the network reads one, the map is wrong."""
+        if noisy.ndim != 4 or noisy.shape[1] != self.channels or min(noisy.shape[-2:]) < 2:
+            name = type(self).__name__
+            raise ValueError(f"{name} takes (B, {self.channels}, h >= 2, w >= 2), got {tuple(noisy.shape)}")
+        self._require_type(noisy, "noisy")
+
+        if self.reads_variance:
+            return self._require_variance(noisy, variance)
+        return variance
 
     def _require_type(self, image: Tensor, name: str) -> None:
         """Raise ValueError unless an image has the type of the weights; mixed precision converts by itself."""
