@@ -51,7 +51,7 @@ class TrainConfig:
         warmup: steps of linear warm-up.
         schedule: of the learning rate after warm-up: cosine, down to 1%, or step, halved every ``halve_every`` steps.
         halve_every: steps between halvings.
-        loss: l1, l2 or rms, or {name, settings}.
+        loss: l1, l2, rms or log_mse, or {name, settings}.
         weigh: loss weighting of light and shade: linear, normalised, stabilised, mixed or relative,
             see :mod:`rawaug.training.weighing`.
         ema: decay of the running average of the weights, which are validated and saved; 0 disables it.

@@ -1,4 +1,4 @@
-"""The norms by which a training compares denoised RAW with its target: l1, l2 and rms."""
+"""The norms by which a training compares denoised RAW with its target: l1, l2, rms and log_mse."""
 
 from __future__ import annotations
 
@@ -34,3 +34,21 @@ class RootMeanSquare(nn.Module):
         """Compare two batches ``(B, C, H, W)``: a scalar."""
         mean_square = (a - b).square().flatten(1).mean(1)
         return (mean_square + self.epsilon**2).sqrt().mean()
+
+
+@LOSSES.register("log_mse")
+class LogMeanSquare(nn.Module):
+    """The mean over pictures of ``log(mean (a - b)^2 + epsilon) / 2``: their PSNR, but for its sign and unit.
+
+    A flat picture, whose error is small, then counts as much as a picture full of texture, as it does in a table of
+    PSNR. Source: the PSNR loss of Chen et al., "HINet", CVPR Workshops 2021.
+    """
+
+    def __init__(self, epsilon: float = 1e-4) -> None:
+        super().__init__()
+        self.epsilon = epsilon
+
+    def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        """Compare two batches ``(B, C, H, W)``: a scalar."""
+        mean_square = (a - b).square().flatten(1).mean(1)
+        return 0.5 * (mean_square + self.epsilon).log().mean()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -9,7 +11,8 @@ from torch.nn import L1Loss, MSELoss
 
 from denoisers.domains import Anscombe
 from rawaug.data.pairs import Sample
-from rawaug.training.losses import RootMeanSquare
+from rawaug.metrics import psnr
+from rawaug.training.losses import LogMeanSquare, RootMeanSquare
 from rawaug.training.weighing import weigh_loss
 
 SHOT, READ = 2e-3, 1e-5
@@ -30,6 +33,14 @@ def test_rms_counts_every_picture_by_its_own_error() -> None:
     denoised = torch.stack([level(0.5)[0], level(0.2)[0]])
     assert RootMeanSquare(epsilon=0.0)(denoised, level(0.1)).item() == pytest.approx((0.4 + 0.1) / 2)
     assert RootMeanSquare(epsilon=0.3)(level(0.5), level(0.1)).item() == pytest.approx(0.5)
+
+
+def test_log_mse_is_the_mean_psnr_of_the_pictures_but_for_sign_and_unit() -> None:
+    denoised = torch.stack([level(0.5)[0], level(0.2)[0]])
+    scores = psnr(denoised, level(0.1))
+    decibels = -20.0 / math.log(10.0) * LogMeanSquare(epsilon=0.0)(denoised, level(0.1)).item()
+    assert decibels == pytest.approx(float(scores.mean()))
+    assert math.isfinite(LogMeanSquare()(level(0.1), level(0.1)).item())
 
 
 def test_normalised_is_the_loss_in_units_of_the_noise_of_each_pixel() -> None:
