@@ -14,7 +14,8 @@ from rawaug.isp.camera_names import camera_key, similar_cameras
 from rawaug.isp.cameras import load_cameras
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.own_cameras import Camera, is_camera_file
-from rawaug.noise.cameras import SPREAD, load_profiles, measured_ranges, profile_ends
+from rawaug.noise.cameras import measured_ranges
+from rawaug.noise.profiles import SPREAD, load_profiles, profile_ends
 from rawaug.version import __version__
 
 _WITH_LEVELS = 3

@@ -21,7 +21,7 @@ from rawaug.noise import (
     estimate_noise,
     noise_levels,
 )
-from rawaug.noise.cameras import ProfileLevels
+from rawaug.noise.profiles import ProfileLevels
 from rawaug.seeding import keyed_generator
 
 Shots = Mapping[tuple[str, float | None], tuple[float, float]]

@@ -33,9 +33,10 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import frame_coordinates
 from rawaug.metrics import psnr
 from rawaug.noise import noise_levels, noise_names
-from rawaug.noise.cameras import ProfileLevels
 from rawaug.noise.models import NOISE
-from rawaug.plugin.augment import RawAugment, with_iso
+from rawaug.noise.profiles import ProfileLevels
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.camera_noise import with_iso
 from rawaug.plugin.config import AugmentConfig, pair_generator
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.pictures import trim_to_even

@@ -1,16 +1,7 @@
 """Noise that real sensors make: models, published levels, the estimate of a camera's own, and stabilisation."""
 
-from rawaug.noise.cameras import (
-    CalibratedNoise,
-    IsoLevel,
-    MeasuredLevels,
-    NoiseSpec,
-    camera_law,
-    camera_names,
-    noise_levels,
-    noise_model,
-    noise_names,
-)
+from rawaug.noise.calibrated import CalibratedNoise
+from rawaug.noise.cameras import NoiseSpec, camera_names, noise_levels, noise_model, noise_names
 from rawaug.noise.estimate import (
     NoiseEstimate,
     estimate_dark_noise,
@@ -20,6 +11,7 @@ from rawaug.noise.estimate import (
     plot_noise,
 )
 from rawaug.noise.levels import EldLevels, FixedLevels, Iso, NoiseLevels, PmridLevels, Preset, SiddLevels
+from rawaug.noise.measured import IsoLevel, MeasuredLevels, camera_law
 from rawaug.noise.models import NOISE, NoiseModel, Params, PoissonGaussianNoise, ShotReadModel, ShotReadNoise
 from rawaug.noise.sensor import (
     BlackOffset,

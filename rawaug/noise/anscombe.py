@@ -34,8 +34,8 @@ def forward(y: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Te
         >>> torch.allclose(inverse(z, 1e-3, 1e-5), torch.tensor(0.25), atol=1e-3)
         True
     """
-    shot, read = _levels(y, shot_var, read_var)
-    return (shot * y + 0.375 * shot.square() + read).clamp_(min=0).sqrt_().mul_(2 / shot)
+    s, r = _levels(y, shot_var, read_var)
+    return (s * y + 0.375 * s.square() + r).clamp_(min=0).sqrt_().mul_(2 / s)
 
 
 def inverse(z: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Tensor:
@@ -44,22 +44,23 @@ def inverse(z: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Te
     The result is the clean RAW whose transformed noisy RAW has the mean ``z`` ``(B, ...)``. It is never below
     black; the levels are those of :func:`forward`.
     """
-    shot, read = _levels(z, shot_var, read_var)
+    levels = torch.stack(_levels(z, shot_var, read_var)).flatten(1)
 
     pictures = []
-    for picture, s, r in zip(z, shot.flatten().tolist(), read.flatten().tolist(), strict=True):
+    for picture, s, r in zip(z, *levels.tolist(), strict=True):
         pictures.append(s * _counts(picture, math.sqrt(r) / s))
     return torch.stack(pictures)
 
 
 def _levels(like: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> tuple[Tensor, Tensor]:
+    """s and r of each picture, ``(B, 1, ...)``."""
     shape = (len(like), *(1,) * (like.ndim - 1))
-    shot = torch.as_tensor(shot_var).to(like).expand(len(like)).reshape(shape)
-    read = torch.as_tensor(read_var).to(like).expand(len(like)).reshape(shape)
+    s = torch.as_tensor(shot_var).to(like).expand(len(like)).reshape(shape)
+    r = torch.as_tensor(read_var).to(like).expand(len(like)).reshape(shape)
 
-    if not (shot > 0).all() or not (read >= 0).all():
+    if not (s > 0).all() or not (r >= 0).all():
         raise ValueError(f"variance stabilisation needs shot_var > 0 and read_var >= 0, got {shot_var} and {read_var}")
-    return shot, read
+    return s, r
 
 
 def _counts(z: Tensor, sigma: float) -> Tensor:

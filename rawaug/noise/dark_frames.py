@@ -35,30 +35,53 @@ class DarkFrames(PoissonGaussianNoise):
     by_plane = True
 
     def __init__(self, path: str, shot_var: Range | None = None) -> None:
-        require_not_negative(shot_var=0.0 if shot_var is None else shot_var)
-        frames = [read_raw(file) for file in files_in(path, "RAW", RAW_EXTENSIONS)]
-        untagged = [frame.name for frame in frames if shot_var is None and frame.noise_profile is None]
-        if untagged:
-            raise ValueError(f"DarkFrames: {untagged[0]} has no NoiseProfile tag; give shot_var, the photons' share")
-        self.planes = [pack(frame.mosaic[None], frame.cfa)[0] for frame in frames]
-        self.read_var = torch.tensor([estimate_dark_noise([frame.mosaic], frame.cfa).read_var for frame in frames])
-        self.shot_var = [frame.noise_profile[0] if shot_var is None else shot_var for frame in frames]  # type: ignore[index]
+        if shot_var is not None:
+            require_not_negative(shot_var=shot_var)
+
+        self.planes: list[Tensor] = []
+        self.shot_var: list[Range] = []
+        read_var = []
+        for file in files_in(path, "RAW", RAW_EXTENSIONS):
+            frame = read_raw(file)
+            if shot_var is not None:
+                self.shot_var.append(shot_var)
+            elif frame.noise_profile is not None:
+                self.shot_var.append(frame.noise_profile[0])
+            else:
+                raise ValueError(f"DarkFrames: {frame.name} has no NoiseProfile tag; give shot_var, the photons' share")
+
+            self.planes.append(pack(frame.mosaic[None], frame.cfa)[0])
+            read_var.append(estimate_dark_noise([frame.mosaic], frame.cfa).read_var)
+        self.read_var = torch.tensor(read_var)
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         """Draw a dark frame for each picture with its levels, and the seeds, each ``(batch,)``."""
-        frame = torch.randint(len(self.planes), (batch,), generator=generator, device=generator.device)
-        shot = torch.stack([draw_between(self.shot_var[k], 1, generator)[0] for k in frame.tolist()])
-        read = self.read_var.to(generator.device)[frame]
-        return {"shot_var": shot, "read_var": read, "dark_frame": frame, "seed": draw_seeds(batch, generator)}
+        frames = torch.randint(len(self.planes), (batch,), generator=generator, device=generator.device)
+
+        shot_var = []
+        for frame in frames.tolist():
+            shot_var.append(draw_between(self.shot_var[frame], 1, generator)[0])
+
+        return {
+            "shot_var": torch.stack(shot_var),
+            "read_var": self.read_var.to(generator.device)[frames],
+            "dark_frame": frames,
+            "seed": draw_seeds(batch, generator),
+        }
 
     def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
         """Cut a patch for each picture out of its dark frame, ``(B, 4, h, w)``."""
+        height, width = like.shape[-2:]
         noise = torch.empty_like(like, memory_format=torch.contiguous_format)
-        for picture, index, generator in zip(noise, params["dark_frame"].tolist(), generators, strict=True):
-            planes = self.planes[index].to(like)
-            rows, columns = (
-                (torch.arange(size) + int(torch.randint(side, (), generator=generator, device=like.device))) % side
-                for side, size in zip(planes.shape[-2:], like.shape[-2:], strict=True)
-            )
+        for picture, frame, generator in zip(noise, params["dark_frame"].tolist(), generators, strict=True):
+            planes = self.planes[frame].to(like)
+            rows = _draw_interval(height, planes.shape[-2], generator)
+            columns = _draw_interval(width, planes.shape[-1], generator)
             picture.copy_(planes[:, rows[:, None], columns])
         return noise
+
+
+def _draw_interval(length: int, side: int, generator: torch.Generator) -> Tensor:
+    """Draw where ``length`` lines begin among ``side``; after the last one the first follows: ``(length,)``."""
+    first = int(torch.randint(side, (), generator=generator, device=generator.device))
+    return (torch.arange(length) + first) % side

@@ -22,7 +22,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -38,25 +38,39 @@ if TYPE_CHECKING:
 WORST_FIT = 0.5
 """Minimum R^2 of a fit."""
 BLOCK = 8
+"""Side of a block, in sites of one plane."""
+
+# The bands of a block's DCT, by the sum of a coefficient's row and column.
 _order = np.add.outer(np.arange(BLOCK), np.arange(BLOCK))
 _inner = np.logical_and.outer(np.arange(BLOCK) > 0, np.arange(BLOCK) > 0)
 _LOW = (_order > 0) & (_order < 5)
 _HIGH = _inner & (_order >= 5)
 _MIDDLE = _HIGH & (_order <= 7)
 _TOP = _inner & (_order >= 9)
+
 _DOF = int(_HIGH.sum())
-_MEDIAN = (1 - 2 / (9 * _DOF)) ** 3  # of chi-squared / dof, Wilson and Hilferty
-_RELATIVE_SD = math.sqrt(2 / _DOF)  # of one block's variance
+_MEDIAN = (1 - 2 / (9 * _DOF)) ** 3
+"""Median of chi-squared over its degrees of freedom (Wilson and Hilferty)."""
+_RELATIVE_SD = math.sqrt(2 / _DOF)
+"""Relative standard deviation of one block's variance."""
 
-_FLAT = 1.2  # low over expected energy: passes 70 % of the blocks that hold noise alone
-_WHITE = 0.15  # how far the bands' energies may differ
-_CLIP_MARGIN = 4.0  # in standard deviations of a pixel
-_MIN_BLOCKS = 30  # of one level
+_FLAT = 1.2
+"""Largest ratio of low to expected energy in a flat block; 70 % of the blocks that hold noise alone have less."""
+_WHITE = 0.15
+"""Largest relative difference between the bands' energies."""
+_CLIP_MARGIN = 4.0
+"""Least distance to clipping, in standard deviations of a pixel."""
+_MIN_BLOCKS = 30
+"""Minimum number of blocks of a level."""
 _MIN_POINTS = 6
+"""Minimum number of points of a line."""
 _ROUNDS = 10
+"""Number of repetitions of the fit."""
 
-_OUTLIER = 8.0  # in robust standard deviations: hot pixels, not tails
-_PILED_UP = 0.25  # share of pixels at the lowest value, above which nothing can be measured
+_OUTLIER = 8.0
+"""Deviation of a hot pixel, in robust standard deviations; tails have less."""
+_PILED_UP = 0.25
+"""Share of pixels at the lowest value, above which nothing can be measured."""
 
 
 @dataclass(frozen=True)
@@ -132,29 +146,34 @@ def estimate_noise(
         >>> model = noise_model((estimate.shot_var, estimate.read_var))  # doctest: +SKIP
     """
     frames = [mosaics] if isinstance(mosaics, Tensor) else list(mosaics)
-    measured = [_measure(frame, cfa) for frame in frames]
-    if not measured:
+    if not frames:
         raise ValueError("no frames given to measure the noise of")
-    levels = _split_levels(_Blocks(*map(torch.cat, zip(*measured, strict=True))))
+    blocks = [_measure(frame, cfa) for frame in frames]
+    levels = _split_levels(_Blocks(*map(torch.cat, zip(*blocks, strict=True))))
+
     first = points = _start(levels)
     try:
         for _ in range(_ROUNDS):
-            shot, read, _ = _fit(points, read_var)
-            points = _points(levels, shot, read)
-        shot, read, points = _fit(points, read_var)
+            slope, intercept, _ = _fit(points, read_var)
+            points = _points(levels, slope, intercept)
+        slope, intercept, points = _fit(points, read_var)
     except ValueError:
         if float(first.variance.median()) <= _rounding(frames[0]):
             raise ValueError("no noise found: flat regions vary by no more than the file's rounding") from None
         raise
+
     x, y = points.signal[points.used], points.variance[points.used]
-    r2 = float(1 - (y - shot * x - read).square().sum() / (y - y.mean()).square().sum())
-    return NoiseEstimate(shot, read, r2, points)
+    r2 = float(1 - (y - slope * x - intercept).square().sum() / (y - y.mean()).square().sum())
+    return NoiseEstimate(slope, intercept, r2, points)
 
 
 def _rounding(frame: Tensor) -> float:
     """Compute twice the variance of rounding to the steps that a frame's values have."""
-    steps = frame.flatten()[:: max(1, frame.numel() // 2**18)].double().unique().diff()
-    return 2.0 * float(steps.min()) ** 2 / 12.0 if len(steps) else math.inf
+    stride = max(1, frame.numel() // 2**18)
+    steps = frame.flatten()[::stride].double().unique().diff()
+    if not len(steps):
+        return math.inf
+    return 2.0 * float(steps.min()) ** 2 / 12.0
 
 
 def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
@@ -164,26 +183,46 @@ def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
         raise ValueError(f"a mosaic must have shape (1, H, W) or (1, 1, H, W), got {tuple(frame.shape)}")
     if min(frame.shape[-2:]) < pattern(cfa).period * BLOCK:
         raise ValueError(f"a mosaic of {tuple(frame.shape[-2:])} is too small to estimate noise from")
-    floor = float(frame.min()) if _piles_up(frame) else -math.inf
-    ceiling = min(float(frame.max()) if _piles_up(-frame) else 1.0, 1.0)
-    planes, kinds = _planes(frame.reshape(1, *frame.shape[-2:]).float(), cfa)
-    tiles = planes.unfold(-2, BLOCK, BLOCK).unfold(-2, BLOCK, BLOCK).reshape(len(kinds), -1, BLOCK, BLOCK)
+
+    floor, ceiling = -math.inf, 1.0
+    if _piles_up(frame):
+        floor = float(frame.min())
+    if _piles_up(-frame):
+        ceiling = min(float(frame.max()), 1.0)
+
+    planes, channels = _planes(frame.reshape(1, *frame.shape[-2:]).float(), cfa)
+    tiles = planes.unfold(-2, BLOCK, BLOCK).unfold(-2, BLOCK, BLOCK).reshape(len(channels), -1, BLOCK, BLOCK)
     energy = torch.from_numpy(dctn(tiles.cpu().numpy(), axes=(-2, -1), norm="ortho")).square_()
-    bands = [energy[..., torch.from_numpy(band)].mean(-1) for band in (_LOW, _HIGH, _MIDDLE, _TOP)]
     signal = tiles.mean((-2, -1)).flatten()
-    channel = kinds.to(tiles.device).repeat_interleave(tiles.shape[1])
-    inside = ((tiles > floor) & (tiles < ceiling)).all(-1).all(-1).flatten()
-    room = signal - floor, ceiling - signal
-    return _Blocks(*(t.flatten()[inside].double().cpu() for t in (channel, signal, *bands, *room)))
+
+    blocks = _Blocks(
+        channel=channels.to(tiles.device).repeat_interleave(tiles.shape[1]),
+        signal=signal,
+        low=_band_energy(energy, _LOW),
+        high=_band_energy(energy, _HIGH),
+        middle=_band_energy(energy, _MIDDLE),
+        top=_band_energy(energy, _TOP),
+        to_black=signal - floor,
+        to_white=ceiling - signal,
+    )
+    unclipped = ((tiles > floor) & (tiles < ceiling)).all(-1).all(-1).flatten()
+    return _Blocks(*(values[unclipped].double().cpu() for values in blocks))
+
+
+def _band_energy(energy: Tensor, band: np.ndarray[Any, Any]) -> Tensor:
+    """The mean energy of a band of the coefficients ``(n, N, BLOCK, BLOCK)``, flat."""
+    return energy[..., torch.from_numpy(band)].mean(-1).flatten()
 
 
 def _planes(mosaic: Tensor, cfa: CFA | str) -> tuple[Tensor, Tensor]:
     """Split a mosaic ``(1, H, W)`` into planes of one site of the cell each, ``(n, h, w)``, and say which they are."""
     if cfa in CFA.__members__:
         return pack(mosaic, cfa), torch.arange(4)
-    size = pattern(cfa).period
-    height, width = (side // size * size for side in mosaic.shape[-2:])
-    return F.pixel_unshuffle(mosaic[:, :height, :width], size), plane_indices(cfa).flatten()
+
+    period = pattern(cfa).period
+    height = mosaic.shape[-2] // period * period
+    width = mosaic.shape[-1] // period * period
+    return F.pixel_unshuffle(mosaic[:, :height, :width], period), plane_indices(cfa).flatten()
 
 
 def _piles_up(frame: Tensor) -> bool:
@@ -192,7 +231,9 @@ def _piles_up(frame: Tensor) -> bool:
     above = frame[frame > lowest]
     if above.numel() == 0:
         return False
-    count, next_count = frame.numel() - above.numel(), int((above == above.min()).sum())
+
+    count = frame.numel() - above.numel()
+    next_count = int((above == above.min()).sum())
     return count >= max(10, frame.numel() // 100_000, next_count)
 
 
@@ -203,7 +244,10 @@ def _split_levels(blocks: _Blocks) -> list[_Blocks]:
         index = torch.nonzero(blocks.channel == channel).flatten()
         index = index[blocks.signal[index].argsort()]
         count = min(32, max(4, len(index) // 200))
-        levels += [blocks.take(part) for part in index.tensor_split(count) if len(part) >= _MIN_BLOCKS]
+        for part in index.tensor_split(count):
+            if len(part) >= _MIN_BLOCKS:
+                levels.append(blocks.take(part))
+
     if len(levels) < _MIN_POINTS:
         raise ValueError("too few blocks without clipped pixels to estimate noise; give larger or more frames")
     return levels
@@ -211,67 +255,99 @@ def _split_levels(blocks: _Blocks) -> list[_Blocks]:
 
 def _start(levels: list[_Blocks]) -> NoisePoints:
     """Guess first from the twentieth of each level's blocks that varies least in the low frequencies."""
-    flattest = [b.take(b.low.argsort()[: max(_MIN_BLOCKS, len(b.low) // 20)]) for b in levels]
-    return _gather([(b, b.high.median() / _MEDIAN) for b in flattest])
+    flattest = []
+    variances = []
+    for level in levels:
+        count = max(_MIN_BLOCKS, len(level.low) // 20)
+        blocks = level.take(level.low.argsort()[:count])
+        flattest.append(blocks)
+        variances.append(blocks.high.median() / _MEDIAN)
+    return _gather(flattest, variances)
 
 
 def _points(levels: list[_Blocks], shot_var: float, read_var: float) -> NoisePoints:
     """Measure each level's signal and variance over the blocks that the line says are flat and clear of clipping."""
-    chosen = []
-    for b in levels:
-        expected = (shot_var * b.signal.clamp(min=0) + read_var).clamp(min=1e-12)
-        clear = torch.minimum(b.to_black, b.to_white) > _CLIP_MARGIN * expected.sqrt()
-        no_outlier = b.high < (1 + 6 * _RELATIVE_SD) * expected
-        keep = torch.nonzero(clear & no_outlier & (b.low < _FLAT * expected)).flatten()
-        if len(keep) == 0:
+    flat_levels = []
+    variances = []
+    for level in levels:
+        expected = (shot_var * level.signal.clamp(min=0) + read_var).clamp(min=1e-12)
+        is_clear = torch.minimum(level.to_black, level.to_white) > _CLIP_MARGIN * expected.sqrt()
+        is_regular = level.high < (1 + 6 * _RELATIVE_SD) * expected
+        is_flat = level.low < _FLAT * expected
+        index = torch.nonzero(is_clear & is_regular & is_flat).flatten()
+        if len(index) == 0:
             continue
-        flat, expected = b.take(keep), expected[keep]
+
         # The median is taken of the ratio to the line, so that a wide level is not skewed by its spread of signals.
-        chosen.append((flat, (flat.high / expected).median() / _MEDIAN * expected.mean()))
-    if not chosen:
+        flat, expected = level.take(index), expected[index]
+        flat_levels.append(flat)
+        variances.append((flat.high / expected).median() / _MEDIAN * expected.mean())
+
+    if not flat_levels:
         raise ValueError("no flat regions found to estimate noise from; give frames with sky, walls or a chart")
-    return _gather(chosen)
+    return _gather(flat_levels, variances)
 
 
-def _gather(levels: list[tuple[_Blocks, Tensor]]) -> NoisePoints:
-    counts = torch.tensor([len(b.signal) for b, _ in levels])
-    whiteness = torch.stack([b.top.mean() / b.middle.mean() for b, _ in levels])
+def _gather(levels: list[_Blocks], variances: list[Tensor]) -> NoisePoints:
+    """One point for each level, of its blocks and of their variance."""
+    signals = []
+    channels = []
+    counts = []
+    whiteness = []
+    for level in levels:
+        signals.append(level.signal.mean())
+        channels.append(level.channel[0])
+        counts.append(len(level.signal))
+        whiteness.append(level.top.mean() / level.middle.mean())
+
+    blocks = torch.tensor(counts)
+    is_white = (torch.stack(whiteness) - 1).abs() < _WHITE
     return NoisePoints(
-        signal=torch.stack([b.signal.mean() for b, _ in levels]),
-        variance=torch.stack([variance for _, variance in levels]).clamp(min=1e-12),
-        channel=torch.stack([b.channel[0] for b, _ in levels]).long(),
-        blocks=counts,
-        used=(counts >= _MIN_BLOCKS) & ((whiteness - 1).abs() < _WHITE),
+        signal=torch.stack(signals),
+        variance=torch.stack(variances).clamp(min=1e-12),
+        channel=torch.stack(channels).long(),
+        blocks=blocks,
+        used=(blocks >= _MIN_BLOCKS) & is_white,
     )
 
 
-def _fit(points: NoisePoints, known_read_var: float | None) -> tuple[float, float, NoisePoints]:
-    """Fit shot and read by robust weighted least squares, and mark outliers among the points as unused."""
+def _fit(points: NoisePoints, dark_var: float | None) -> tuple[float, float, NoisePoints]:
+    """Fit slope and intercept by robust weighted least squares, and mark outliers among the points as unused.
+
+    The intercept is ``dark_var`` where dark frames have given it.
+    """
     used = points.used
     x, y, n = points.signal, points.variance, points.blocks.double()
     if int(used.sum()) < _MIN_POINTS or x[used].max() < 1.5 * x[used].min().clamp(min=1e-6):
         raise ValueError("too few flat regions, or all of one brightness, to fit noise; give more frames, or charts")
+
     variance, trust = y, used
     for _ in range(_ROUNDS):
         weight = trust * n / variance.square()
-        shot, read = _line(x, y, weight, known_read_var)
-        variance = (shot * x.clamp(min=0) + read).clamp(min=1e-12)
+        slope, intercept = _line(x, y, weight, dark_var)
+        variance = (slope * x.clamp(min=0) + intercept).clamp(min=1e-12)
         residual = y / variance - 1
         scale = max(1.4826 * float(residual[used].abs().median()), 0.02)
         trust = used & (residual.abs() < 4 * scale)
-    return shot, read, replace(points, used=trust)
+    return slope, intercept, replace(points, used=trust)
 
 
-def _line(x: Tensor, y: Tensor, weight: Tensor, known_read_var: float | None) -> tuple[float, float]:
-    """Fit the slope, and the intercept unless it is known, by weighted least squares; the intercept is at least 0."""
-    w, wx, wxx = (float((weight * t).sum()) for t in (torch.ones_like(x), x, x * x))
+def _line(x: Tensor, y: Tensor, weight: Tensor, dark_var: float | None) -> tuple[float, float]:
+    """Fit the slope, and the intercept unless it is ``dark_var``, by weighted least squares; it is at least 0."""
+    w = float(weight.sum())
+    wx, wxx = float((weight * x).sum()), float((weight * (x * x)).sum())
     wy, wxy = float((weight * y).sum()), float((weight * x * y).sum())
-    determinant = w * wxx - wx * wx
-    read = (wxx * wy - wx * wxy) / determinant if known_read_var is None else known_read_var
-    if known_read_var is None and read >= 0:
-        return (w * wxy - wx * wy) / determinant, read
-    read = max(read, 0.0)
-    return (wxy - read * wx) / wxx, read
+
+    if dark_var is None:
+        determinant = w * wxx - wx * wx
+        intercept = (wxx * wy - wx * wxy) / determinant
+        if intercept >= 0:
+            return (w * wxy - wx * wy) / determinant, intercept
+    else:
+        intercept = dark_var
+
+    intercept = max(intercept, 0.0)
+    return (wxy - intercept * wx) / wxx, intercept
 
 
 def own_noise(raw: Tensor, cfa: CFA | str) -> tuple[float, float] | None:
@@ -288,7 +364,10 @@ def own_noise(raw: Tensor, cfa: CFA | str) -> tuple[float, float] | None:
         estimate = estimate_noise(raw, cfa)
     except ValueError:
         return None
-    return None if estimate.r2 < WORST_FIT else (estimate.shot_var, estimate.read_var)
+
+    if estimate.r2 < WORST_FIT:
+        return None
+    return estimate.shot_var, estimate.read_var
 
 
 def own_noise_share(levels: tuple[float, float], reference: Tensor, squared_error: float) -> float:
@@ -329,8 +408,13 @@ def estimate_dark_noise(frames: Sequence[Tensor], cfa: CFA | str) -> DarkNoise:
     """
     if not frames:
         raise ValueError("no dark frames given")
-    measured = [_measure_dark(pack(frame.reshape(1, *frame.shape[-2:]).double(), cfa)) for frame in frames]
-    read_var, row_var, *offsets = torch.stack(measured).mean(0).tolist()
+
+    figures = []
+    for frame in frames:
+        mosaic = frame.reshape(1, *frame.shape[-2:]).double()
+        figures.append(_measure_dark(pack(mosaic, cfa)))
+
+    read_var, row_var, *offsets = torch.stack(figures).mean(0).tolist()
     return DarkNoise(read_var, max(row_var, 0.0), (offsets[0], offsets[1], offsets[2], offsets[3]))
 
 
@@ -339,14 +423,21 @@ def _measure_dark(planes: Tensor) -> Tensor:
     lowest = planes == planes.min()
     if float(lowest.double().mean()) > _PILED_UP:
         raise ValueError("a dark frame is clipped at black, so its noise cannot be measured")
+
     difference = planes.diff(dim=-1)
     scale = 1.4826 * difference.abs().median()
-    regular = difference.abs() <= _OUTLIER * scale if scale > 0 else torch.ones_like(difference, dtype=torch.bool)
-    read_var = difference[regular].square().mean() / 2
-    # R and Gr share a row of the sensor, Gb and B the next. A median is coarse on digital numbers: cap the outliers.
+    is_regular = torch.ones_like(difference, dtype=torch.bool)
+    limit = planes.abs().max()
+    if scale > 0:
+        limit = _OUTLIER * scale
+        is_regular = difference.abs() <= limit
+    read_var = difference[is_regular].square().mean() / 2
+
+    # A median is coarse on digital numbers: cap the outliers.
     offsets = planes.flatten(1).median(-1).values
-    limit = _OUTLIER * scale if scale > 0 else planes.abs().max()
     levelled = (planes - offsets[:, None, None]).clamp(-limit, limit)
+
+    # R and Gr share a row of the sensor, Gb and B the next.
     rows = levelled.reshape(2, 2, *planes.shape[1:]).mean((1, 3))
     row_var = rows.diff(dim=-1).square().mean() / 2 - read_var / (2 * planes.shape[-1])
     return torch.cat([read_var[None], row_var[None], levelled.mean((1, 2)) + offsets])
@@ -360,19 +451,22 @@ def plot_noise(estimate: NoiseEstimate, path: str | Path | None = None, *, title
     with extra("train"):
         from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
     points = estimate.points
     signal, variance = points.signal.numpy(), points.variance.numpy()
     used, channel = points.used.numpy(), points.channel.numpy()
+
     right = 1.05 * signal[used].max()
     line = np.geomspace(max(signal[used].min(), 1e-5) / 2, right, 200)
     name = f"{estimate.shot_var:.3g} y + {estimate.read_var:.3g}   (R² {estimate.r2:.3f})"
+
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
     for axes, scale in zip(figure.subplots(1, 2), ("linear", "log"), strict=True):
         axes.scatter(signal[~used], variance[~used], s=14, facecolors="none", edgecolors="0.7", label="left out")
         for index, (label, colour) in enumerate(_CHANNELS):
-            shown = used & (channel == index)
-            if shown.any():
-                axes.scatter(signal[shown], variance[shown], s=14, color=colour, label=label)
+            of_channel = used & (channel == index)
+            if of_channel.any():
+                axes.scatter(signal[of_channel], variance[of_channel], s=14, color=colour, label=label)
+
         axes.plot(line, estimate.shot_var * line + estimate.read_var, color="black", lw=1.2, label=name)
         axes.set(xscale=scale, yscale=scale, xlabel="signal (white = 1)", ylabel="variance")
         if scale == "linear":
@@ -380,6 +474,7 @@ def plot_noise(estimate: NoiseEstimate, path: str | Path | None = None, *, title
             axes.legend(fontsize=8)
         else:
             axes.set(xlim=(line[0], 1.0), ylim=(variance[used].min() / 3, 3 * variance[used].max()))
+
     figure.suptitle(escape(title), parse_math=False)
     if path is not None:
         figure.savefig(Path(path), dpi=120)

@@ -152,13 +152,13 @@ def interpolate_levels(table: Tensor, iso: Tensor) -> tuple[Tensor, Tensor]:
 
     ``table``, float64 ``(3, N)`` with N at least 2, holds the logarithms of ISO, ascending, shot_var and read_var.
     """
-    x, shot, read = table
+    x, log_shot, log_read = table
     at = iso.log().double()
     right = torch.bucketize(at, x).clamp(1, len(x) - 1)
     t = (at - x[right - 1]) / (x[right] - x[right - 1])
 
-    shot_var = torch.lerp(shot[right - 1], shot[right], t).exp().float()
-    read_var = torch.lerp(read[right - 1], read[right], t).exp().float()
+    shot_var = torch.lerp(log_shot[right - 1], log_shot[right], t).exp().float()
+    read_var = torch.lerp(log_read[right - 1], log_read[right], t).exp().float()
     return shot_var, read_var
 
 

@@ -37,7 +37,8 @@ from rawaug.noise.models import (
 )
 from rawaug.registry import require_between
 
-_NO_STEP = 1e-12  # replaces a quantum of 0, where nothing is rounded
+_NO_STEP = 1e-12
+"""Replaces a quantum of 0, where nothing is rounded."""
 
 Range = float | tuple[float, float]
 """One value for all pictures, or the limits between which each picture draws its own."""
@@ -46,8 +47,11 @@ Range = float | tuple[float, float]
 def require_not_negative(**values: Range) -> None:
     """Raise ValueError unless each number is at least 0, or each range is positive and ascending."""
     for name, value in values.items():
-        low = value[0] if isinstance(value, tuple) else value
-        if low < 0 or (isinstance(value, tuple) and not 0 < low <= value[1]):
+        if isinstance(value, tuple):
+            is_valid = 0 < value[0] <= value[1]
+        else:
+            is_valid = not value < 0
+        if not is_valid:
             raise ValueError(f"{name} must be at least 0, or a range (low, high) with 0 < low <= high, got {value}")
 
 
@@ -74,7 +78,7 @@ class TukeyLambdaNoise(PoissonGaussianNoise):
     def __init__(self, levels: NoiseLevels, shape: float | tuple[float, float]) -> None:
         super().__init__(levels)
         self.shape = shape if isinstance(shape, tuple) else (shape, shape)
-        tukey_lambda_variance(min(self.shape))
+        tukey_lambda_variance(min(self.shape))  # raises for an infinite variance
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         """Draw levels, seeds and the shape ``tukey_lambda`` of the tails, each ``(batch,)``."""
@@ -87,14 +91,17 @@ class TukeyLambdaNoise(PoissonGaussianNoise):
         noise = torch.empty_like(like, memory_format=torch.contiguous_format)
         shapes, variances = params["tukey_lambda"].tolist(), params["read_var"].tolist()
         for picture, shape, read_var, generator in zip(noise, shapes, variances, generators, strict=True):
+            scale = math.sqrt(read_var / tukey_lambda_variance(shape))
             u = uniform(generator, *picture.shape)
-            picture.copy_(_tukey_lambda(u, shape).mul_(math.sqrt(read_var / tukey_lambda_variance(shape))))
+            picture.copy_(_tukey_lambda(u, shape).mul_(scale))
         return noise
 
 
 def _tukey_lambda(u: Tensor, shape: float) -> Tensor:
     """Compute the quantile function Q(u)."""
-    log_u, log_v = u.clamp(min=2**-25).log_(), (1 - u).log_()  # rand is a multiple of 2^-24, and may be 0
+    log_u = u.clamp(min=2**-25).log_()  # rand is a multiple of 2^-24, and may be 0
+    log_v = (1 - u).log_()
+
     if shape == 0:
         return log_u.sub_(log_v)
     return log_u.mul_(shape).expm1_().sub_(log_v.mul_(shape).expm1_()).div_(shape)
@@ -214,8 +221,9 @@ class DefectPixels(_FixedPattern):
     def __init__(self, dead: Range = 0.0, hot: Range = 0.0, clusters: float = 0.0) -> None:
         require_not_negative(dead=dead, hot=hot)
         require_between("clusters", clusters, 0.0, 1.0)
-        if sum(max(share) if isinstance(share, tuple) else share for share in (dead, hot)) > 1:
+        if _largest(dead) + _largest(hot) > 1:
             raise ValueError(f"shares of dead and hot pixels must add up to at most 1, got {dead} and {hot}")
+
         self.dead, self.hot, self.clusters = dead, hot, clusters
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
@@ -233,15 +241,21 @@ class DefectPixels(_FixedPattern):
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
         """Put the defects into ``clean`` ``(B, 4, h, w)``."""
         noisy = clean.clone() if out is None else out.copy_(clean)
+
         for i, generator in enumerate(self.generators(params, clean.device)):
             dead, hot = float(params["dead_share"][i]), float(params["hot_share"][i])
             place, current = uniform(generator, 2, *clean.shape[1:]).to(clean)
             if self.clusters:
                 cell = uniform(generator, *clean.shape[-2:])
                 place = torch.where(cell < self.clusters, place[:1], place)
+
             noisy[i].masked_fill_(place < dead, 0.0)
             noisy[i] += torch.where(place >= 1 - hot, current, 0.0)
         return noisy
+
+
+def _largest(share: Range) -> float:
+    return max(share) if isinstance(share, tuple) else share
 
 
 class Quantisation(NoiseModel):
@@ -256,16 +270,22 @@ class Quantisation(NoiseModel):
 
     def __init__(self, bits: int | tuple[int, ...], black_level: int = 0) -> None:
         depths = bits if isinstance(bits, tuple) else (bits,)
-        if not all(1 <= depth <= 16 and 0 <= black_level < 2**depth - 1 for depth in depths) or not depths:
-            raise ValueError(f"bits must be 1 to 16 and the black level below white, got {bits} and {black_level}")
-        self.quanta = [1 / (2**depth - 1 - black_level) for depth in depths]
+        if not depths:
+            raise ValueError("bits must be 1 to 16, got none")
+
+        self.quanta = []
+        for depth in depths:
+            if not 1 <= depth <= 16 or not 0 <= black_level < 2**depth - 1:
+                raise ValueError(f"bits must be 1 to 16 and the black level below white, got {bits} and {black_level}")
+            self.quanta.append(1 / (2**depth - 1 - black_level))
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         """Draw the step of the grid for each picture, ``(batch,)``, white = 1."""
         if len(self.quanta) == 1:
             return {"quantum": draw_between(self.quanta[0], batch, generator)}
-        chosen = torch.randint(len(self.quanta), (batch,), generator=generator, device=generator.device)
-        return {"quantum": torch.tensor(self.quanta, device=generator.device)[chosen]}
+
+        index = torch.randint(len(self.quanta), (batch,), generator=generator, device=generator.device)
+        return {"quantum": torch.tensor(self.quanta, device=generator.device)[index]}
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
         """Round ``clean`` ``(B, 4, h, w)`` to the grid."""

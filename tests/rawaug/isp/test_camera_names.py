@@ -10,7 +10,8 @@ import pytest
 from rawaug.cli import main
 from rawaug.isp.camera_names import camera_key, find_camera, similar_cameras
 from rawaug.isp.cameras import load_cameras
-from rawaug.noise.cameras import load_profiles, noise_levels
+from rawaug.noise import noise_levels
+from rawaug.noise.profiles import load_profiles
 
 MATRICES, PROFILES = load_cameras().names, load_profiles().names
 

@@ -17,7 +17,7 @@ from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.cameras import SRGB_TO_XYZ, XYZ_TO_SRGB, daylight_gains, load_cameras
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.own_cameras import Camera, adaptation, light_xyz
-from rawaug.noise.cameras import MeasuredNoise
+from rawaug.noise.measured import MeasuredNoise
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.config import AugmentConfig
 

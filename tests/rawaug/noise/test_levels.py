@@ -25,7 +25,9 @@ from rawaug.noise import (
     noise_model,
     noise_names,
 )
-from rawaug.noise.cameras import (
+from rawaug.noise.levels import MixedLevels
+from rawaug.noise.models import NoiseModel
+from rawaug.noise.profiles import (
     READ_ON_MOSAIC,
     SHOT_ON_MOSAIC,
     SPREAD,
@@ -33,8 +35,6 @@ from rawaug.noise.cameras import (
     load_profiles,
     profile_ends,
 )
-from rawaug.noise.levels import MixedLevels
-from rawaug.noise.models import NoiseModel
 
 N = 20_000
 LAWS = {  # name: base of the logarithm, shot range, slope, intercept, sigma

@@ -1,0 +1,251 @@
+"""The noise of cameras that were measured, on their own files or by their data sheets, by ISO.
+
+Between the ISO values of a camera's levels, the logarithms of both variances are linear in that of the ISO. Outside the
+measured range an ISO is refused. Files without an ISO give one level for every picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from rawaug.noise.levels import FixedLevels, Iso, MixedLevels, NoiseLevels, interpolate_levels, iso_limits, log_uniform
+from rawaug.noise.models import NOISE, Params, ShotReadNoise, per_picture
+
+_LEAST = 1e-12
+"""Stands for a variance of 0 in the logarithms."""
+
+
+class IsoLevel(NamedTuple):
+    """The noise levels that were measured at one ISO.
+
+    Args:
+        iso: None if the files have none.
+        shot_var, read_var: variances, white = 1.
+        r2: of the line through the measured points; None if unknown.
+        frames: how many were measured; None if unknown.
+    """
+
+    iso: float | None
+    shot_var: float
+    read_var: float
+    r2: float | None = None
+    frames: int | None = None
+
+
+class MeasuredLevels:
+    """The levels of one camera, at the measured ISO values and between them.
+
+    Args:
+        levels: one for each ISO, or a single one without.
+        camera: make and model, for messages.
+
+    Raises:
+        ValueError: if there is no level, two have the same ISO, or one of several has none.
+
+    Example:
+        >>> law = MeasuredLevels([IsoLevel(100, 1e-4, 1e-7), IsoLevel(400, 4e-4, 1.6e-6)], "Maker Model")
+        >>> [f"{level:.2g}" for level in law.at(200)]
+        ['0.0002', '4e-07']
+    """
+
+    def __init__(self, levels: Sequence[IsoLevel], camera: str = "unknown") -> None:
+        values = [level.iso for level in levels]
+        if not values or len(set(values)) < len(values) or (None in values and len(values) > 1):
+            raise ValueError(f"a noise law takes levels of different ISO values, or one without; got {values}")
+        self.levels = sorted(levels, key=lambda level: level.iso or 0.0)
+        self.camera = camera
+
+        rows = []
+        for level in self.levels:
+            rows.append((level.iso or 1.0, max(level.shot_var, _LEAST), max(level.read_var, _LEAST)))
+        self.table = torch.tensor(rows, dtype=torch.float64).log().T.contiguous()
+
+    @property
+    def limits(self) -> tuple[float, float] | None:
+        """The lowest and the highest ISO that was measured; None where the files have no ISO."""
+        low, high = self.levels[0].iso, self.levels[-1].iso
+        if low is None or high is None:
+            return None
+        return low, high
+
+    def at(self, iso: float | None) -> tuple[float, float]:
+        """Give (shot_var, read_var) at an ISO, or the one measured level for None; ValueError outside the range."""
+        if self.limits is None or (iso is None and len(self.levels) == 1):
+            return self.levels[0].shot_var, self.levels[0].read_var
+        if iso is None:
+            raise ValueError(f"the noise of {self.camera} depends on the ISO, which the file does not say")
+
+        low, _ = iso_limits(self.camera, iso, self.limits)
+        for level in self.levels:
+            if level.iso == iso:
+                return level.shot_var, level.read_var
+
+        shot_var, read_var = interpolate_levels(self.table, torch.tensor([low]))
+        return float(shot_var), float(read_var)
+
+    def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw an ISO for each picture, log-uniformly over the measured range, and its levels, ``(batch,)``."""
+        if self.limits is None or len(self.levels) == 1:
+            return FixedLevels(*self.at(None)).sample(batch, generator)
+        table = self.table.to(generator.device)
+        return interpolate_levels(table, log_uniform(self.limits, batch, generator))
+
+    def within(self, iso: float | tuple[float, float]) -> NoiseLevels:
+        """The law at one ISO, or between two; ValueError outside the measured range.
+
+        Example:
+            >>> law = MeasuredLevels([IsoLevel(100, 1e-4, 1e-7), IsoLevel(400, 4e-4, 1.6e-6)], "Maker Model")
+            >>> shot_var, _ = law.within((100, 200)).sample(1000, torch.Generator().manual_seed(0))
+            >>> bool(shot_var.max() < 2.001e-4)
+            True
+        """
+        if self.limits is None:
+            raise ValueError(f"the noise of {self.camera} was measured at no ISO; omit iso")
+
+        low, high = iso_limits(self.camera, iso, self.limits)
+        if low == high:
+            return FixedLevels(*self.at(low))
+
+        levels = [IsoLevel(low, *self.at(low))]
+        for level in self.levels:
+            if level.iso is not None and low < level.iso < high:
+                levels.append(level)
+        levels.append(IsoLevel(high, *self.at(high)))
+        return MeasuredLevels(levels, self.camera)
+
+    def spec(self) -> dict[str, Any]:
+        """Write the law as a name with settings, which files of weights hold and :func:`noise_model` reads."""
+        rows = []
+        for level in self.levels:
+            rows.append({key: value for key, value in level._asdict().items() if value is not None})
+        return {"name": "MeasuredNoise", "settings": {"camera": self.camera, "levels": rows}}
+
+
+class RoundedNoise(ShotReadNoise):
+    """Shot and read noise of RAW that is rounded to digital numbers.
+
+    Args:
+        levels: whose ``read_var`` contains the rounding, as it does where it is measured on RAW files.
+        quantum: step of the digital numbers, white = 1; None rounds nothing.
+
+    Raises:
+        ValueError: if the step is not in (0, 1).
+    """
+
+    def __init__(self, levels: NoiseLevels, quantum: float | None = None) -> None:
+        if quantum is not None and not 0.0 < quantum < 1.0:
+            raise ValueError(f"quantum must be between 0 and 1, got {quantum}")
+        self.quantum = quantum
+        super().__init__(levels)
+
+    def sample(self, batch: int, generator: torch.Generator) -> Params:
+        """Draw ``shot_var``, ``read_var`` (without the rounding), ``seed`` and, where RAW is rounded, ``quantum``."""
+        params = super().sample(batch, generator)
+        if self.quantum is not None:
+            quantum = torch.full_like(params["read_var"], self.quantum)
+            params["read_var"] = (params["read_var"] - quantum.square() / 12).clamp_min(0.0)
+            params["quantum"] = quantum
+        return params
+
+    def apply(self, clean: Tensor, params: Params) -> Tensor:
+        """Make noisy RAW ``(B, 4, h, w)``, rounded where the camera rounds; see :meth:`NoiseModel.apply`."""
+        noisy = super().apply(clean, params)
+        return _round_to_quantum(noisy, params)
+
+    def apply_with_variance(self, clean: Tensor, params: Params) -> tuple[Tensor, Tensor]:
+        """Make noisy RAW and its variance map, both ``(B, 4, h, w)``."""
+        if "quantum" not in params:
+            return super().apply_with_variance(clean, params)
+        noisy = self.apply(clean, params)
+        return noisy, self.variance(noisy, params)
+
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        """Add the noise to ``clean`` ``(B, 4, h, w)`` without the clip at white."""
+        noisy = super().disturb(clean, params, out)
+        return _round_to_quantum(noisy, params)
+
+    def variance(self, clean: Tensor, params: Params) -> Tensor:
+        """Compute ``shot_var max(clean, 0) + read_var``, ``(B, 4, h, w)``, where ``read_var`` contains the rounding."""
+        variance = super().variance(clean, params)
+        if "quantum" in params:
+            variance += per_picture(params["quantum"].square() / 12, clean)
+        return variance
+
+
+def _round_to_quantum(noisy: Tensor, params: Params) -> Tensor:
+    """Round RAW ``(B, 4, h, w)`` in place to multiples of the drawn steps, if there are any."""
+    if "quantum" not in params:
+        return noisy
+    quantum = per_picture(params["quantum"], noisy)
+    return noisy.div_(quantum).round_().mul_(quantum)
+
+
+@NOISE.register("MeasuredNoise")
+class MeasuredNoise(RoundedNoise):
+    """Shot and read noise of a camera measured at several ISO values; each picture draws an ISO.
+
+    Args:
+        levels: for each ISO ``{iso, shot_var, read_var}``, besides ``r2`` and ``frames`` if known.
+        camera: make and model.
+        quantum: as for :class:`RoundedNoise`.
+        iso: one ISO, or (lowest, highest), from which the levels are drawn; by default all that was measured.
+
+    Raises:
+        ValueError: if a level is incomplete, the step is not in (0, 1), or the ISO was not measured.
+    """
+
+    def __init__(
+        self,
+        levels: Sequence[Mapping[str, Any]],
+        camera: str = "unknown",
+        quantum: float | None = None,
+        iso: Iso = None,
+    ) -> None:
+        rows = []
+        for row in levels:
+            if not {"shot_var", "read_var"} <= row.keys() <= set(IsoLevel._fields):
+                raise ValueError(f"MeasuredNoise: a level is {{iso, shot_var, read_var}}, got {dict(row)}")
+            rows.append(IsoLevel(**{"iso": None, **row}))
+
+        self.law = MeasuredLevels(rows, camera)
+        drawn_from: NoiseLevels = self.law
+        if iso is not None:
+            drawn_from = self.law.within(iso)
+        super().__init__(drawn_from, quantum)
+
+
+def camera_law(stored: Mapping[str, Any]) -> MeasuredLevels:
+    """Read the law in the entry ``noise`` of an ISP's file; ValueError if it is no law of a camera."""
+    if "shot_var" in stored:  # a single level, as in the shipped canon-powershot
+        return MeasuredLevels([IsoLevel(None, stored["shot_var"], stored["read_var"], stored.get("r2"))])
+    if stored.get("name") != "MeasuredNoise":
+        raise ValueError(f"expected the noise law of a camera, got {dict(stored)}; fit the ISP again")
+    return MeasuredNoise(**stored["settings"]).law
+
+
+def measured_noise(specs: Sequence[Mapping[str, Any]], iso: Iso = None) -> RoundedNoise:
+    """The noise of one or several cameras, of which each picture draws one.
+
+    Args:
+        specs: laws as an ISP's file holds them.
+        iso: one ISO, limits, or None for what was measured.
+
+    Raises:
+        ValueError: if a law is none of a camera, or the cameras round to different digital numbers.
+    """
+    laws: list[NoiseLevels] = []
+    quanta = set()
+    for spec in specs:
+        law = camera_law(spec)
+        laws.append(law if iso is None else law.within(iso))
+        quanta.add(spec.get("settings", {}).get("quantum"))
+
+    if len(quanta) > 1:
+        raise ValueError("the cameras round to different digital numbers; give the noise of one, or leave out bits")
+    if len(laws) == 1:
+        return RoundedNoise(laws[0], quanta.pop())
+    return RoundedNoise(MixedLevels(laws), quanta.pop())
