@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from rawaug.isp.config import ISPResult as ISPResult
     from rawaug.isp.model import DictionaryISP as DictionaryISP
     from rawaug.isp.own_cameras import Camera as Camera
-    from rawaug.plugin.augment import ISPModel as ISPModel
     from rawaug.plugin.augment import RawAugment as RawAugment
     from rawaug.plugin.clean_raw import RawNoise as RawNoise
     from rawaug.plugin.dataset import RawPairs as RawPairs
     from rawaug.plugin.dataset import RawPairStream as RawPairStream
+    from rawaug.plugin.degradation import ISPModel as ISPModel
     from rawaug.plugin.draw import Draw as Draw
     from rawaug.plugin.finishing import Finish as Finish
     from rawaug.plugin.loader import ResumableLoader as ResumableLoader
@@ -46,9 +46,10 @@ _PUBLIC = {
     "rawaug.isp.config": ("ISPConfig", "ISPParams", "ISPResult"),
     "rawaug.isp.model": ("DictionaryISP",),
     "rawaug.isp.own_cameras": ("Camera",),
-    "rawaug.plugin.augment": ("ISPModel", "RawAugment"),
+    "rawaug.plugin.augment": ("RawAugment",),
     "rawaug.plugin.clean_raw": ("RawNoise",),
     "rawaug.plugin.dataset": ("RawPairStream", "RawPairs"),
+    "rawaug.plugin.degradation": ("ISPModel",),
     "rawaug.plugin.draw": ("Draw",),
     "rawaug.plugin.finishing": ("Finish",),
     "rawaug.plugin.loader": ("ResumableLoader", "WrappedLoader", "resumable", "wrap"),

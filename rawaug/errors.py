@@ -26,6 +26,23 @@ def escape(text: object) -> str:
     return "".join(characters)
 
 
+def count_of(number: int, noun: str, plural: str | None = None) -> str:
+    """Write a number and its noun.
+
+    Args:
+        number: of things.
+        noun: of one of them.
+        plural: of several, where it is not the noun and an s.
+
+    Example:
+        >>> count_of(1, "picture"), count_of(2, "picture"), count_of(0, "pass", "passes")
+        ('1 picture', '2 pictures', '0 passes')
+    """
+    if number == 1:
+        return f"1 {noun}"
+    return f"{number} {plural or noun + 's'}"
+
+
 class MissingExtra(ImportError):
     """A library of an extra is not installed."""
 

@@ -25,7 +25,7 @@ from rawaug.experiment.report import Report, say, write_report
 from rawaug.experiment.stages import Camera, Experiment, Results, fit_isp, is_leader, score_arm, train_arm
 from rawaug.files import LOCK, locked
 from rawaug.noise import noise_model
-from rawaug.plugin.augment import noise_for
+from rawaug.plugin.camera_noise import noise_for
 from rawaug.registry import Spec, split_spec
 from rawaug.tasks.base import TASKS
 from rawaug.tasks.settings import Recipe

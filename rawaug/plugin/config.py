@@ -10,6 +10,7 @@ from pydantic import TypeAdapter
 from rawaug.files import parse_object, to_json
 from rawaug.isp.own_cameras import Camera, as_camera, is_camera_file
 from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.camera_noise import USUAL
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.targets import Burst, Srgb, Target
 from rawaug.seeding import keyed_generator
@@ -52,26 +53,32 @@ class AugmentConfig:
     def __post_init__(self) -> None:
         if self.noise is None:
             raise ValueError("noise must be a name or a pair (shot_var, read_var) of variances, got None")
+
+        # The figures of a camera count, not its file, which may change or lie elsewhere.
         if self.camera is not None and (isinstance(self.camera, Camera) or is_camera_file(self.camera)):
-            # The figures count, not the file, which may change or lie elsewhere.
             camera = as_camera(self.camera)
             object.__setattr__(self, "camera", to_json(camera.to_json()))
+
         if self.noise == USUAL_NOISE:
             own = self.own_camera
-            object.__setattr__(self, "noise", "camera" if own is not None and own.levels else "cycleisp_sidd")
+            noise = "camera" if own is not None and own.levels else USUAL
+            object.__setattr__(self, "noise", noise)
 
     @property
     def own_camera(self) -> Camera | None:
         """The camera of one's own; None where the cameras are published ones, or a fitted one."""
         if self.camera is not None and self.camera.startswith("{"):
             return Camera.from_json(parse_object(self.camera))
-        return Camera.load(self.isp) if is_camera_file(self.isp) else None
+        if is_camera_file(self.isp):
+            return Camera.load(self.isp)
+        return None
 
     def make(self) -> RawAugment:
         """The augmentation of these settings; it raises what :meth:`rawaug.RawAugment.from_pretrained` raises."""
         settings = dict(vars(self))
         if self.camera is not None and self.own_camera is not None:
             settings["camera"] = self.own_camera
+
         return RawAugment.from_pretrained(**settings)
 
     @property

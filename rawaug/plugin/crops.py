@@ -23,6 +23,7 @@ def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
     """
     if crop is None:
         return None
+
     sides: tuple[Any, ...] = ()
     if isinstance(crop, SupportsIndex):
         sides = (crop, crop)
@@ -30,8 +31,9 @@ def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
         sides = tuple(crop)
     if len(sides) != 2 or not all(isinstance(side, SupportsIndex) for side in sides):
         raise ValueError(f"crop must be an even side or (height, width), got {crop!r}")
-    height, width = (int(side) for side in sides)
-    return bayer.RandomCrop((height, width)).size
+
+    height, width = sides
+    return bayer.RandomCrop((int(height), int(width))).size
 
 
 def draw_crop(
@@ -51,6 +53,7 @@ def draw_crop(
     """
     height, width = picture.shape[-2:]
     region = size or (height, width)
+
     if size and zoom > 1.0:
         share, exponent = torch.rand(2, generator=generator).tolist()
         rows = size[0]
@@ -99,9 +102,11 @@ def cut_patch(picture: Tensor, crop: Tensor, size: tuple[int, int] | None) -> Te
     top, left, height, width, view, rows = (*crop.tolist(), 0)[:6]
     if picture.shape[-2:] != (height, width):
         raise ValueError(f"the parameters belong to a picture of {height} x {width}, got {tuple(picture.shape[-2:])}")
-    region = _region(size, rows) if size else (height, width)
-    patch = bayer.crop(picture, top, left, *region)
-    if size and patch.shape[-2:] != size:
+    if size is None:
+        return bayer.turn(bayer.crop(picture, top, left, height, width), view).contiguous()
+
+    patch = bayer.crop(picture, top, left, *_region(size, rows))
+    if patch.shape[-2:] != size:
         patch = enlarge(patch, size)
     return bayer.turn(patch, view).contiguous()
 
@@ -117,6 +122,7 @@ def enlarge(patch: Tensor, size: tuple[int, int]) -> Tensor:
     """Enlarge a patch ``(3, h, w)`` to ``(3, *size)`` by bicubic interpolation; it keeps its type, uint8 or float."""
     with one_thread():  # the same bits everywhere
         larger = F.interpolate(patch[None].float(), size=size, mode="bicubic", align_corners=False)[0]
+
     if patch.dtype == torch.uint8:
         return larger.round_().clamp_(0, 255).to(torch.uint8)
     return larger.clamp_(0.0, 1.0).to(patch.dtype)

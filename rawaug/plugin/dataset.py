@@ -19,19 +19,20 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
+from rawaug.errors import count_of
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.own_cameras import Camera
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.clean_raw import RawNoise
 from rawaug.plugin.crops import crop_size
 from rawaug.plugin.epochs import Passes, Visits
+from rawaug.plugin.maker import PairMaker
 from rawaug.plugin.params import AugmentParams, Keys, RawPair, pair_form
 from rawaug.plugin.pictures import find_picture, get_picture, replace_picture
 from rawaug.seeding import keyed_generator
 
 Sample = TypeVar("Sample", covariant=True)
 
-Maker = RawAugment | RawNoise | DictionaryISP | Camera | str | Path
+Maker = PairMaker | DictionaryISP | Camera | str | Path
 """What makes pairs: an augmentation, or a camera for one with the default settings."""
 
 Pictures = Dataset[Tensor] | Sequence[Tensor] | Sequence["np.ndarray[Any, Any]"] | str | Path
@@ -58,15 +59,19 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
     ) -> None:
         if not zoom >= 1.0 or (zoom > 1.0 and crop is None):
             raise ValueError(f"zoom must be at least 1, and 1 without a crop; got {zoom} with crop={crop}")
+
         self.augment = as_augment(augment)
-        self.crop, self.seed, self.turns, self.zoom = crop_size(crop), seed, turns, zoom
-        self.key, self.form, self.bgr = key, pair_form(keys, fields, order), bgr
+        self.crop = crop_size(crop)
+        self.form = pair_form(keys, fields, order)
+        self.seed, self.key, self.turns, self.bgr, self.zoom = seed, key, turns, bgr, zoom
         self.dataset = self._open(dataset)
         self._epochs = self._make_epochs(self.dataset)
 
     def _open(self, dataset: Any) -> Any:
         """The pictures of a folder where its path is given."""
-        return open_dataset(dataset, self.augment, self.crop) if isinstance(dataset, (str, Path)) else dataset
+        if isinstance(dataset, (str, Path)):
+            return open_dataset(dataset, self.augment, self.crop)
+        return dataset
 
     def _make_epochs(self, dataset: Any) -> Visits | Passes:
         raise NotImplementedError
@@ -111,9 +116,14 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
 
     def __repr__(self) -> str:
         """The pictures, the crop and the seed in a line, then what the augmentation draws."""
-        count = f"{len(self.dataset)} pictures" if isinstance(self.dataset, Sized) else type(self.dataset).__name__
-        crop = "uncropped" if self.crop is None else f"crops of {self.crop[0]} x {self.crop[1]}"
-        return f"{type(self).__name__} of {count}, {crop}, seed {self.seed}\n{self.augment!r}"
+        pictures = type(self.dataset).__name__
+        if isinstance(self.dataset, Sized):
+            pictures = count_of(len(self.dataset), "picture")
+
+        crop = "uncropped"
+        if self.crop is not None:
+            crop = f"crops of {self.crop[0]} x {self.crop[1]}"
+        return f"{type(self).__name__} of {pictures}, {crop}, seed {self.seed}\n{self.augment!r}"
 
     def _generator(self, epoch: int, *names: int | str) -> torch.Generator:
         return keyed_generator(self.seed, "pairs", epoch, *names)
@@ -121,20 +131,25 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
     def _make_pair(self, sample: Any, name: int | str, generator: torch.Generator) -> Any:
         where = find_picture(sample, self.key)
         picture = get_picture(sample, where)
+
         try:
             patch, place = self.augment.draw_patch(picture, self.crop, self.turns, generator, self.zoom, self.bgr)
             batch = self.augment.make_pair(patch[None], generator, place[None])
         except ValueError as error:
             raise ValueError(f"picture {name}: {error}") from error
+
         pair = batch.map(lambda tensor: tensor[0])
         return replace_picture(sample, where, self.form(pair, self._name_of(name)))
 
     def _name_of(self, number: int | str) -> str:
         """The name of a picture: that of its file where the dataset knows it, else its number."""
-        if isinstance(number, int) and hasattr(self.dataset, "file"):
+        if not isinstance(number, int):
+            return str(number)
+        if hasattr(self.dataset, "file"):
             return str(self.dataset.file(number))
+
         names = getattr(self.dataset, "names", None)
-        if isinstance(number, int) and isinstance(names, Sequence):
+        if isinstance(names, Sequence):
             return str(names[number])
         return str(number)
 
@@ -274,13 +289,16 @@ class RawPairs(_Pairs[Sample]):
             raise TypeError(
                 f"{type(dataset).__name__} has no index; use RawPairStream(dataset, augment) for an iterable"
             )
-        return Visits(len(dataset) if isinstance(dataset, Sized) else 0)
+        if not isinstance(dataset, Sized):
+            return Visits(0)
+        return Visits(len(dataset))
 
     def __getitem__(self, index: int) -> Sample:
-        number, count = operator.index(index), len(self)
-        if not -count <= number < count:
-            raise IndexError(f"there is no pair {number}: the dataset has {count} pictures")  # it ends iteration, too
-        number %= count
+        number, length = operator.index(index), len(self)
+        if not -length <= number < length:  # an IndexError ends iteration, too
+            raise IndexError(f"there is no pair {number}: the dataset has {count_of(length, 'picture')}")
+
+        number %= length
         return self.draw(number, self._generator(*self._epochs.key(number)))
 
     def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
@@ -309,7 +327,8 @@ class RawPairs(_Pairs[Sample]):
             picture = self.dataset[index]
             patch, place = self.augment.draw_patch(picture, self.crop, self.turns, generator, self.zoom, self.bgr)
             patches.append(patch[None])
-            parameters.append(self.augment.sample(patches[-1], generator, place[None]))
+            parameters.append(self.augment.sample(patch[None], generator, place[None]))
+
         pair: RawPair = self.augment.apply(torch.cat(patches), AugmentParams.concatenate(parameters))
         return pair
 
@@ -380,28 +399,41 @@ class RawPairStream(_Pairs[Any], IterableDataset[Any]):
             bgr=bgr,
             zoom=zoom,
         )
-        self.identity, self.divide = identity, divide or isinstance(dataset, (str, Path))
+        self.identity = identity
+        self.divide = divide or isinstance(self.dataset, _InOrder)
 
     def _open(self, dataset: Any) -> Any:
-        return _InOrder(super()._open(dataset)) if isinstance(dataset, (str, Path)) else dataset
+        if isinstance(dataset, (str, Path)):
+            return _InOrder(super()._open(dataset))
+        return dataset
 
     def _make_epochs(self, dataset: Any) -> Passes:
         return Passes()
 
     def __iter__(self) -> Iterator[Any]:
         info = get_worker_info()
-        epoch, start = self._epochs.begin(info.num_workers if info else 0, info.id if info else 0)  # now, not at next()
-        return self._samples(epoch, start, *((info.id, info.num_workers) if info else (0, 1)))
+        worker = 0 if info is None else info.id
+        workers = 0 if info is None else info.num_workers
+        epoch, start = self._epochs.begin(workers, worker)  # the pass begins now, not with its first sample
+        return self._samples(epoch, start, worker, max(workers, 1))
 
     def _samples(self, epoch: int, start: int, worker: int, workers: int) -> Iterator[Any]:
-        for n, sample in enumerate(self.dataset):
-            number = n if self.divide else n * workers + worker
-            if number < start or (self.divide and n % workers != worker):
+        for count, sample in enumerate(self.dataset):
+            number = count
+            if not self.divide:
+                number = count * workers + worker
+            elif count % workers != worker:
                 continue
-            name = (number, *self._epochs.rank()) if self.identity is None else (self._read_identity(sample),)
+            if number < start:
+                continue
+
+            name: tuple[int | str, ...] = (number, *self._epochs.rank())
+            if self.identity is not None:
+                name = (self._read_identity(sample),)
             pair = self._make_pair(sample, name[0], self._generator(epoch, *name))
             self._epochs.at(number + 1)
             yield pair
+
         self._epochs.end()
 
     def _read_identity(self, sample: Any) -> int | str:
@@ -409,6 +441,7 @@ class RawPairStream(_Pairs[Any], IterableDataset[Any]):
             value = sample[self.identity]
         except (KeyError, IndexError, TypeError) as error:
             raise ValueError(f"identity={self.identity!r}: the samples have no such field") from error
+
         return value if isinstance(value, int) else str(value)
 
 
@@ -430,13 +463,13 @@ class _InOrder(IterableDataset[Any]):
         return path
 
 
-def as_augment(augment: Maker) -> RawAugment | RawNoise:
+def as_augment(augment: Maker) -> PairMaker:
     """An augmentation as it is, or one of an ISP, its name or its path, or of a camera, with the default settings.
 
     Raises:
         TypeError: if it is something else.
     """
-    if isinstance(augment, (RawAugment, RawNoise)):
+    if isinstance(augment, PairMaker):
         return augment
     if isinstance(augment, (DictionaryISP, Camera, str, Path)):
         return RawAugment.from_pretrained(augment)
@@ -445,7 +478,7 @@ def as_augment(augment: Maker) -> RawAugment | RawNoise:
     )
 
 
-def open_dataset(path: str | Path, augment: RawAugment | RawNoise, size: tuple[int, int] | None) -> Any:
+def open_dataset(path: str | Path, augment: PairMaker, size: tuple[int, int] | None) -> Any:
     """The pictures, or the clean RAW, of a folder or of ``kind:path``, with an index.
 
     Args:

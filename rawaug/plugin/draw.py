@@ -60,12 +60,23 @@ class Draw:
         if self.exposure is not None:
             require_range("exposure", self.exposure)
 
+    @property
+    def exposure_range(self) -> tuple[float, float] | None:
+        """The lowest and highest exposure in stops; None for that of the ISP."""
+        if isinstance(self.exposure, (int, float)):
+            return self.exposure, self.exposure
+        return self.exposure
 
-def require_range(key: str, given: Any) -> None:
+
+def require_range(key: str, limits: Any) -> None:
     """Refuse what is neither a finite number nor (lowest, highest)."""
-    ends = given if isinstance(given, (list, tuple)) else (given, given)
-    if len(ends) != 2 or not all(isinstance(end, Real) and math.isfinite(end) for end in ends) or ends[0] > ends[1]:
-        raise ValueError(f"{key} must be (lowest, highest) in stops or one number, got {given!r:.100}")
+    ends = limits if isinstance(limits, (list, tuple)) else (limits, limits)
+
+    is_range = len(ends) == 2
+    for end in ends:
+        is_range = is_range and isinstance(end, Real) and math.isfinite(end)
+    if not is_range or ends[0] > ends[1]:
+        raise ValueError(f"{key} must be (lowest, highest) in stops or one number, got {limits!r:.100}")
 
 
 class SettingSampler:
@@ -81,52 +92,64 @@ class SettingSampler:
     """
 
     def __init__(self, draw: Draw, isp: DictionaryISP, baked: BakedISP) -> None:
-        published = bool(isp.config.cameras)
-        if (draw.light, draw.tone) != (None, None) and not (published and draw.sampling in ("convex", "independent")):
-            whose = f"with sampling {draw.sampling!r}" if published else "of a fitted ISP"
-            raise ValueError(f"light and tone are drawn for published cameras, as in universal, not {whose}; omit them")
+        has_cameras = bool(isp.config.cameras)
+        if draw.light is not None or draw.tone is not None:
+            rule = "light and tone are drawn for published cameras, as in universal"
+            if not has_cameras:
+                raise ValueError(f"{rule}, not of a fitted ISP; omit them")
+            if draw.sampling not in ("convex", "independent"):
+                raise ValueError(f"{rule}, not with sampling {draw.sampling!r}; omit them")
         self.draw, self.isp, self.baked = draw, isp, baked
-        usual = EXPOSURE if published else (0.0, 0.0)
-        given = (draw.exposure, draw.exposure) if isinstance(draw.exposure, (int, float)) else draw.exposure
-        self.exposure: tuple[float, float] = usual if given is None else given
+
+        usual = EXPOSURE if has_cameras else (0.0, 0.0)
+        self.exposure: tuple[float, float] = draw.exposure_range or usual
         self._cameras = isp.camera_sampler(draw.sampling == "convex", draw.light)
         self._tone = None if draw.tone is None else tone_weights(isp, draw.tone)
 
     def sample(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
         """Draw the settings of ``srgb`` ``(B, 3, H, W)``, exposure included, from a generator on the CPU."""
-        setting = self._sample(srgb, generator)
+        setting = self._sample_at_exposure_0(srgb, generator)
         if not any(self.exposure):
             return setting
+
         low, high = self.exposure
         stops = low + (high - low) * torch.rand(len(srgb), 1, generator=generator, dtype=torch.float32)
         return setting._replace(gains=setting.gains * torch.exp2(-stops).to(setting.gains))
 
-    def _sample(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
-        if self.draw.sampling in ("convex", "independent"):
-            if self._cameras is None:
-                return self.isp.draw_setting(len(srgb), generator)
-            setting = self._cameras.sample(len(srgb), generator, srgb.device)
-            if self._tone is None:
-                return setting
-            return setting._replace(tone_weights=self._tone.to(setting.tone_weights).expand_as(setting.tone_weights))
-        chosen = self.baked.choose(srgb)
+    def _sample_at_exposure_0(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
         if self.draw.sampling == "chosen":
-            return chosen
-        weights = [w for w in (chosen.colour_weights, chosen.gain_weights, chosen.tone_weights) if w.shape[1]]
-        return self.isp.params_from_weights(*(perturb(w, self.draw.strength, generator) for w in weights))
+            return self.baked.choose(srgb)
+        if self.draw.sampling == "perturb":
+            return self._perturb(self.baked.choose(srgb), generator)
+        if self._cameras is None:
+            return self.isp.draw_setting(len(srgb), generator)
+
+        setting = self._cameras.sample(len(srgb), generator, srgb.device)
+        if self._tone is None:
+            return setting
+        return setting._replace(tone_weights=self._tone.to(setting.tone_weights).expand_as(setting.tone_weights))
+
+    def _perturb(self, setting: ISPParams, generator: torch.Generator) -> ISPParams:
+        weights = []
+        for atoms in (setting.colour_weights, setting.gain_weights, setting.tone_weights):
+            if atoms.shape[1]:
+                weights.append(perturb(atoms, self.draw.strength, generator))
+        return self.isp.params_from_weights(*weights)
 
     def __repr__(self) -> str:
         """The camera, the sampling, the light and the exposure in a line."""
-        known = self.isp.config.cameras
-        camera = (
-            self.isp.info["cameras"][0]
-            if known == 1
-            else f"mixtures of {known} published"
-            if known
-            else "the fitted one"
-        )
-        light = "" if self.draw.light is None else f", light {self.draw.light}"
-        return f"{camera}, {self.draw.sampling}{light}, exposure {self.exposure[0]:g} to {self.exposure[1]:g} stops"
+        count = self.isp.config.cameras
+        if count == 1:
+            line = str(self.isp.info["cameras"][0])
+        elif count:
+            line = f"mixtures of {count} published"
+        else:
+            line = "the fitted one"
+
+        line += f", {self.draw.sampling}"
+        if self.draw.light is not None:
+            line += f", light {self.draw.light}"
+        return f"{line}, exposure {self.exposure[0]:g} to {self.exposure[1]:g} stops"
 
 
 def tone_weights(isp: DictionaryISP, name: str) -> Tensor:

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import get_worker_info
 
+from rawaug.errors import count_of
 from rawaug.plugin.order import world_size
 from rawaug.seeding import rank_key
 
@@ -58,7 +59,9 @@ class _Epochs:
     def pinned(self) -> int | None:
         """The pinned epoch, None while epochs are counted."""
         epoch = int(self._pinned)
-        return None if epoch == _COUNTED else epoch
+        if epoch == _COUNTED:
+            return None
+        return epoch
 
     def pin(self, epoch: int) -> None:
         """Fix the epoch, in the workers too, until the next call."""
@@ -101,7 +104,8 @@ class Visits(_Epochs):
         if self.pinned is not None:
             return (self.pinned, index)
         if index >= len(self._counts):
-            raise ValueError(f"the dataset has grown from {len(self._counts)} pictures; create RawPairs again")
+            pictures = count_of(len(self._counts), "picture")
+            raise ValueError(f"the dataset has grown from {pictures}; create RawPairs again")
 
         if get_worker_info() is not None:
             self._in_workers[0] = True
@@ -134,11 +138,14 @@ class Visits(_Epochs):
         """
         visits = torch.as_tensor(state["visits"])
         if visits.shape != self._counts.shape:
-            raise ValueError(f"the state is that of {len(visits)} pictures, the dataset has {len(self._counts)}")
+            pictures = count_of(len(visits), "picture")
+            raise ValueError(f"the state is that of {pictures}, the dataset has {len(self._counts)}")
+
         if next_epoch and len(visits):
             visits = torch.full_like(visits, int(visits.max()))
         elif not state.get("exact", True):
             raise ValueError(_BROKEN_OFF)
+
         self._resume(state["epoch"])
         self._counts.copy_(visits)
         self._in_workers[0] = False
@@ -153,6 +160,7 @@ class Visits(_Epochs):
             return worker.num_workers > 1
         if not bool(self._in_workers) or not len(visits):
             return False
+
         behind = int((visits < visits.max()).sum())
         return behind >= int(self._batch)  # fewer are those that drop_last leaves out
 
@@ -161,8 +169,10 @@ class Visits(_Epochs):
         world = world_size()
         if world == 1 or not len(visits):
             return visits
+
         share = math.ceil(len(visits) / world)  # a sampler fills the shares up where they do not divide
-        return torch.full_like(visits, max(math.ceil(int(visits.sum()) / share), int(visits.max())))
+        passes = math.ceil(int(visits.sum()) / share)
+        return torch.full_like(visits, max(passes, int(visits.max())))
 
 
 class Passes(_Epochs):
@@ -191,10 +201,15 @@ class Passes(_Epochs):
         if worker == 0:
             self._of_workers[workers] += 1
 
+        start = 0
         resumed, first = self._resumed.tolist()
-        start = first if started == resumed else 0
+        if started == resumed:
+            start = first
         self._running = (started, start)
-        return (started if self.pinned is None else self.pinned), start
+
+        if self.pinned is not None:
+            return self.pinned, start
+        return started, start
 
     @property
     def passes(self) -> int:
@@ -224,6 +239,7 @@ class Passes(_Epochs):
         passes, position = state["passes"], state["position"]
         if next_epoch and position:
             passes, position = passes + 1, 0
+
         self._resume(state["epoch"])
         self._counts.zero_()
         self._of_workers.zero_()

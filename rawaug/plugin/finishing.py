@@ -31,6 +31,7 @@ from torch import Tensor
 
 from rawaug.kernels import fastest
 from rawaug.kernels.runtime import one_thread
+from rawaug.noise.models import per_picture
 
 _REACH = 2.5
 """Half-width of a Gaussian filter, in standard deviations."""
@@ -73,6 +74,7 @@ class Finish:
             most = 1.0 if key in ("luma", "chroma") else 100.0
             if not 0.0 <= low <= high <= most:
                 raise ValueError(f"finish: {key} must be (lowest, highest) within 0 to {most:g}, got ({low}, {high})")
+
         if not 0.0 <= self.unfinished <= 1.0:
             raise ValueError(f"finish: unfinished must be a share in [0, 1], got {self.unfinished}")
 
@@ -80,41 +82,51 @@ class Finish:
         """``finish`` ``(batch, 8)``: a column for each of the ranges before ``quality``, zeros if it is unfinished;
         ``chroma_420`` ``(batch,)`` says where JPEG halves the chroma.
         """
-        drawn = torch.rand(len(_RANGES) + 2, batch, generator=generator)
-        rows = [_between(getattr(self, key), x, key in _BY_LOGARITHM) for key, x in zip(_RANGES, drawn, strict=False)]
-        finished = drawn[-2] >= self.unfinished
-        return {"finish": torch.stack(rows, dim=1) * finished[:, None], "chroma_420": drawn[-1] < 0.5}
+        *shares, unfinished, chroma = torch.rand(len(_RANGES) + 2, batch, generator=generator)
+        columns = []
+        for key, share in zip(_RANGES, shares, strict=True):
+            columns.append(_between(getattr(self, key), share, by_logarithm=key in _BY_LOGARITHM))
+
+        is_finished = unfinished >= self.unfinished
+        return {"finish": torch.stack(columns, dim=1) * is_finished[:, None], "chroma_420": chroma < 0.5}
 
     @one_thread()  # the same bits everywhere
     def apply(self, noisy: Tensor, clean: Tensor, finish: Tensor) -> tuple[Tensor, Tensor]:
         """Noisy and clean sRGB ``(B, 3, H, W)`` in [0, 1], finished alike; ``finish`` is as :meth:`sample` gives it."""
         pictures = torch.cat([noisy, clean], dim=1)
-        if (which := finish.any(dim=1)).any():
-            pictures[which.to(pictures.device)] = _finish(pictures[which.to(pictures.device)], finish[which])
-        first, second = pictures.split(3, dim=1)
-        return first.contiguous(), second.contiguous()
+        is_finished = finish.any(dim=1)
+        if is_finished.any():
+            index = is_finished.to(pictures.device)
+            pictures[index] = _finish(pictures[index], finish[is_finished])
+
+        noisy, clean = pictures.split(3, dim=1)
+        return noisy.contiguous(), clean.contiguous()
 
 
 _RANGES = ("softness", "window", "luma", "edge", "chroma_blur", "chroma", "sharpening", "radius")
 _BY_LOGARITHM = ("edge", "chroma_blur")
 
 
-def _between(limits: tuple[float, float], drawn: Tensor, by_logarithm: bool) -> Tensor:
+def _between(limits: tuple[float, float], share: Tensor, by_logarithm: bool) -> Tensor:
+    """The values at shares ``(B,)`` of the way from the lowest to the highest."""
     low, high = limits
-    return low * (high / low) ** drawn if by_logarithm and low > 0.0 else low + (high - low) * drawn
+    if by_logarithm and low > 0.0:
+        return low * (high / low) ** share
+    return low + (high - low) * share
 
 
 def _finish(pictures: Tensor, finish: Tensor) -> Tensor:
     """Noisy and clean ``(B, 6, H, W)``, colour by colour, finished as ``(B, 8)`` says."""
     softness, window, share, edge, chroma_blur, mix, amount, radius = finish.cpu().unbind(1)
-    share, edge, mix, amount = (x.to(pictures)[:, None, None, None] for x in (share, edge, mix, amount))
     pictures = blur(pictures, softness)
-    red, green, blue = (pictures[:, colour::3] for colour in range(3))
+    red, green, blue = pictures[:, 0::3], pictures[:, 1::3], pictures[:, 2::3]
+
     luma = (0.299 * red).add_(green, alpha=0.587).add_(blue, alpha=0.114)
     chroma = torch.cat([red - luma, blue - luma], dim=1)
-    chroma.lerp_(blur(chroma, chroma_blur), mix)
-    luma = _reduce_noise(luma, window, share, edge)
-    luma.addcmul_(amount, luma - blur(luma, radius))
+    chroma.lerp_(blur(chroma, chroma_blur), per_picture(mix, chroma))
+    luma = _reduce_noise(luma, window, per_picture(share, luma), per_picture(edge, luma))
+    luma.addcmul_(per_picture(amount, luma), luma - blur(luma, radius))
+
     torch.add(chroma[:, :2], luma, out=red)
     torch.add(chroma[:, 2:], luma, out=blue)
     torch.sub(luma, chroma[:, :2], alpha=0.299 / 0.587, out=green).sub_(chroma[:, 2:], alpha=0.114 / 0.587)
@@ -126,9 +138,11 @@ def _reduce_noise(luma: Tensor, window: Tensor, share: Tensor, edge: Tensor) -> 
     noise = torch.stack([(noisy - clean).square().mean() for noisy, clean in luma])[:, None, None, None]
     mean = box_mean(torch.cat([luma, luma[:, :1].square()], dim=1), window)
     variance = (mean[:, 2:] - mean[:, :1].square()).clamp_min(1e-9)
+
     weights = (1.0 - edge * noise / variance).clamp_min(0.0)
-    kept = box_mean(torch.cat([weights, (1.0 - weights) * mean[:, :2]], dim=1), window)
-    return luma + share * (kept[:, 1:] - (1.0 - kept[:, :1]) * luma)
+    smoothed = box_mean(torch.cat([weights, (1.0 - weights) * mean[:, :2]], dim=1), window)
+    mean_weights, flat = smoothed[:, :1], smoothed[:, 1:]
+    return luma + share * (flat - (1.0 - mean_weights) * luma)
 
 
 def blur(image: Tensor, deviation: Tensor) -> Tensor:
@@ -146,7 +160,7 @@ def box_mean(image: Tensor, reach: Tensor) -> Tensor:
 
 
 def _filter(image: Tensor, taps: Tensor) -> Tensor:
-    """Along both axes with ``(B, K)`` taps, the middle one first, brought to a sum of 1."""
+    """Filter along both axes with ``(B, K)`` taps, the middle one first, normalised to a sum of 1."""
     taps = taps / (2.0 * taps.sum(1, keepdim=True) - taps[:, :1])
     return fastest("smooth", image, taps, otherwise=lambda: _convolve(image, taps))
 
@@ -155,6 +169,7 @@ def _convolve(image: Tensor, taps: Tensor) -> Tensor:
     batch, count, height, width = image.shape
     reach = taps.shape[1] - 1
     kernel = torch.cat([taps[:, 1:].flip(1), taps], dim=1).to(image).repeat_interleave(count, 0)[:, None, None]
+
     planes = F.pad(image.reshape(1, -1, height, width), (reach,) * 4, mode="replicate")
     for weights in (kernel, kernel.mT):
         planes = F.conv2d(planes, weights, groups=batch * count)

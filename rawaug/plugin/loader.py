@@ -19,14 +19,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from rawaug.isp.model import DictionaryISP
-from rawaug.isp.own_cameras import Camera
 from rawaug.kernels.runtime import find_device
-from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.clean_raw import RawNoise
 from rawaug.plugin.crops import crop_size
-from rawaug.plugin.dataset import as_augment, open_dataset
+from rawaug.plugin.dataset import Maker, as_augment, open_dataset
 from rawaug.plugin.epochs import require_epoch
+from rawaug.plugin.maker import PairMaker
 from rawaug.plugin.order import is_drawn, keep_order, own_share, pack_order, unpack_order, world_size
 from rawaug.plugin.params import Keys, PairForm, RawPair, pair_form
 from rawaug.plugin.pictures import find_picture, get_picture, is_picture, replace_picture
@@ -64,9 +61,11 @@ class ResumableLoader(Generic[Batch]):
     @property
     def share(self) -> Any:
         """The wrapped loader, or in a distributed run this process's part of it."""
-        if self._share is None and world_size() > 1:
+        if self._share is None:
+            if world_size() == 1:
+                return self.loader
             self._share = own_share(self.loader, self.seed)
-        return self.loader if self._share is None else self._share
+        return self._share
 
     def __len__(self) -> int:
         return len(self.share)
@@ -96,10 +95,12 @@ class ResumableLoader(Generic[Batch]):
         """
         if self._loaded is not None:  # nothing has been asked for since
             return dict(self._loaded)
+
         state: dict[str, Any] = {"epoch": self._at.epoch, "batch": self._at.batch}
         if self._generator is not None:
             state["generator"] = self._generator.get_state()
             state["pool"] = self._has_pool
+
         if hasattr(self.loader, "state_dict"):
             state["loader"] = self.loader.state_dict()
         elif self._at.batch and self._order is not None and is_drawn(self._order.sampler):
@@ -130,12 +131,17 @@ class ResumableLoader(Generic[Batch]):
             self._require_repeatable(batch)
             self._next = self._at = Position(epoch, batch, passed=batch)
             return
+
         if state.get("rank", rank_key()) != rank_key():
             raise ValueError("the state is that of another process; save and load one for each process")
         if batch and is_drawn(order.sampler) and "order" not in state:
             raise ValueError("the state does not hold the order of the pass; it was saved by another kind of loader")
+
         self._next = self._at = Position(epoch, batch)
-        order.start_at(batch, unpack_order(state["order"]) if batch and "order" in state else None)
+        visits = None
+        if batch and "order" in state:
+            visits = unpack_order(state["order"])
+        order.start_at(batch, visits)
         self._restore_generator(state, batch)
         self._loaded = state
 
@@ -164,12 +170,12 @@ class ResumableLoader(Generic[Batch]):
 
     def _require_repeatable(self, batch: int) -> None:
         """Raise ValueError in the middle of a pass where the order is neither kept nor told by the epoch."""
-        if not batch or not isinstance(self.loader, DataLoader) or isinstance(self.loader.dataset, IterableDataset):
-            return
-        raise ValueError(
-            "the loader's sampler has no length, so its order cannot be kept; resume at the start of an epoch, or use "
-            "torchdata's StatefulDataLoader"
-        )
+        has_order = isinstance(self.loader, DataLoader) and not isinstance(self.loader.dataset, IterableDataset)
+        if batch and has_order:
+            raise ValueError(
+                "the loader's sampler has no length, so its order cannot be kept; resume at the start of an epoch, or "
+                "use torchdata's StatefulDataLoader"
+            )
 
     @property
     def _generator(self) -> torch.Generator | None:
@@ -200,9 +206,9 @@ class ResumableLoader(Generic[Batch]):
                 self._resumed_generator = None
             if number < start:
                 continue
+
             converted = self._convert(batch, epoch, number)
-            is_last = number + 1 == length  # where training loops stop, before the end of the iterator
-            self._at = Position(epoch + 1, 0) if is_last else Position(epoch, number + 1)
+            self._at = self._after(epoch, number, is_last=number + 1 == length)
             yield converted
 
         self._at = Position(epoch + 1, 0)
@@ -214,10 +220,17 @@ class ResumableLoader(Generic[Batch]):
         length = self._length()
         for number, batch in enumerate(self.share):
             converted = self._convert(batch, epoch, number)
-            is_last = number + 1 == length
-            self._at = Position(epoch + 1, 0) if is_last else Position(epoch, number + 1)
+            self._at = self._after(epoch, number, is_last=number + 1 == length)
             yield converted
+
         self._at = Position(epoch + 1, 0)
+
+    @staticmethod
+    def _after(epoch: int, number: int, is_last: bool) -> Position:
+        """Where a pass goes on after a batch; training loops stop at the last one, before the end of the iterator."""
+        if is_last:
+            return Position(epoch + 1, 0)
+        return Position(epoch, number + 1)
 
     def _begin(self, epoch: int) -> None:
         """Called before each pass: a dataset that numbers its epochs is told this one."""
@@ -234,8 +247,11 @@ class ResumableLoader(Generic[Batch]):
         """Batches of a pass, where they can be counted on."""
         if isinstance(getattr(self.loader, "dataset", None), IterableDataset):
             return None
+        if not isinstance(self.loader, Sized):
+            return None
+
         try:
-            return len(self) if isinstance(self.loader, Sized) else None
+            return len(self)
         except TypeError:  # of a sampler without a length
             return None
 
@@ -257,8 +273,7 @@ def resumable(loader: Iterable[Any], seed: int = 0) -> ResumableLoader[Any]:
             has ``shuffle=True``.
 
     Example:
-        >>> from rawaug.isp.model import DictionaryISP
-        >>> from rawaug.plugin.dataset import RawPairs
+        >>> from rawaug import DictionaryISP, RawAugment, RawPairs
         >>> pairs = RawPairs([torch.rand(3, 32, 32) for _ in range(4)], RawAugment(DictionaryISP()), crop=32)
         >>> loader = resumable(DataLoader(pairs, batch_size=2, shuffle=True))
         >>> batches = iter(loader)
@@ -282,7 +297,7 @@ class WrappedLoader(ResumableLoader[Batch]):
     def __init__(
         self,
         loader: Iterable[Any],
-        augment: RawAugment | RawNoise,
+        augment: PairMaker,
         crop: tuple[int, int] | None,
         key: str | int | None,
         form: PairForm,
@@ -291,47 +306,60 @@ class WrappedLoader(ResumableLoader[Batch]):
     ) -> None:
         super().__init__(loader, augment.seed)
         self.key, self.crop, self.form, self.bgr = key, crop, form, bgr
-        named = find_device(device) if isinstance(device, str) else device
-        self.device = named if named is not None else augment.device
-        self.augment = augment.to(self.device)
+
+        if isinstance(device, str):
+            device = find_device(device)
+        elif device is None:
+            device = augment.device
+        self.device = device
+        self.augment = augment.to(device)
 
     def _begin(self, epoch: int) -> None:
         """The pairs are drawn here, so that the dataset's epochs are its own."""
 
     def _convert(self, batch: Any, epoch: int, number: int) -> Batch:
         where = find_picture(batch, self.key, batched=True)
+        pictures = self._with_channel(get_picture(batch, where))
         generator = keyed_generator(self.augment.seed, "wrap", epoch, number, *rank_key())
-        pair = self._make_pair(self._with_channel(get_picture(batch, where)), generator)
+
+        pair = self._make_pair(pictures, generator)
         converted: Batch = replace_picture(batch, where, self.form(pair))
         return converted
 
     def _with_channel(self, batch: Any) -> Any:
         """Batches of grey pictures ``(B, H, W)``, which a DataLoader collates, with an axis for their one channel."""
-        grey = isinstance(batch, (Tensor, np.ndarray)) and batch.ndim == 3
-        return batch[:, None] if grey and getattr(self.loader, "batch_size", None) is not None else batch
+        if getattr(self.loader, "batch_size", None) is None:
+            return batch
+        if isinstance(batch, (Tensor, np.ndarray)) and batch.ndim == 3:
+            return batch[:, None]
+        return batch
 
     def _make_pair(self, pictures: Any, generator: torch.Generator) -> RawPair:
         if self.crop is None:
-            images, places = self.augment.as_batch(pictures, self.bgr), None
-        else:
-            images, places = self._draw_crops(pictures, generator)
-        return self.augment.make_pair(images.to(self.device, non_blocking=True), generator, places)
+            whole = self.augment.as_batch(pictures, self.bgr).to(self.device, non_blocking=True)
+            return self.augment.make_pair(whole, generator)
+
+        patches, places = self._draw_crops(pictures, generator)
+        return self.augment.make_pair(patches.to(self.device, non_blocking=True), generator, places)
 
     def _draw_crops(self, pictures: Any, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """One crop of each picture ``(B, C, height, width)``, and their places ``(B, 5)``."""
-        listed = [pictures] if is_picture(pictures) else pictures
+        if is_picture(pictures):
+            pictures = [pictures]
+
         patches, places = [], []
-        for picture in listed:
+        for picture in pictures:
             patch, place = self.augment.draw_patch(picture, self.crop, False, generator, bgr=self.bgr)
             patches.append(patch)
             places.append(place)
+
         return self.augment.stack(patches), torch.stack(places)
 
 
 @overload
 def wrap(
     loader: DataLoader[Tensor] | str | Path,
-    augment: RawAugment | RawNoise | DictionaryISP | Camera | str | Path,
+    augment: Maker,
     crop: int | tuple[int, int] | None = None,
     *,
     key: None = None,
@@ -346,7 +374,7 @@ def wrap(
 @overload
 def wrap(
     loader: DataLoader[Tensor] | str | Path,
-    augment: RawAugment | RawNoise | DictionaryISP | Camera | str | Path,
+    augment: Maker,
     crop: int | tuple[int, int] | None = None,
     *,
     key: None = None,
@@ -361,7 +389,7 @@ def wrap(
 @overload
 def wrap(
     loader: Iterable[Any] | str | Path,
-    augment: RawAugment | RawNoise | DictionaryISP | Camera | str | Path,
+    augment: Maker,
     crop: int | tuple[int, int] | None = None,
     *,
     key: str | int | None = None,
@@ -375,7 +403,7 @@ def wrap(
 ) -> WrappedLoader[Any]: ...
 def wrap(
     loader: Iterable[Any] | str | Path,
-    augment: RawAugment | RawNoise | DictionaryISP | Camera | str | Path,
+    augment: Maker,
     crop: int | tuple[int, int] | None = None,
     *,
     key: str | int | None = None,
@@ -412,12 +440,14 @@ def wrap(
             they do not form a batch.
 
     Example:
-        >>> from rawaug.isp.model import DictionaryISP
+        >>> from rawaug import DictionaryISP, RawAugment
         >>> loader = wrap([(torch.rand(2, 3, 64, 64), ["cat", "dog"])], RawAugment(DictionaryISP()))
         >>> [(pair.noisy.shape, labels) for pair, labels in loader]
         [(torch.Size([2, 4, 32, 32]), ['cat', 'dog'])]
     """
-    maker, size = as_augment(augment), crop_size(crop)
+    maker = as_augment(augment)
+    size = crop_size(crop)
+
     if isinstance(loader, (str, Path)):
         pictures = open_dataset(loader, maker, size)
         loader = DataLoader(pictures, batch_size=batch_size or 1, shuffle=bool(shuffle), collate_fn=list)

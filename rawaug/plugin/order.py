@@ -25,8 +25,9 @@ from torch.utils.data import (
 
 def world_size() -> int:
     """The number of processes of a distributed run, 1 without one."""
-    distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
-    return torch.distributed.get_world_size() if distributed else 1
+    if not torch.distributed.is_available() or not torch.distributed.is_initialized():
+        return 1
+    return torch.distributed.get_world_size()
 
 
 class KeptOrder:
@@ -51,6 +52,7 @@ class KeptOrder:
         if self._generator is not None:
             generator, state = self._generator
             generator.set_state(state)
+
         order, first = self._next, self._first
         self.start_at(0)
         self.current = list(self.sampler) if order is None else order
@@ -77,12 +79,14 @@ def keep_order(loader: Any) -> tuple[Any, KeptOrder | None]:
     """
     if not isinstance(loader, DataLoader) or hasattr(loader, "load_state_dict"):
         return loader, None
-    batched = loader.batch_sampler is not None
-    sampler: Any = loader.batch_sampler if batched else loader.sampler
+
+    name = "sampler" if loader.batch_sampler is None else "batch_sampler"
+    sampler = getattr(loader, name)
     if isinstance(loader.dataset, IterableDataset) or not _has_length(sampler):
         return loader, None
+
     order = KeptOrder(sampler)
-    return _with_sampler(loader, **{"batch_sampler" if batched else "sampler": order}), order
+    return _with_samplers(loader, **{name: order}), order
 
 
 def _has_length(sampler: Any) -> bool:
@@ -100,19 +104,29 @@ def is_drawn(sampler: Any) -> bool:
 
 def pack_order(order: Sequence[Any]) -> dict[str, Any]:
     """An order as tensors where it is of whole numbers or batches of them, to be kept with a state."""
-    batches = [batch if isinstance(batch, (list, tuple)) else [batch] for batch in order]
-    indices = [index for batch in batches for index in batch]
-    if not all(isinstance(index, int) for index in indices):
+    indices: list[Any] = []
+    sizes = []
+    for entry in order:
+        if isinstance(entry, (list, tuple)):
+            indices += entry
+            sizes.append(len(entry))
+        else:
+            indices.append(entry)
+
+    is_batched = len(sizes) == len(order)
+    if not all(isinstance(index, int) for index in indices) or (sizes and not is_batched):
         return {"order": list(order)}
-    batched = bool(order) and isinstance(order[0], (list, tuple))
-    sizes = torch.tensor([len(batch) for batch in batches]) if batched else torch.empty(0, dtype=torch.int64)
-    return {"indices": torch.tensor(indices, dtype=torch.int64), "sizes": sizes}
+    return {
+        "indices": torch.tensor(indices, dtype=torch.int64),
+        "sizes": torch.tensor(sizes, dtype=torch.int64),
+    }
 
 
 def unpack_order(packed: dict[str, Any]) -> list[Any]:
     """The order that :func:`pack_order` has packed."""
     if "order" in packed:
         return list(packed["order"])
+
     indices, sizes = packed["indices"], packed["sizes"]
     if not len(sizes):
         return list(indices.tolist())
@@ -134,6 +148,7 @@ def own_share(loader: Any, seed: int) -> Any:
     """
     if world_size() == 1 or not isinstance(loader, DataLoader) or not _has_own_order(loader):
         return loader
+
     dataset: Any = loader.dataset
     sampler: DistributedSampler[Any] = DistributedSampler(
         dataset, shuffle=isinstance(loader.sampler, RandomSampler), seed=seed, drop_last=loader.drop_last
@@ -141,21 +156,22 @@ def own_share(loader: Any, seed: int) -> Any:
     batches = None
     if loader.batch_size is not None:
         batches = BatchSampler(sampler, loader.batch_size, loader.drop_last)
-    return _with_sampler(loader, sampler=sampler, batch_sampler=batches)
+    return _with_samplers(loader, sampler=sampler, batch_sampler=batches)
 
 
-def _with_sampler(loader: DataLoader[Any], **samplers: Any) -> DataLoader[Any]:
+def _with_samplers(loader: DataLoader[Any], **samplers: Any) -> DataLoader[Any]:
     """A copy of a DataLoader with other samplers, and workers of its own."""
     other = copy.copy(loader)
-    for name, value in {**samplers, "_iterator": None}.items():
-        object.__setattr__(other, name, value)  # a DataLoader refuses a sampler once it is made, but not before a pass
+    for name, sampler in samplers.items():
+        object.__setattr__(other, name, sampler)  # a DataLoader itself refuses it after its construction
+    object.__setattr__(other, "_iterator", None)
     return other
 
 
 def _has_own_order(loader: DataLoader[Any]) -> bool:
     """Whether the sampler is the one that the loader made from ``shuffle``."""
     sampler, batches = loader.sampler, loader.batch_sampler
-    if batches is not None and not (type(batches) is BatchSampler and batches.sampler is sampler):
+    if batches is not None and (type(batches) is not BatchSampler or batches.sampler is not sampler):
         return False
     if type(sampler) is RandomSampler:
         return not sampler.replacement and sampler.num_samples == len(sampler.data_source)

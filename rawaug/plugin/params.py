@@ -41,33 +41,47 @@ class AugmentParams(NamedTuple):
         Of a batch, ``params.map(lambda t: t[0])`` gives the parameters of the first picture, from ``(B, ...)`` to
         ``(...)``.
         """
-        noise, extras = ({name: change(value) for name, value in drawn.items()} for drawn in (self.noise, self.extras))
-        return AugmentParams(ISPParams(*map(change, self.isp)), noise, change(self.crop), extras)
+        isp = ISPParams(*map(change, self.isp))
+        noise = {name: change(value) for name, value in self.noise.items()}
+        extras = {name: change(value) for name, value in self.extras.items()}
+        return AugmentParams(isp, noise, change(self.crop), extras)
 
     def tensors(self) -> dict[str, Tensor]:
         """The parameters as a flat dict, to store with a batch; :meth:`from_tensors` reads it back."""
-        groups = {"isp": self.isp._asdict(), "noise": self.noise, "extras": self.extras}
-        flat = {f"{group}.{name}": value for group, drawn in groups.items() for name, value in drawn.items()}
-        return flat | {"crop": self.crop}
+        flat = {}
+        for group, tensors in (("isp", self.isp._asdict()), ("noise", self.noise), ("extras", self.extras)):
+            for name, tensor in tensors.items():
+                flat[f"{group}.{name}"] = tensor
+
+        flat["crop"] = self.crop
+        return flat
 
     @classmethod
     def concatenate(cls, parts: Sequence[AugmentParams]) -> AugmentParams:
         """Join the parameters of several batches ``(B, ...)`` to those of one."""
-        flat = [params.tensors() for params in parts]
-        return cls.from_tensors({name: torch.cat([tensors[name] for tensors in flat]) for name in flat[0]})
+        batches = [params.tensors() for params in parts]
+
+        joined = {}
+        for name in batches[0]:
+            joined[name] = torch.cat([tensors[name] for tensors in batches])
+        return cls.from_tensors(joined)
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> AugmentParams:
         """Read the flat dict of :meth:`tensors`, ``(B, ...)`` or of one picture; ValueError if a tensor is missing."""
-        missing = {"crop", *(f"isp.{name}" for name in ISPParams._fields)} - set(tensors)
+        setting = [f"isp.{name}" for name in ISPParams._fields]
+        missing = sorted({"crop", *setting} - set(tensors))
         if missing:
-            raise ValueError(f"not the parameters of an augmentation: {', '.join(sorted(missing))} missing")
-        isp = ISPParams(*(tensors[f"isp.{name}"] for name in ISPParams._fields))
-        noise, extras = (
-            {name.removeprefix(group): value for name, value in tensors.items() if name.startswith(group)}
-            for group in ("noise.", "extras.")
-        )
-        return cls(isp, noise, tensors["crop"], extras)
+            raise ValueError(f"not the parameters of an augmentation: {', '.join(missing)} missing")
+
+        groups: dict[str, dict[str, Tensor]] = {"isp": {}, "noise": {}, "extras": {}}
+        for name, tensor in tensors.items():
+            group, _, key = name.partition(".")
+            if group in groups:
+                groups[group][key] = tensor
+
+        isp = ISPParams(*[tensors[name] for name in setting])
+        return cls(isp, groups["noise"], tensors["crop"], groups["extras"])
 
 
 class RawPair(NamedTuple):
@@ -98,18 +112,20 @@ class RawPair(NamedTuple):
 
         It is what networks for developed pictures are told, on the scale white = 1.
         """
-        single = self.params.crop.ndim == 1
-        difference = self.noisy - self.clean if self.noisy.shape == self.clean.shape else self.noisy[:, :0]
-        if difference.numel() == 0:
+        if self.noisy.shape != self.clean.shape or self.noisy.numel() == 0:
             raise ValueError("level: noisy and clean differ in shape; a level is one of pairs of one kind")
-        square = difference.square()
-        return square.mean().sqrt() if single else square.flatten(1).mean(1).sqrt()
+
+        square = (self.noisy - self.clean).square()
+        if self.params.crop.ndim == 1:
+            return square.mean().sqrt()
+        return square.flatten(1).mean(1).sqrt()
 
 
 FIELDS = ("noisy", "clean", "variance", "params", "name", "level")
 """What a sample of a Dataset can hold: a pair's parts, the name of its picture, and the strength of its noise."""
 
 RAW_PLANES = ("R", "Gr", "Gb", "B")
+"""The planes of packed RAW, in order."""
 _ORDERS = {"RGGB": (0, 1, 2, 3), "BGGR": (3, 2, 1, 0), "GRBG": (1, 0, 3, 2), "GBRG": (2, 3, 0, 1)}
 """What ``pixel_unshuffle`` of a mosaic of each CFA gives, as numbers of :data:`RAW_PLANES`."""
 
@@ -142,24 +158,34 @@ class PairForm:
             pair = self._in_order(pair)
         if self.fields is None:
             return pair
+
         values = []
         for field in self.fields:
-            if field == "name" and name is None:
+            if field != "name":
+                values.append(getattr(pair, field))
+            elif name is not None:
+                values.append(name)
+            else:
                 raise ValueError("keys: a loader of batches has no names of pictures; let its samples hold them")
-            values.append(name if field == "name" else getattr(pair, field))
-        return tuple(values) if self.keys is None else dict(zip(self.keys, values, strict=True))
+
+        if self.keys is None:
+            return tuple(values)
+        return dict(zip(self.keys, values, strict=True))
 
     def _in_order(self, pair: RawPair) -> RawPair:
-        planes = list(self.planes or ())
-        parts = []
-        for part in (pair.noisy, pair.clean, pair.variance):
-            is_packed = part.ndim >= 3 and part.shape[-3] == len(RAW_PLANES)
-            parts.append(part[..., planes, :, :] if is_packed else part)
-        noisy, clean, variance = parts
-        return RawPair(noisy, clean, variance, pair.params)
+        noisy, clean, variance, params = pair
+        return RawPair(self._reorder(noisy), self._reorder(clean), self._reorder(variance), params)
+
+    def _reorder(self, part: Tensor) -> Tensor:
+        """Packed RAW ``(..., 4, h, w)`` in the order of the planes; all else as it is."""
+        is_packed = part.ndim >= 3 and part.shape[-3] == len(RAW_PLANES)
+        if not is_packed or self.planes is None:
+            return part
+        return part[..., list(self.planes), :, :]
 
 
 Keys = Sequence[str] | Mapping[str, str]
+"""Names for the parts of a pair, or names and the fields that they stand for."""
 
 
 def pair_form(
@@ -180,15 +206,18 @@ def pair_form(
     planes = None if order is None else _planes_of(order)
     if keys is not None and fields is not None:
         raise ValueError("give keys for a dict, or fields for a tuple; keys={'lq': 'noisy'} names fields")
+
     if fields is not None:
-        wanted = () if isinstance(fields, str) else tuple(fields)
-        if not wanted or not set(wanted) <= set(FIELDS):
+        parts = () if isinstance(fields, str) else tuple(fields)
+        if not parts or not set(parts) <= set(FIELDS):
             raise ValueError(f"fields are one or more of {', '.join(FIELDS)}, got {fields!r}")
-        return PairForm(wanted, None, planes)
+        return PairForm(parts, None, planes)
+
     if isinstance(keys, Mapping):
         if not keys or not set(keys.values()) <= set(FIELDS):
             raise ValueError(f"keys are a mapping of names to {', '.join(FIELDS)}, got {dict(keys)!r}")
         return PairForm(tuple(keys.values()), tuple(keys), planes)
+
     if keys is None:
         return PairForm(planes=planes)
 
@@ -202,11 +231,13 @@ def pair_form(
 def _planes_of(order: str | Sequence[str]) -> tuple[int, ...]:
     if isinstance(order, str) and order in _ORDERS:
         return _ORDERS[order]
+
     names: list[str] = []
     for letter in order:
         if letter == "G":
             letter = "Gb" if "Gr" in names else "Gr"
         names.append(letter)
+
     if sorted(names) != sorted(RAW_PLANES):
         raise ValueError(f"order must be a CFA, RGBG or the like, or four of {', '.join(RAW_PLANES)}; got {order!r}")
     return tuple(RAW_PLANES.index(name) for name in names)
@@ -227,10 +258,12 @@ def load_params(path: str | Path) -> AugmentParams:
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file of parameters")
+
     header, tensors = read_tensors(path, "save the parameters again")
     kind = header.get("kind", "no rawaug parameters")
     if kind != _KIND:
         raise ValueError(f"{path}: holds {kind}, not the parameters of an augmentation")
+
     try:
         return AugmentParams.from_tensors(tensors)
     except ValueError as error:

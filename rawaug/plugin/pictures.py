@@ -75,8 +75,11 @@ def stack_pictures(images: Sequence[Tensor]) -> Tensor:
     """Stack pictures ``(3, H, W)`` of one size to ``(B, 3, H, W)``; where only some are 8 bits, all become float32."""
     sizes = sorted({tuple(image.shape[-2:]) for image in images})
     if len(sizes) != 1:
-        named = ", ".join(f"{height} x {width}" for height, width in sizes) or "no pictures"
-        raise ValueError(f"pictures of a batch must have one size, got {named}; crop them, as wrap(..., crop=256) does")
+        listed = ", ".join(f"{height} x {width}" for height, width in sizes) or "no pictures"
+        raise ValueError(
+            f"pictures of a batch must have one size, got {listed}; crop them, as wrap(..., crop=256) does"
+        )
+
     if len({image.dtype for image in images}) > 1:
         images = [as_float(image) for image in images]
     return torch.stack(list(images))
@@ -92,7 +95,9 @@ def trim_to_even(image: Tensor) -> Tensor:
 
 def is_picture(value: Any) -> bool:
     """Tell whether ``value`` is one picture: a PIL image, or a tensor or array with two or three axes."""
-    return value.ndim in (2, 3) if isinstance(value, (Tensor, np.ndarray)) else hasattr(value, "getbands")
+    if isinstance(value, (Tensor, np.ndarray)):
+        return value.ndim in (2, 3)
+    return hasattr(value, "getbands")
 
 
 def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> Where:
@@ -138,10 +143,13 @@ def warn_of_pairs() -> None:
 def _likely_pair(first: Any, second: Any) -> bool:
     """Whether both are pictures in colour, or batches of them, of one shape."""
     if isinstance(first, (Tensor, np.ndarray)) and isinstance(second, (Tensor, np.ndarray)):
-        coloured = first.ndim in (3, 4) and 3 in (first.shape[-3], first.shape[-1])
-        return coloured and tuple(first.shape) == tuple(second.shape)
-    images = hasattr(first, "getbands") and hasattr(second, "getbands")
-    return images and first.mode == second.mode == "RGB" and first.size == second.size
+        if first.ndim not in (3, 4) or 3 not in (first.shape[-3], first.shape[-1]):
+            return False
+        return tuple(first.shape) == tuple(second.shape)
+
+    if not hasattr(first, "getbands") or not hasattr(second, "getbands"):
+        return False
+    return first.mode == second.mode == "RGB" and bool(first.size == second.size)
 
 
 def get_picture(sample: Any, where: Where) -> Any:
@@ -157,16 +165,26 @@ def replace_picture(sample: Any, where: Where, value: Any) -> Any:
     if where is None:
         return value
     if isinstance(sample, Mapping):
-        if not isinstance(value, dict):
-            return {**sample, where: value}
-        others = {name: field for name, field in sample.items() if name != where}
-        if taken := sorted(map(str, others.keys() & value.keys())):
-            raise ValueError(f"the samples have {', '.join(taken)} already; give other keys=")
-        return others | value
-    fields = [value if index == where else field for index, field in enumerate(sample)]
-    if isinstance(sample, tuple):
-        return type(sample)(*fields) if hasattr(sample, "_fields") else tuple(fields)
-    return fields
+        return _replace_in_mapping(sample, where, value)
+
+    fields = list(sample)
+    fields[int(where)] = value
+    if isinstance(sample, list):
+        return fields
+    if hasattr(sample, "_fields"):  # a named tuple
+        return type(sample)(*fields)
+    return tuple(fields)
+
+
+def _replace_in_mapping(sample: Mapping[Any, Any], where: str | int, value: Any) -> dict[Any, Any]:
+    if not isinstance(value, dict):
+        return {**sample, where: value}
+
+    others = {name: field for name, field in sample.items() if name != where}
+    duplicates = sorted(map(str, others.keys() & value.keys()))
+    if duplicates:
+        raise ValueError(f"the samples have {', '.join(duplicates)} already; give other keys=")
+    return others | value
 
 
 def _as_tensor(picture: Any) -> Tensor:
@@ -175,14 +193,17 @@ def _as_tensor(picture: Any) -> Tensor:
         if picture.layout != torch.strided:
             raise ValueError(f"a picture must be a dense tensor, got {picture.layout}; call to_dense()")
         return picture.as_subclass(Tensor)
+
     if hasattr(picture, "getbands"):
-        if picture.mode not in _PIL_AS_RGB + _PIL_AS_IS:
+        if picture.mode in _PIL_AS_RGB:
+            picture = picture.convert("RGB")
+        elif picture.mode not in _PIL_AS_IS:
             raise ValueError(f"a PIL image of mode {picture.mode!r} is not sRGB; convert it to RGB first")
-        picture = picture.convert("RGB") if picture.mode in _PIL_AS_RGB else picture
     if isinstance(picture, (str, Path)):
         raise ValueError(
             f"a picture must be read first, got the path {str(picture)!r:.100}; a folder's path is a dataset"
         )
+
     array = np.array(picture)
     if array.dtype.kind not in "uif" or array.dtype.itemsize > 8:
         raise ValueError(f"a picture must be a tensor, a NumPy array or a PIL image, got {describe(picture)}")
@@ -191,16 +212,26 @@ def _as_tensor(picture: Any) -> Tensor:
 
 def _rgb(image: Tensor, original: Any) -> Tensor:
     """``(..., C, H, W)`` or ``(..., H, W, C)`` to ``(..., 3, H, W)``, uint8 or float32."""
-    first, last = (image.shape[axis] in _CHANNELS for axis in (-3, -1))
-    if not (first or last):
+    is_first = image.shape[-3] in _CHANNELS
+    is_last = image.shape[-1] in _CHANNELS
+    if not is_first and not is_last:
         raise ValueError(f"a picture must be (3, H, W), (H, W, 3), grey or RGBA, got {describe(original)}")
-    trailing = last and not (first and isinstance(original, Tensor))
-    image = image.movedim(-1, -3) if trailing else image
-    if image.shape[-3] == 4 and image.is_floating_point() and not (trailing and isinstance(original, np.ndarray)):
-        raise ValueError(
-            f"{describe(original)} has four channels: is this packed RAW? It needs sRGB; of RGBA pass the first three"
-        )
-    image = image.expand(*image.shape[:-3], 3, -1, -1) if image.shape[-3] == 1 else image[..., :3, :, :]
+    if is_first and isinstance(original, Tensor):
+        is_last = False
+    if is_last:
+        image = image.movedim(-1, -3)
+
+    if image.shape[-3] == 1:
+        image = image.expand(*image.shape[:-3], 3, -1, -1)
+    elif image.shape[-3] == 4:
+        is_rgba = is_last and isinstance(original, np.ndarray)
+        if image.is_floating_point() and not is_rgba:
+            raise ValueError(
+                f"{describe(original)} has four channels: is this packed RAW? It needs sRGB; of RGBA pass the first "
+                "three"
+            )
+        image = image[..., :3, :, :]
+
     if image.dtype == torch.uint8:
         return image
     if image.dtype == torch.uint16:

@@ -26,6 +26,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug import bayer
+from rawaug.errors import count_of
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fast import FastForward
 from rawaug.kernels.runtime import one_thread
@@ -57,7 +58,7 @@ class Srgb:
     finish: Finish | bool = False
 
     def __post_init__(self) -> None:
-        if self.jpeg is not None and not (len(self.jpeg) == 2 and 1 <= self.jpeg[0] <= self.jpeg[1] <= 100):
+        if self.jpeg is not None and (len(self.jpeg) != 2 or not 1 <= self.jpeg[0] <= self.jpeg[1] <= 100):
             raise ValueError(f"jpeg must be (lowest, highest) quality within 1 to 100, got {self.jpeg}")
         for name in self.methods:
             bayer.require_method(name)
@@ -67,21 +68,33 @@ class Srgb:
         """The names of the demosaicings that are drawn from."""
         if self.demosaicing is None:
             return tuple(bayer.METHODS)
-        return (self.demosaicing,) if isinstance(self.demosaicing, str) else tuple(self.demosaicing)
+        if isinstance(self.demosaicing, str):
+            return (self.demosaicing,)
+        return tuple(self.demosaicing)
 
     @property
     def finishing(self) -> Finish | None:
         """The ranges of the finishing, None without it."""
-        return Finish() if self.finish is True else self.finish or None
+        if self.finish is True:
+            return Finish()
+        return self.finish or None
+
+    @property
+    def quality(self) -> tuple[int, int] | None:
+        """The range of the JPEG's quality, None without it."""
+        if self.jpeg or self.finishing is None:
+            return self.jpeg
+        return self.finishing.quality
 
     def sample(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw for ``batch`` pictures what :class:`AugmentParams` keeps as ``extras``, each ``(batch, ...)``."""
-        drawn = {"demosaicing": torch.randint(len(self.methods), (batch,), generator=generator)}
-        finishing = self.finishing
-        quality = self.jpeg if self.jpeg or finishing is None else finishing.quality
-        if quality is not None:
-            drawn["quality"] = torch.randint(quality[0], quality[1] + 1, (batch,), generator=generator)
-        return drawn if finishing is None else drawn | finishing.sample(batch, generator)
+        extras = {"demosaicing": torch.randint(len(self.methods), (batch,), generator=generator)}
+        if self.quality is not None:
+            lowest, highest = self.quality
+            extras["quality"] = torch.randint(lowest, highest + 1, (batch,), generator=generator)
+        if self.finishing is not None:
+            extras |= self.finishing.sample(batch, generator)
+        return extras
 
     def develop(
         self, forward: FastForward, noisy: Tensor, clean: Tensor, params: AugmentParams
@@ -99,10 +112,11 @@ class Srgb:
         """
         if min(noisy.shape[-2:]) < 4:
             raise ValueError(f"target 'srgb' demosaics pictures of at least 4 x 4, got {tuple(noisy.shape[-2:])}")
+
         methods = [self.methods[number] for number in params.extras["demosaicing"].tolist()]
         noisy, clean = forward.develop((noisy, clean), methods, keep_white(params.isp), params.crop)
-        if (finishing := self.finishing) is not None:
-            noisy, clean = finishing.apply(noisy, clean, params.extras["finish"])
+        if self.finishing is not None:
+            noisy, clean = self.finishing.apply(noisy, clean, params.extras["finish"])
         if "quality" in params.extras:
             noisy = compress_jpeg(noisy, params.extras["quality"], params.extras.get("chroma_420"))
         return noisy, clean
@@ -123,10 +137,13 @@ def compress_jpeg(srgb: Tensor, quality: Tensor, chroma_420: Tensor | None = Non
     """
     from rawaug.io.pictures import recode_jpeg  # OpenImageIO
 
-    in_bytes = (srgb * 255.0).round().to("cpu", torch.uint8)
-    halved = ["4:2:2"] * len(srgb) if chroma_420 is None else ["4:2:0" if x else "4:4:4" for x in chroma_420.tolist()]
-    shown = [recode_jpeg(*one) for one in zip(in_bytes, quality.tolist(), halved, strict=True)]
-    return torch.stack(shown).to(srgb) / 255.0
+    subsampling = ["4:2:2"] * len(srgb)
+    if chroma_420 is not None:
+        subsampling = ["4:2:0" if is_halved else "4:4:4" for is_halved in chroma_420.tolist()]
+
+    pictures = (srgb * 255.0).round().to("cpu", torch.uint8)
+    decoded = list(map(recode_jpeg, pictures, quality.tolist(), subsampling))
+    return torch.stack(decoded).to(srgb) / 255.0
 
 
 @dataclass(frozen=True)
@@ -151,10 +168,14 @@ class Burst:
             raise ValueError(f"burst must be a number of frames, at least 1, got {self.frames!r}")
         if len(self.motion) != 2 or not all(_is_finite(most) and most >= 0 for most in self.motion):
             raise ValueError(f"motion must be (pixels, degrees), both at least 0, got {self.motion}")
-        if self.stops is not None and not all(_is_finite(stop) for stop in self.stops):
+
+        if self.stops is None:
+            return
+        if not all(_is_finite(stop) for stop in self.stops):
             raise ValueError(f"stops must be finite numbers, got {self.stops}")
-        if self.stops is not None and len(self.stops) != self.frames:
-            raise ValueError(f"stops must be one exposure for each of {self.frames} frames, got {len(self.stops)}")
+        if len(self.stops) != self.frames:
+            frames = count_of(self.frames, "frame")
+            raise ValueError(f"stops must have an exposure for each of {frames}, got {len(self.stops)}")
 
     def sample(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw ``frame_seed`` ``(batch, N)`` and ``motion`` ``(batch, N, 3)``: dy, dx in pixels, angle in radians."""
@@ -162,12 +183,15 @@ class Burst:
         motion = 2.0 * torch.rand(batch, self.frames, 3, generator=generator) - 1.0
         motion *= torch.tensor([shift, shift, math.radians(degrees)])
         motion[:, 0] = 0.0
-        return {"motion": motion, "frame_seed": draw_seeds(batch * self.frames, generator).reshape(batch, self.frames)}
+
+        seeds = draw_seeds(batch * self.frames, generator)
+        return {"motion": motion, "frame_seed": seeds.reshape(batch, self.frames)}
 
     def move(self, scene: Tensor, motion: Tensor) -> Tensor:
         """The frames ``(B * N, 3, H, W)`` that see linear light ``(B, 3, H, W)`` after their motions ``(B, N, 3)``."""
         moving = move(scene.repeat_interleave(self.frames, 0), motion.flatten(0, 1))
         moving.clamp_(min=0.0)  # beside edges a bicubic curve undershoots
+
         first = (motion == 0.0).all(-1).flatten().nonzero()[:, 0].to(scene.device)
         moving[first] = scene[first // self.frames]  # which nothing interpolates
         return moving
@@ -194,10 +218,9 @@ def move(image: Tensor, motion: Tensor) -> Tensor:
     height, width = image.shape[-2:]
     dy, dx, angle = motion.to(image).unbind(1)
     cosine, sine = angle.cos(), angle.sin()
-    across, down = (
-        torch.stack([cosine, -sine * height / width, 2.0 * dx / width], dim=1),
-        torch.stack([sine * width / height, cosine, 2.0 * dy / height], dim=1),
-    )
+    across = torch.stack([cosine, -sine * height / width, 2.0 * dx / width], dim=1)
+    down = torch.stack([sine * width / height, cosine, 2.0 * dy / height], dim=1)
+
     with one_thread():  # the same bits everywhere
         grid = F.affine_grid(torch.stack([across, down], dim=1), list(image.shape), align_corners=False)
         return F.grid_sample(image, grid, mode="bicubic", padding_mode="reflection", align_corners=False)

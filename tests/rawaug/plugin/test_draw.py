@@ -10,7 +10,8 @@ import torch
 
 from rawaug.isp.cameras import LAMPS, gains_in_light, light_range, load_cameras, sample_lights, white_point
 from rawaug.isp.model import DictionaryISP
-from rawaug.plugin.augment import RawAugment, with_iso
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.camera_noise import with_iso
 from rawaug.plugin.config import AugmentConfig
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.finishing import Finish

@@ -20,7 +20,7 @@ from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.denoising.levels import find_levels, load_noise
 from rawaug.io import RawFrame
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, camera_law, estimate_noise, noise_model
-from rawaug.plugin.augment import noise_for
+from rawaug.plugin.camera_noise import noise_for
 from rawaug.training.camera_fit import fit, measure_camera_noise
 from rawaug.training.noisy_frames import noisy_frame
 

@@ -1,0 +1,218 @@
+"""The base of what makes pairs: parameters are drawn first and applied after.
+
+:class:`rawaug.RawAugment` makes pairs of pictures, :class:`rawaug.RawNoise` of clean RAW. Each says what its inputs
+are, how their parameters are drawn (:meth:`PairMaker.draw_params`) and what parameters make of them
+(:meth:`PairMaker.apply_params`). What is around these two is written here once: single inputs and batches, tuples and
+mappings, generators and devices.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, overload
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import get_worker_info
+
+from rawaug.kernels.runtime import eager
+from rawaug.plugin.params import AugmentParams, RawPair
+from rawaug.plugin.pictures import Where, find_picture, get_picture, replace_picture
+from rawaug.seeding import keyed_generator, rank_key
+
+
+class PairMaker(nn.Module, ABC):
+    """Base of what makes pairs of batches.
+
+    Args:
+        seed: of the module's own draws, where no generator is passed. They are counted from its construction: to
+            resume, pass a generator, or use RawPairs or wrap.
+    """
+
+    stream: ClassVar[str]
+    """Key of the module's own draws, beside the seed."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self.seed = seed
+        self._calls = 0
+        self._rank: tuple[int, ...] = ()
+
+    # -- what a subclass says -----------------------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def device(self) -> torch.device:
+        """The device that pairs are made on."""
+
+    @abstractmethod
+    def open_folder(self, path: str | Path, size: tuple[int, int] | None) -> Any:
+        """The inputs of a folder, or of ``kind:path``, as a Dataset; ``size`` is that of the crops."""
+
+    @abstractmethod
+    def is_single(self, inputs: Any) -> bool:
+        """Whether these are one input, and not a batch of them."""
+
+    @abstractmethod
+    def as_batch(self, inputs: Any, bgr: bool = False) -> Tensor:
+        """Inputs of one size, in any form, as a batch ``(B, C, H, W)``."""
+
+    @abstractmethod
+    def stack(self, patches: Sequence[Tensor]) -> Tensor:
+        """Stack patches of one size to a batch ``(B, C, H, W)``; ValueError if they differ."""
+
+    @abstractmethod
+    def draw_patch(
+        self,
+        whole: Any,
+        size: tuple[int, int] | None,
+        turns: bool,
+        generator: torch.Generator,
+        zoom: float = 1.0,
+        bgr: bool = False,
+    ) -> tuple[Tensor, Tensor]:
+        """Draw a crop of an input and cut it out: the patch, and its place as :class:`AugmentParams` keeps it."""
+
+    @abstractmethod
+    def cut_patch(self, whole: Any, place: Tensor, size: tuple[int, int] | None, bgr: bool = False) -> Tensor:
+        """Cut the patch of a drawn place out of an input."""
+
+    @abstractmethod
+    def draw_params(self, batch: Tensor, generator: torch.Generator, crop: Tensor | None) -> AugmentParams:
+        """Draw the parameters of a batch ``(B, C, H, W)``; ``crop`` ``(B, 5)`` is None for whole inputs."""
+
+    @abstractmethod
+    def apply_params(self, batch: Tensor, params: AugmentParams) -> RawPair:
+        """Make the pairs that parameters describe of a batch ``(B, C, H, W)``."""
+
+    def find(self, sample: Any, key: str | int | None) -> Where:
+        """Where the inputs are in a loader's batch; None if it is nothing else."""
+        return find_picture(sample, key, batched=True)
+
+    # -- draw, apply --------------------------------------------------------------------------------------------------
+
+    @eager
+    @torch.no_grad()
+    def sample(
+        self, inputs: Any, generator: torch.Generator | None = None, crop: Tensor | None = None
+    ) -> AugmentParams:
+        """Draw the parameters of a batch; those of a single input have no leading B.
+
+        Args:
+            inputs: a batch or a single input, in any form that the class lists.
+            generator: on the CPU; the module's own by default.
+            crop: ``(B, 5)`` where the inputs lie in larger frames, as :class:`AugmentParams` has it; by default they
+                are full frames.
+        """
+        params = self.draw_params(self._batch(inputs), generator or self._own_generator(), crop)
+        if self.is_single(inputs):
+            return params.map(_first)
+        return params
+
+    @eager
+    @torch.no_grad()
+    def apply(self, inputs: Any, params: AugmentParams | None = None) -> Any:
+        """Make the :class:`RawPair` that parameters describe, bit for bit the same at every call.
+
+        Args:
+            inputs: as for :meth:`sample`. A function alone, as a surrounding module may pass it, goes to
+                ``nn.Module.apply``.
+            params: those of as many inputs; for a single one they and the pair have no leading B.
+
+        Raises:
+            ValueError: if there is no batch, or ``params`` are for another number of inputs.
+        """
+        if params is None:
+            return super().apply(inputs)
+        if not isinstance(params, AugmentParams):
+            raise ValueError(f"apply takes the params of a pair, pair.params, got {type(params).__name__}")
+
+        batch = self._batch(inputs)
+        if self.is_single(inputs):
+            return self.apply_params(batch, params.map(_as_batch)).map(_first)
+        return self.apply_params(batch, params)
+
+    @eager
+    @torch.no_grad()
+    def make_pair(self, batch: Tensor, generator: torch.Generator, crop: Tensor | None = None) -> RawPair:
+        """Sample, then apply, without converting the inputs.
+
+        Args:
+            batch: ``(B, C, H, W)`` as :meth:`as_batch` gives it, on the module's device.
+            generator: on the CPU.
+            crop: ``(B, 5)``, as for :meth:`sample`.
+        """
+        return self.apply_params(batch, self.draw_params(batch, generator, crop))
+
+    @overload
+    def forward(self, batch: Tensor, generator: torch.Generator | None = None, key: None = None) -> RawPair: ...
+    @overload
+    def forward(self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None) -> Any: ...
+    @eager
+    @torch.no_grad()
+    def forward(self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None) -> Any:
+        """Draw parameters for a batch and apply them.
+
+        Args:
+            batch: inputs as for :meth:`sample`, or a tuple or mapping that has them. A single input makes a single
+                pair, without the leading B.
+            generator: of all that is drawn, on the CPU; the module's own by default.
+            key: name or index of the inputs in a mapping or tuple.
+
+        Returns:
+            A :class:`RawPair`; of a tuple or mapping, this with the pair in place of the inputs.
+
+        Raises:
+            ValueError: if there are no inputs.
+        """
+        where = self.find(batch, key)
+        inputs = get_picture(batch, where)
+
+        pair = self.make_pair(self._batch(inputs), generator or self._own_generator())
+        if self.is_single(inputs):
+            pair = pair.map(_first)
+        return replace_picture(batch, where, pair)
+
+    if TYPE_CHECKING:  # nn.Module's own call is of any kind
+
+        @overload
+        def __call__(self, batch: Tensor, generator: torch.Generator | None = None, key: None = None) -> RawPair: ...
+        @overload
+        def __call__(
+            self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None
+        ) -> Any: ...
+        def __call__(
+            self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None
+        ) -> Any: ...
+
+    def _batch(self, inputs: Any) -> Tensor:
+        """Inputs as a batch; what is no tensor yet is moved to the module's device."""
+        batch = self.as_batch(inputs)
+        if isinstance(inputs, Tensor):
+            return batch
+        return batch.to(self.device)
+
+    def _require_as_many(self, batch: Tensor, params: AugmentParams) -> None:
+        if len(params.crop) != len(batch):
+            raise ValueError(f"the parameters describe a batch of {len(params.crop)}, this one has {len(batch)}")
+
+    def _own_generator(self) -> torch.Generator:
+        """A new generator for each call, worker and process."""
+        self._calls += 1
+        worker = get_worker_info()
+        worker_seed = worker.seed if worker else 0
+        rank = rank_key() or self._rank
+        return keyed_generator(self.seed, self.stream, worker_seed, self._calls, *rank)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_rank": rank_key() or self._rank}  # a spawned worker has no process group
+
+
+def _first(tensor: Tensor) -> Tensor:
+    return tensor[0]
+
+
+def _as_batch(tensor: Tensor) -> Tensor:
+    return tensor[None]
