@@ -21,7 +21,7 @@ from rawaug.explore.views import stage_pictures
 from rawaug.files import require_writable
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.io.shots import read_shot
-from rawaug.isp.stages import frame_coordinates
+from rawaug.isp.functional import frame_coordinates
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import trim_to_even
 from rawaug.seeding import keyed_generator

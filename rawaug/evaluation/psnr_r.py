@@ -13,8 +13,8 @@ from rawaug.data.pairs import Pair
 from rawaug.isp import staged
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fit.samples import block_averages
+from rawaug.isp.functional import as_float, frame_coordinates
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import as_float, frame_coordinates
 from rawaug.metrics import PATCH, patch_psnr
 from rawaug.seeding import keyed_generator
 

@@ -29,8 +29,8 @@ from rawaug.explore import figures
 from rawaug.explore.figures import Example
 from rawaug.io import encode_srgb, read_picture
 from rawaug.isp.config import ISPParams
+from rawaug.isp.functional import frame_coordinates
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import frame_coordinates
 from rawaug.metrics import psnr
 from rawaug.noise import noise_levels, noise_names
 from rawaug.noise.models import NOISE

@@ -24,8 +24,9 @@ import torch
 from torch import Tensor
 
 from rawaug.isp.config import ISPParams, ISPResult
+from rawaug.isp.functional import as_display_referred, inverse_gains
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import WhiteBalance, as_display_referred, inverse_gains
+from rawaug.isp.stages import WhiteBalance
 
 MIDDLE_GREY = 0.18
 """The linear light above which highlights are compressed."""

@@ -24,9 +24,11 @@ from torch import Tensor, nn
 
 from rawaug import bayer
 from rawaug.bayer import CFA, unpack
+from rawaug.errors import count_of
 from rawaug.isp.config import ISPParams
+from rawaug.isp.functional import highlight_rise
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import BatchParams, Stage, Tables, highlight_rise, node_colours
+from rawaug.isp.stages import BatchParams, Stage, Tables, node_colours
 from rawaug.isp.tone import STEPS, to_code
 from rawaug.kernels import fastest
 from rawaug.kernels.reference import Camera, Display, fall_off, look_up, mask_frame, render, unprocess
@@ -114,6 +116,7 @@ class BakedISP(nn.Module):
             gain = _place_gain(self.isp.ordered_stages, place, size, self.table, forward=False)
         else:
             camera = camera._replace(attention=camera.attention[:0], shading=camera.shading[:0])
+
         ceiling = math.inf
         if gain is None:
             ceiling = white
@@ -243,18 +246,16 @@ class FastForward(nn.Module):
         self, raws: Sequence[Tensor], methods: Sequence[str], params: ISPParams, place: Tensor | None
     ) -> list[Tensor]:
         """Develop picture by picture, so that each is the same whatever is beside it."""
-        pictures: list[list[Tensor]] = [[] for _ in raws]
+        pictures = []
         for i, method in enumerate(methods):
-            own_params = ISPParams(*(value[i, None] for value in params))
+            own_params = ISPParams(*[value[i, None] for value in params])
             own_place = None
             if place is not None:
                 own_place = place[i, None]
 
             own_raws = [raw[i, None] for raw in raws]
-            developed = self.develop(own_raws, [method], own_params, own_place)
-            for group, picture in zip(pictures, developed, strict=True):
-                group.append(picture)
-        return [torch.cat(group) for group in pictures]
+            pictures.append(self.develop(own_raws, [method], own_params, own_place))
+        return list(map(torch.cat, zip(*pictures, strict=True)))
 
     def _gain(self, image: Tensor, place: Tensor | None) -> Tensor | None:
         size = image.shape[-2], image.shape[-1]
@@ -373,7 +374,7 @@ def _require_batch(srgb: Tensor, params: ISPParams, place: Tensor | None) -> Non
         raise ValueError(f"sRGB must have shape (B, 3, H, W) with even sides, got {tuple(srgb.shape)}")
     for what, value in (("matrix", params.matrix), ("gains", params.gains), ("place", place)):
         if value is not None and len(value) != len(srgb):
-            raise ValueError(f"{what} is for {len(value)} pictures, but the batch has {len(srgb)}")
+            raise ValueError(f"{what} is for {count_of(len(value), 'picture')}, but the batch has {len(srgb)}")
 
 
 def _as_table(values: Tensor, nodes: int) -> Tensor:

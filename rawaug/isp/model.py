@@ -18,13 +18,15 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
+from rawaug.errors import count_of
 from rawaug.files import find_weights, parse_object, read_tensors, to_json, write_tensors
-from rawaug.isp import staged, stages
+from rawaug.isp import functional, staged, stages
 from rawaug.isp.camera_names import find_camera
 from rawaug.isp.cameras import D65, gains_in_light, light_range, load_cameras, white_point
 from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
 from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weights, log_light
-from rawaug.isp.own_cameras import Camera, as_camera, is_camera_file, mired_of, weights_in_light
+from rawaug.isp.lights import mired_of, weights_in_light
+from rawaug.isp.own_cameras import Camera, as_camera, is_camera_file
 from rawaug.isp.own_sampler import OwnCameraSampler, own_cameras
 from rawaug.isp.staged import StagedISP, Tone, thumbnail
 from rawaug.registry import suggest
@@ -109,14 +111,14 @@ class DictionaryISP(StagedISP):
         if not self.config.encoders:
             return self.params_from_weights(encoders.colour(srgb), encoders.gain(srgb))
 
-        x2 = self.linear(thumbnail(stages.as_float(srgb)))
+        x2 = self.linear(thumbnail(functional.as_float(srgb)))
         candidates = torch.einsum("nij,bjhw->bnihw", self.colour.atoms(), x2)
         colour_weights = encoders.colour(candidates)
         x3 = torch.einsum("bn,bnihw->bihw", colour_weights, candidates)
 
         balanced = []
         for gains in self.gain.channel_gains():
-            balanced.append(stages.inverse_gains(x3, gains.expand(len(x3), 3), self.config.knee))
+            balanced.append(functional.inverse_gains(x3, gains.expand(len(x3), 3), self.config.knee))
         return self.params_from_weights(colour_weights, encoders.gain(torch.stack(balanced, dim=1)))
 
     def choose_forward(self, x4: Tensor) -> ISPParams:
@@ -125,7 +127,7 @@ class DictionaryISP(StagedISP):
         balanced = small[:, None] * self.gain.channel_gains()[None, :, :, None, None]
         gain_weights = self.forward_encoders.gain(balanced)
 
-        x3 = stages.apply_gains(small, self.gain.combine(gain_weights))
+        x3 = functional.apply_gains(small, self.gain.combine(gain_weights))
         candidates = torch.einsum("nij,bjhw->bnihw", torch.linalg.pinv(self.colour.atoms()), x3)
         return self.params_from_weights(self.forward_encoders.colour(candidates), gain_weights)
 
@@ -157,7 +159,7 @@ class DictionaryISP(StagedISP):
             raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are solved for from these few readings
                 (:func:`rawaug.isp.staged.with_raw_samples`).
             coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame
-                (:func:`rawaug.isp.stages.frame_coordinates`); the picture is taken for a full frame by default.
+                (:func:`rawaug.isp.functional.frame_coordinates`); the picture is taken for a full frame by default.
             intermediates: also return x1 ... x5.
 
         Returns:
@@ -171,14 +173,15 @@ class DictionaryISP(StagedISP):
             raise ValueError(f"sRGB must have shape (B, 3, H >= 2, W >= 2), got {tuple(srgb.shape)}")
 
         with self._float32(srgb):
-            x = stages.as_display_referred(srgb)
+            x = functional.as_display_referred(srgb)
 
             params = staged.with_white_balance(self, params or self.choose(x), white_balance, digital_gain)
             params = staged.with_tone(self, params, tone)
             if len(params.gains) != len(x):
-                raise ValueError(f"the parameters are for {len(params.gains)} pictures, but the batch has {len(x)}")
+                pictures = count_of(len(params.gains), "picture")
+                raise ValueError(f"the parameters are for {pictures}, but the batch has {len(x)}")
             if raw_samples is not None:
-                where = stages.coordinates_or_full(x, coordinates)
+                where = functional.coordinates_or_full(x, coordinates)
                 params = staged.with_raw_samples(self, x, params, raw_samples, where)
 
             images: dict[str, Tensor] = {}
@@ -391,10 +394,12 @@ def _with_own_cameras(isp: DictionaryISP, cameras: Sequence[Camera]) -> Dictiona
     """An ISP of cameras of one's own: an atom for each light of a camera."""
     anchors = [camera.anchors() for camera in cameras]
     count = sum(map(len, anchors))
+
     patterns = {camera.cfa for camera in cameras}
     if len(patterns) > 1:
         raise ValueError(f"cameras have several patterns, {', '.join(sorted(patterns))}; give those of one pattern")
     (mosaic,) = patterns
+
     tones, curves = _tones_of(isp, cameras)
     own = _without_colour(
         isp,

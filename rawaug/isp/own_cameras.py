@@ -6,13 +6,11 @@ adaptation from the light's white point to D65, the matrix from XYZ under that l
 
 .. math:: X = \mathrm{diag}(1 / g) \; C \; S^{-1} B(L) .
 
-Between two lights of colour temperatures :math:`T_1 < T < T_2` matrices are mixed linearly in mired, as the DNG
-specification does (Adobe, 1.7, "Mapping camera color space to CIE XYZ space"),
+In other light the matrices of the lights beside it are mixed, with the weights of :mod:`rawaug.isp.lights`,
 
-.. math:: w_1 = \frac{1/T - 1/T_2}{1/T_1 - 1/T_2}, \qquad C = \sum_i w_i C_i, \qquad
-    g(L) = \frac{(X L)_G}{X L}, \quad X = \sum_i w_i X_i,
+.. math:: C = \sum_i w_i C_i, \qquad g(L) = \frac{(X L)_G}{X L}, \quad X = \sum_i w_i X_i,
 
-and beyond the outermost light its matrix stays. So the gains of a light on the data sheet are exactly those stated.
+so that the gains of a light on the data sheet are exactly those stated.
 
 *Noise.* A gain of K digital numbers (DN) for an electron, read noise of :math:`\sigma` DN and V = white level - black
 level give the variances on the scale white = 1:
@@ -38,39 +36,24 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, PATTERNS
 from rawaug.files import read_yaml
-from rawaug.isp.cameras import (
-    LAMPS,
-    SRGB_TO_XYZ,
-    XYZ_TO_SRGB,
-    Array,
-    camera_from_srgb,
-    daylight,
-    gains_in_light,
-    load_cameras,
-    planckian,
-    white_point,
+from rawaug.isp.cameras import XYZ_TO_SRGB, camera_from_srgb, gains_in_light, load_cameras
+from rawaug.isp.lights import (
+    REFERENCE,
+    adaptation,
+    light_mired,
+    light_xyz,
+    mired_of,
+    mix_by_light,
+    weights_in_light,
 )
 from rawaug.registry import suggest
 
 YAML_EXTENSIONS = (".yaml", ".yml")
 """Extensions of a camera's file."""
 
-ILLUMINANTS = {
-    "A": (0.44758, 0.40745),
-    "D50": (0.34567, 0.35850),
-    "D55": (0.33242, 0.34743),
-    "D65": (0.31271, 0.32902),
-    "D75": (0.29902, 0.31485),
-}
-"""Chromaticities (x, y) of CIE standard illuminants, 2 degree observer (CIE 15:2018, table T.3)."""
-
 MatrixKind = Literal["xyz_to_camera", "srgb_to_camera", "camera_to_srgb"]
 NoiseUnit = Literal["variance", "DN"]
 
-_BRADFORD = torch.tensor(
-    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]], dtype=torch.float64
-)
-_REFERENCE = "D65"
 _LARGEST_VAR = 0.2
 """A shot_var above it means fewer than five electrons at white: such numbers are more likely in DN."""
 
@@ -267,13 +250,12 @@ class Camera:
             keys = ("K", "sigma") if in_dn else ("shot_var", "read_var")
             if set(values) != set(keys):
                 raise self._error("noise", f"{where} is {{{keys[0]}, {keys[1]}}}, got {', '.join(map(str, values))}")
+            values = [values[keys[0]], values[keys[1]]]
 
-            values = [values[key] for key in keys]
-
-        if not isinstance(values, list) or len(values) != 2 or not all(_is_number(value) for value in values):
+        if not isinstance(values, list) or len(values) != 2 or not all(map(_is_number, values)):
             raise self._error("noise", f"{where} must be two numbers, got {values!r:.100}")
 
-        first, second = (float(value) for value in values)
+        first, second = float(values[0]), float(values[1])
         if min(first, second) < 0:
             raise self._error("noise", f"{where} must not be negative, got {first:g} and {second:g}")
         if not in_dn:
@@ -299,8 +281,8 @@ class Camera:
 
         rows = []
         for level in self.levels:
-            row = {"iso": level.iso, "shot_var": level.shot_var, "read_var": level.read_var}
-            rows.append({key: value for key, value in row.items() if value is not None})
+            row = {} if level.iso is None else {"iso": level.iso}
+            rows.append({**row, "shot_var": level.shot_var, "read_var": level.read_var})
 
         settings: dict[str, Any] = {"camera": self.name, "levels": rows}
         if self.quantum:
@@ -314,22 +296,24 @@ class Camera:
         matrices = self._by_light("matrix", self.matrix, (3, 3))
         gains = self._by_light("white_balance", self.white_balance, (3,))
         if len(matrices) == 1 and gains and not isinstance(self.white_balance, dict):
-            gains = dict.fromkeys(matrices, gains[_REFERENCE])  # both are of one light, that of the matrix
+            gains = dict.fromkeys(matrices, gains[REFERENCE])  # both are of one light, that of the matrix
 
-        from_srgb = {light: self._from_srgb(light, matrix) for light, matrix in matrices.items()}
+        from_srgb = {}
+        for light, matrix in matrices.items():
+            from_srgb[light] = self._from_srgb(light, matrix)
         lights = {*matrices, *gains}
         if gains and not isinstance(self.matrix, dict):
             lights = {*gains}  # the one matrix serves in all of them
 
         anchors = []
         for light in sorted(lights, key=light_mired, reverse=True):
-            matrix = _mix_by_light(from_srgb, light)
+            matrix = mix_by_light(from_srgb, light)
             stated = gains.get(light)
             if stated is None:
                 stated = self._implied_gains(light, matrices)
 
             stated = stated / stated[1]
-            to_d65 = adaptation(light_xyz(light), light_xyz(_REFERENCE))
+            to_d65 = adaptation(light_xyz(light), light_xyz(REFERENCE))
             from_xyz = torch.diag(1.0 / stated) @ matrix @ XYZ_TO_SRGB @ to_d65
             anchors.append(Anchor(light, light_mired(light), matrix, stated, from_xyz))
 
@@ -339,7 +323,7 @@ class Camera:
         if value is None:
             return {}
         if not isinstance(value, dict):
-            value = {_REFERENCE: value}
+            value = {REFERENCE: value}
 
         by_light = {}
         for light, numbers in value.items():
@@ -364,7 +348,7 @@ class Camera:
     def _from_srgb(self, light: str, matrix: Tensor) -> Tensor:
         """The matrix of a light from linear sRGB to white-balanced camera RGB, rows of sum 1."""
         if self.matrix_is == "xyz_to_camera":
-            under_light = adaptation(light_xyz(_REFERENCE), light_xyz(light))
+            under_light = adaptation(light_xyz(REFERENCE), light_xyz(light))
             return camera_from_srgb(matrix @ under_light)
 
         if self.matrix_is == "camera_to_srgb":
@@ -397,14 +381,20 @@ class Camera:
         anchors = self.anchors()
         mireds = np.linspace(100.0, 500.0, 81)
         lights = torch.stack([light_xyz(f"{1e6 / mired:.6f}") for mired in mireds])
-        weights = torch.from_numpy(weights_in_light([anchor.mired for anchor in anchors], mired_of(lights.numpy())))
 
-        from_xyz = torch.einsum("bn,nij->bij", weights, torch.stack([anchor.from_xyz for anchor in anchors]))
+        mired_of_anchor, matrices, from_xyz_of_anchor = [], [], []
+        for anchor in anchors:
+            mired_of_anchor.append(anchor.mired)
+            matrices.append(anchor.matrix)
+            from_xyz_of_anchor.append(anchor.from_xyz)
+
+        weights = torch.from_numpy(weights_in_light(mired_of_anchor, mired_of(lights.numpy())))
+        from_xyz = torch.einsum("bn,nij->bij", weights, torch.stack(from_xyz_of_anchor))
         gains = gains_in_light(from_xyz, lights).clamp_min(1e-6)
         stated = torch.tensor(white_balance, dtype=torch.float64)
         distance = (gains.log() - (stated / stated[1]).log()).square().sum(dim=1)
         nearest = weights[int(distance.argmin())]
-        return torch.einsum("n,nij->ij", nearest, torch.stack([anchor.matrix for anchor in anchors]))
+        return torch.einsum("n,nij->ij", nearest, torch.stack(matrices))
 
     # -- tone ---------------------------------------------------------------------------------------------------------
 
@@ -434,7 +424,10 @@ class Camera:
     def to_json(self) -> dict[str, Any]:
         """The figures as plain values, without those that have their defaults; :meth:`from_json` reads them back."""
         figures = asdict(self)
-        return {field.name: figures[field.name] for field in fields(self) if figures[field.name] != field.default}
+        for field in fields(self):
+            if figures[field.name] == field.default:
+                del figures[field.name]
+        return figures
 
     @classmethod
     def from_json(cls, content: Any, where: str = "camera") -> Camera:
@@ -491,80 +484,6 @@ def as_camera(camera: str | Path | Camera) -> Camera:
     if isinstance(camera, Camera):
         return camera
     return Camera.load(camera) if is_camera_file(camera) else Camera.published(str(camera))
-
-
-# -- lights ------------------------------------------------------------------------------------------------------------
-
-
-def light_chromaticity(light: str) -> tuple[float, float]:
-    """The chromaticity (x, y) of a light by its name or its colour temperature in kelvin; ValueError if unknown."""
-    if light in ILLUMINANTS:
-        return ILLUMINANTS[light]
-    if light in LAMPS:
-        return LAMPS[light]
-
-    try:
-        kelvin = float(light.removesuffix("K").strip())
-    except ValueError:
-        names = [*ILLUMINANTS, *LAMPS]
-        listed = f"{', '.join(names)}{suggest(light, names)}"
-        raise ValueError(f"light {light!r:.40} is unknown; use a number in kelvin, {listed}") from None
-
-    if not 1000 <= kelvin <= 15000:
-        raise ValueError(f"a light must be 1,000 to 15,000 kelvin, got {kelvin:g}")
-
-    locus = planckian if kelvin < 4000 else daylight
-    x, y = locus(np.array(kelvin)).tolist()
-    return x, y
-
-
-def light_xyz(light: str) -> Tensor:
-    """The white point of a light, XYZ ``(3,)`` with Y = 1; that of D65 is the white of sRGB."""
-    if light == _REFERENCE:
-        return SRGB_TO_XYZ.sum(dim=1)
-    return white_point(light_chromaticity(light))
-
-
-def light_mired(light: str) -> float:
-    """A million over the correlated colour temperature of a light."""
-    return float(mired_of(light_xyz(light)[None].numpy())[0])
-
-
-def mired_of(white: Array) -> Array:
-    """A million over the correlated colour temperatures ``(B,)`` of white points ``(B, 3)`` (McCamy, 1992)."""
-    total = white.sum(axis=1)
-    x, y = white[:, 0] / total, white[:, 1] / total
-    n = (x - 0.3320) / (0.1858 - y)
-    kelvin = ((449.0 * n + 3525.0) * n + 6823.3) * n + 5520.33
-    return np.asarray(1e6 / np.maximum(kelvin, 1000.0))
-
-
-def adaptation(white: Tensor, other: Tensor) -> Tensor:
-    """Bradford's adaptation ``(3, 3)`` of XYZ from one white point ``(3,)`` to another."""
-    cones = (_BRADFORD @ other) / (_BRADFORD @ white)
-    return torch.linalg.inv(_BRADFORD) @ torch.diag(cones) @ _BRADFORD
-
-
-def weights_in_light(anchors: Sequence[float], mired: Array) -> Array:
-    """Weights ``(B, N)`` of anchors at ascending or descending mireds, linear between two and constant beyond."""
-    mireds = np.asarray(anchors, dtype=np.float64)
-    if len(mireds) == 1:
-        return np.ones((len(mired), 1))
-
-    order = np.argsort(mireds)
-    rows = np.eye(len(mireds))[order]
-    columns = [np.interp(mired, mireds[order], rows[:, column]) for column in range(len(mireds))]
-    return np.stack(columns, axis=1)
-
-
-def _mix_by_light(matrices: Mapping[str, Tensor], light: str) -> Tensor:
-    """The matrix of a light, or the mixture of those of the lights beside it."""
-    if light in matrices:
-        return matrices[light]
-
-    mireds = [light_mired(name) for name in matrices]
-    weights = torch.from_numpy(weights_in_light(mireds, np.array([light_mired(light)])))[0]
-    return torch.einsum("n,nij->ij", weights, torch.stack(list(matrices.values())))
 
 
 def _is_number(value: Any) -> bool:

@@ -16,7 +16,8 @@ from rawaug.isp.dictionary import (
     CameraSampler,
     sparse_shares,
 )
-from rawaug.isp.own_cameras import ILLUMINANTS, Camera, light_xyz, mired_of, weights_in_light
+from rawaug.isp.lights import ILLUMINANTS, light_xyz, mired_of, weights_in_light
+from rawaug.isp.own_cameras import Anchor, Camera
 
 _ROUNDS = 100
 
@@ -45,18 +46,22 @@ class OwnCameraSampler(CameraSampler):
         light: float | str | None = None,
         consistent: bool = True,
     ) -> None:
-        anchors = [camera.anchors() for camera in cameras]
-        self._mireds = [[anchor.mired for anchor in in_lights] for in_lights in anchors]
-        self._from_xyz = np.stack([anchor.from_xyz.numpy() for in_lights in anchors for anchor in in_lights])
-        self._exact: Array | None = None
+        anchors: list[Anchor] = []
+        self._mireds: list[list[float]] = []
+        for camera in cameras:
+            in_lights = camera.anchors()
+            anchors += in_lights
+            self._mireds.append([anchor.mired for anchor in in_lights])
+        self._from_xyz = np.stack([anchor.from_xyz.numpy() for anchor in anchors])
 
         # Gains of the data sheets are plausible, whatever they are.
-        stated = np.stack([anchor.gains.numpy() for in_lights in anchors for anchor in in_lights])
-        self._lowest = min(PLAUSIBLE_GAINS[0], float(stated.min()))
-        self._highest = max(PLAUSIBLE_GAINS[1], float(stated.max()))
+        gains = np.stack([anchor.gains.numpy() for anchor in anchors])
+        self._lowest = min(PLAUSIBLE_GAINS[0], float(gains.min()))
+        self._highest = max(PLAUSIBLE_GAINS[1], float(gains.max()))
 
-        by_name = {anchor.light for in_lights in anchors for anchor in in_lights} | ILLUMINANTS.keys()
-        if isinstance(light, str) and light in by_name:
+        self._exact: Array | None = None
+        names = [*ILLUMINANTS, *[anchor.light for anchor in anchors]]
+        if isinstance(light, str) and light in names:
             self._exact = light_xyz(light).numpy()
             lights = LightRange()
         else:

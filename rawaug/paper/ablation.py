@@ -31,8 +31,8 @@ from rawaug.isp import staged
 from rawaug.isp.config import POINTWISE_STAGES
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import block_averages
+from rawaug.isp.functional import as_float, frame_coordinates
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import as_float, frame_coordinates
 from rawaug.progress import progress
 
 YUV = ((0.299, 0.587, 0.114), (-0.14713, -0.28886, 0.436), (0.615, -0.51499, -0.10001))

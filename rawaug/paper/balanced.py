@@ -18,7 +18,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.data.pairs import Pair
-from rawaug.isp.stages import frame_coordinates
+from rawaug.isp.functional import frame_coordinates
 from rawaug.metrics import psnr
 
 GAMMA = 2.2

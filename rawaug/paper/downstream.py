@@ -23,8 +23,8 @@ from rawaug.data.pairs import Sample, SomePairs
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import Row, score
 from rawaug.evaluation.trials import Trial, trial_of
+from rawaug.isp.functional import as_float
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import as_float
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.paper.baselines.base import BaselineISP
 from rawaug.plugin.augment import RawAugment

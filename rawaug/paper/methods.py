@@ -28,8 +28,8 @@ from rawaug.isp.config import ISPParams
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.descent import cycle_error
 from rawaug.isp.fit.samples import block_averages, sample_pixels
+from rawaug.isp.functional import as_float, coordinates_or_full
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import as_float, coordinates_or_full
 from rawaug.metrics import PATCH, psnr
 from rawaug.paper.balanced import balanced_psnr
 from rawaug.paper.baselines import BASELINES, CycleISP, Training, fit_baseline

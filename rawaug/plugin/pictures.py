@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug.isp.stages import as_float, require_display_range
+from rawaug.isp.functional import as_float, require_display_range
 
 _CHANNELS = (1, 3, 4)
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)

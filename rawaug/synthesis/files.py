@@ -24,7 +24,8 @@ from rawaug.data.formats import write_npz, write_tiff
 from rawaug.files import digest, find_weights, read_header, replacing, sha256, write_tensors
 from rawaug.io import GainMap, RawFrame, read_picture, write_dng
 from rawaug.io.pictures import MAX_PIXELS, encode_png
-from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, frame_coordinates
+from rawaug.isp.functional import frame_coordinates
+from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.config import AugmentConfig, pair_generator
 from rawaug.plugin.params import AugmentParams, RawPair, load_params

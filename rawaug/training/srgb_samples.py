@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from rawaug.data.pairs import Sample
-from rawaug.isp.stages import as_float
+from rawaug.isp.functional import as_float
 from rawaug.plugin.crops import crop_size, draw_patch
 from rawaug.registry import require_between
 from rawaug.training.srgb_noise import SrgbNoise

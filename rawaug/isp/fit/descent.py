@@ -65,15 +65,16 @@ def cycle_error(
     ahead: dict[str, Tensor] = {}
     start = back["raw"].detach() if config.noisy else part.cell_raw
     error = (isp.forward_pixels(start, params, part.coordinates, ahead) - part.cell_srgb) ** 2
-    for name in ahead:
-        error = error + config.intermediate * (ahead[name] - back[name]) ** 2 if name in back else error
+    for name, image in ahead.items():
+        if name in back:
+            error = error + config.intermediate * (image - back[name]) ** 2
     return (error * part.cell_weight).sum() / (3.0 * part.cell_weight.sum()).clamp_min(1.0)
 
 
 def mean_square(isp: DictionaryISP, part: PixelSamples, params: ISPParams) -> Tensor:
     """Compute the mean squared error of every frame ``(F,)`` on its unclipped pixels."""
     count = len(part.srgb)
-    params = ISPParams(*(value.expand(count, *value.shape[1:]) for value in params))
+    params = ISPParams(*[value.expand(count, *value.shape[1:]) for value in params])
     error = (isp.reverse_pixels(part.srgb, params, part.coordinates) - part.target) ** 2 * part.known
     return error.sum((1, 2, 3)) / part.known.sum((1, 2, 3)).clamp_min(1.0)
 
@@ -88,10 +89,10 @@ def weight_distance(ours: ISPParams, theirs: ISPParams) -> Tensor:
 def mean_psnr(isp: DictionaryISP, frames: FitFrames, as_shot: bool = False) -> float:
     """Average the PSNR of the frames, each in the setting that the ISP chooses for it, or under as-shot gains."""
     values = []
-    for k, shot in enumerate(frames.shots):
+    for number, shot in enumerate(frames.shots):
         balance = shot.white_balance if as_shot else None
         params = with_white_balance(isp, isp.choose(shot.srgb), balance, None)
-        values.append(mean_square(isp, frames.some([k]).pixels, params))
+        values.append(mean_square(isp, frames.some([number]).pixels, params))
 
     return float(-10.0 * torch.cat(values).log10().mean())
 
@@ -162,8 +163,9 @@ class Descent:
         if path is not None and path.is_file():
             header, tensors = read_tensors(path, "delete this state of an interrupted fit")
             if header.get("key") == key:
-                self.watched = {k: BestScore(*values) for k, values in json.loads(header["watched"]).items()}
                 self._ends = tensors
+                for stage, values in json.loads(header["watched"]).items():
+                    self.watched[stage] = BestScore(*values)
 
     def run(
         self,
@@ -188,10 +190,14 @@ class Descent:
         """
 
         def scores(step: int) -> str:
-            reported = report() if report is not None and step else ""
-            return reported + ("" if watch is None else self._note(stage, step, watch(), tensors))
+            text = ""
+            if report is not None and step:
+                text += report()
+            if watch is not None:
+                text += self._note(stage, step, watch(), tensors)
+            return text
 
-        if not all(f"{stage}/{name}" in self._ends for name in tensors):
+        if not self._has_end(stage, tensors):
             scores(0)
             for tensor in tensors.values():
                 tensor.requires_grad_()
@@ -202,11 +208,12 @@ class Descent:
                 lambda step: loss(keyed_generator(self.seed, stage, step)),
                 lambda step: step / steps if step < steps else 1.0,
             )
-            bar, losses = progress(descent, label=stage, unit="step", total=steps, shown=self.progress), list[Tensor]()
-            for done, value in enumerate(bar, 1):
+            bar = progress(descent, label=stage, unit="step", total=steps, shown=self.progress)
+            losses: list[Tensor] = []
+            for step, value in enumerate(bar, 1):
                 losses.append(value)
-                if done % self.report_steps == 0 or done == steps:
-                    bar.set_postfix_str(f"loss {torch.stack(losses).mean():.2e} {scores(done)}", refresh=False)
+                if step % self.report_steps == 0 or step == steps:
+                    bar.set_postfix_str(f"loss {torch.stack(losses).mean():.2e} {scores(step)}", refresh=False)
                     losses.clear()
 
             if watch is None:
@@ -223,8 +230,12 @@ class Descent:
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 
+    def _has_end(self, stage: str, tensors: Mapping[str, Tensor]) -> bool:
+        return all(f"{stage}/{name}" in self._ends for name in tensors)
+
     def _keep(self, stage: str, tensors: Mapping[str, Tensor]) -> None:
-        self._ends |= {f"{stage}/{name}": tensor.detach().clone() for name, tensor in tensors.items()}
+        for name, tensor in tensors.items():
+            self._ends[f"{stage}/{name}"] = tensor.detach().clone()
 
     def _note(self, stage: str, step: int, score: float, tensors: Mapping[str, Tensor]) -> str:
         """Note a score, and the tensors if it is the best so far."""
@@ -258,13 +269,13 @@ Refit = Callable[[FitFrames, str, FitConfig], DictionaryISP]
 
 def gain_left_out(frames: FitFrames, folds: int, gain: Callable[[FitFrames, FitFrames, str], float]) -> float:
     """Mean over the frames of ``gain(left out, kept, name of the fold)``, every frame being left out once."""
-    every, total = range(len(frames.shots)), 0.0
+    count = len(frames.shots)
+    total = 0.0
     for fold in range(folds):
-        out = every[fold::folds]
-        rest = frames.some([k for k in every if k not in out])
-        total += len(out) * gain(frames.some(out), rest, f" without part {fold + 1} of {folds}")
+        out, rest = frames.split(range(fold, count, folds))
+        total += len(out.shots) * gain(out, rest, f" without part {fold + 1} of {folds}")
 
-    return total / len(every)
+    return total / count
 
 
 def with_better_tone(frames: FitFrames, config: FitConfig, refit: Refit) -> tuple[FitConfig, float | None]:
@@ -315,11 +326,16 @@ def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, des
 
 def _train(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent, stage: str) -> None:
     isp.use_encoders(True, descent.seed)
-    tensors = {name: p for name, p in isp.named_parameters() if "_encoders." in name and ".layers." in name}
+    tensors = {}
+    for name, parameter in isp.named_parameters():
+        if "_encoders." in name and ".layers." in name:
+            tensors[name] = parameter
 
     def loss(generator: torch.Generator) -> Tensor:
-        parts = _draw_frames(frames, FRAMES_A_STEP, ENCODER_PIXELS, generator)
-        return torch.stack([_frame_loss(isp, part, shot, config, generator) for part, shot in parts]).mean()
+        losses = []
+        for part, shot in _draw_frames(frames, FRAMES_A_STEP, ENCODER_PIXELS, generator):
+            losses.append(_frame_loss(isp, part, shot, config, generator))
+        return torch.stack(losses).mean()
 
     descent.run(stage, loss, tensors, config.encoder_steps, ENCODER_RATE)
 
@@ -330,7 +346,12 @@ def _draw_frames(
     """Draw ``count`` of the frames, with replacement, each with the same random pixels."""
     numbers = torch.randint(len(frames.shots), (count,), generator=generator).tolist()
     index = torch.randint(frames.pixels.srgb.shape[-1], (pixels,), generator=generator)
-    return [(frames.pixels.pick(index, torch.tensor([k])), frames.shots[k]) for k in numbers]
+
+    parts = []
+    for number in numbers:
+        pixels_of_frame = frames.pixels.pick(index, torch.tensor([number]))
+        parts.append((pixels_of_frame, frames.shots[number]))
+    return parts
 
 
 def _frame_loss(
@@ -338,8 +359,9 @@ def _frame_loss(
 ) -> Tensor:
     srgb, raw = _same_piece(shot.srgb, isp.remove_shading(shot.raw, None), generator)
     ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
-    errors = [(mean_square(isp, part, params) + config.mse_floor).log() for params in (ours, theirs)]
-    return (errors[0] + errors[1]).sum() + config.consistency * weight_distance(ours, theirs)
+    our_error = (mean_square(isp, part, ours) + config.mse_floor).log()
+    their_error = (mean_square(isp, part, theirs) + config.mse_floor).log()
+    return (our_error + their_error).sum() + config.consistency * weight_distance(ours, theirs)
 
 
 def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -388,13 +410,12 @@ def train_jointly(
 
     trained = frames
     if watched is None:
-        held_out = range(0, count, 10)[: max(1, count // 2)]
-        watched = frames.some(held_out)
-        trained = frames.some([k for k in range(count) if k not in held_out])
+        watched, trained = frames.split(range(0, count, 10)[: max(1, count // 2)])
 
     published = config.method == "published"
-    frames_a_step = PUBLISHED_FRAMES if published else FRAMES_A_STEP
-    pixels = min(config.batch, PUBLISHED_PIXELS) if published else config.batch
+    frames_a_step, pixels, rate = FRAMES_A_STEP, config.batch, LEARNING_RATE
+    if published:
+        frames_a_step, pixels, rate = PUBLISHED_FRAMES, min(config.batch, PUBLISHED_PIXELS), PUBLISHED_RATE
 
     def loss(generator: torch.Generator) -> Tensor:
         losses = []
@@ -408,17 +429,16 @@ def train_jointly(
         return LOSS_SCALE * torch.stack(losses).sum() / frames_a_step
 
     tensors = dict(isp.named_parameters())
-    rate = PUBLISHED_RATE if published else LEARNING_RATE
     descent.run("end to end", loss, tensors, steps, rate, watch=lambda: mean_psnr(isp, watched))
-    seen = descent.watched["end to end"]
-    if seen.step > 0:
-        measure_lights(isp, trained)
 
+    score = descent.watched["end to end"]
+    if score.step > 0:
+        measure_lights(isp, trained)
     isp.info["joint"] = {
         "steps": steps,
-        "kept_step": seen.step,
-        "gain_db": round(seen.best - seen.start, 2),
-        "curve": seen.curve(),
+        "kept_step": score.step,
+        "gain_db": round(score.best - score.start, 2),
+        "curve": score.curve(),
     }
 
 
@@ -435,8 +455,9 @@ def _draw_batches(
 
     batches = []
     for members in groups.values():
-        srgb = torch.cat([frames.shots[k].srgb for k in members])
-        raw = torch.cat([frames.shots[k].raw for k in members])
+        shots = [frames.shots[k] for k in members]
+        srgb = torch.cat([shot.srgb for shot in shots])
+        raw = torch.cat([shot.raw for shot in shots])
         batches.append((frames.pixels.pick(index, torch.tensor(members)), srgb, raw))
 
     return batches

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from rawaug.files import digest
-from rawaug.isp import stages
+from rawaug.isp import functional, stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.descent import (
@@ -56,12 +56,14 @@ from rawaug.version import __version__
 
 STANDARD_CURVES = ((2.2, 0.0), (2.4, 0.055 / 1.055), (1.0 / 0.45, 0.099 / 1.099))
 """gamma and toe a of a plain gamma camera, of sRGB (IEC 61966-2-1) and of ITU-R BT.709."""
-CURVE_STEPS = 150
-CURVE_RATE = 2e-2
+CURVE_STEPS, CURVE_RATE = 150, 2e-2
+"""Default steps and rate of stage 1."""
 DIMMEST = 0.01
+"""Minimum share of a corner's light that a mask takes for being tried."""
 SHADING_PAYS = 0.5
 """Maximum ratio of the squared errors with and without a mask for keeping the mask."""
 FRAMES_A_STEP = 16
+"""Maximum number of frames in a step."""
 START_STEPS, START_RATE = 1000, 3e-3
 """Steps and rate of the descent that brings the tone near that of the ISP that a fit starts from."""
 MOST_LEFT_OUT = 0.1
@@ -114,9 +116,13 @@ def fit_isp(
         train_jointly(fit.isp, frames, config, descent, held_out)
 
     descent.finish()
-    fit.isp.info |= {} if gain is None else {"curve_gain_db": round(gain, 2)}
-    fit.isp.info["registered"] = sum(shot.registered for shot in frames.shots)
-    fit.isp.info |= {"frames": [shot.name for shot in frames.shots], "steps": config.steps, "seed": config.seed}
+    info = fit.isp.info
+    if gain is not None:
+        info["curve_gain_db"] = round(gain, 2)
+    info["registered"] = sum(shot.registered for shot in frames.shots)
+    info["frames"] = [shot.name for shot in frames.shots]
+    info["steps"] = config.steps
+    info["seed"] = config.seed
     return fit.isp.eval()
 
 
@@ -148,9 +154,12 @@ def _with_enough_pixels(frames: FitFrames) -> FitFrames:
 
 def _key(config: FitConfig, frames: FitFrames, camera: Camera | None) -> str:
     """Hash the settings and pixels that a kept state belongs to."""
-    facts = [(shot.name, shot.camera, shot.white_balance) for shot in frames.shots]
-    start = () if camera is None else (camera,)
-    settings = repr((__version__, config, facts, *start)).encode()
+    facts: list[Any] = [__version__, config]
+    facts.append([(shot.name, shot.camera, shot.white_balance) for shot in frames.shots])
+    if camera is not None:
+        facts.append(camera)
+
+    settings = repr(tuple(facts)).encode()
     return digest(settings, frames.pixels.srgb.numpy().tobytes(), frames.pixels.target.numpy().tobytes())
 
 
@@ -159,16 +168,20 @@ def new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
     patterns = {shot.cfa for shot in shots}
     count = min(config.most_atoms, len(shots))
     more = REACH_ATOMS if config.reach > 1.0 else 0
-    tone: dict[str, Any] = {"stages": ("curve", *POINTWISE_STAGES[2:]), "tone_atoms": 1}
+
     settings: dict[str, Any] = {
-        **(tone if config.tone == "curve" else {}),
         "colour_atoms": count,
         "gain_atoms": min(config.most_atoms, count + more),
-        "encoder_widths": (SMALL if config.size == "small" else ISPConfig()).encoder_widths,
         "attention": config.attention,
-        "cfa": str(patterns.pop()) if len(patterns) == 1 else "RGGB",
-        **config.isp,
     }
+    if config.tone == "curve":
+        settings |= {"stages": ("curve", *POINTWISE_STAGES[2:]), "tone_atoms": 1}
+    if config.size == "small":
+        settings["encoder_widths"] = SMALL.encoder_widths
+    if len(patterns) == 1:
+        settings["cfa"] = str(patterns.pop())
+    settings |= config.isp
+
     fewest, most = settings["colour_atoms"], settings["colour_atoms"] + more
     if not fewest <= settings["gain_atoms"] <= most:
         raise ValueError(f"isp: gain_atoms is {settings['gain_atoms']}, but these frames need {fewest} to {most}")
@@ -236,7 +249,10 @@ class _Fit:
             return
 
         error = self._error()
-        before = {name: tensor.detach().clone() for name, tensor in self._few_numbers(without=shading).items()}
+        before = {}
+        for name, tensor in self._few_numbers(without=shading).items():
+            before[name] = tensor.detach().clone()
+
         shading.mask.set(mean, precision)
         self._descend_on_curve("curve and shading")
         if mode == "auto" and self._error() > SHADING_PAYS * error:
@@ -246,11 +262,12 @@ class _Fit:
 
     def _remove(self, stage: Stage | None) -> None:
         if stage is not None:
-            self.isp.configure(stages=tuple(name for name in self.isp.config.stages if name != stage.name))
+            names = [name for name in self.isp.config.stages if name != stage.name]
+            self.isp.configure(stages=tuple(names))
 
     @torch.no_grad()
     def _error(self) -> float:
-        predicted = stages.correct_colour(self._apply_curve(self.samples), self.colour.product())
+        predicted = functional.correct_colour(self._apply_curve(self.samples), self.colour.product())
         return float(reading_error(predicted, self.samples))
 
     def _apply_curve(self, part: PixelSamples) -> Tensor:
@@ -265,7 +282,7 @@ class _Fit:
 
         def loss(generator: torch.Generator) -> Tensor:
             frames, part = self._draw(generator)
-            predicted = stages.correct_colour(self._apply_curve(part), self.colour.pick(frames).product())
+            predicted = functional.correct_colour(self._apply_curve(part), self.colour.pick(frames).product())
             return reading_error(predicted, part) + self.tie(self.colour)
 
         steps = CURVE_STEPS if self.config.curve_steps is None else self.config.curve_steps
@@ -311,19 +328,12 @@ class _Fit:
                 tensors += stage.parameters_of(forward=False).values()
 
         before = [tensor.detach().clone() for tensor in tensors]
-        colour, error = self.colour, self._tone_error(self.isp.linear)[0]
-        best: tuple[float, Tensor] | None = None
-        with torch.no_grad():
-            curves = [other.linear] if other.tone is None else [_curve_of(table) for table in other.tone.curves]
-            for curve in curves:
-                value, _ = self._tone_error(curve)
-                if best is None or value < best[0]:
-                    best = value, curve(colours)
-
-        if best is None or best[0] >= error:
+        colour = self.colour
+        error, _ = self._tone_error(self.isp.linear)
+        best, target = self._best_tone(other, colours)
+        if best >= error:
             return
 
-        target = best[1]
         for tensor in tensors:
             tensor.requires_grad_()
 
@@ -346,6 +356,17 @@ class _Fit:
                 tensor.data.copy_(old)
 
     @torch.no_grad()
+    def _best_tone(self, other: DictionaryISP, colours: Tensor) -> tuple[float, Tensor]:
+        """Compute the least error under the tone of another ISP, or one of its curves, and x2 of ``colours`` by it."""
+        curves = [other.linear]
+        if other.tone is not None:
+            curves = list(map(_curve_of, other.tone.curves))
+
+        errors = [self._tone_error(curve)[0] for curve in curves]
+        best = errors.index(min(errors))
+        return errors[best], curves[best](colours)
+
+    @torch.no_grad()
     def _tone_error(self, linear: Callable[[Tensor], Tensor]) -> tuple[float, FrameColour]:
         """Compute the error under a tone with each frame's best colour, and that colour."""
         shading = self.isp.find(LensShading)
@@ -354,12 +375,16 @@ class _Fit:
             x = x * shading.mask(self.samples.coordinates)
 
         colour = FrameColour.from_product(least_squares(x, self.samples, self.known_matrix))
-        return float(reading_error(stages.correct_colour(x, colour.product()), self.samples)), colour
+        return float(reading_error(functional.correct_colour(x, colour.product()), self.samples)), colour
 
     def _few_numbers(self, without: Stage | None = None) -> dict[str, Tensor]:
-        used = [stage for stage in self.isp.ordered_stages if stage is not without]
-        coarse = {f"{stage.name}.{key}": p for stage in used for key, p in stage.coarse_parameters().items()}
-        return coarse | self._colours()
+        tensors = {}
+        for stage in self.isp.ordered_stages:
+            if stage is without:
+                continue
+            for key, parameter in stage.coarse_parameters().items():
+                tensors[f"{stage.name}.{key}"] = parameter
+        return tensors | self._colours()
 
     def _colours(self) -> dict[str, Tensor]:
         return {"log_scale": self.colour.log_scale, "matrix": self.colour.matrix}
@@ -384,14 +409,16 @@ class _Fit:
 
     def forward(self) -> None:
         """Run stage 5: fit the forward networks to the reverse pass."""
-        isp, tensors = self.isp, dict[str, Tensor]()
+        isp = self.isp
+        tensors: dict[str, Tensor] = {}
         for stage in isp.ordered_stages:
             stage.start_forward()
             tensors |= stage.parameters_of(forward=True)
 
         def loss(generator: torch.Generator) -> Tensor:
             frames, part = self._draw(generator)
-            params, back = self.colour.pick(frames).params(), dict[str, Tensor]()
+            params = self.colour.pick(frames).params()
+            back: dict[str, Tensor] = {}
             with torch.no_grad():
                 back["raw"] = isp.reverse_pixels(part.cell_srgb, params, part.coordinates, back)
             return cycle_error(isp, part, params, back, self.config)

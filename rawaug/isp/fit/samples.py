@@ -8,7 +8,7 @@ are compared as averages over blocks instead, where every channel is known.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
 
 import torch
@@ -18,12 +18,14 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.errors import extra
+from rawaug.isp.functional import as_float, frame_coordinates
 from rawaug.isp.staged import thumbnail
-from rawaug.isp.stages import as_float, frame_coordinates
 from rawaug.seeding import keyed_generator
 
 CLIPPED_SRGB = 0.98
+"""The value from which on a picture counts as clipped."""
 CLIPPED_RAW = 0.98
+"""The value from which on a reading counts as clipped."""
 LEAST_LIKENESS = 0.8
 """Minimum correlation of the greens of an unregistered pair, after the shift is removed."""
 BLOCK = 16
@@ -115,9 +117,13 @@ class PixelSamples(NamedTuple):
     cell_raw: Tensor
     cell_weight: Tensor
 
+    def map(self, change: Callable[[Tensor], Tensor]) -> PixelSamples:
+        """Apply a function to every tensor."""
+        return PixelSamples(*map(change, self))
+
     def pick(self, index: Tensor, frames: Tensor | slice = slice(None)) -> PixelSamples:
         """Pick the pixels of an index ``(p,)`` from every frame, or from those of an index ``(f,)``."""
-        return PixelSamples(*(value[frames].index_select(-1, index) for value in self))
+        return self.map(lambda tensor: tensor[frames].index_select(-1, index))
 
 
 class FitFrames(NamedTuple):
@@ -129,9 +135,23 @@ class FitFrames(NamedTuple):
     def some(self, frames: Sequence[int]) -> FitFrames:
         """Take some of the frames by their numbers."""
         index = torch.tensor(frames)
-        pixels = PixelSamples(*(value[index] for value in self.pixels))
         shots = [self.shots[k] for k in frames]
-        return FitFrames(pixels, shots)
+        return FitFrames(self.pixels.map(lambda tensor: tensor[index]), shots)
+
+    def split(self, frames: Sequence[int]) -> tuple[FitFrames, FitFrames]:
+        """Take some of the frames by their numbers, and the rest."""
+        rest = [number for number in range(len(self.shots)) if number not in frames]
+        return self.some(frames), self.some(rest)
+
+    @property
+    def as_shot(self) -> Tensor:
+        """The as-shot multipliers of R, G and B of each frame, ``(F, 3)``."""
+        return as_shot(self.shots)
+
+
+def as_shot(shots: Sequence[FrameSummary]) -> Tensor:
+    """The as-shot multipliers of R, G and B of each frame, ``(F, 3)``."""
+    return torch.tensor([shot.white_balance for shot in shots])
 
 
 def sample_pixels(pairs: Iterable[FramePair], pixels: int, seed: int, noisy: bool = False) -> FitFrames:
@@ -155,26 +175,24 @@ def sample_pixels(pairs: Iterable[FramePair], pixels: int, seed: int, noisy: boo
     if not frames:
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")
 
-    stacked = (torch.stack(values) for values in zip(*frames, strict=True))
+    stacked = map(torch.stack, zip(*frames, strict=True))
     return FitFrames(PixelSamples(*stacked), shots)
 
 
 def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple[PixelSamples, FrameSummary]:
     if not pair.color_known:
         raise ValueError(f"{pair.name}: its white balance and colour matrix are unknown; use an ISP such as universal")
-    raw: Tensor | None
-    if noisy:
-        raw = pair.noisy
-    else:
-        raw = pair.raw
+    raw = pair.noisy if noisy else pair.raw
     if raw is None:
         raise ValueError(f"{pair.name}: has no noisy RAW; fit on clean frames or add noise first")
+
     generator = keyed_generator(seed, "pixels", pair.name)
-    draw = _sites if pair.registered else _blocks
+    draw = _draw_sites if pair.registered else _draw_blocks
     try:
         samples = draw(pair.srgb, raw, pair.cfa, pixels, generator)
     except ValueError as error:
         raise ValueError(f"{pair.name}: {error}") from None
+
     summary = FrameSummary(
         name=pair.name,
         camera=pair.camera,
@@ -187,7 +205,7 @@ def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple
     return samples, summary
 
 
-def _sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:
+def _draw_sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:
     """Draw mosaic sites with the one colour that they have, and the cells around them."""
     height, width = raw.shape[-2:]
     row = torch.randint(height, (pixels,), generator=generator)
@@ -200,19 +218,22 @@ def _sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Ge
     inside = (pixel.amax(0) < CLIPPED_SRGB) & (pixel.amin(0) > 0.0) & (reading < CLIPPED_RAW)
 
     top, left = row // 2 * 2, column // 2 * 2
-    corners = torch.stack([srgb[:, top + i, left + j].float() / scale for i in (0, 1) for j in (0, 1)])
-    sites = torch.stack([raw[0, top + i, left + j] for i, j in cfa.sites])
-    cell_raw = torch.stack([sites[0], (sites[1] + sites[2]) / 2, sites[3]])
+    corners = []
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        corners.append(srgb[:, top + i, left + j].float() / scale)
+    cell_srgb = torch.stack(corners)
+    red, green_r, green_b, blue = [raw[0, top + i, left + j] for i, j in cfa.sites]
+    cell_raw = torch.stack([red, (green_r + green_b) / 2, blue])
 
-    spread = (corners.amax(0) - corners.amin(0)).amax(0)
-    unclipped = (corners.amax((0, 1)) < CLIPPED_SRGB) & (cell_raw.amax(0) < CLIPPED_RAW)
-    weight = unclipped / (1.0 + (spread * 32.0) ** 2)
+    spread = (cell_srgb.amax(0) - cell_srgb.amin(0)).amax(0)
+    is_unclipped = (cell_srgb.amax((0, 1)) < CLIPPED_SRGB) & (cell_raw.amax(0) < CLIPPED_RAW)
+    weight = is_unclipped / (1.0 + (spread * 32.0) ** 2)
 
     coordinates = frame_coordinates(height, width)[0, :, row, column]
-    return _samples(pixel, reading * own, own, own * inside, coordinates, corners.mean(0), cell_raw, weight)
+    return _samples(pixel, reading * own, own, own * inside, coordinates, cell_srgb.mean(0), cell_raw, weight)
 
 
-def _blocks(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:
+def _draw_blocks(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:
     """Draw averages over blocks in linear light, which tolerate a shift of a few pixels."""
     blocks = block_averages(srgb, raw, cfa)
     greens = torch.stack([blocks.srgb[1], blocks.raw[1].clamp_min(0.0).sqrt()])[:, ~blocks.clipped]

@@ -19,11 +19,11 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from rawaug.isp import stages
+from rawaug.isp import functional
 from rawaug.isp.config import ISPParams
 from rawaug.isp.dictionary import l1_normalise, log_light
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.samples import FitFrames, FrameSummary, PixelSamples
+from rawaug.isp.fit.samples import FitFrames, FrameSummary, PixelSamples, as_shot
 from rawaug.isp.model import DictionaryISP
 from rawaug.seeding import derive_seed
 
@@ -75,9 +75,12 @@ class Tie:
     """A penalty that draws the frames of one camera together."""
 
     def __init__(self, shots: Sequence[FrameSummary]) -> None:
-        cameras = [shot.camera for shot in shots]
-        self.groups = [torch.tensor([c == camera for c in cameras]) for camera in dict.fromkeys(cameras)]
-        self.balance = torch.tensor([shot.white_balance for shot in shots])
+        numbers: dict[str, list[int]] = {}
+        for number, shot in enumerate(shots):
+            numbers.setdefault(shot.camera, []).append(number)
+
+        self.groups = list(map(torch.tensor, numbers.values()))
+        self.balance = as_shot(shots)
 
     def __call__(self, colour: FrameColour) -> Tensor:
         matrix, neutral = colour.neutral(self.balance)
@@ -128,7 +131,7 @@ def fit_fall_off(linear: Tensor, samples: PixelSamples, product: Tensor) -> tupl
     ``product`` ``(F, 3, 3)`` takes ``linear`` ``(F, 3, 1, P)`` to the prediction.
     """
     # A quadratic in the coordinates; an offset for each frame and channel takes up what the mask does to the matrices.
-    predicted = stages.correct_colour(linear, product)
+    predicted = functional.correct_colour(linear, product)
     bright = (samples.known * (samples.target > 0.02) * (predicted > 0.02))[:, :, 0].double()
     ratio = (samples.target.clamp_min(1e-3) / predicted.clamp_min(1e-3)).log()[:, :, 0].double()
     y, x = samples.coordinates[:, :, 0].double().unbind(1)
@@ -180,7 +183,7 @@ def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSumm
         shots: their summaries.
         config: gives the reach of further gain atoms, and the seed of the clusters.
     """
-    balance = torch.tensor([shot.white_balance for shot in shots])
+    balance = as_shot(shots)
     params = colour.params()
     light, neutral = log_light(balance), -colour.neutral(balance)[1]
     count = isp.config.colour_atoms
@@ -188,7 +191,8 @@ def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSumm
     members = torch.arange(len(points))
     if len(points) > count:
         plausible = plausible_matrices(params.matrix).nonzero()[:, 0]
-        members = plausible if len(plausible) >= count else members
+        if len(plausible) >= count:
+            members = plausible
 
     groups = points.new_zeros(count, len(points))
     groups[:, members] = _groups(points[members], count, config.seed)
@@ -251,7 +255,9 @@ def _spread(colour: FrameColour, balance: Tensor) -> float:
     distance.fill_diagonal_(torch.inf)
     errors: dict[float, float] = {}
     for width in SPREADS:
-        logits = -distance / (2.0 * width**2) if width < torch.inf else torch.where(distance.isinf(), -torch.inf, 0.0)
+        logits = torch.where(distance.isinf(), -torch.inf, 0.0)
+        if width < torch.inf:
+            logits = -distance / (2.0 * width**2)
         square = ((values - logits.softmax(1) @ values) ** 2).sum(1)
         errors[width] = float((square + SPREAD_EPS).log().sum())
 
@@ -284,7 +290,7 @@ def measure_lights(isp: DictionaryISP, frames: FitFrames) -> None:
     An atom's light is the mean of those frames that choose it, where encoders choose. The neutrals are those under
     which as-shot gains come nearest to each frame's best gains, and the spread is the one under which they do so best.
     """
-    balance = torch.tensor([shot.white_balance for shot in frames.shots])
+    balance = frames.as_shot
     if isp.config.encoders:
         frame_weights = torch.cat([isp.choose(shot.srgb).colour_weights for shot in frames.shots])
         share = frame_weights / frame_weights.sum(dim=0).clamp_min(1e-6)
@@ -317,7 +323,7 @@ def _second_moments(
     """Compute ``<x x>`` and ``<x y>`` of each frame's channels under gains of 1, and which channels have any pixel."""
     moments: list[Tensor] = []
     for index in torch.arange(len(matrix)).split(LIGHT_FRAMES):
-        part = PixelSamples(*(value[index] for value in pixels))
+        part = PixelSamples(*[tensor[index] for tensor in pixels])
         none = weights.new_empty(len(index), 0)
         tones = isp.typical_tones().expand(len(index), -1)
         params = ISPParams(weights[index], none, matrix[index], torch.ones(len(index), 3), tones)
@@ -343,7 +349,8 @@ def set_priors(isp: DictionaryISP, samples: PixelSamples, config: FitConfig) -> 
         plain = isp.params_from_weights(colour_weights[None], torch.ones(1, isp.config.gain_atoms))
         plain = plain._replace(gains=torch.ones(1, 3))
         x = isp.reverse_pixels(samples.srgb, plain, samples.coordinates)
-        a, b = ((samples.known * m).mean((2, 3)) for m in (x * x, x * samples.target))
+        a = (samples.known * (x * x)).mean((2, 3))
+        b = (samples.known * (x * samples.target)).mean((2, 3))
 
     inverse = 1.0 / isp.gain.channel_gains().detach()
     weights = best_constants(a, b, inverse, config.prior_steps, config.mse_floor)

@@ -28,7 +28,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.fit.descent import adam
 from rawaug.isp.fit.samples import FramePair
-from rawaug.isp.stages import as_float
+from rawaug.isp.functional import as_float
 from rawaug.progress import progress as progress_bar
 from rawaug.registry import Registry
 from rawaug.seeding import keyed_generator

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from denoisers.cycleisp import Trunk, load_published
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.isp.stages import as_float
+from rawaug.isp.functional import as_float
 from rawaug.paper.baselines.base import BASELINES, Crops, CropTrainedISP
 from rawaug.seeding import derive_seed, initialise_from
 

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.isp import stages
+from rawaug.isp import functional
 from rawaug.isp.fit.samples import FramePair
 from rawaug.paper.baselines.base import BASELINES, Crops, CropTrainedISP
 from rawaug.paper.baselines.jpeg import jpeg
@@ -76,8 +76,8 @@ class CompressedISP(CropTrainedISP):
 
     def unprocess(self, srgb: Tensor, setting: Balance = None) -> Tensor:
         """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape."""
-        balanced = stages.gamma_expand(self.from_picture(srgb), GAMMA)
-        return stages.apply_gains(balanced, 1.0 / self.gains(setting, len(srgb)))
+        balanced = functional.gamma_expand(self.from_picture(srgb), GAMMA)
+        return functional.apply_gains(balanced, 1.0 / self.gains(setting, len(srgb)))
 
     def render(self, raw: Tensor, setting: Balance = None) -> Tensor:
         """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``."""
@@ -85,8 +85,8 @@ class CompressedISP(CropTrainedISP):
 
     def compress(self, raw: Tensor, setting: Balance = None) -> Tensor:
         """Mosaic ``(B, 1, H, W)`` to balanced, gamma-compressed colour ``(B, 3, H, W)``, what the network sees."""
-        balanced = stages.apply_gains(bayer.demosaic(raw, self.cfa), self.gains(setting, len(raw)))
-        return stages.gamma_compress(balanced, GAMMA)
+        balanced = functional.apply_gains(bayer.demosaic(raw, self.cfa), self.gains(setting, len(raw)))
+        return functional.gamma_compress(balanced, GAMMA)
 
     def gains(self, setting: Balance, batch: int) -> Tensor:
         """The multipliers ``(B, 3)`` of a setting, of largest entry 1."""

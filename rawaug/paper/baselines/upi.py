@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from rawaug.bayer import CFA
-from rawaug.isp import stages
+from rawaug.isp import functional
 from rawaug.isp.cameras import SRGB_TO_XYZ
 from rawaug.isp.config import HIGHLIGHT_KNEE
 from rawaug.isp.fit.samples import FramePair, PixelSamples, sample_pixels
@@ -81,8 +81,8 @@ class SmoothstepISP(BaselineISP):
 
 def unprocess_pixels(x: Tensor, params: UPIParams) -> Tensor:
     """sRGB to linear camera colour, both ``(B, 3, H, W)``; not clipped yet."""
-    linear = stages.gamma_expand(inverse_smoothstep(x), GAMMA)
-    return stages.inverse_gains(stages.correct_colour(linear, params.matrix.to(x)), params.gains.to(x))
+    linear = functional.gamma_expand(inverse_smoothstep(x), GAMMA)
+    return functional.inverse_gains(functional.correct_colour(linear, params.matrix.to(x)), params.gains.to(x))
 
 
 @BASELINES.register("upi")
@@ -158,7 +158,7 @@ class Moments(NamedTuple):
     @classmethod
     def of(cls, samples: PixelSamples) -> Moments:
         """Moments of the pixels below the highlights, where the inverse gains are plain divisions."""
-        linear = stages.gamma_expand(inverse_smoothstep(samples.srgb), GAMMA)
+        linear = functional.gamma_expand(inverse_smoothstep(samples.srgb), GAMMA)
         below = samples.known * (linear.mean(1, keepdim=True) < HIGHLIGHT_KNEE)
         x = linear[:, :, 0].double()
         y = samples.target[:, :, 0].double()

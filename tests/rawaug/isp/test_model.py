@@ -11,8 +11,8 @@ import torch
 
 from rawaug.files import WEIGHTS, read_tensors
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
+from rawaug.isp.functional import frame_coordinates
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import frame_coordinates
 from rawaug.metrics import psnr
 
 

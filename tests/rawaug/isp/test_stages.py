@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from rawaug import bayer
-from rawaug.isp import stages
+from rawaug.isp import functional, layers
 from rawaug.isp.config import POINTWISE_STAGES, ISPConfig, ISPParams
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
@@ -25,15 +25,15 @@ def x() -> torch.Tensor:
 
 
 def test_untrained_networks_are_the_identity(x: torch.Tensor) -> None:
-    assert torch.equal(stages.ToneNetwork()(x), x)
-    where = stages.frame_coordinates(6, 8)
-    assert torch.equal(stages.AttentionMask()(x, where), torch.ones(2, 1, 6, 8))
-    torch.testing.assert_close(stages.GaussianMask()(where), torch.ones(1, 1, 6, 8), atol=3e-4, rtol=0)
+    assert torch.equal(layers.ToneNetwork()(x), x)
+    where = functional.frame_coordinates(6, 8)
+    assert torch.equal(layers.AttentionMask()(x, where), torch.ones(2, 1, 6, 8))
+    torch.testing.assert_close(layers.GaussianMask()(where), torch.ones(1, 1, 6, 8), atol=3e-4, rtol=0)
 
 
 def test_a_tone_network_starts_from_exactly_the_curve(x: torch.Tensor) -> None:
     torch.manual_seed(0)
-    tone, toe = stages.ToneNetwork(), 0.055 / 1.055
+    tone, toe = layers.ToneNetwork(), 0.055 / 1.055
     tone.start_from(toe)
     torch.testing.assert_close(tone(x), (x + 0.055) / 1.055, atol=1e-6, rtol=0)
     tone.start_from(0.0)
@@ -43,32 +43,32 @@ def test_a_tone_network_starts_from_exactly_the_curve(x: torch.Tensor) -> None:
 def test_highlights_come_back_saturated() -> None:
     gains = torch.tensor([[2.0, 1.0, 1.5]])
     white = torch.ones(1, 3, 1, 1)
-    assert torch.equal(stages.inverse_gains(white, gains), white)
-    torch.testing.assert_close(stages.inverse_gains(white, gains, knee=None).flatten(), 1 / gains[0])
+    assert torch.equal(functional.inverse_gains(white, gains), white)
+    torch.testing.assert_close(functional.inverse_gains(white, gains, knee=None).flatten(), 1 / gains[0])
 
 
 def test_a_gain_below_one_divides_plainly_in_highlights_too() -> None:
     """Bending its factor towards 1 would make bright pixels darker than the plain division does."""
     gains, bright = torch.tensor([[2.0, 0.8, 1.5]]), torch.linspace(0.9, 1.0, 11).expand(1, 3, 1, 11)
-    spared, plain = (stages.inverse_gains(bright, gains, knee=knee) for knee in (0.9, None))
+    spared, plain = (functional.inverse_gains(bright, gains, knee=knee) for knee in (0.9, None))
     torch.testing.assert_close(spared[:, 1], plain[:, 1])
     assert (spared[:, 0::2, :, 1:] > plain[:, 0::2, :, 1:]).all()
 
 
 def test_a_crop_keeps_its_place_in_the_frame() -> None:
-    whole = stages.frame_coordinates(20, 30)
-    crop = stages.frame_coordinates(8, 10, offset=(4, 6), frame=(20, 30))
+    whole = functional.frame_coordinates(20, 30)
+    crop = functional.frame_coordinates(8, 10, offset=(4, 6), frame=(20, 30))
     torch.testing.assert_close(crop, whole[..., 4:12, 6:16])
-    corner = stages.frame_coordinates(2000, 3000)[0, :, -1, -1]
+    corner = functional.frame_coordinates(2000, 3000)[0, :, -1, -1]
     assert corner.norm().item() == pytest.approx(1.0, abs=1e-3)
 
 
 def test_gaussian_mask_takes_mean_and_precision() -> None:
-    mask = stages.GaussianMask()
+    mask = layers.GaussianMask()
     mean, precision = torch.tensor([0.1, -0.2]), torch.tensor([[0.8, 0.1], [0.1, 0.5]])
     mask.set(mean, precision)
     torch.testing.assert_close(mask.precision, precision)
-    coordinates = stages.frame_coordinates(40, 60)
+    coordinates = functional.frame_coordinates(40, 60)
     p = coordinates[0] - mean[:, None, None]
     expected = torch.exp(-0.5 * (0.8 * p[0] ** 2 + 0.2 * p[0] * p[1] + 0.5 * p[1] ** 2))
     torch.testing.assert_close(mask(coordinates)[0, 0], expected)
@@ -76,7 +76,7 @@ def test_gaussian_mask_takes_mean_and_precision() -> None:
 
 def vignetted_wall(height: int = 24, width: int = 36) -> tuple[torch.Tensor, torch.Tensor]:
     """Coordinates, and what is left of the light there: 60 % in the corners, around a point off centre."""
-    where = stages.frame_coordinates(height, width)
+    where = functional.frame_coordinates(height, width)
     centre = torch.tensor([0.1, -0.05])[None, :, None, None]
     return where, torch.exp(-0.5 * ((where - centre) ** 2).sum(1, keepdim=True))
 
@@ -94,11 +94,11 @@ def descend(module: nn.Module, wanted: torch.Tensor, *inputs: torch.Tensor) -> f
 
 def test_a_gaussian_mask_is_learned_from_scratch() -> None:
     where, light = vignetted_wall()
-    assert descend(stages.GaussianMask(), light, where) < 0.01
+    assert descend(layers.GaussianMask(), light, where) < 0.01
 
 
 def test_a_mask_that_was_set_flat_can_still_be_learned() -> None:
-    mask = stages.GaussianMask()
+    mask = layers.GaussianMask()
     mask.set(torch.zeros(2), torch.zeros(2, 2))
     where, light = vignetted_wall()
     assert descend(mask, light, where) < 0.01
@@ -108,7 +108,7 @@ def test_the_attention_mask_sees_where_a_pixel_is() -> None:
     torch.manual_seed(0)
     where, light = vignetted_wall()
     wall = torch.full((1, 3, 24, 36), 0.5)
-    assert descend(stages.AttentionMask(), light, wall, where) < 0.05
+    assert descend(layers.AttentionMask(), light, wall, where) < 0.05
 
 
 class Squeeze(Stage):

@@ -10,7 +10,7 @@ import torch
 
 from rawaug.data.pairs import Pair
 from rawaug.isp.fit.samples import BLOCK, block_averages, find_shift, sample_pixels
-from rawaug.isp.stages import frame_coordinates
+from rawaug.isp.functional import frame_coordinates
 
 WB = (1.6, 1.0, 1.5)
 SHIFTS = [(0, 0), (4, -6), (-3, 5), (7, 2), (-8, -1)]
