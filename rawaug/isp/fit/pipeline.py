@@ -358,9 +358,9 @@ class _Fit:
     @torch.no_grad()
     def _best_tone(self, other: DictionaryISP, colours: Tensor) -> tuple[float, Tensor]:
         """Compute the least error under the tone of another ISP, or one of its curves, and x2 of ``colours`` by it."""
-        curves = [other.linear]
+        curves: list[Callable[[Tensor], Tensor]] = [other.linear]
         if other.tone is not None:
-            curves = list(map(_curve_of, other.tone.curves))
+            curves = [_curve_of(table) for table in other.tone.curves]
 
         errors = [self._tone_error(curve)[0] for curve in curves]
         best = errors.index(min(errors))
