@@ -26,7 +26,15 @@ from rawaug.evaluation.scores import METRICS, NOISY, Row, group_rows, score, sum
 from rawaug.evaluation.tables import join_figures
 from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise, raw_trial
 from rawaug.files import digest
-from rawaug.noise import FixedLevels, NoiseLevels, SensorNoise, ShotReadNoise, estimate_noise, noise_levels
+from rawaug.noise import (
+    FixedLevels,
+    NoiseLevels,
+    NoiseModel,
+    SensorNoise,
+    ShotReadNoise,
+    estimate_noise,
+    noise_levels,
+)
 from rawaug.progress import progress
 
 STRENGTHS = {
@@ -36,6 +44,7 @@ STRENGTHS = {
     "very strong": (2.8e-2, 2.5e-3),
 }
 """(shot_var, read_var) of Google's Pixel at ISO 100, 800 and 3200 by its tags, and of noise two stops stronger."""
+
 SENSOR: dict[str, Any] = {
     "row_var": 2e-6,
     "black_offset_sd": 5e-4,
@@ -45,8 +54,12 @@ SENSOR: dict[str, Any] = {
     "black_level": 64,
 }
 """The faults that sensors add to shot and read noise, at the strengths of :data:`OF_SENSORS` or at the caller's."""
+
 OF_SENSORS = ("phone", "strong")
+"""The strengths at which sensors as they are are simulated."""
+
 CONDITIONS = TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensors as they are"
+"""What the denoisers are told, and what the sensor does: a table each."""
 
 
 def strengths_of(
@@ -63,7 +76,11 @@ def strengths_of(
         return {name: FixedLevels(*levels) for name, levels in STRENGTHS.items()}
     if not isos:
         return {str(noise): noise_levels(noise)}
-    return {f"ISO {iso:g}": noise_levels(noise, iso=iso) for iso in isos}
+
+    levels_by_iso = {}
+    for iso in isos:
+        levels_by_iso[f"ISO {iso:g}"] = noise_levels(noise, iso=iso)
+    return levels_by_iso
 
 
 def trials(
@@ -80,7 +97,7 @@ def trials(
         strengths: noise levels by name, see :func:`strengths_of`.
     """
     strengths = strengths or strengths_of()
-    with_faults = [name for name in strengths if name in OF_SENSORS] or list(strengths)
+    with_faults = set(OF_SENSORS).intersection(strengths) or set(strengths)
 
     cases: list[Trial] = []
     for frame in progress(frames, label="noise", unit="frame"):
@@ -112,8 +129,14 @@ def noisy_frame(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real
         seed: of the noise.
         real: whether what sensors add, :data:`SENSOR`, is added.
     """
-    noise = SensorNoise(levels, **SENSOR) if real else ShotReadNoise(levels)
-    key = ("benchmark", strength) if strength in STRENGTHS else (TEST_NOISE,)
+    noise: NoiseModel = ShotReadNoise(levels)
+    if real:
+        noise = SensorNoise(levels, **SENSOR)
+
+    key: tuple[str, ...] = (TEST_NOISE,)
+    if strength in STRENGTHS:
+        key = "benchmark", strength
+
     packed = bayer.pack(frame.raw[None], frame.cfa)
     noisy, _, exact = freeze_noise(packed, noise, seed, *key, frame.name)
     assert exact is not None
@@ -133,7 +156,7 @@ def _middle(noisy: Noisy, frame: Pair, crop: int, condition: str, strength: str)
 def hash_of(trials: Iterable[Trial]) -> str:
     """Eight digits of the SHA-256 of all noisy inputs, rounded to steps of 2^-12, on which all processors agree."""
     cases = list(trials)
-    strengths = list(dict.fromkeys(trial.strength for trial in cases))
+    strengths = _strengths_in(cases)
     cases.sort(key=lambda trial: (CONDITIONS.index(trial.condition), strengths.index(trial.strength)))
 
     images = []
@@ -151,32 +174,44 @@ def benchmark(denoisers: Sequence[RawDenoiser], cases: Sequence[Trial]) -> dict[
         ``frames``, ``hash``, and ``rows`` by name: ``gmac`` and ``seconds`` a mosaic megapixel, and ``scores`` by
         condition and strength, means of :data:`rawaug.evaluation.scores.METRICS`.
     """
-    gmacs = {one.name: _gmac(one, cases[0]) for one in denoisers}
-    strengths = list(dict.fromkeys(trial.strength for trial in cases))
+    strengths = _strengths_in(cases)
+    rows_by_name = group_rows(score([NOISY, *denoisers], cases, "benchmark"))
 
     rows: dict[str, dict[str, Any]] = {}
-    for name, of_one in group_rows(score([NOISY, *denoisers], cases, "benchmark")).items():
-        seconds = None
-        if name in gmacs:
-            seconds = round(fmean(row.seconds for row in of_one), 3)
-        rows[name] = {"gmac": gmacs.get(name), "seconds": seconds, "scores": _by_condition(of_one, strengths)}
+    for name, of_one in rows_by_name.items():
+        rows[name] = {"gmac": None, "seconds": None, "scores": _by_condition(of_one, strengths)}
+
+    for one in denoisers:
+        seconds = fmean(row.seconds for row in rows_by_name[one.name])
+        rows[one.name]["seconds"] = round(seconds, 3)
+        rows[one.name]["gmac"] = _gmac(one, cases[0])
 
     frames = list(dict.fromkeys(trial.frame for trial in cases))
     return {"frames": frames, "hash": hash_of(cases), "rows": rows}
+
+
+def _strengths_in(cases: Iterable[Trial]) -> list[str]:
+    """The strengths of these trials, in their order."""
+    return list(dict.fromkeys(trial.strength for trial in cases))
 
 
 def _by_condition(rows: Sequence[Row], strengths: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Mean scores of one denoiser by condition and strength; sensors have some of the strengths alone."""
     scores: dict[str, dict[str, Any]] = {}
     for condition in CONDITIONS:
+        of_condition = group_rows(rows, "condition").get(condition, [])
+        of_strengths = group_rows(of_condition, "strength")
         for strength in strengths:
-            of_place = [row for row in rows if (row.condition, row.strength) == (condition, strength)]
-            if condition == REAL and not of_place:
+            cell = of_strengths.get(strength, [])
+            if condition == REAL and not cell:
                 continue
 
-            means = summary(of_place)
-            figures: dict[str, Any] = {key: means[key] for key in (*METRICS, "own_noise") if key in means}
-            figures["frames"] = len(of_place)
+            means = summary(cell)
+            figures: dict[str, Any] = {}
+            for key in (*METRICS, "own_noise"):
+                if key in means:
+                    figures[key] = means[key]
+            figures["frames"] = len(cell)
             scores.setdefault(condition, {})[strength] = figures
 
     return scores
@@ -218,38 +253,44 @@ def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str
 
     for condition in CONDITIONS:
         of_input = result["rows"]["noisy input"]["scores"][condition]
-        shown = display_strength(of_input)
+        strength_of_ssim = display_strength(of_input)
 
         head = []
         for strength, scores in of_input.items():
-            part = "" if scores["frames"] == count else f" ({scores['frames']} of {count} frames)"
-            head.append(strength + part)
+            column = strength
+            if scores["frames"] != count:
+                column += f" ({scores['frames']} of {count} frames)"
+            head.append(column)
         if condition == TOLD:
-            head += [f"SSIM, {shown}", "GMAC", "s"]
+            head += [f"SSIM, {strength_of_ssim}", "GMAC", "s"]
 
         cells = {}
         for name, row in result["rows"].items():
             scores = row["scores"][condition]
             cells[name] = [join_figures(scores[strength], "psnr", "psnr_srgb") for strength in of_input]
             if condition == TOLD:
-                costs = [_format_cost(row[key]) for key in ("gmac", "seconds")]
-                cells[name] += [join_figures(scores[shown], "ssim", "ssim_srgb"), *costs]
+                cells[name].append(join_figures(scores[strength_of_ssim], "ssim", "ssim_srgb"))
+                cells[name].append(_format_cost(row["gmac"]))
+                cells[name].append(_format_cost(row["seconds"]))
 
         yield f"{condition}: PSNR of RAW / sRGB in dB, {frames}", head, cells
 
 
 def _format_cost(value: float | None) -> str:
-    return "" if value is None else f"{value:.2f}"
+    if value is None:
+        return ""
+
+    return f"{value:.2f}"
 
 
 def costs_of(result: Mapping[str, Any]) -> dict[str, tuple[float | None, float, float]]:
     """By denoiser its GMAC a megapixel and its PSNR of RAW and sRGB, at the strength that is shown."""
-    shown = display_strength(result["rows"]["noisy input"]["scores"][TOLD])
+    strength = display_strength(result["rows"]["noisy input"]["scores"][TOLD])
     costs = {}
     for name, row in result["rows"].items():
         if name == "noisy input":
             continue
-        scores = row["scores"][TOLD][shown]
+        scores = row["scores"][TOLD][strength]
         costs[name] = row["gmac"], scores["psnr"], scores["psnr_srgb"]
 
     return costs
@@ -257,14 +298,19 @@ def costs_of(result: Mapping[str, Any]) -> dict[str, tuple[float | None, float, 
 
 def display_strength(strengths: Collection[str]) -> str:
     """The strength whose pictures and SSIM are shown."""
+    if "strong" in strengths:
+        return "strong"
+
     *_, last = strengths
-    return "strong" if "strong" in strengths else last
+    return last
 
 
 def crops(denoisers: Sequence[RawDenoiser], cases: Iterable[Trial], most: int) -> Iterator[Panels]:
     """Pictures for the page: the first ``most`` frames with noise of :func:`display_strength`, by every denoiser."""
-    exact = [trial for trial in cases if trial.condition == TOLD]
-    shown = display_strength(dict.fromkeys(trial.strength for trial in exact))
-    of_strength = [trial for trial in exact if trial.strength == shown]
-    for trial in of_strength[:most]:
-        yield panels_of(denoisers, trial)
+    cases = list(cases)
+    strength = display_strength(_strengths_in(cases))
+    count = 0
+    for trial in cases:
+        if trial.condition == TOLD and trial.strength == strength and count < most:
+            yield panels_of(denoisers, trial)
+            count += 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,39 +66,48 @@ class Comparison:
     report: str | None = None
 
 
-def compare_raw(asked: Comparison) -> None:
+def compare_raw(comparison: Comparison) -> None:
     """Compare denoisers of RAW on the same frozen noise; tables are printed, and written as JSON and as a page."""
-    strengths = strengths_of(asked.noise, asked.iso)
-    denoisers = open_denoisers(asked)
+    strengths = strengths_of(comparison.noise, comparison.iso)
+    denoisers = open_denoisers(comparison)
 
-    pairs = open_pairs(asked.data, split="test")
-    chosen = SomePairs(pairs, range(len(pairs))[: asked.count])
-    frames = Binned(Measured(chosen, asked.count), asked.bin)
-    cases = trials(frames, asked.crop, asked.seed, strengths)
+    pairs = open_pairs(comparison.data, split="test")
+    pairs = SomePairs(pairs, range(len(pairs))[: comparison.count])
+    frames = Binned(Measured(pairs, comparison.count), comparison.bin)
+    cases = trials(frames, comparison.crop, comparison.seed, strengths)
 
-    noise = noise_note(cases, strengths, asked.seed)
-    facts = {"data": asked.data, "bin": asked.bin, "crop": asked.crop, "seed": asked.seed, "noise": noise}
+    noise = noise_note(cases, strengths, comparison.seed)
+    facts = {
+        "data": comparison.data,
+        "bin": comparison.bin,
+        "crop": comparison.crop,
+        "seed": comparison.seed,
+        "noise": noise,
+    }
     result = {**facts, **benchmark(denoisers, cases)}
 
     for title, head, cells in tables(result):
-        print_rows(title, ["denoiser", *head], [[name, *row] for name, row in cells.items()])
+        rows = [[name, *row] for name, row in cells.items()]
+        print_rows(title, ["denoiser", *head], rows)
+
     notes = notes_of(result)
     print("\n".join([*notes, noise]))
 
-    if asked.json:
-        write_json(result, asked.json)
-    if asked.report:
-        page = page_of(asked, result, denoisers, cases, notes)
-        print(f"page: {page.write(Path(asked.report), settings_of(asked))}")
+    if comparison.json:
+        write_json(result, comparison.json)
+    if comparison.report:
+        page = page_of(comparison, result, denoisers, cases, notes)
+        print(f"page: {page.write(Path(comparison.report), settings_of(comparison))}")
 
 
-def open_denoisers(asked: Comparison) -> list[RawDenoiser]:
+def open_denoisers(comparison: Comparison) -> list[RawDenoiser]:
     """The denoisers of the table; one whose name is taken goes by its spec."""
     by_name: dict[str, RawDenoiser] = {}
-    for spec in dict.fromkeys((ALWAYS, *shipped_of_mosaics(), *asked.denoisers)):
-        denoiser = denoiser_of(spec, asked.device).require_mosaic()
-        name = spec if denoiser.name in by_name else denoiser.name
-        by_name[name] = replace(denoiser, name=name)
+    for spec in dict.fromkeys((ALWAYS, *shipped_of_mosaics(), *comparison.denoisers)):
+        denoiser = denoiser_of(spec, comparison.device).require_mosaic()
+        if denoiser.name in by_name:
+            denoiser = replace(denoiser, name=spec)
+        by_name[denoiser.name] = denoiser
 
     return list(by_name.values())
 
@@ -121,31 +130,33 @@ def notes_of(result: dict[str, Any]) -> list[str]:
 
 
 def page_of(
-    asked: Comparison,
+    comparison: Comparison,
     result: dict[str, Any],
     denoisers: Sequence[RawDenoiser],
     cases: Sequence[Trial],
     notes: Sequence[str],
 ) -> Page:
     """The page: tables, quality over cost, and crops of some frames by every denoiser."""
-    page = Page(f"Denoisers on {asked.data}", result["noise"])
+    page = Page(f"Denoisers on {comparison.data}", result["noise"])
     page.add(texts=notes)
     for title, head, cells in tables(result):
         page.add(title, head=["", *head], rows=cells)
 
-    strength = display_strength(strengths_of(asked.noise, asked.iso))
+    strength = display_strength(strengths_of(comparison.noise, comparison.iso))
     costs = plot_costs(costs_of(result))
     chart = Figure(costs, "PSNR over GMAC", "curve", f"{strength}, levels told")
     page.add("Quality and cost", figures=[chart])
 
     page.add("Pictures", texts=[f"Noise: {strength}, levels told; PSNR of RAW."])
     for panels in crops(denoisers, cases, ON_PAGE):
-        page.add_frame(panels, asked.crop)
+        page.add_frame(panels, comparison.crop)
 
     return page
 
 
-def settings_of(asked: Comparison) -> dict[str, Any]:
+def settings_of(comparison: Comparison) -> dict[str, Any]:
     """The settings at the end of the page."""
-    keys = ("denoisers", "data", "bin", "count", "crop", "seed", "noise", "iso")
-    return {key: getattr(asked, key) for key in keys}
+    settings = asdict(comparison)
+    for key in ("device", "json", "report"):
+        del settings[key]
+    return settings

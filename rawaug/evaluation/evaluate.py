@@ -76,49 +76,60 @@ class Evaluation:
             write_json(result, self.json)
 
 
-def evaluate_raw(asked: Evaluation) -> dict[str, Any]:
+def evaluate_raw(evaluation: Evaluation) -> dict[str, Any]:
     """Score a denoiser of RAW, print its tables and write its files; the result, as in the JSON.
 
     The plain scores are printed and written first, then those of the self-ensemble and of filters, which take longer.
     """
-    denoiser = replace(denoiser_of(asked.denoiser, asked.device), checked=False).require_mosaic()
-    filters = [RawDenoiser.of(spec) for spec in asked.classical]
-    noise = asked.noise or denoiser.info.get("noise", PRESET)
+    denoiser = replace(denoiser_of(evaluation.denoiser, evaluation.device), checked=False).require_mosaic()
+    filters = [RawDenoiser.of(spec) for spec in evaluation.classical]
+    noise = evaluation.noise or denoiser.info.get("noise", PRESET)
     model = noise_model(noise)
 
-    pairs = open_pairs(asked.data, split="test", **vars(asked.settings))
-    frames = Readable(Kept(Binned(Measured(pairs), asked.bin)))
+    pairs = open_pairs(evaluation.data, split="test", **vars(evaluation.settings))
+    frames = Readable(Kept(Binned(Measured(pairs), evaluation.bin)))
     for _ in frames:
         pass  # finds those that cannot be read
-    trials = make_trials(frames.kept(), lambda pair: trial_of(pair, model, denoiser.cfa, asked.seed))
+    trials = make_trials(frames.kept(), lambda pair: trial_of(pair, model, denoiser.cfa, evaluation.seed))
 
-    facts = asked.facts("denoiser", denoiser_file(asked.denoiser))
-    unreadable = {"broken": frames.reasons()} if frames.broken else {}
+    facts = evaluation.facts("denoiser", denoiser_file(evaluation.denoiser))
+    unreadable = {}
+    if frames.broken:
+        unreadable["broken"] = frames.reasons()
+
     noisy, plain = group_rows(_finite_rows([NOISY, denoiser], trials, "evaluate")).values()
     plain_scores = summary(plain, noisy)
-    result = {**facts, "self_ensemble": False, "seed": asked.seed, **plain_scores, **unreadable}
+    result = {**facts, "self_ensemble": False, "seed": evaluation.seed, **plain_scores, **unreadable}
     print_scores(result)
-    asked.write(result)
+    evaluation.write(result)
 
-    if asked.views > 1 or filters:
-        ensemble = [replace(denoiser, name="views", views=asked.views)] if asked.views > 1 else []
-        rows = group_rows(_finite_rows([*ensemble, *filters], trials, "evaluate, the rest"))
+    others = list(filters)
+    if evaluation.views > 1:
+        others.insert(0, replace(denoiser, name="views", views=evaluation.views))
 
-        if ensemble:
-            about = {"self_ensemble": True, "seed": asked.seed, "views": asked.views, "plain": plain_scores}
+    if others:
+        rows = group_rows(_finite_rows(others, trials, "evaluate, the rest"))
+
+        if evaluation.views > 1:
+            about = {"self_ensemble": True, "seed": evaluation.seed, "views": evaluation.views, "plain": plain_scores}
             result = {**facts, **about, **summary(rows.pop("views"), noisy), **unreadable}
-        if filters:
-            result["classical"] = {name: summary(of_filter, noisy) for name, of_filter in rows.items()}
+        for name, of_filter in rows.items():
+            result.setdefault("classical", {})[name] = summary(of_filter, noisy)
         print_scores(result)
-        asked.write(result)
+        evaluation.write(result)
 
     note = own_noise_note({"the denoiser": result, **result.get("classical", {})})
     if note:
         print(note)
-    if asked.report:
-        page = _page(asked, result, denoiser, filters, trials, noise)
-        settings = {"weights": asked.denoiser, "data": asked.data, "noise": asked.noise, "seed": asked.seed}
-        print(f"page: {page.write(Path(asked.report), settings)}")
+    if evaluation.report:
+        page = _page(evaluation, result, denoiser, filters, trials, noise)
+        settings = {
+            "weights": evaluation.denoiser,
+            "data": evaluation.data,
+            "noise": evaluation.noise,
+            "seed": evaluation.seed,
+        }
+        print(f"page: {page.write(Path(evaluation.report), settings)}")
 
     return result
 
@@ -156,7 +167,7 @@ def require_finite(frame: str, value: float) -> float:
 
 
 def _page(
-    asked: Evaluation,
+    evaluation: Evaluation,
     result: Mapping[str, Any],
     denoiser: RawDenoiser,
     filters: Sequence[RawDenoiser],
@@ -168,8 +179,8 @@ def _page(
     if "plain" in result:
         runs["self_ensemble"] = result
 
-    facts = {"Noise": noise, "Seed": str(asked.seed)}
-    title = f"{denoiser.name} on {asked.data}"
+    facts = {"Noise": noise, "Seed": str(evaluation.seed)}
+    title = f"{denoiser.name} on {evaluation.data}"
     page = Page.of_scores(title, {denoiser.name: [runs]}, result.get("classical", {}), facts)
     for trial in select_for_page(trials):
         page.add_frame(panels_of([*filters, denoiser], trial))

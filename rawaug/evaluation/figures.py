@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -68,7 +69,10 @@ def panels_of(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOI
     """The trial noisy, denoised by each, and clean; captions say the PSNR. ``noisy`` shows the noisy input."""
     panels = Panels(trial)
     clean = as_compared(trial.clean, trial)
-    titles = {"noisy": noisy} | {one.name: one for one in denoisers}
+
+    titles: dict[str, Denoiser] = {"noisy": noisy}
+    for denoiser in denoisers:
+        titles[denoiser.name] = denoiser
 
     for title, denoiser in titles.items():
         denoised = denoiser(trial.input_for(denoiser))
@@ -88,19 +92,25 @@ def find_detail(image: Tensor, side: int = WINDOW) -> tuple[int, int]:
     right = (green[..., :-1, 1:] - green[..., :-1, :-1]).abs()
     steep = down + right
 
-    size = [min(side, length) for length in steep.shape[-2:]]
-    means = F.avg_pool2d(steep, size, stride=4)
+    height, width = steep.shape[-2:]
+    means = F.avg_pool2d(steep, (min(side, height), min(side, width)), stride=4)
     row, column = divmod(int(means.argmax()), means.shape[-1])
     return 4 * row, 4 * column
+
+
+def detail_window(image: Tensor, side: int = WINDOW) -> tuple[Any, slice, slice]:
+    """The index of the window of :func:`find_detail` in an image."""
+    y, x = find_detail(image, side)
+    return ..., slice(y, y + side), slice(x, x + side)
 
 
 def crops_at_100(rows: Sequence[Panels]) -> Tensor:
     """A row of crops of each trial, every image's where the clean one has most detail; sRGB ``(3, h, w)``."""
     strips = []
     for row in rows:
-        top, left = find_detail(row.trial.clean, CROP)
-        window = (..., slice(top, top + CROP), slice(left, left + CROP))
-        strips.append(torch.cat([row.show(image[window]) for image in row.images.values()], dim=-1))
+        window = detail_window(row.trial.clean, CROP)
+        crops = [row.show(image[window]) for image in row.images.values()]
+        strips.append(torch.cat(crops, dim=-1))
 
     return torch.cat(strips, dim=-2)
 
@@ -115,8 +125,9 @@ def new_figure(width: float, height: float) -> Any:
 
 def save_picture(rows: Sequence[Panels], path: Path) -> Path:
     """Write the panels of each row as a picture, at most :data:`ACROSS` side by side; the path."""
-    columns = min(ACROSS, max(len(row.images) for row in rows))
-    heights = [-(-len(row.images) // columns) for row in rows]
+    counts = [len(row.images) for row in rows]
+    columns = min(ACROSS, max(counts))
+    heights = [math.ceil(count / columns) for count in counts]
 
     figure = new_figure(2.1 * columns, 2.5 * sum(heights))
     axes = figure.subplots(sum(heights), columns, squeeze=False)
@@ -161,30 +172,45 @@ def plot_curves(logs: Mapping[str, Sequence[Path]]) -> dict[str, bytes]:
 
     pictures = {}
     for key, title in CURVES.items():
-        if any(row.get(key) for log in rows.values() for row in log):
-            pictures[title] = _plot_curve(key, title, rows, colours)
+        png = _plot_curve(key, title, rows, colours)
+        if png:
+            pictures[title] = png
 
     return pictures
 
 
 def _plot_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colours: Mapping[str, str]) -> bytes:
+    """A curve for each log, the arm in the legend; empty if no log has the key."""
     figure = new_figure(5.2, 3.6)
     axis = figure.subplots()
 
-    for (arm, seed), rows in logs.items():
-        points = [(int(row["step"]), float(row[key])) for row in rows if row.get(key)]
-        if not points:
+    arms = set()
+    for (arm, _), rows in logs.items():
+        steps = []
+        values = []
+        for row in rows:
+            if row.get(key):
+                steps.append(int(row["step"]))
+                values.append(float(row[key]))
+        if not steps:
             continue
-        steps, values = zip(*points, strict=True)
-        marker = "o" if len(points) == 1 else ""
-        label = arm if seed == 0 else None
-        axis.plot(steps, values, marker=marker, color=colours[arm], linewidth=1.4, label=label)
 
-    axis.set(xlabel="step", ylabel=title, yscale="log" if key == "loss" else "linear")
+        style: dict[str, Any] = {"color": colours[arm], "linewidth": 1.4}
+        if len(steps) == 1:
+            style["marker"] = "o"
+        if arm not in arms:
+            style["label"] = arm
+        axis.plot(steps, values, **style)
+        arms.add(arm)
+
+    if not arms:
+        return b""
+
+    axis.set(xlabel="step", ylabel=title)
+    if key == "loss":
+        axis.set_yscale("log")
     axis.locator_params(axis="x", integer=True)
-    if axis.get_legend_handles_labels()[0]:
-        axis.legend(fontsize=8)
-
+    axis.legend(fontsize=8)
     return _png(figure)
 
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch.nn.functional as F
 
 from rawaug import bayer
-from rawaug.evaluation.figures import WINDOW, Panels, find_detail
+from rawaug.evaluation.figures import WINDOW, Panels, detail_window
 from rawaug.evaluation.table_files import write_tables
 from rawaug.evaluation.tables import (
     ENSEMBLE,
@@ -29,7 +29,7 @@ from rawaug.evaluation.tables import (
     levels_note,
     table_of,
 )
-from rawaug.evaluation.trials import Trial, own_noise_note
+from rawaug.evaluation.trials import Trial, evenly_spaced, own_noise_note
 from rawaug.evaluation.verdict import verdict
 from rawaug.io.pictures import encode_png
 
@@ -65,8 +65,10 @@ class Page:
     """
 
     def __init__(self, title: str, lead: str = "") -> None:
-        self.title, self.lead = title, lead
+        self.title = title
+        self.lead = lead
         self.parts: list[dict[str, Any]] = []
+        self._has_pictures = False
 
     def add(self, heading: str = "", **content: Any) -> None:
         """Add a part.
@@ -109,10 +111,11 @@ class Page:
         terms = {"Command": command_line(), **facts}
         noise = terms.pop("Noise", None)
         if noise:
-            name = noise if isinstance(noise, str) else json.dumps(noise)
+            if not isinstance(noise, str):
+                noise = json.dumps(noise)
             first_arm = next(iter(results.values()))
             levels = levels_range(first_arm[0]["plain"])
-            terms["Noise"] = f"as captured with the frames, else {name}; {levels}".rstrip("; ")
+            terms["Noise"] = f"as captured with the frames, else {noise}; {levels}".rstrip("; ")
 
         self.add(terms={term: text for term, text in terms.items() if text})
 
@@ -124,23 +127,26 @@ class Page:
             others: summaries of other denoisers, by name.
             of: what these scores are of, for the headings, such as a pattern.
         """
-        end = f", {of}" if of else ""
-        first_arm = next(iter(results.values()))
-        note = levels_note(first_arm[0]["plain"])
+        end = ""
+        if of:
+            end = f", {of}"
 
+        first_arm = next(iter(results.values()))
+        notes = list(filter(None, [levels_note(first_arm[0]["plain"])]))
         for heading, columns in (("Scores", PLAIN), ("Self-ensemble", ENSEMBLE), ("Worst and best frames", QUARTERS)):
             table = table_of(results, others, columns)
             if not table.rows:
                 continue
-            texts = [note] if note and columns is PLAIN else []
             head = ["", *table.columns]
-            self.add(heading + end, texts=texts, head=head, rows=table.rows, best=table.best)
+            self.add(heading + end, texts=notes, head=head, rows=table.rows, best=table.best)
+            notes = []  # said once, with the first table
 
         self.add(f"Every image{end}", **_every_image(first_runs(results, others)))
 
     def add_curves(self, pngs: Mapping[str, bytes]) -> None:
         """Add pictures of the curves of a training, by title."""
-        self.add("Training", figures=[Figure(png, title, "curve") for title, png in pngs.items()])
+        figures = [Figure(png, title, "curve") for title, png in pngs.items()]
+        self.add("Training", figures=figures)
 
     def add_frame(self, row: Panels, crop: int | None = None) -> None:
         """Add a frame: its most detailed window in every image, and the whole of the clean one.
@@ -150,9 +156,9 @@ class Page:
             crop: the side in pixels of the middle to which larger frames were cut; None if none was.
         """
         clean = row.trial.clean
-        side = 2 * WINDOW // bayer.sites_per_value(clean)
-        top, left = find_detail(clean, side)
-        window = (..., slice(top, top + side), slice(left, left + side))
+        pixels = bayer.sites_per_value(clean)
+        window = detail_window(clean, 2 * WINDOW // pixels)
+        _, lines, columns = window
 
         figures = []
         for name, image in row.images.items():
@@ -166,13 +172,15 @@ class Page:
         if width > WHOLE:
             whole = F.interpolate(whole[None], scale_factor=WHOLE / width, mode="area")[0]
 
-        pixels = 2 * WINDOW // side
-        caption = f"{part}, clean; window at row {pixels * top}, column {pixels * left}"
+        caption = f"{part}, clean; window at row {pixels * lines.start}, column {pixels * columns.start}"
         figures.append(Figure(encode_png(whole), part, caption=caption))
 
-        first = not any(one["heading"] == "Pictures" for one in self.parts)
+        heading = ""
+        if not self._has_pictures:
+            heading = "Pictures"
+            self._has_pictures = True
         name = ", ".join(filter(None, [row.trial.frame, row.trial.condition]))
-        self.add("Pictures" if first else "", name=name, figures=figures)
+        self.add(heading, name=name, figures=figures)
 
     def write(self, path: Path, settings: Mapping[str, Any]) -> Path:
         """Write the page, which ends with the settings of the run, and its tables beside it; the path of the page."""
@@ -201,8 +209,11 @@ def name_part(height: int, width: int, crop: int | None) -> str:
         >>> name_part(288, 448, crop=512)
         'whole frame, 448 x 288'
     """
-    cut = crop is not None and max(height, width) >= crop
-    return f"{'middle' if cut else 'whole frame'}, {width} x {height}"
+    part = "whole frame"
+    if crop is not None and max(height, width) >= crop:
+        part = "middle"
+
+    return f"{part}, {width} x {height}"
 
 
 def command_line() -> str:
@@ -226,9 +237,8 @@ def levels_range(summary: Mapping[str, Any]) -> str:
 
 def select_for_page(trials: Sequence[Trial]) -> Iterator[Trial]:
     """At most :data:`ON_PAGE` of the trials, evenly spaced."""
-    count = min(ON_PAGE, len(trials))
-    for k in range(count):
-        yield trials[k * len(trials) // count]
+    for k in evenly_spaced(len(trials), ON_PAGE):
+        yield trials[k]
 
 
 def _every_image(summaries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -40,6 +40,7 @@ def picture_trials(pairs: Sequence[Any], registered: bool = False) -> Sequence[T
         noisy, clean = pair.noisy[None] / 255.0, pair.clean[None] / 255.0
         if not registered:
             return Trial(noisy, clean, frame=pair.name, domain="srgb", condition=PUBLISHED)
+
         inner = (..., slice(BORDER, -BORDER), slice(BORDER, -BORDER))
         moved = register(noisy[0], clean[0])[None]
         return Trial(noisy[inner], moved[inner], frame=pair.name, domain="srgb", condition=REGISTERED)
@@ -53,14 +54,18 @@ def register(noisy: Tensor, clean: Tensor) -> Tensor:
         from skimage.registration import phase_cross_correlation
     from scipy.ndimage import shift
 
-    found = phase_cross_correlation(noisy.mean(0).numpy(), clean.mean(0).numpy(), upsample_factor=50)[0]
-    step = np.clip(found, -BORDER + 1.0, BORDER - 1.0)
+    offset, *_ = phase_cross_correlation(noisy.mean(0).numpy(), clean.mean(0).numpy(), upsample_factor=50)
+    offset = np.clip(offset, -BORDER + 1.0, BORDER - 1.0)
+    inner = slice(BORDER, -BORDER), slice(BORDER, -BORDER)
+
     planes = []
     for shot, truth in zip(noisy.double().numpy(), clean.double().numpy(), strict=True):
-        moved = shift(truth, step, order=3, mode="nearest")
-        inner = (slice(BORDER, -BORDER), slice(BORDER, -BORDER))
-        gain, offset = np.polyfit(moved[inner].ravel(), shot[inner].ravel(), 1) if np.ptp(moved) > 0.02 else (1.0, 0.0)
-        planes.append(gain * moved + offset)
+        plane = shift(truth, offset, order=3, mode="nearest")
+        if np.ptp(plane) > 0.02:  # a flat plane has no gain
+            gain, level = np.polyfit(plane[inner].ravel(), shot[inner].ravel(), 1)
+            plane = gain * plane + level
+        planes.append(plane)
+
     return torch.from_numpy(np.stack(planes)).float().clamp(0.0, 1.0)
 
 
@@ -69,9 +74,10 @@ def picture_scores(denoisers: Sequence[Denoiser], pairs: Sequence[Any]) -> dict[
     rows: dict[str, dict[str, Any]] = {}
     for condition in (PUBLISHED, REGISTERED):
         trials = picture_trials(pairs, registered=condition == REGISTERED)
-        found = group_rows(score([NOISY, *denoisers], trials, condition))
-        for name, of_one in found.items():
-            rows.setdefault(name, {})[condition] = summary(of_one, found[NOISY.name])
+        rows_by_name = group_rows(score([NOISY, *denoisers], trials, condition))
+        for name, of_one in rows_by_name.items():
+            rows.setdefault(name, {})[condition] = summary(of_one, rows_by_name[NOISY.name])
+
     return {"pictures": len(pairs), "rows": rows}
 
 
@@ -89,47 +95,47 @@ def print_pictures(data: str, result: Mapping[str, Any]) -> None:
     print_rows(title, ["denoiser", PUBLISHED, REGISTERED], rows)
 
 
-def evaluate_pictures(asked: Evaluation) -> dict[str, Any]:
+def evaluate_pictures(evaluation: Evaluation) -> dict[str, Any]:
     """Score a denoiser of pictures, beside classical filters; the result, as in the JSON.
 
     ``plain`` holds the result with the default number of views, where more are asked for.
     """
-    if asked.noise is not None or asked.bin != 1 or asked.report:
-        raise ValueError(f"{asked.data}: has developed pictures; --noise, --bin and --report are for RAW")
+    if evaluation.noise is not None or evaluation.bin != 1 or evaluation.report:
+        raise ValueError(f"{evaluation.data}: has developed pictures; --noise, --bin and --report are for RAW")
 
-    plain = PictureDenoiser.of(asked.denoiser, asked.device)
-    filters = [PictureDenoiser.of(spec) for spec in asked.classical]
+    plain = PictureDenoiser.of(evaluation.denoiser, evaluation.device)
+    filters = [PictureDenoiser.of(spec) for spec in evaluation.classical]
     denoisers = [plain, *filters]
     main = plain
-    if asked.views > 1:
-        main = replace(plain, name=f"{plain.name}, {asked.views} views", views=asked.views)
+    if evaluation.views > 1:
+        main = replace(plain, name=f"{plain.name}, {evaluation.views} views", views=evaluation.views)
         denoisers.insert(1, main)
 
-    pairs = open_picture_pairs(asked.data, asked.settings.noisy, asked.settings.clean)
+    pairs = open_picture_pairs(evaluation.data, evaluation.settings.noisy, evaluation.settings.clean)
     scores = picture_scores(denoisers, pairs)
-    print_pictures(asked.data, scores)
+    print_pictures(evaluation.data, scores)
 
     rows = scores["rows"]
     result = {
         "kind": "denoiser",
-        "data": asked.data,
+        "data": evaluation.data,
         "version": __version__,
         **rows[main.name][PUBLISHED],
         "registered": rows[main.name][REGISTERED],
     }
-    if asked.views > 1:
-        result |= {"self_ensemble": True, "views": asked.views, "plain": rows[plain.name][PUBLISHED]}
-    if filters:
-        result["classical"] = {one.name: rows[one.name] for one in filters}
+    if evaluation.views > 1:
+        result |= {"self_ensemble": True, "views": evaluation.views, "plain": rows[plain.name][PUBLISHED]}
+    for one in filters:
+        result.setdefault("classical", {})[one.name] = rows[one.name]
 
-    asked.write(result)
+    evaluation.write(result)
     return result
 
 
-def compare_pictures(asked: Comparison) -> None:
+def compare_pictures(comparison: Comparison) -> None:
     """Compare denoisers of pictures; the table is printed, and written as JSON."""
-    denoisers = [PictureDenoiser.of(spec, asked.device) for spec in asked.denoisers]
-    result = picture_scores(denoisers, open_picture_pairs(asked.data))
-    print_pictures(asked.data, result)
-    if asked.json:
-        write_json({"data": asked.data, **result}, asked.json)
+    denoisers = [PictureDenoiser.of(spec, comparison.device) for spec in comparison.denoisers]
+    result = picture_scores(denoisers, open_picture_pairs(comparison.data))
+    print_pictures(comparison.data, result)
+    if comparison.json:
+        write_json({"data": comparison.data, **result}, comparison.json)

@@ -40,7 +40,9 @@ def psnr_r(
         ValueError: if the picture is not in the camera's colours, as SIDD's blocks without their sRGB files.
     """
     pair.require_rendered()
-    as_shot = pair.white_balance if white_balance else None
+    as_shot = None
+    if white_balance:
+        as_shot = pair.white_balance
 
     def choose(srgb: Tensor) -> ISPParams:
         params = staged.with_white_balance(isp, isp.choose(srgb), as_shot, None)
@@ -84,8 +86,10 @@ def windows_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair, count: in
     """Mean PSNR over windows; ``make`` maps an sRGB patch ``(1, 3, h, w)`` and its place in the frame to RAW."""
     height, width = pair.raw.shape[-2:]
     values = []
-    for top, left in windows_of(pair, count):
-        window = (None, slice(None), slice(top, top + PATCH), slice(left, left + PATCH))
-        place = frame_coordinates(min(PATCH, height), min(PATCH, width), (top, left), (height, width))
+    for corner in windows_of(pair, count):
+        y, x = corner
+        window = (None, slice(None), slice(y, y + PATCH), slice(x, x + PATCH))
+        place = frame_coordinates(min(PATCH, height), min(PATCH, width), corner, (height, width))
         values.append(patch_psnr(make(pair.srgb[window], place).clamp(0.0, 1.0), pair.raw[window]))
+
     return torch.cat(values).mean().item()

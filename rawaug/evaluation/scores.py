@@ -47,7 +47,7 @@ class Denoiser(Protocol):
     def takes(self) -> str:
         """The kind of image that it takes."""
 
-    def __call__(self, noisy: Noisy, /) -> Tensor: ...
+    def __call__(self, noisy: Noisy) -> Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,10 @@ def score(denoisers: Sequence[Denoiser], trials: Iterable[Trial], label: str = "
         >>> denoised.psnr > noisy.psnr
         True
     """
-    for trial in progress(trials, label=label, unit="image") if label else trials:
+    if label:
+        trials = progress(trials, label=label, unit="image")
+
+    for trial in trials:
         for denoiser in denoisers:
             yield from _score_one(denoiser, trial)
 
@@ -130,7 +133,10 @@ def _score_one(denoiser: Denoiser, trial: Trial) -> Iterator[Row]:
     for name, image in to_domain(denoiser.name, denoised, trial):
         metrics = compare(image, trial)
         error = 10.0 ** (-metrics[0] / 10.0)
-        has_share = trial.own is not None and error > 0
+        share = None
+        if trial.own is not None and error > 0:
+            share = trial.own / error
+
         yield Row(
             name,
             trial.frame,
@@ -138,7 +144,7 @@ def _score_one(denoiser: Denoiser, trial: Trial) -> Iterator[Row]:
             trial.strength,
             trial.domain,
             *metrics,
-            own_noise=trial.own / error if has_share else None,
+            own_noise=share,
             levels=noisy.levels,
             levels_from_clean=trial.levels_from_clean,
             seconds=seconds,
@@ -155,7 +161,7 @@ def to_domain(name: str, denoised: Tensor, trial: Trial) -> Iterator[tuple[str, 
         return
 
     for way, follow in trial.ways.items():
-        yield f"{name}, {way}" if way else name, follow(denoised)
+        yield ", ".join(filter(None, [name, way])), follow(denoised)
 
 
 def compare(image: Tensor, trial: Trial) -> tuple[float, float, float | None, float | None]:
@@ -176,8 +182,11 @@ def as_compared(image: Tensor, trial: Trial) -> Tensor:
     """An image of the trial's domain as its scores see it: RAW as the mosaic, sRGB cut to [0, 1]."""
     if trial.domain == "raw":
         return bayer.unpack_if_packed(image, trial.cfa)
+    if trial.domain == "srgb":
+        return image.clamp(0.0, 1.0)
 
-    return image.clamp(0.0, 1.0) if trial.domain == "srgb" else image
+
+    return image
 
 
 # -- means as JSON -----------------------------------------------------------------------------------------------------
@@ -206,7 +215,7 @@ def summary(rows: Iterable[Row], noisy: Iterable[Row] = ()) -> dict[str, Any]:
         PSNR of two equal frames. What does not apply is left out.
     """
     rows, noisy = list(rows), list(noisy)
-    images = [_image(row) for row in rows]
+    images = list(map(_image, rows))
     result: dict[str, Any] = {"images": images}
 
     flagged = sum(row.levels_from_clean for row in rows)
@@ -271,7 +280,10 @@ def _own_noise(rows: Sequence[Row], images: Sequence[dict[str, Any]]) -> dict[st
         own.append(row.own_noise * error)
         image["own_noise"] = row.own_noise
 
-    return {"own_noise": sum(own) / sum(errors)} if own else {}
+    if not own:
+        return {}
+
+    return {"own_noise": sum(own) / sum(errors)}
 
 
 def require_numbers(summaries: Iterable[Mapping[str, Any]]) -> None:
@@ -283,6 +295,8 @@ def require_numbers(summaries: Iterable[Mapping[str, Any]]) -> None:
     if not faults:
         return
 
-    hidden = len(faults) - SHOWN_FAULTS
-    more = f"; and {hidden} more" if hidden > 0 else ""
-    raise ValueError(f"left out of the means: {'; '.join(faults[:SHOWN_FAULTS])}{more}")
+    texts = faults[:SHOWN_FAULTS]
+    hidden = len(faults) - len(texts)
+    if hidden:
+        texts.append(f"and {hidden} more")
+    raise ValueError(f"left out of the means: {'; '.join(texts)}")

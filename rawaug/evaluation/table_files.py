@@ -14,7 +14,7 @@ from typing import Any
 
 from rawaug.errors import escape
 
-_LATEX = {
+_ESCAPES = {
     "\\": r"\textbackslash{}",
     "&": r"\&",
     "%": r"\%",
@@ -27,6 +27,7 @@ _LATEX = {
     "^": r"\textasciicircum{}",
     "±": r"$\pm$",
 }
+_LATEX = str.maketrans(_ESCAPES)
 
 
 def write_tables(page: Path, parts: Iterable[Mapping[str, Any]]) -> list[Path]:
@@ -89,7 +90,9 @@ def latex_table(head: Sequence[str], rows: Mapping[str, Sequence[str]], best: Co
         texts = [_escape_latex(name)]
         for column, cell in enumerate(cells):
             text = _escape_latex(cell)
-            texts.append(rf"\textbf{{{text}}}" if (name, column) in best else text)
+            if (name, column) in best:
+                text = rf"\textbf{{{text}}}"
+            texts.append(text)
         lines.append(" & ".join(texts) + r" \\")
 
     lines += [r"\hline", r"\end{tabular}", ""]
@@ -101,4 +104,4 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def _escape_latex(text: str) -> str:
-    return "".join(_LATEX.get(character, character) for character in escape(text))
+    return escape(text).translate(_LATEX)

@@ -31,11 +31,22 @@ Runs = Mapping[str, Sequence[Mapping[str, Any]]]
 Columns = Mapping[str, tuple[str, str]]
 """For each heading of a table the kind of summary, and the figure in it, that the column shows."""
 
-PLAIN: Columns = {name: ("plain", key) for key, name in FIGURES.items()}
-ENSEMBLE: Columns = {name: ("self_ensemble", key) for key, name in FIGURES.items()}
-QUARTERS: Columns = {
-    f"{FIGURES[key]}, {part} 25%": ("plain", f"{key}_{part}25") for key in METRICS for part in ("worst", "best")
-}
+
+def _columns(kind: str) -> Columns:
+    return {heading: (kind, key) for key, heading in FIGURES.items()}
+
+
+def _quarters() -> Columns:
+    columns = {}
+    for key in METRICS:
+        for part in ("worst", "best"):
+            columns[f"{FIGURES[key]}, {part} 25%"] = "plain", f"{key}_{part}25"
+    return columns
+
+
+PLAIN = _columns("plain")
+ENSEMBLE = _columns("self_ensemble")
+QUARTERS = _quarters()
 PRINTED: Columns = {
     "PSNR (dB)": ("plain", "psnr"),
     "SSIM": ("plain", "ssim"),
@@ -61,20 +72,23 @@ def table_of(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, colu
     methods |= results
 
     table = Table([], {}, set())
-    values_by_column = []
+    cells: dict[str, list[str]] = {}
     for head, (kind, key) in columns.items():
-        values = {name: _values(runs, kind, key) for name, runs in methods.items()}
+        values = {}
+        for name, runs in methods.items():
+            values[name] = _values(runs, kind, key)
         if not any(values.values()):
             continue
+
         for name in _best_rows(key, values):
             table.best.add((name, len(table.columns)))
         table.columns.append(head)
-        values_by_column.append((key, values))
+        for name in methods:
+            cells.setdefault(name, []).append(_cell(key, values[name]))
 
-    for name in methods:
-        cells = [_cell(key, values[name]) for key, values in values_by_column]
-        if any(cells):
-            table.rows[name] = cells
+    for name, row in cells.items():
+        if any(row):
+            table.rows[name] = row
 
     return table
 
@@ -82,7 +96,12 @@ def table_of(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, colu
 def _of_input(results: Runs) -> dict[str, Any]:
     """The scores of the noisy input, which every summary holds beside its own."""
     first_arm = next(iter(results.values()))
-    return {key.replace("_noisy", ""): value for key, value in first_arm[0]["plain"].items() if "_noisy" in key}
+    scores = {}
+    for key, value in first_arm[0]["plain"].items():
+        if "_noisy" in key:
+            scores[key.replace("_noisy", "")] = value
+
+    return scores
 
 
 def _best_rows(key: str, values: Mapping[str, Sequence[float]]) -> list[str]:
@@ -101,7 +120,11 @@ def _best_rows(key: str, values: Mapping[str, Sequence[float]]) -> list[str]:
 
 def first_runs(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
     """The summary of every method by name; of an arm that of its first seed."""
-    return {**others, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
+    summaries = dict(others)
+    for arm, runs in results.items():
+        summaries[arm] = runs[0]["plain"]
+
+    return summaries
 
 
 # -- cells -------------------------------------------------------------------------------------------------------------
@@ -115,11 +138,17 @@ def _cell(key: str, values: Sequence[float]) -> str:
     if len(values) > 1 and key != "own_noise":
         return mean_and_spread(values, _digits(key))
 
-    return format_figure(key, statistics.fmean(values) if values else None)
+    if not values:
+        return ""
+
+    return format_figure(key, statistics.fmean(values))
 
 
 def _digits(key: str) -> int:
-    return 2 if "psnr" in key else 4
+    if "psnr" in key:
+        return 2
+
+    return 4
 
 
 def mean_and_spread(values: Sequence[float], digits: int) -> str:
@@ -135,14 +164,17 @@ def format_figure(key: str, value: float | None) -> str:
     """The figure of a metric as tables have it; empty if there is none."""
     if value is None:
         return ""
+    if key == "own_noise":
+        return f"{value:.0%}"
 
-    return f"{value:.0%}" if key == "own_noise" else f"{value:.{_digits(key)}f}"
+    return f"{value:.{_digits(key)}f}"
 
 
 def join_figures(scores: Mapping[str, Any], first: str, second: str) -> str:
     """Two figures in a cell; a dash stands for what is no number."""
-    cells = [format_figure(key, scores.get(key)) or "-" for key in (first, second)]
-    return " / ".join(cells)
+    figure = format_figure(first, scores.get(first)) or "-"
+    other = format_figure(second, scores.get(second)) or "-"
+    return f"{figure} / {other}"
 
 
 # -- printing ----------------------------------------------------------------------------------------------------------
@@ -155,8 +187,9 @@ def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str
     from rich.text import Text
 
     table = RichTable(title=Text(escape(title)))
-    for k, column in enumerate(head):
-        table.add_column(column, justify="right" if k else "left")
+    table.add_column(head[0])
+    for column in head[1:]:
+        table.add_column(column, justify="right")
 
     for rows in sections:
         for row in rows:
@@ -187,18 +220,22 @@ def print_table(results: Runs, title: str, others: Mapping[str, Mapping[str, Any
 def print_scores(result: Mapping[str, Any]) -> None:
     """Print the table of ``rawaug evaluate`` from what ``--json`` writes."""
     denoises = result["kind"] == "denoiser"
-    keys = ["psnr"]
     title = "PSNR_r, RAW reconstruction"
+    keys = ["psnr"]
     if denoises:
-        keys = [key for key in FIGURES if key != "own_noise" or key in result]
         title = "PSNR_d, RAW denoising"
+        keys = list(METRICS)
+        if "own_noise" in result:
+            keys.append("own_noise")
     if result.get("self_ensemble"):
         title += f", self-ensemble of {result['views']} views"
 
     images = []
     for image in result["images"]:
-        mark = " *" if image.get("levels_from_clean") else ""
-        images.append([f"{image['name']}{mark}", *_figures(image, keys)])
+        name = image["name"]
+        if image.get("levels_from_clean"):
+            name += " *"
+        images.append([name, *_figures(image, keys)])
 
     means = []
     for name, end in (("mean", ""), ("worst 25%", "_worst25"), ("best 25%", "_best25"), ("noisy", "_noisy")):

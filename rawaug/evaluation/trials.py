@@ -31,10 +31,13 @@ from rawaug.seeding import keyed_generator
 
 Domain = Literal["raw", "rgb", "srgb"]
 """The form in which results are compared: packed RAW ``(1, 4, h, w)``, linear camera RGB or sRGB ``(1, 3, H, W)``."""
-KEPT = 1024
-"""Megabytes of trials that stay in memory; others are made again for each pass."""
+
 TEST_NOISE = "test noise"
 """The part of the key of test frames' noise that is the same for all of them."""
+
+_CACHE_MB = 1024
+"""Megabytes of trials that stay in memory; others are made again for each pass."""
+
 Case = TypeVar("Case")
 
 
@@ -81,7 +84,10 @@ class Trial:
 
     def input_for(self, denoiser: Any) -> Noisy:
         """The input of this denoiser: a denoiser of RAW gets the RAW that a picture was developed from."""
-        return self.raw if self.raw is not None and denoiser.takes == "raw" else self.input
+        if self.raw is not None and denoiser.takes == "raw":
+            return self.raw
+
+        return self.input
 
 
 def trial_of(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: int = 0, **about: Any) -> Trial:
@@ -94,13 +100,12 @@ def trial_of(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: 
         seed: of the drawn noise.
         about: other attributes, such as ``condition``.
     """
-    pair, cfa = pair.with_levels(), CFA(pair.cfa if cfa is None else cfa)
+    pair = pair.with_levels()
+    cfa = CFA(cfa or pair.cfa)
     clean = bayer.pack(crop_to_cfa(pair.raw, pair.cfa, cfa)[None], cfa)
     if pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None:
-        captured = Noisy.of(
-            bayer.pack(crop_to_cfa(pair.noisy, pair.cfa, cfa)[None], cfa), (pair.shot_var, pair.read_var), cfa
-        )
-        noisy, variance, levels, _ = captured
+        packed = bayer.pack(crop_to_cfa(pair.noisy, pair.cfa, cfa)[None], cfa)
+        noisy, variance, levels, _ = Noisy.of(packed, (pair.shot_var, pair.read_var), cfa)
     else:
         noisy, variance, levels = freeze_noise(clean, noise, seed, TEST_NOISE, pair.name)
     assert variance is not None
@@ -121,7 +126,10 @@ def freeze_noise(clean: Tensor, noise: NoiseModel, seed: int, *key: str) -> tupl
     """
     params = noise.sample(1, keyed_generator(seed, *key))
     noisy = noise.apply(clean, params)
-    levels = (params["shot_var"].item(), params["read_var"].item()) if "shot_var" in params else None
+    levels = None
+    if "shot_var" in params:
+        levels = params["shot_var"].item(), params["read_var"].item()
+
     return noisy, noise.variance(noisy, params), levels
 
 
@@ -140,26 +148,43 @@ def raw_trial(
         about: other attributes of the trial.
     """
     develop = partial(develop_packed, cfa=cfa, pair=pair, exposure=exposure_of(clean, pair))
-    own = None if pair.own_noise is None else noise_variance(clean, *pair.own_noise).mean().item()
+    own = None
+    if pair.own_noise is not None:
+        own = noise_variance(clean, *pair.own_noise).mean().item()
+
     return Trial(noisy, clean, variance, pair.name, levels=levels, cfa=cfa, develop=develop, own=own, **about)
 
 
 def make_trials(cases: Sequence[Case], make: Callable[[Case], Trial]) -> Sequence[Trial]:
-    """``make(case)`` of every case, made when it is asked for and kept, up to :data:`KEPT`."""
-    kept: Any = Cached(cases, KEPT, make)
-    return kept
+    """``make(case)`` of every case, made at its first use and kept in memory, up to a gigabyte."""
+    trials: Any = Cached(cases, _CACHE_MB, make)
+    return trials
+
+
+def evenly_spaced(length: int, most: int) -> list[int]:
+    """At most ``most`` of the indices of a sequence of this length, evenly spaced from the first.
+
+    Example:
+        >>> evenly_spaced(10, 4)
+        [0, 2, 5, 7]
+    """
+    count = min(most, length)
+    return [k * length // count for k in range(count)]
 
 
 # -- the references' own noise -----------------------------------------------------------------------------------------
 
 MUCH = 0.1
 """Threshold for warning of the references' own noise, as a share of the squared error."""
+
 MOST_MEASURED = 12
 """Maximum number of frames whose own noise is measured; a frame of 12 megapixels takes seconds."""
+
 MOST_TARGETS = 3
-"""The number of training frames whose own noise is measured."""
-SHOWN = 4
-ADVICE = CLEANER_TEST
+"""Maximum number of training frames whose own noise is measured."""
+
+_SHOWN = 4
+"""Maximum number of methods that a line names."""
 
 
 class Measured(SomePairs):
@@ -170,8 +195,7 @@ class Measured(SomePairs):
 
     def __init__(self, pairs: Sequence[Pair], most: int = MOST_MEASURED) -> None:
         super().__init__(pairs)
-        count = min(most, len(pairs))
-        self.measured = {k * len(pairs) // count for k in range(count)}
+        self.measured = set(evenly_spaced(len(pairs), most))
 
     def read(self, index: int) -> Pair:
         """The reference at ``index``, with its own noise if it is one of those that are measured."""
@@ -192,27 +216,34 @@ def own_noise_note(summaries: Mapping[str, Mapping[str, Any]]) -> str:
     if not shares:
         return ""
 
-    names = sorted(shares, key=lambda name: -shares[name])[:SHOWN]
-    listed = ", ".join(f"{name} {shares[name]:.0%}" for name in names)
-    kept = " (more than 100%: it keeps that noise)" if max(shares.values()) > 1.0 else ""
-    return f"own noise of the references as a share of the squared error: {listed}{kept}; {ADVICE}"
+    names = sorted(shares, key=lambda name: -shares[name])[:_SHOWN]
+    text = ", ".join(f"{name} {shares[name]:.0%}" for name in names)
+    if max(shares.values()) > 1.0:
+        text += " (more than 100%: it keeps that noise)"
+
+    return f"own noise of the references as a share of the squared error: {text}; {CLEANER_TEST}"
 
 
 def added_noise_note(trials: Iterable[Trial]) -> str:
     """A line that warns of noise hardly stronger than that of the references; empty if it is much stronger."""
-    own = []
-    added = []
+    own_variances = []
+    test_variances = []
     for trial in trials:
         if trial.own is not None and trial.variance is not None:
-            own.append(trial.own)
-            added.append(trial.variance.mean().item())
+            own_variances.append(trial.own)
+            test_variances.append(trial.variance.mean().item())
 
-    if not own or fmean(own) <= MUCH * fmean(added):
+    if not own_variances:
+        return ""
+
+    own = fmean(own_variances)
+    share = own / fmean(test_variances)
+    if share <= MUCH:
         return ""
 
     return (
-        f"the test frames' own noise has {fmean(own) / fmean(added):.0%} of the variance of the noise added to them: "
-        f"a perfect denoiser would score {-10.0 * math.log10(fmean(own)):.1f} dB; {ADVICE}"
+        f"the test frames' own noise has {share:.0%} of the variance of the noise added to them: "
+        f"a perfect denoiser would score {-10.0 * math.log10(own):.1f} dB; {CLEANER_TEST}"
     )
 
 
@@ -227,12 +258,13 @@ def training_noise_note(pairs: Sequence[Pair], noise: NoiseModel, arms: Sequence
     Returns:
         The line; empty if there are no such frames or arms, or their noise is weak or cannot be measured.
     """
-    targets = [pair for pair in pairs if pair.noisy is None]
-    count = min(MOST_TARGETS, len(targets)) if arms else 0
+    if not arms:
+        return ""
 
+    targets = [pair for pair in pairs if pair.noisy is None]
     shares = []
-    for k in range(count):
-        pair = targets[k * len(targets) // count]
+    for k in evenly_spaced(len(targets), MOST_TARGETS):
+        pair = targets[k]
         levels = pair.own_noise or own_noise(pair.raw, pair.cfa)
         if levels is None:
             continue
@@ -240,11 +272,11 @@ def training_noise_note(pairs: Sequence[Pair], noise: NoiseModel, arms: Sequence
         params = noise.sample(1, keyed_generator(0, "training noise", pair.name))
         shares.append((noise_variance(clean, *levels).mean() / noise.variance(clean, params).mean()).item())
 
-    share = fmean(shares) if shares else 0.0
-    if share <= MUCH:
+    if not shares or fmean(shares) <= MUCH:
         return ""
 
     return (
-        f"the clean training frames' own noise has {share:.0%} of the variance of the noise added to them: training on "
-        f"them ({', '.join(arms)}) teaches to keep it; use noisy and clean captures (pairs:PATH), or augmented: 1"
+        f"the clean training frames' own noise has {fmean(shares):.0%} of the variance of the noise added to them: "
+        f"training on them ({', '.join(arms)}) teaches to keep it; use noisy and clean captures (pairs:PATH), or "
+        "augmented: 1"
     )

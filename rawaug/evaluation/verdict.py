@@ -54,11 +54,11 @@ def verdict(results: Mapping[str, Sequence[Mapping[str, Summary]]], others: Mapp
     Returns:
         The recommendation, which names an arm, one of the others or :data:`INPUT`, or nothing.
     """
-    runs_by_arm = {}
+    runs_by_arm: dict[str, list[Summary]] = {}
     for arm, runs in results.items():
-        scored = [run["plain"] for run in runs if "psnr" in run["plain"]]
-        if scored:
-            runs_by_arm[arm] = scored
+        for run in runs:
+            if "psnr" in run["plain"]:
+                runs_by_arm.setdefault(arm, []).append(run["plain"])
 
     if not runs_by_arm:
         return Verdict("", "")
@@ -66,25 +66,28 @@ def verdict(results: Mapping[str, Sequence[Mapping[str, Summary]]], others: Mapp
     arm = max(runs_by_arm, key=lambda name: _mean(runs_by_arm[name], "psnr"))
     runs = runs_by_arm[arm]
 
-    rivals = {name: summary for name, summary in others.items() if "psnr" in summary}
-    if not rivals:
-        rivals = {INPUT: _of_input(runs[0])}
+    rival, scores = _best_rival(others)
+    if not rival:
+        rival, scores = INPUT, _of_input(runs[0])
 
-    rival = max(rivals, key=lambda name: rivals[name]["psnr"])
-    gain = _mean(runs, "psnr") - rivals[rival]["psnr"]
-    gain_srgb = _gain_srgb(runs, rivals[rival])
+    gain = _mean(runs, "psnr") - scores["psnr"]
+    gain_srgb = _gain_srgb(runs, scores)
 
-    doubt = _kept_noise(arm, runs, rival, rivals[rival]) or _disagreement(arm, rival, gain, gain_srgb)
+    doubt = _kept_noise(arm, runs, rival, scores) or _disagreement(arm, rival, gain, gain_srgb)
     if doubt:
         return Verdict("", f"No recommendation: {doubt}.")
 
-    use = arm if gain >= MATTERS else rival
-    reasons = [f"{gain:+.2f} dB over {rival}"]
-    if use == rival:
-        more_or_less = "more" if gain >= 0 else "less"
-        reasons = [f"{arm}, the best arm, scores {abs(gain):.2f} dB {more_or_less}"]
+    if gain >= MATTERS:
+        use = arm
+        reasons = [f"{gain:+.2f} dB over {rival}"]
+    elif gain >= 0:
+        use = rival
+        reasons = [f"{arm}, the best arm, scores {gain:.2f} dB more"]
+    else:
+        use = rival
+        reasons = [f"{arm}, the best arm, scores {-gain:.2f} dB less"]
 
-    reasons.append(_how_sure(runs, rivals[rival], gain))
+    reasons.append(_how_sure(runs, scores, gain))
     if gain_srgb is not None:
         reasons.append(f"{gain_srgb:+.2f} dB after development")
 
@@ -93,6 +96,16 @@ def verdict(results: Mapping[str, Sequence[Mapping[str, Summary]]], others: Mapp
 
 def _mean(runs: Sequence[Summary], key: str) -> float:
     return fmean(run[key] for run in runs)
+
+
+def _best_rival(others: Mapping[str, Summary]) -> tuple[str, Summary]:
+    """The name and scores of the method of the highest PSNR; an empty name if none has one."""
+    rival = ""
+    for name, summary in others.items():
+        if "psnr" in summary and (not rival or summary["psnr"] > others[rival]["psnr"]):
+            rival = name
+
+    return rival, others.get(rival, {})
 
 
 def _of_input(summary: Summary) -> dict[str, Any]:
@@ -118,12 +131,18 @@ def _how_sure(runs: Sequence[Summary], rival: Summary, gain: float) -> str:
     """A clause that compares the gain with the spread of the seeds, or counts frames if there is one seed."""
     if len(runs) > 1:
         spread = stdev(run["psnr"] for run in runs)
-        relation = "within" if abs(gain) <= spread else "more than"
+        relation = "more than"
+        if abs(gain) <= spread:
+            relation = "within"
         return f"{relation} the noise of the seeds (± {spread:.2f} dB)"
 
-    pairs = list(zip(runs[0]["images"], rival["images"], strict=False))
-    higher = sum((image.get("psnr") or 0.0) > (other.get("psnr") or 0.0) for image, other in pairs)
-    return f"higher on {higher} of {len(pairs)} frames, one seed"
+    frames = 0
+    higher = 0
+    for image, other in zip(runs[0]["images"], rival["images"], strict=False):
+        frames += 1
+        if (image.get("psnr") or 0.0) > (other.get("psnr") or 0.0):
+            higher += 1
+    return f"higher on {higher} of {frames} frames, one seed"
 
 
 def _disagreement(arm: str, rival: str, gain: float, gain_srgb: float | None) -> str:
@@ -145,8 +164,11 @@ def _disagreement(arm: str, rival: str, gain: float, gain_srgb: float | None) ->
 def _kept_noise(arm: str, runs: Sequence[Summary], rival: str, other: Summary) -> str:
     """Why the references' own noise leaves the comparison open; empty where it does not."""
     best = max(runs, key=lambda run: run["psnr"])
-    name, scores = (arm, best) if best["psnr"] >= other["psnr"] else (rival, other)
-    own, added = noise_of_references(scores)
+    name, scores = arm, best
+    if other["psnr"] > best["psnr"]:
+        name, scores = rival, other
+
+    own, test_noise = noise_of_references(scores)
     if own is None:
         return ""
 
@@ -157,9 +179,11 @@ def _kept_noise(arm: str, runs: Sequence[Summary], rival: str, other: Summary) -
             f"on these references, whose noise it has kept; {decides}"
         )
 
-    errors = [10.0 ** (-one["psnr"] / 10.0) for one in (best, other)]
-    gap = abs(errors[0] - errors[1])
-    by_keeping = own**2 / (own + added) if added is not None else 0.0
+    if test_noise is None:
+        return ""
+
+    gap = abs(_squared_error(best["psnr"]) - _squared_error(other["psnr"]))
+    by_keeping = own**2 / (own + test_noise)
     if abs(best["psnr"] - other["psnr"]) >= MATTERS and gap <= by_keeping:
         return f"{arm} and {rival} differ by no more than a method gains by keeping the references' noise; {decides}"
 
@@ -168,13 +192,25 @@ def _kept_noise(arm: str, runs: Sequence[Summary], rival: str, other: Summary) -
 
 def noise_of_references(summary: Summary) -> tuple[float | None, float | None]:
     """The mean variance of the references' own noise and that of the noise added to them; None if not known."""
-    own = []
-    added = []
+    own_variances = []
+    test_variances = []
     for image in summary["images"]:
         if "own_noise" not in image:
             continue
-        own.append(image["own_noise"] * 10.0 ** (-image["psnr"] / 10.0))
+        own_variances.append(image["own_noise"] * _squared_error(image["psnr"]))
         if "psnr_noisy" in image:
-            added.append(10.0 ** (-image["psnr_noisy"] / 10.0))
+            test_variances.append(_squared_error(image["psnr_noisy"]))
 
-    return fmean(own) if own else None, fmean(added) if added else None
+    return _mean_or_none(own_variances), _mean_or_none(test_variances)
+
+
+def _squared_error(psnr: float) -> float:
+    """The mean squared error at a PSNR in dB."""
+    return float(10.0 ** (-psnr / 10.0))
+
+
+def _mean_or_none(values: Sequence[float]) -> float | None:
+    if not values:
+        return None
+
+    return fmean(values)
