@@ -24,7 +24,7 @@ FREE = frozenset({"name", "out", "device", "devices", "seeds", "self_ensemble", 
 FREE_ANYWHERE = SAME_WEIGHTS | {"memory_mb"}
 """Keys in parts of the recipe that may change when a run is resumed."""
 
-SHOWN = 3
+_SHOWN = 3
 """Maximum number of changed keys that an error names."""
 
 
@@ -64,10 +64,10 @@ def require_free(settings: Any, overwrite: bool = False) -> Path:
         changes.append(f"{key} {before.get(key)}, now {now.get(key)}")
 
     if changes:
-        hidden = len(changes) - SHOWN
-        more = f", and {hidden} more" if hidden > 0 else ""
-        differences = ", ".join(changes[:SHOWN])
-        raise ValueError(f"{folder}: holds a run with other settings ({differences}{more}); {advice}")
+        texts = changes[:_SHOWN]
+        if len(changes) > _SHOWN:
+            texts.append(f"and {len(changes) - _SHOWN} more")
+        raise ValueError(f"{folder}: holds a run with other settings ({', '.join(texts)}); {advice}")
 
     return folder
 
@@ -77,7 +77,7 @@ def _holds_results(folder: Path) -> bool:
     if not folder.is_dir():
         return False
 
-    return not all(file.name.endswith((LOCK, ".partial")) for file in folder.iterdir())
+    return any(not file.name.endswith((LOCK, ".partial")) for file in folder.iterdir())
 
 
 def claim(settings: Any, overwrite: bool = False) -> Path:

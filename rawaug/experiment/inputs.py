@@ -60,21 +60,22 @@ class Inputs:
 
         validate = "no frames: monitored on RAW made from the pictures; the final weights are kept"
         if self.validation:
-            source = f"{data.pairs}, held out" if self.held_out else data.validation
+            source = data.validation
+            if self.held_out:
+                source = f"{data.pairs}, held out"
             validate = listing(self.validation, of_validation, source, MOST_HELD_OUT)
 
         isp = f"{recipe.camera}, unchanged"
         if recipe.camera is None:
             isp = f"fitted to {len(self.pairs)} frame{'s' * (len(self.pairs) != 1)}"
 
-        texts = {
-            "train": train,
-            "validate": validate,
-            "test": listing(self.test, of_test, data.test),
-            "pictures": f"{len(self.pictures)} of {data.pictures}",
-            "ISP": isp,
-        }
-        return [f"{part:<10}{text}" for part, text in texts.items()]
+        return [
+            f"train     {train}",
+            f"validate  {validate}",
+            f"test      {listing(self.test, of_test, data.test)}",
+            f"pictures  {len(self.pictures)} of {data.pictures}",
+            f"ISP       {isp}",
+        ]
 
     def read(self) -> tuple[Inputs, list[str]]:
         """The data without the frames that cannot be read, and lines that name these.
@@ -102,8 +103,11 @@ def listing(frames: Sequence[Pair], available: int, source: Any, most: int = _NA
         most: the number of frames that are named.
     """
     names = names_of(frames)
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return f"{len(names)} of {available} of {source}: {', '.join(names[:most])}{more}"
+    text = ", ".join(names[:most])
+    if len(names) > most:
+        text += f" and {len(names) - most} more"
+
+    return f"{len(names)} of {available} of {source}: {text}"
 
 
 # -- opening -----------------------------------------------------------------------------------------------------------
@@ -122,26 +126,27 @@ def open_inputs(recipe: Recipe, frames: Mapping[str, Sequence[Pair]], task: Task
 
     test = task.open(frames.get("test", data.test), "test", True)
     pairs = task.open(frames.get("pairs", data.pairs), "train", clean)
-
     _require_unseen(test, pairs, "pairs")
 
     validation_source = frames.get("validation", data.validation)
     held_out = isinstance(validation_source, str) and validation_source == HELD_OUT
-    count = len(pairs)
     if held_out:
-        count -= _number_held_out(len(pairs))
+        count = len(pairs) - _number_held_out(len(pairs))
         validation: Sequence[Any] = SomePairs(pairs, range(count, len(pairs)))
+        available = len(pairs)
     else:
+        count = len(pairs)
         validation = task.open(validation_source, "validation", clean)
+        available = len(validation)
         _require_unseen(test, validation, "validation")
 
-    chosen = SomePairs(pairs, select_pairs(pairs, count, data.count, data.select))
+    training_pairs = SomePairs(pairs, select_pairs(pairs, count, data.count, data.select))
     return Inputs(
-        pairs=chosen,
+        pairs=training_pairs,
         validation=task.prepare(validation, "validation"),
         test=task.prepare(test, "test"),
-        pictures=_open_pictures(data, chosen, recipe.train.crop),
-        available=(len(pairs), len(pairs) if held_out else len(validation), len(test)),
+        pictures=_open_pictures(data, training_pairs, recipe.train.crop),
+        available=(len(pairs), available, len(test)),
         held_out=held_out,
     )
 
@@ -167,7 +172,10 @@ def _open_pictures(data: DataConfig, pairs: Sequence[Pair], crop: int) -> Any:
     if data.pictures != OWN_PICTURES:
         pictures = open_pictures(data.pictures, crop + MARGIN, data.max_pixels)
 
-    return Cached(pictures, data.memory_mb) if data.memory_mb else pictures
+    if data.memory_mb:
+        pictures = Cached(pictures, data.memory_mb)
+
+    return pictures
 
 
 # -- data in place of the recipe's -------------------------------------------------------------------------------------
@@ -199,7 +207,10 @@ def use_all_pairs(recipe: Recipe, content: Mapping[str, Any], keys: Collection[s
 def _dataset(spec: str | None) -> str | None:
     """The dataset that a spec names; each folder counts as a dataset."""
     kind, colon, _ = (spec or "").partition(":")
-    return kind if colon and len(kind) > 1 and kind != "pairs" else spec
+    if colon and len(kind) > 1 and kind != "pairs":  # one letter is a drive of Windows
+        return kind
+
+    return spec
 
 
 def name_given_pairs(recipe: Recipe, frames: Mapping[str, Sequence[Pair]]) -> Recipe:
@@ -242,5 +253,9 @@ def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[P
     levels = None
     if recipe.camera is not None:
         levels = DictionaryISP.from_pretrained(find_weights(recipe.camera)).info.get("noise")
-    for pair in [*(pairs if real else []), *validation]:
+
+    noisy_frames = list(validation)
+    if real:
+        noisy_frames += pairs
+    for pair in noisy_frames:
         noise_of(pair, levels)

@@ -27,15 +27,15 @@ def read_recipe(file: str | Path) -> dict[str, Any]:
     content = read_yaml(file, "recipe") or {}
     if not isinstance(content, dict):
         raise ValueError(f"{file}: not a recipe: it must hold keys and values")
+
     return content
 
 
 def kind_of(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
     """The kind of experiment that a recipe is for; ValueError, which names the file, if there is no such kind."""
     kind = content.get("experiment", DEFAULT_KIND)
-    known = kinds()
-    if kind not in known:
-        raise ValueError(f"{file}: unknown experiment {kind!r:.80}; use one of {', '.join(known)}")
+    if kind not in kinds():
+        raise ValueError(f"{file}: unknown experiment {kind!r:.80}; use one of {', '.join(kinds())}")
 
     return str(kind)
 
@@ -56,17 +56,31 @@ def settings_of(kind: str) -> type[Any]:
 
 def shipped_recipes() -> dict[str, Path]:
     """The recipes that travel with the package, by name."""
-    shipped = Path(str(resources.files("rawaug"))) / "recipes"
-    folder = shipped if shipped.is_dir() else Path(__file__).parents[2] / "recipes"
-    return {file.relative_to(folder).with_suffix("").as_posix(): file for file in sorted(folder.rglob("*.yaml"))}
+    folder = Path(str(resources.files("rawaug"))) / "recipes"
+    if not folder.is_dir():  # a clone, in which they lie beside the package
+        folder = Path(__file__).parents[2] / "recipes"
+
+    recipes = {}
+    for file in sorted(folder.rglob("*.yaml")):
+        name = file.relative_to(folder).with_suffix("").as_posix()
+        recipes[name] = file
+
+    return recipes
 
 
 def recipe_list() -> str:
     """The names of the shipped recipes and the first lines of their files, a line each."""
-    shipped = sorted(shipped_recipes().items(), key=lambda item: ("/" in item[0], item[0]))  # those at the top first
-    known = {name: file.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ") for name, file in shipped}
-    width = max(map(len, known)) + 2
-    return "\n".join(f"  {name:<{width}}{title}" for name, title in known.items())
+    recipes = shipped_recipes()
+    names = sorted(recipes, key=lambda name: ("/" in name, name))  # those at the top first
+    width = max(map(len, names)) + 2
+
+    lines = []
+    for name in names:
+        first_line, *_ = recipes[name].read_text(encoding="utf-8").partition("\n")
+        title = first_line.lstrip("# ")
+        lines.append(f"  {name:<{width}}{title}")
+
+    return "\n".join(lines)
 
 
 def find_recipe(name: str) -> Path:
@@ -75,11 +89,15 @@ def find_recipe(name: str) -> Path:
     Raises:
         FileNotFoundError: if there is no such recipe.
     """
-    path, known = Path(name), shipped_recipes()
+    path = Path(name)
     if path.is_file():
         return path
-    wanted = path.with_suffix("").as_posix() if path.suffix == ".yaml" else path.as_posix()
-    if wanted in known:
-        return known[wanted]
-    shipped = f"{', '.join(known)}{suggest(wanted, known)}"
-    raise FileNotFoundError(f"{name}: no such recipe; give a YAML file or a shipped recipe: {shipped}")
+
+    if path.suffix == ".yaml":
+        path = path.with_suffix("")
+    recipes = shipped_recipes()
+    if path.as_posix() in recipes:
+        return recipes[path.as_posix()]
+
+    choices = f"{', '.join(recipes)}{suggest(path.as_posix(), recipes)}"
+    raise FileNotFoundError(f"{name}: no such recipe; give a YAML file or a shipped recipe: {choices}")

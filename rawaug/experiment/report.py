@@ -81,14 +81,15 @@ def write_report(report: Report) -> None:
     others |= score_methods(camera, methods)
     write_results(report, others)
 
-    verdicts = {group: verdict(results, others[group]) for group, results in report.tables.items()}
+    verdicts = {}
+    for group, results in report.tables.items():
+        verdicts[group] = verdict(results, others[group])
     commands = usage(experiment, report.tables, verdicts)
 
     title = title_of(experiment)
     page = Page(title, lead_of(verdicts))
     page.add_facts(facts_of(report, others, commands[-1]), next(iter(report.tables.values())))
-    names = {one.name for of_group in methods.values() for one in of_group} | set(recipe.arms)
-    page.add("Methods", terms={name: text for name, text in methods_of(recipe).items() if name in names})
+    page.add("Methods", terms=methods_of(recipe, methods))
     for group, results in report.tables.items():
         page.add_scores(results, others[group], group)
 
@@ -100,7 +101,7 @@ def write_report(report: Report) -> None:
     picture = task.save_picture(panels, folder / "picture.png")
 
     for group, results in report.tables.items():
-        print_table(results, f"{title}: {group}" if group else title, others[group])
+        print_table(results, ": ".join(filter(None, [title, group])), others[group])
     say(page.lead, own_noise_note(all_first_runs(report, others)), report.noise_note)
     print(f"table: {file}\npicture: {picture}\npage: {folder / 'report.html'}")
     say(*reports(experiment.inputs.pictures), *experiment.unreadable, *commands)
@@ -109,9 +110,9 @@ def write_report(report: Report) -> None:
 
 def say(*lines: str) -> None:
     """Print what is not empty, in the process that writes."""
-    texts = [line for line in lines if line]
-    if texts and is_leader():
-        print("\n".join(texts))
+    text = "\n".join(filter(None, lines))
+    if text and is_leader():
+        print(text)
 
 
 # -- scores ------------------------------------------------------------------------------------------------------------
@@ -151,9 +152,14 @@ def all_first_runs(report: Report, others: Mapping[str, Mapping[str, Any]]) -> d
     runs = {}
     for group, results in report.tables.items():
         for name, scores in first_runs(results, others[group]).items():
-            runs[f"{name}, {group}" if group else name] = scores
+            runs[_with_group(name, group)] = scores
 
     return runs
+
+
+def _with_group(name: str, group: str) -> str:
+    """The name of a row, with that of its table where there are several."""
+    return ", ".join(filter(None, [name, group]))
 
 
 def require_all_numbers(report: Report, others: Mapping[str, Mapping[str, Any]]) -> None:
@@ -176,14 +182,14 @@ def title_of(experiment: Experiment) -> str:
     recipe, task = experiment.recipe, experiment.task
     settings = f"real pairs: {len(experiment.inputs.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
     title = f"{recipe.name} tested on {recipe.data.test} ({settings})"
-    return f"{title}: {task.compared_in}" if task.compared_in else title
+    return ": ".join(filter(None, [title, task.compared_in]))
 
 
 def lead_of(verdicts: Mapping[str, Verdict]) -> str:
     """The verdict of every table in a sentence each."""
     sentences = []
     for group, one in verdicts.items():
-        sentences.append(f"{group}: {one.sentence}" if group else one.sentence)
+        sentences.append(": ".join(filter(None, [group, one.sentence])))
 
     return " ".join(sentences)
 
@@ -199,11 +205,19 @@ def facts_of(report: Report, others: Mapping[str, Mapping[str, Any]], command: s
     }
 
 
-def methods_of(recipe: Recipe) -> dict[str, str]:
-    """Explain each row of the table in a line, by its name."""
-    texts = {spec_label(spec): "a filter, nothing is trained" for spec in recipe.classical}
-    for name in recipe.untouched:
-        texts[Path(name).stem] = "trained weights as they are"
+def methods_of(recipe: Recipe, methods: Mapping[str, Sequence[Any]]) -> dict[str, str]:
+    """A line on each row of the tables, by its name; ``methods`` are the denoisers beside the arms, by table."""
+    names: set[str] = set()
+    for of_group in methods.values():
+        names.update(one.name for one in of_group)
+
+    texts = {}
+    for spec in recipe.classical:
+        if spec_label(spec) in names:
+            texts[spec_label(spec)] = "a filter, nothing is trained"
+    for file in recipe.untouched:
+        if Path(file).stem in names:
+            texts[Path(file).stem] = "trained weights as they are"
     for label in recipe.arms:
         texts[label] = _explain(recipe, label)
 
@@ -249,11 +263,11 @@ def shown_methods(report: Report, camera: Camera, methods: Mapping[str, Sequence
     for arm, network in report.networks.items():
         arms.append(experiment.task.denoiser(arm, network, camera.pattern(arm)))
 
-    shown = {}
+    denoisers = {}
     for group, of_group in methods.items():
-        shown[group] = [one for one in of_group if one.name not in hidden] + arms
+        denoisers[group] = [one for one in of_group if one.name not in hidden] + arms
 
-    return shown
+    return denoisers
 
 
 def usage(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from contextlib import nullcontext, redirect_stdout
+from contextlib import ExitStack, redirect_stdout
 from dataclasses import replace
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -59,15 +59,19 @@ def run(
         pattern or level, each of these has such results.
     """
     frames = {}
-    for part, given in {"pairs": pairs, "validation": validation, "test": test}.items():
-        if given is not None:
-            frames[part] = given
+    if pairs is not None:
+        frames["pairs"] = pairs
+    if validation is not None:
+        frames["validation"] = validation
+    if test is not None:
+        frames["test"] = test
 
     experiment = prepare(recipe, overwrite, frames)
     leads = is_leader()
 
-    with locked(experiment.folder / LOCK) if leads else nullcontext():
+    with ExitStack() as stack:
         if leads:
+            stack.enter_context(locked(experiment.folder / LOCK))
             claim(experiment.recipe, overwrite)
 
         report = Report(experiment)
@@ -107,7 +111,8 @@ def prepare(recipe: Recipe, overwrite: bool, frames: dict[str, Sequence[Pair]]) 
         task.require_network(network, config.start or type(network).__name__)
         starts[label] = start_of(config)
 
-    methods = task.open_methods(classical, [find_denoiser(name) for name in recipe.untouched])
+    untouched = [find_denoiser(name) for name in recipe.untouched]
+    methods = task.open_methods(classical, untouched)
 
     inputs = open_inputs(recipe, frames, task)
     say(*inputs.lines(recipe))
@@ -121,10 +126,11 @@ def prepare(recipe: Recipe, overwrite: bool, frames: dict[str, Sequence[Pair]]) 
 
 def hide_clean_frames(recipe: Recipe, inputs: Inputs) -> Inputs:
     """The inputs in memory; if no arm sees clean frames, nothing but the test knows one from here on."""
-    pairs, validation = list(inputs.pairs), inputs.validation
+    pairs = list(inputs.pairs)
+    validation = inputs.validation
     if recipe.self_supervised:
-        pairs = [drop_clean(pair) for pair in pairs]
-        validation = [drop_clean(pair) for pair in validation]
+        pairs = list(map(drop_clean, pairs))
+        validation = list(map(drop_clean, validation))
 
     pictures = inputs.pictures
     if recipe.data.pictures == OWN_PICTURES:
@@ -159,17 +165,17 @@ def find_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
         ValueError: if another filter's library is missing, or a filter or setting is unknown.
     """
     missing = FILTERS["BM3D"].missing()
-    kept = []
+    installed = []
     for spec in specs:
-        if missing and split_spec(spec)[0] == "BM3D":
-            continue
-        kept.append(spec)
+        name, _ = split_spec(spec)
+        if name != "BM3D" or not missing:
+            installed.append(spec)
 
-    if shown and len(kept) < len(specs):
+    if shown and len(installed) < len(specs):
         print(f"classical: BM3D is left out: {missing}")
 
-    require_classical(kept)
-    return kept
+    require_classical(installed)
+    return installed
 
 
 def run_kind(kind: str, settings: Any, overwrite: bool = False) -> Any:
@@ -195,6 +201,10 @@ def dry_run(kind: str, settings: Any, overwrite: bool = False) -> None:
     with TemporaryDirectory() as elsewhere, redirect_stdout(io.StringIO()) as output:
         run_kind(kind, replace(settings.shortest(), out=elsewhere))
 
-    notes = [line for line in output.getvalue().splitlines() if line.startswith("note: ")]
-    verdict = "it runs, but see the note above" if notes else "no problems found"
-    print("\n".join([*notes, f"Dry run: {verdict}, nothing written to {folder}"]))
+    result = "no problems found"
+    for line in output.getvalue().splitlines():
+        if line.startswith("note: "):
+            print(line)
+            result = "it runs, but see the note above"
+
+    print(f"Dry run: {result}, nothing written to {folder}")

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import denoisers
 from denoisers.network import Denoiser
@@ -179,7 +179,11 @@ def fit_isp(experiment: Experiment, seed: int) -> DictionaryISP:
                 print(f"already fitted: {path}")
             return isp
 
-    isp = fit(pairs, noise="on" if measures_noise else "off", **settings)
+    noise: Literal["on", "off"] = "off"
+    if measures_noise:
+        noise = "on"
+
+    isp = fit(pairs, noise=noise, **settings)
     isp.info["key"] = key
     isp.save(path)
     return isp
@@ -252,7 +256,9 @@ def arm_key(experiment: Experiment, camera: Camera, arm: str, seed: int) -> str:
 
     real = camera.isp.info["key"], recipe.noise, data.pairs, stamps(inputs.pairs)
     pictures = data.pictures, len(inputs.pictures), data.max_pixels
-    start_hash = None if start is None else start.sha256
+    start_hash = None
+    if start is not None:
+        start_hash = start.sha256
     how = recipe.target, asdict(recipe.arms[arm]), experiment.estimators[arm].revision, start_hash
 
     validation = None
@@ -261,7 +267,10 @@ def arm_key(experiment: Experiment, camera: Camera, arm: str, seed: int) -> str:
 
     key = weights_key(recipe.network_of(arm), recipe.loop_of(arm), (seed, *real, *pictures, *how), validation)
     more = task.samples_key()
-    return fingerprint(key, *more) if more else key
+    if more:
+        key = fingerprint(key, *more)
+
+    return key
 
 
 # -- score -------------------------------------------------------------------------------------------------------------
@@ -278,20 +287,32 @@ def score_arm(experiment: Experiment, camera: Camera, arm: str, seed: int, netwo
         kinds.append(ENSEMBLE)
 
     tables = read_scores(path, key)
-    missing = [kind for kind in kinds if not tables or any(kind not in table for table in tables.values())]
+    missing = [kind for kind in kinds if not _all_have(tables, kind)]
     if not missing:
         print(f"already evaluated: {path}")
 
     for kind in missing:
-        views = recipe.views if kind == ENSEMBLE else 1
+        views = 1
+        if kind == ENSEMBLE:
+            views = recipe.views
+
         denoiser = task.denoiser(arm, network, camera.pattern(arm), views)
         for group, result in score_tables(camera, denoiser, f"evaluate {arm}, {kind}").items():
             tables.setdefault(group, {})[kind] = result
-            name = f"{arm}, seed {seed}, {kind}" + (f", {group}" if group else "")
+            name = ", ".join(filter(None, [arm, f"seed {seed}", kind, group]))
             print(f"evaluated {name}: {result.get('psnr', math.nan):.2f} dB: {path}")
         write_json({"key": key, **without_tables(tables)}, path)
 
-    return {group: {kind: table[kind] for kind in kinds} for group, table in tables.items()}
+    requested = {}
+    for group, table in tables.items():
+        requested[group] = {kind: table[kind] for kind in kinds}
+
+    return requested
+
+
+def _all_have(tables: Mapping[str, Summaries], kind: str) -> bool:
+    """Whether there are tables and each has summaries of this kind."""
+    return bool(tables) and all(kind in table for table in tables.values())
 
 
 def read_scores(path: Path, key: str) -> dict[str, Summaries]:
@@ -303,7 +324,10 @@ def read_scores(path: Path, key: str) -> dict[str, Summaries]:
     if content.pop("key", None) != key:
         return {}
 
-    tables: dict[str, Summaries] = {"": content} if PLAIN in content else content
+    tables: dict[str, Summaries] = content
+    if PLAIN in content:
+        tables = {"": content}
+
     return tables
 
 
@@ -312,7 +336,12 @@ def score_tables(camera: Camera, denoiser: Any, label: str) -> dict[str, dict[st
     task = camera.experiment.task
     trials = (trial for trial in camera.trials if task.can_denoise(denoiser, trial))
     rows = group_by_table(task, score([denoiser], trials, label))
-    return {group: summary(of_group, camera.noisy_rows(group)) for group, of_group in rows.items()}
+
+    summaries = {}
+    for group, of_group in rows.items():
+        summaries[group] = summary(of_group, camera.noisy_rows(group))
+
+    return summaries
 
 
 def group_by_table(task: Task, rows: Any) -> dict[str, list[Row]]:
@@ -354,4 +383,7 @@ def score_methods(camera: Camera, methods: Mapping[str, Sequence[Any]]) -> dict[
 
 def without_tables(by_table: Mapping[str, Any]) -> Any:
     """What a file has of several tables: all of them by name, or the only one, which has none."""
-    return by_table[""] if set(by_table) == {""} else dict(by_table)
+    if set(by_table) == {""}:
+        return by_table[""]
+
+    return dict(by_table)
