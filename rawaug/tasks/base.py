@@ -33,6 +33,9 @@ from rawaug.training.stream import TrainingStream
 TASKS = Registry("task", "rawaug.tasks", "rawaug.tasks")
 """Subclasses of :class:`Task`, by the name in a recipe's key ``experiment``."""
 
+_MOST_ROWS = 3
+"""Maximum number of test frames in ``picture.png``."""
+
 
 def task_of(data: str) -> type[Task]:
     """The task whose images a test set, ``kind:path``, holds: RAW, unless another task reads it."""
@@ -122,14 +125,14 @@ class Task(ABC):
     # -- one denoiser on a test set, and several
 
     @staticmethod
-    def evaluate(asked: Evaluation) -> dict[str, Any]:
+    def evaluate(evaluation: Evaluation) -> dict[str, Any]:
         """Score a denoiser on a test set, see :mod:`rawaug.evaluation.evaluate`."""
-        return evaluate_raw(asked)
+        return evaluate_raw(evaluation)
 
     @staticmethod
-    def benchmark(asked: Comparison) -> None:
+    def benchmark(comparison: Comparison) -> None:
         """Compare denoisers on a test set, see :mod:`rawaug.evaluation.comparison`."""
-        compare_raw(asked)
+        compare_raw(comparison)
 
     # -- networks
 
@@ -138,12 +141,17 @@ class Task(ABC):
         if network.upscale == self.upscale:
             return
 
-        gives = "full colour: rawaug run demosaic trains it" if network.upscale > 1 else "no full colour"
+        gives = "no full colour"
+        if network.upscale > 1:
+            gives = "full colour: rawaug run demosaic trains it"
         raise ValueError(f"denoiser: {name} gives {gives}; take another network")
 
     def pattern(self, start: Start | None, isp: DictionaryISP) -> CFA:
         """The CFA that an arm is trained for: that of the weights that it starts from, else the ISP's."""
-        return isp.cfa if start is None else start.cfa
+        if start is not None:
+            return start.cfa
+
+        return isp.cfa
 
     # -- samples
 
@@ -228,14 +236,14 @@ class Task(ABC):
         """The frames of the page: test frames, denoised by the methods of their table."""
         panels = []
         for trial in select_for_page(trials):
-            fit = [one for one in methods[self.group(trial)] if self.can_denoise(one, trial)]
-            panels.append(panels_of(fit, trial, self.input))
+            denoisers = [one for one in methods[self.group(trial)] if self.can_denoise(one, trial)]
+            panels.append(panels_of(denoisers, trial, self.input))
 
         return panels
 
     def save_picture(self, panels: Sequence[Panels], path: Path) -> Path:
         """Write ``picture.png``, which has some of the frames of the page."""
-        return save_picture(panels[:SHOWN], path)
+        return save_picture(panels[:_MOST_ROWS], path)
 
     def command_of_weights(self, path: Path) -> str:
         """The command that uses the weights of an arm."""
@@ -249,7 +257,9 @@ class Task(ABC):
 
         for spec in self.recipe.classical:
             if f"{name}, ".startswith(f"{spec_label(spec)}, "):
-                text = spec if isinstance(spec, str) else shlex.quote(json.dumps(spec))
+                text = spec
+                if not isinstance(spec, str):
+                    text = shlex.quote(json.dumps(spec))
                 return f"rawaug denoise IN.dng OUT.dng --classical {text}"
 
         return ""
@@ -257,7 +267,3 @@ class Task(ABC):
     def notes(self, test: Sequence[Any]) -> dict[str, Any]:
         """What ``results.json`` says besides scores."""
         return {}
-
-
-SHOWN = 3
-"""Maximum number of test frames in ``picture.png``."""

@@ -47,8 +47,8 @@ def full_colour(pair: Pair) -> Tensor:
     """The truth of a frame: linear camera RGB ``(1, 3, H/2, W/2)`` cut to even sides, each pixel from one cell."""
     red, green, other_green, blue = bayer.pack(pair.raw[None], pair.cfa).unbind(1)
     rgb = torch.stack([red, (green + other_green) / 2, blue], dim=1)
-    height, width = (side // 2 * 2 for side in rgb.shape[-2:])
-    return rgb[..., :height, :width].contiguous()
+    height, width = rgb.shape[-2:]
+    return rgb[..., : height // 2 * 2, : width // 2 * 2].contiguous()
 
 
 def rgb_trial(
@@ -96,13 +96,19 @@ def in_pattern(squares: Tensor, cfa: str) -> Tensor:
 
 def develop(image: Tensor, pair: Pair, exposure: float) -> Tensor:
     """Linear RGB ``(1, 3, H, W)``, or packed RAW at its own size, to sRGB ``(3, H, W)`` in the frame's colours."""
-    rgb = image[0, [0, 1, 3]] if image.shape[1] == PACKED else image[0]
+    rgb = image[0]
+    if image.shape[1] == PACKED:
+        rgb = image[0, [0, 1, 3]]
+
     return render_rgb(rgb, pair.white_balance, pair.color_matrix, exposure, least=None)
 
 
 def mosaic_of(image: Tensor, cfa: str) -> Tensor:
     """RAW as a denoiser takes it, packed or not, as the mosaic ``(1, 1, H, W)``."""
-    return image if image.shape[1] == 1 else bayer.unpack(image, cfa)
+    if image.shape[1] == 1:
+        return image
+
+    return bayer.unpack(image, cfa)
 
 
 def demosaic(image: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB) -> Tensor:
@@ -172,7 +178,11 @@ def libraw_demosaic(mosaic: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB
 
 def _repeat_cells(side: int, period: int) -> Tensor:
     """Numbers of the lines of a side, which go on with its whole cells if LibRaw would find it too small."""
-    lines = torch.arange(side if period == 2 else max(side, LEAST))
+    count = side
+    if period != 2:
+        count = max(side, LEAST)
+
+    lines = torch.arange(count)
     return torch.where(lines < side, lines, lines % (side // period * period))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any, ClassVar
 
 from denoisers.mosaic import lines_before, with_planes
@@ -49,7 +50,10 @@ class MosaicRecipe(FullColourRecipe):
 
 def mosaic_trial(pair: Pair, cfa: str, noise: NoiseModel) -> Trial:
     """A frame as a test case of a pattern, in the domain ``rgb``: packed RAW if it is Bayer's, else a mosaic."""
-    method = "bilinear" if cfa.startswith("QUAD") else "AHD"
+    method = "AHD"
+    if cfa.startswith("QUAD"):
+        method = "bilinear"
+
     return rgb_trial(pair, noise, {"": method}, cfa, condition=cfa)
 
 
@@ -62,12 +66,14 @@ def planes_trial(pair: Pair, cfa: str, noise: NoiseModel) -> Trial:
     assert trial.variance is not None
 
     pattern = bayer.pattern(cfa)
-    top, left = (-lines % pattern.period for lines in lines_before(pattern))
-    raw = mosaic_of(trial.noisy, cfa)[..., top:, left:]
-    variance = mosaic_of(trial.variance, cfa)[..., top:, left:]
-    clean = pattern.mosaic(trial.clean)[..., top:, left:]
+    rows_before, columns_before = lines_before(pattern)
+    y = -rows_before % pattern.period
+    x = -columns_before % pattern.period
 
-    noisy = with_planes(raw, pattern.shift(top, left))
+    raw = mosaic_of(trial.noisy, cfa)[..., y:, x:]
+    variance = mosaic_of(trial.variance, cfa)[..., y:, x:]
+    clean = pattern.mosaic(trial.clean)[..., y:, x:]
+    noisy = with_planes(raw, pattern.shift(y, x))
     return Trial(noisy, clean, variance, pair.name, condition=cfa)
 
 
@@ -100,8 +106,13 @@ class MosaicTask(FullColourTask):
 
     def test_trials(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
         """The frames in every pattern."""
-        cases = [(cfa, k) for cfa in self.recipe.test_patterns for k in range(len(frames))]
-        return make_trials(cases, lambda case: mosaic_trial(frames[case[1]], case[0], self.noise))
+
+        def make(case: tuple[str, int]) -> Trial:
+            cfa, index = case
+            return mosaic_trial(frames[index], cfa, self.noise)
+
+        cases = list(product(self.recipe.test_patterns, range(len(frames))))
+        return make_trials(cases, make)
 
     def samples_key(self) -> Sequence[Any]:
         """The patterns."""

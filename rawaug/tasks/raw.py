@@ -88,6 +88,11 @@ class RawTask(Task):
 
     def open_methods(self, classical: Sequence[Spec], untouched: Sequence[Path]) -> list[RawDenoiser]:
         """Filters and trained denoisers of mosaics."""
-        filters = [RawDenoiser.of(spec) for spec in classical]
-        trained = [RawDenoiser.of(file, self.recipe.device, name=file.stem) for file in untouched]
-        return [one.require_mosaic() for one in (*filters, *trained)]
+        denoisers = []
+        for spec in classical:
+            denoisers.append(RawDenoiser.of(spec).require_mosaic())
+        for file in untouched:
+            denoiser = RawDenoiser.of(file, self.recipe.device, name=file.stem)
+            denoisers.append(denoiser.require_mosaic())
+
+        return denoisers

@@ -40,10 +40,10 @@ class RgbRecipe(FullColourRecipe):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        known = *bayer.STENCILS, *LIBRAW
+        choices = *bayer.STENCILS, *LIBRAW
         for name in self.demosaicing:
-            if name not in known:
-                raise ValueError(f"demosaicing {name!r} is unknown; use one of {', '.join(known)}")
+            if name not in choices:
+                raise ValueError(f"demosaicing {name!r} is unknown; use one of {', '.join(choices)}")
 
 
 class MalvarInput:
@@ -51,8 +51,8 @@ class MalvarInput:
 
     name, takes = NOISY.name, "raw"
 
-    def __call__(self, given: Noisy) -> Tensor:
-        return bayer.demosaic(bayer.unpack(given.image, given.cfa), given.cfa, "malvar")
+    def __call__(self, noisy: Noisy, /) -> Tensor:
+        return bayer.demosaic(bayer.unpack(noisy.image, noisy.cfa), noisy.cfa, "malvar")
 
 
 @TASKS.register("rgb")

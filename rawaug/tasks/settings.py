@@ -23,12 +23,16 @@ from rawaug.training.srgb_samples import Told
 
 SHORT_CROP = 256
 """Side in pixels of the middles of frames that a dry run uses."""
+
 HELD_OUT = "auto"
 """The value of ``data.validation`` for a part of ``data.pairs``."""
+
 USUAL = "usual"
 """The value of ``data.validation`` that :class:`DataConfig` replaces by the one that suits ``data.pairs``."""
+
 DEMO = "demo:"
 """The beginning of the names of the built-in, simulated frames."""
+
 _PAIRS = "pairs:"
 _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("count", "validation_count", "test_count"), (1, MOST)),
@@ -95,8 +99,9 @@ class DataConfig(PairSettings):
                 require_between(f"data.{key}", getattr(self, key), least, most)
 
         if self.validation == USUAL:
-            own_frames = self.pairs is not None and not self.pairs.startswith(DEMO)
-            self.validation = HELD_OUT if own_frames else "demo:validation"
+            self.validation = "demo:validation"
+            if self.pairs is not None and not self.pairs.startswith(DEMO):
+                self.validation = HELD_OUT
 
         if self.validation == HELD_OUT and self.pairs is None:
             raise ValueError("data.validation: auto holds out a part of data.pairs, which is null; set one of them")
@@ -104,17 +109,26 @@ class DataConfig(PairSettings):
             raise ValueError("data.pictures must name a folder, demo:, or a list of these, got an empty list")
         if self.pictures == OWN_PICTURES and self.pairs is None:
             raise ValueError("data.pictures: pairs takes those of data.pairs, which is null; set one of them")
-        given = [key for key, value in self._pair_settings().items() if value is not None]
-        specs = (self.pairs, self.validation, self.test)
-        if given and not any(isinstance(spec, str) and spec.startswith(_PAIRS) for spec in specs):
-            raise ValueError(f"data.{given[0]}: applies to {_PAIRS}PATH, which neither pairs, validation nor test is")
+        if _is_pair_folder(self.pairs) or _is_pair_folder(self.validation) or _is_pair_folder(self.test):
+            return
+        for key, value in self._pair_settings().items():
+            if value is not None:
+                raise ValueError(f"data.{key}: applies to {_PAIRS}PATH, which neither pairs, validation nor test is")
 
     def settings_of(self, spec: str | Sequence[Pair]) -> dict[str, Any]:
         """The settings of ``pairs:PATH`` that are for this spec; none if it is another kind of data."""
-        return self._pair_settings() if isinstance(spec, str) and spec.startswith(_PAIRS) else {}
+        if not _is_pair_folder(spec):
+            return {}
+
+        return self._pair_settings()
 
     def _pair_settings(self) -> dict[str, Any]:
         return {setting.name: getattr(self, setting.name) for setting in fields(PairSettings)}
+
+
+def _is_pair_folder(spec: str | Sequence[Pair] | None) -> bool:
+    """Whether frames are named as ``pairs:PATH``."""
+    return isinstance(spec, str) and spec.startswith(_PAIRS)
 
 
 @dataclass

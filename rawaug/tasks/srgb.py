@@ -93,8 +93,10 @@ class SrgbRecipe(Recipe):
             reads_level = arm.told is not None
             settings = network.settings.get("channels"), network.settings.get("variance_map", True)
             if network.start is None and settings != (3, reads_level):
-                wanted = f"channels: 3, variance_map: {str(reads_level).lower()}"
-                raise ValueError(f"denoiser.settings: set {wanted} for the network of arms.{label}, as told requires")
+                raise ValueError(
+                    f"denoiser.settings: set channels: 3, variance_map: {str(reads_level).lower()} for the network of "
+                    f"arms.{label}, as told requires"
+                )
 
         for spec in self.classical:
             name, _ = split_spec(spec)
@@ -116,14 +118,14 @@ class SrgbTask(Task):
         return is_picture_pairs(data)
 
     @staticmethod
-    def evaluate(asked: Evaluation) -> dict[str, Any]:
+    def evaluate(evaluation: Evaluation) -> dict[str, Any]:
         """Score a denoiser on real pairs."""
-        return evaluate_pictures(asked)
+        return evaluate_pictures(evaluation)
 
     @staticmethod
-    def benchmark(asked: Comparison) -> None:
+    def benchmark(comparison: Comparison) -> None:
         """Compare denoisers on real pairs."""
-        compare_pictures(asked)
+        compare_pictures(comparison)
 
     def open(self, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Any]:
         """Open frames, or real pairs of developed pictures."""
@@ -140,8 +142,11 @@ class SrgbTask(Task):
         data = self.recipe.data
         count = getattr(data, f"{part}_count")
         crop = getattr(data, f"{part}_crop")
-        chosen = SomePairs(frames, range(len(frames))[:count])
-        return Kept(chosen if crop is None else Middles(chosen, crop))
+        pairs: Sequence[Any] = SomePairs(frames, range(len(frames))[:count])
+        if crop is not None:
+            pairs = Middles(pairs, crop)
+
+        return Kept(pairs)
 
     def stream(
         self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
@@ -154,11 +159,11 @@ class SrgbTask(Task):
             augment = RawAugment(isp, noise, draw=settings.draw, target=settings.srgb or "srgb")
             camera = PictureCrops(RawPairs(pictures, augment, train.crop, zoom=settings.zoom))
 
-        drawn = None
+        on_pictures = None
         if settings.srgb_noise is not None:
-            drawn = NoisyPictures(pictures, noise_on_srgb(settings.srgb_noise), train.crop, settings.zoom)
+            on_pictures = NoisyPictures(pictures, noise_on_srgb(settings.srgb_noise), train.crop, settings.zoom)
 
-        samples = SrgbSamples(camera, drawn, settings.srgb_share, settings.told)
+        samples = SrgbSamples(camera, on_pictures, settings.srgb_share, settings.told)
         return TrainingStream(None, samples, train.batch, 1.0, derive_seed(seed, "stream"))
 
     def validation_trials(
@@ -198,9 +203,13 @@ class SrgbTask(Task):
     def methods_for(self, group: str, methods: Sequence[Any], validation: Sequence[Any]) -> list[Any]:
         """Filters, each at the strength that is best on validation frames of this level, and the rivals."""
         same_level = [trial for trial in validation if trial.strength == group]
-        filters = [best_filter(spec, same_level or validation) for spec in self.recipe.classical]
-        rivals = [] if group == REAL else list(methods)
-        return [*filters, *rivals]
+        denoisers: list[Any] = []
+        for spec in self.recipe.classical:
+            denoisers.append(best_filter(spec, same_level or validation))
+        if group != REAL:
+            denoisers += methods
+
+        return denoisers
 
     def panels(self, methods: Any, trials: Sequence[Trial]) -> list[Panels]:
         """The first frame of each level."""
