@@ -26,7 +26,6 @@ from denoisers.classical import FILTERS
 from denoisers.network import DENOISERS
 from rawaug.data import demo_pairs, demo_pictures
 from rawaug.data.pairs import DATASETS, PICTURES, Pair
-from rawaug.data.picture_pairs import PICTURE_PAIRS
 from rawaug.experiment.recipe import EXPERIMENTS
 from rawaug.isp.stages import STAGES
 from rawaug.noise.models import NOISE
@@ -107,7 +106,6 @@ def registries(monkeypatch: pytest.MonkeyPatch) -> list[Registry]:
         LOSSES,
         NOISE,
         PICTURES,
-        PICTURE_PAIRS,
         STAGES,
         TASKS,
     ]

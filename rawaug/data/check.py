@@ -7,8 +7,8 @@ anything else is a folder of RAW files, of pictures, or both.
 
 from __future__ import annotations
 
+import fnmatch
 import pickle
-import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -24,6 +24,7 @@ from rawaug.data.formats import READABLE
 from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import DATASETS, PICTURES, Lazy, Pair
+from rawaug.data.picture_pairs import PicturePair, is_picture_pairs, open_picture_pairs
 from rawaug.data.published import RAWIR_FOLDERS, Rawir, Zurich
 from rawaug.data.sidd import SiddFrames
 from rawaug.data.sidd_benchmark import SiddBenchmark
@@ -156,7 +157,9 @@ def _left_out(folder: Path) -> list[str]:
 def _of_kind(kind: str, spec: str) -> list[tuple[str, Callable[[], Any]]]:
     """How to open ``kind:path``, which may be pairs, pictures, or both."""
     openers: list[tuple[str, Callable[[], Any]]] = []
-    if kind in DATASETS:
+    if is_picture_pairs(spec):
+        openers.append((f"pairs of pictures of {spec}", partial(open_picture_pairs, spec)))
+    elif kind in DATASETS:
         openers.append((f"pairs of {spec}", partial(open_pairs, spec)))
     if kind in PICTURES:
         openers.append((f"pictures of {spec}", partial(open_pictures, spec)))
@@ -168,18 +171,20 @@ def _of_kind(kind: str, spec: str) -> list[tuple[str, Callable[[], Any]]]:
 def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     """The published datasets recognised by file names, and how to open each."""
     files = list(files_below(path))
-    names = {file.name for file in files}
+    names = [file.name for file in files]
+
     if any("GT_RAW" in file.name.upper() and is_scene(file.parent.name) for file in files):
         yield "SIDD, full frames", partial(SiddFrames, path)
-    if any(re.fullmatch(r"Validation\w+BlocksRaw\.mat", name) for name in names):
+    if fnmatch.filter(names, "Validation?*BlocksRaw.mat"):
         yield "SIDD, validation blocks", partial(SiddBlocks, path)
     if "BenchmarkNoisyBlocksRaw.mat" in names:
         yield "SIDD, benchmark blocks (noisy only)", partial(SiddBenchmark, path)
-    if any(re.fullmatch(r"siddplus_valid_\w+_raw\.mat", name) for name in names):
+    if fnmatch.filter(names, "siddplus_valid_?*_raw.mat"):
         yield "SIDD+, validation blocks", partial(SiddPlusBlocks, path)
     if (path / "info.mat").is_file():
         yield "DND, boxes (noisy only)", partial(Dnd, path)
-    has_npy = any(name.endswith(".npy") for name in names)
+
+    has_npy = bool(fnmatch.filter(names, "*.npy"))
     if (path / "train" / "huawei_raw").is_dir() or (path / "test" / "huawei_raw").is_dir():
         for split in ("train", "test"):
             yield f"Zurich RAW to RGB, {split}", partial(Zurich, path, split)
@@ -266,6 +271,8 @@ def _facts(opening: bytes, index: int) -> dict[str, str]:
     """Size, pattern, levels, camera and ISO of an item, which is a picture, pair, RAW frame or noisy block."""
     items = _opened(opening)
     item = getattr(items, "read", items.__getitem__)(index)
+    if isinstance(item, PicturePair):
+        return {"sizes": _size(item.noisy)}
     if not isinstance(item, (Pair, RawFrame)):
         return {"sizes": _size(item)}
 

@@ -246,9 +246,11 @@ def _boxes(picture: Any, centre: np.ndarray, radius: float, rng: Rng, angle: flo
     cosine, sine = math.cos(angle), math.sin(angle)
 
     def lay(left: float, right: float, colour: Colour) -> None:
-        corners = [(left, -half_height), (right, -half_height), (right, half_height), (left, half_height)]
-        turned = [(cosine * x - sine * y, sine * x + cosine * y) for x, y in corners]
-        _brush(picture).polygon([(centre[0] + x, centre[1] + y) for x, y in turned], fill=colour)
+        points = []
+        for x, y in ((left, -half_height), (right, -half_height), (right, half_height), (left, half_height)):
+            turned_x, turned_y = cosine * x - sine * y, sine * x + cosine * y
+            points.append((centre[0] + turned_x, centre[1] + turned_y))
+        _brush(picture).polygon(points, fill=colour)
 
     lay(-half_width, half_width, _colour(rng))
     if stripes:

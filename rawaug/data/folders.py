@@ -340,7 +340,9 @@ class RawFolder(LazyPairs):
 
     def read(self, index: int) -> Pair:
         file = self.files[index]
-        jpeg = _jpeg_beside(file) if self.camera_jpeg else None
+        jpeg = None
+        if self.camera_jpeg:
+            jpeg = _jpeg_beside(file)
         if jpeg is not None:
             pair = self._pair_with_jpeg(self.names[index], file, jpeg)
             if pair is not None:

@@ -12,6 +12,7 @@ from torch.utils.data import ConcatDataset
 from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.pair_folder import require_no_pairs
 from rawaug.data.pairs import DATASETS, PICTURES, Binned, LazyPairs, Pair
+from rawaug.data.picture_pairs import is_picture_pairs
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.registry import Registry, check_settings, suggest
 
@@ -62,6 +63,9 @@ def open_pairs(
         folder = RawFolder(path, max_pixels=max_pixels or MAX_PIXELS)
         require_no_pairs(folder, str(spec), as_clean)
         return folder
+
+    if is_picture_pairs(str(spec)):
+        raise ValueError(f"{spec} is pairs of developed pictures, for rawaug run srgb; give RAW frames")
 
     reader = _reader(DATASETS, str(spec), kind, path, "a RAW file or folder")
     path, split_of_spec = _path_and_split(path)

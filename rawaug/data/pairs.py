@@ -27,7 +27,10 @@ from rawaug.registry import Registry
 T = TypeVar("T")
 
 DATASETS = Registry("kind of data", "rawaug.datasets", "rawaug.data")
-"""The readers of pairs by name: ``reader(path, split) -> Sequence[Pair]``, for ``kind:path``."""
+"""The readers of pairs by name, for ``kind:path``: ``reader(path, split)`` returns a sequence of :class:`Pair`.
+
+A reader of pairs of developed pictures is a subclass of :class:`rawaug.data.picture_pairs.PicturePairs`.
+"""
 
 PICTURES = Registry("kind of pictures", "rawaug.pictures", "rawaug.data")
 """The readers of pictures by name: ``reader(path, min_side)`` returns a sequence of sRGB ``(3, H, W)``."""

@@ -131,7 +131,10 @@ def _phone(
     rendering: Rendering,
 ) -> Phone:
     name, cfa = PHONES[code]
-    matrix = [[value / 1e4 for value in xyz_to_camera[row : row + 3]] for row in (0, 3, 6)]
+    matrix = []
+    for row in (0, 3, 6):
+        matrix.append([value / 1e4 for value in xyz_to_camera[row : row + 3]])
+
     return Phone(code, name, cfa, black, matrix, noise, tuple(isos), shading, rendering)
 
 
@@ -272,12 +275,15 @@ class PhoneFrames(LazyPairs):
         self.files = scene_files(path, split)
         self.instances = self._draw_instances()
 
-        if split == "train":
-            numbers: tuple[str, ...] = SHOTS
-        else:
-            numbers = SHOTS[:1] if split == "test" else SHOTS[1:]
+        numbers: tuple[str, ...] = SHOTS
+        if split == "test":
+            numbers = SHOTS[:1]
+        elif split == "validation":
+            numbers = SHOTS[1:]
+
         self.shots = []
-        labels, names = [], []
+        labels = []
+        names = []
         for instance in self.instances:
             for number in numbers:
                 self.shots.append((instance, number))

@@ -11,7 +11,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,14 +20,11 @@ from torch import Tensor
 
 from rawaug.data.mat import read_array
 from rawaug.data.pair_folder import clean_pattern, pairs_by_pattern
-from rawaug.data.pairs import LazyPairs, centre
+from rawaug.data.pairs import DATASETS, LazyPairs, centre
 from rawaug.data.sidd_scenes import find_file
 from rawaug.files import files_below
 from rawaug.io.pictures import read_picture
-from rawaug.registry import Registry
-
-PICTURE_PAIRS = Registry("kind of picture pairs", "rawaug.picture_pairs", "rawaug.data")
-"""The readers of pairs of developed pictures by name: ``reader(folder) -> PicturePairs``, for ``kind:DIR``."""
+from rawaug.registry import suggest
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 """Extensions of the pictures of a pair."""
@@ -49,20 +46,21 @@ class PicturePair:
 
 
 class PicturePairs(LazyPairs):
-    """Pairs of developed pictures, read on access.
+    """Pairs of developed pictures, read on access: the base class of readers registered in :data:`DATASETS`.
 
     Args:
         names: a name for each pair.
-        files: the files of each pair, for reports.
-        read: a function of a pair's index that returns the noisy and the clean picture, uint8 ``(3, H, W)`` each.
+        files: the noisy and the clean file of each pair; empty for pairs that :meth:`load` takes from elsewhere.
     """
 
-    def __init__(
-        self, names: Sequence[str], files: Sequence[Sequence[Path]], read: Callable[[int], tuple[Tensor, Tensor]]
-    ) -> None:
+    def __init__(self, names: Sequence[str], files: Sequence[Sequence[Path]]) -> None:
         super().__init__(names)
         self._files = files
-        self._read = read
+
+    def load(self, index: int) -> tuple[Tensor, Tensor]:
+        """The noisy and the clean picture of a pair, uint8 ``(3, H, W)`` each."""
+        noisy, clean = self._files[index]
+        return read_picture(noisy), read_picture(clean)
 
     def __iter__(self) -> Iterator[PicturePair]:  # type: ignore[override]
         return map(self.read, range(len(self)))
@@ -72,7 +70,7 @@ class PicturePairs(LazyPairs):
 
     def read(self, index: int) -> PicturePair:  # type: ignore[override]
         name = self.names[index]
-        noisy, clean = self._read(index)
+        noisy, clean = self.load(index)
         if noisy.shape != clean.shape:
             raise ValueError(f"{name}: the noisy picture is {tuple(noisy.shape)}, the clean one {tuple(clean.shape)}")
         return PicturePair(name, noisy, clean)
@@ -81,14 +79,18 @@ class PicturePairs(LazyPairs):
 def is_picture_pairs(spec: str) -> bool:
     """Whether ``spec`` names pairs of developed pictures, as ``cc15:DIR`` does."""
     kind, colon, _ = spec.partition(":")
-    return bool(colon) and kind in PICTURE_PAIRS
+    if not colon or kind not in DATASETS:
+        return False
+
+    reader = DATASETS[kind]
+    return isinstance(reader, type) and issubclass(reader, PicturePairs)
 
 
 def open_picture_pairs(spec: str, noisy: str | None = None, clean: str | None = None) -> PicturePairs:
     """Open pairs of developed pictures.
 
     Args:
-        spec: ``kind:DIR``, of one of :data:`PICTURE_PAIRS`.
+        spec: ``kind:DIR``, whose kind is a subclass of :class:`PicturePairs` in :data:`DATASETS`.
         noisy, clean: patterns of the files of ``pictures:DIR``, such as ``"*_iso6400.jpg"`` and ``"*_iso100.jpg"``.
 
     Raises:
@@ -96,7 +98,9 @@ def open_picture_pairs(spec: str, noisy: str | None = None, clean: str | None = 
         ValueError: if the kind is unknown, or the folder has no pair.
     """
     kind, _, path = spec.partition(":")
-    reader = PICTURE_PAIRS[kind]
+    if not is_picture_pairs(spec):
+        raise ValueError(f"{spec}: no such kind of picture pairs; use pictures:DIR{suggest(kind, DATASETS)}")
+
     patterns = {}
     if noisy is not None or clean is not None:
         patterns = {"noisy": noisy, "clean": clean}
@@ -106,59 +110,69 @@ def open_picture_pairs(spec: str, noisy: str | None = None, clean: str | None = 
     folder = Path(path)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of noisy and clean pictures")
-    pairs: PicturePairs = reader(folder, **patterns)
+    pairs: PicturePairs = DATASETS[kind](path, **patterns)
     return pairs
 
 
-@PICTURE_PAIRS.register("pictures")
-def _by_pattern(folder: Path, noisy: str | None = None, clean: str | None = None) -> PicturePairs:
-    if noisy is None:
-        noisy, clean = "*_noisy.*", "*_clean.*"
-    elif clean is None:
-        clean = clean_pattern(noisy)
-    return _matched(folder, noisy, str(clean))
+@DATASETS.register("pictures")
+class NamedPictures(PicturePairs):
+    """The files of a folder, paired by their names.
+
+    Args:
+        path: the folder.
+        split: of no effect, since there is one.
+        noisy: the pattern of the names of noisy files.
+        clean: that of clean files; None for the one that belongs to ``noisy``.
+    """
+
+    def __init__(self, path: str, split: str = "test", noisy: str | None = None, clean: str | None = None) -> None:
+        if noisy is None:
+            noisy, clean = "*_noisy.*", "*_clean.*"
+        elif clean is None:
+            clean = clean_pattern(noisy)
+
+        folder = Path(path)
+        pairs = pairs_by_pattern(folder, sorted(files_below(folder, EXTENSIONS)), noisy, str(clean))
+        if not pairs:
+            raise ValueError(f"{folder}: has no pictures named {noisy} and {clean}")
+        pairs.sort(key=lambda pair: pair.noisy)
+
+        names = []
+        files = []
+        for pair in pairs:
+            names.append(pair.name)
+            files.append((pair.noisy, pair.clean))
+        super().__init__(names, files)
 
 
-@PICTURE_PAIRS.register("cc15")
-@PICTURE_PAIRS.register("polyu")
-def _of_means(folder: Path) -> PicturePairs:
-    return _matched(folder, "*_real.*", "*_mean.*")
+@DATASETS.register("cc15")
+@DATASETS.register("polyu")
+class MeanPictures(NamedPictures):
+    """Shots ``*_real.*`` and the means ``*_mean.*`` of many."""
+
+    def __init__(self, path: str, split: str = "test") -> None:
+        super().__init__(path, split, "*_real.*", "*_mean.*")
 
 
-def _matched(folder: Path, noisy: str, clean: str) -> PicturePairs:
-    """Pair the files of a folder by their names."""
-    pairs = pairs_by_pattern(folder, sorted(files_below(folder, EXTENSIONS)), noisy, clean)
-    if not pairs:
-        raise ValueError(f"{folder}: has no pictures named {noisy} and {clean}")
-    pairs.sort(key=lambda pair: pair.noisy)
+@DATASETS.register("sidd-srgb")
+class SiddPictures(PicturePairs):
+    """SIDD's validation blocks of developed pictures, in the order of the published file."""
 
-    names, files = [], []
-    for pair in pairs:
-        names.append(pair.name)
-        files.append((pair.noisy, pair.clean))
+    def __init__(self, path: str, split: str = "test") -> None:
+        self._noisy = _blocks(Path(path), "Noisy")
+        self._clean = _blocks(Path(path), "Gt")
+        names = [f"block {number:04d}" for number in range(len(self._noisy))]
+        super().__init__(names, [()] * len(names))
 
-    def read(index: int) -> tuple[Tensor, Tensor]:
-        noisy_file, clean_file = files[index]
-        return read_picture(noisy_file), read_picture(clean_file)
-
-    return PicturePairs(names, files, read)
+    def load(self, index: int) -> tuple[Tensor, Tensor]:
+        return self._noisy[index].contiguous(), self._clean[index].contiguous()
 
 
-@PICTURE_PAIRS.register("sidd-srgb")
-def _blocks(folder: Path) -> PicturePairs:
-    arrays = []
-    for kind in ("Noisy", "Gt"):
-        file = find_file(folder, f"Validation{kind}BlocksSrgb.mat")
-        array = read_array(file, file.stem)
-        if array.dtype.name != "uint8" or array.ndim != 5 or array.shape[-1] != 3:
-            raise ValueError(
-                f"{file}: holds {array.dtype} {array.shape}; the published file uint8 (40, 32, 256, 256, 3)"
-            )
-        arrays.append(torch.from_numpy(array).flatten(0, 1).movedim(-1, 1))
-    noisy, clean = arrays
+def _blocks(folder: Path, kind: str) -> Tensor:
+    """The blocks of a file of SIDD's, uint8 ``(1280, 3, 256, 256)``."""
+    file = find_file(folder, f"Validation{kind}BlocksSrgb.mat")
+    array = read_array(file, file.stem)
+    if array.dtype.name != "uint8" or array.ndim != 5 or array.shape[-1] != 3:
+        raise ValueError(f"{file}: holds {array.dtype} {array.shape}; the published file uint8 (40, 32, 256, 256, 3)")
 
-    def read(index: int) -> tuple[Tensor, Tensor]:
-        return noisy[index].contiguous(), clean[index].contiguous()
-
-    names = [f"block {number:04d}" for number in range(len(noisy))]
-    return PicturePairs(names, [()] * len(names), read)
+    return torch.from_numpy(array).flatten(0, 1).movedim(-1, 1)

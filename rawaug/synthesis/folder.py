@@ -107,17 +107,20 @@ def synth(
     run_settings = _settings(format, per_image, seed, AugmentConfig(**settings))
     PairMaker(run_settings, max_pixels)  # raises for a wrong name here, not in a worker
 
-    lock = LOCK if parts == 1 else f"rawaug-{part}-of-{parts}.lock"
-    stored = run_settings.to_json()
+    lock = LOCK
+    if parts != 1:
+        lock = f"rawaug-{part}-of-{parts}.lock"
+
+    content = run_settings.to_json()
     tasks: list[Task] = []
     with locked(out / lock):
         if format == "webdataset":
             tasks += shards.shard_tasks(pictures, source, out, per_image, per_shard)
-            stored["isp"] = Path(run_settings.config.isp).name  # its path differs between machines
-            stored |= shards.shard_settings(pictures, source, per_image, per_shard, max_pixels)
+            content["isp"] = Path(run_settings.config.isp).name  # its path differs between machines
+            content |= shards.shard_settings(pictures, source, per_image, per_shard, max_pixels)
         else:
             tasks += picture_tasks(pictures, source, out, per_image)
-        require_same_settings(out / "synth.json", stored)
+        require_same_settings(out / "synth.json", content)
 
         result = _run(out, tasks[part - 1 :: parts], run_settings, max_pixels, workers)
         if format == "webdataset":

@@ -16,7 +16,6 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.folders import Kept
 from rawaug.data.pairs import Binned, Middles, Pair, SomePairs
-from rawaug.data.picture_pairs import is_picture_pairs
 from rawaug.evaluation.comparison import Comparison, compare_raw
 from rawaug.evaluation.evaluate import Evaluation, evaluate_raw
 from rawaug.evaluation.figures import Panels, panels_of, save_picture
@@ -96,9 +95,6 @@ class Task(ABC):
         """
         if spec is None:
             return []
-
-        if isinstance(spec, str) and is_picture_pairs(spec):
-            raise ValueError(f"data: {spec} is pairs of developed pictures, for rawaug run srgb; give RAW frames")
 
         data = self.recipe.data
         return open_pairs(spec, split, clean, data.max_pixels, **data.settings_of(spec))
