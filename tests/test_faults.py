@@ -72,12 +72,12 @@ def in_child(work: Callable[[], object]) -> int:
 
 def test_a_second_run_is_refused_with_the_name_of_the_folder(tmp_path: Path) -> None:
     def second() -> None:
-        with pytest.raises(ValueError, match=rf"{tmp_path}: in use by another run \(rawaug\.lock\)"):
+        with pytest.raises(ValueError, match=rf"{tmp_path}: in use \(rawaug\.lock\)"):
             locked(tmp_path / LOCK).__enter__()
 
     with locked(tmp_path / LOCK):
         assert in_child(second) == 0
-        with pytest.raises(ValueError, match="in use by another run"):
+        with pytest.raises(ValueError, match="in use"):
             locked(tmp_path / LOCK).__enter__()
     with locked(tmp_path / LOCK):
         pass

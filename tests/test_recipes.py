@@ -128,7 +128,7 @@ def test_seeds_steps_and_device_work_and_nothing_is_done_twice(
 
 def test_what_cannot_be_run_is_refused_before_anything_is_fitted(tmp_path: Path, refused: Callable[..., str]) -> None:
     arm = {"real": ArmConfig()}
-    with pytest.raises(ValueError, match="at least one arm"):
+    with pytest.raises(ValueError, match="arm"):
         Recipe()
     with pytest.raises(ValueError, match=r"data\.pairs: .*fitting"):
         Recipe(arms=arm, data=DataConfig(pairs=None))

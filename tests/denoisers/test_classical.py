@@ -57,22 +57,20 @@ def test_each_picture_has_its_own_noise_level(method: type[Classical]) -> None:
 @pytest.mark.parametrize("method", [*OWN, BM3D])
 def test_small_and_wrong_inputs(method: type[Classical]) -> None:
     least = method.smallest
-    with pytest.raises(ValueError, match="strength must be positive"):
+    with pytest.raises(ValueError, match=r"strength.*positive"):
         method(0)
     if method is not BM3D:
         noisy = torch.rand(1, 4, least, least + 1, generator=torch.Generator().manual_seed(0))
         assert method()(noisy, torch.full_like(noisy, 1e-3)).isfinite().all()
     with pytest.raises(ValueError, match="packed"):
         method()(torch.zeros(1, 4, least - 1, 32), torch.zeros(1))
-    with pytest.raises(ValueError, match="needs the noise variance"):
+    with pytest.raises(ValueError, match="variance"):
         method()(torch.zeros(1, 4, 32, 32))
 
 
 def test_bm3d_says_how_to_get_it_and_under_which_licence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "bm3d", None)
-    with pytest.raises(
-        ImportError, match=r"non-commercial use only; run: pip install '(?!rawaug).*\[bm3d\]'"
-    ):  # a checkout
+    with pytest.raises(ImportError, match=r"pip install '(?!rawaug).*\[bm3d\]'"):  # a checkout
         BM3D()(torch.zeros(1, 4, 16, 16), torch.ones(1))
 
 

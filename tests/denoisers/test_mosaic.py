@@ -135,7 +135,7 @@ def test_what_it_cannot_take_is_refused() -> None:
     with pytest.raises(ValueError, match="mosaic"):
         net(noisy, variance)
     given = with_planes(noisy, pattern("XTRANS"))
-    with pytest.raises(ValueError, match="pass the noise variance"):
+    with pytest.raises(ValueError, match="variance"):
         net(given)
     with pytest.raises(ValueError, match="domain linear"):
         MosaicDRUNet(**SMALL, domain="linear")

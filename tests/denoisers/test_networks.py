@@ -74,9 +74,9 @@ def test_no_picture_depends_on_its_batch(make: Make) -> None:
 def test_the_noise_map_is_required_and_read(make: Make) -> None:
     noisy, variance = pair(1, 4, 16, 16)
     model = awake(make(deviation=True))
-    with pytest.raises(ValueError, match="variance_map=True: pass"):
+    with pytest.raises(ValueError, match="variance_map"):
         model(noisy)
-    with pytest.raises(ValueError, match="must have the shape"):
+    with pytest.raises(ValueError, match="shape"):
         model(noisy, variance[:, :1])
     assert not torch.allclose(model(noisy, variance), model(noisy, 2 * variance))
     squared = awake(make(deviation=False))
@@ -156,7 +156,7 @@ def test_every_network_works_in_every_domain(make: Make, domain: str) -> None:
     torch.testing.assert_close(blind.eval()(noisy, variance), noisy, rtol=0, atol=1e-5)
     model = awake(blind)
     assert (model(noisy, variance) - noisy).abs().max() > 1e-3
-    with pytest.raises(ValueError, match=f"domain='{domain}': pass the noise variance"):
+    with pytest.raises(ValueError, match=f"domain='{domain}'.*variance"):
         model(noisy)
     # The same picture at twice the gain is the same problem, whose solution is twice as bright.
     torch.testing.assert_close(model(2 * noisy, 4 * variance), 2 * model(noisy, variance), rtol=1e-4, atol=1e-4)
@@ -328,9 +328,9 @@ def test_unet_has_the_published_features() -> None:
     [
         (lambda: UNet(width=0), "positive multiple of 1"),
         (lambda: DHDN(width=5), "positive multiple of 2"),
-        (lambda: UNet(scales=0), "scales must be a whole number from 1 to 12, got 0"),
-        (lambda: DnCNN(depth=1), "depth must be at least 2"),
-        (lambda: NAFNet(encoder=(1,), decoder=(1, 1)), "the same number of scales"),
+        (lambda: UNet(scales=0), r"scales .*1 to 12"),
+        (lambda: DnCNN(depth=1), r"depth .*2"),
+        (lambda: NAFNet(encoder=(1,), decoder=(1, 1)), "scales"),
     ],
 )
 def test_impossible_settings_are_refused(make_bad: Make, message: str) -> None:

@@ -115,7 +115,7 @@ def test_what_would_move_the_pattern_is_refused() -> None:
     assert bayer.crop(mosaic, 2, 4, 4, 4).shape == (1, 4, 4)
     with pytest.raises(ValueError, match="even"):
         bayer.crop(mosaic, 1, 0, 4, 4)
-    with pytest.raises(ValueError, match="extends beyond the mosaic"):
+    with pytest.raises(ValueError, match="beyond"):
         bayer.crop(mosaic, 6, 0, 4, 4)
     with pytest.raises(ValueError, match="even"):
         bayer.RandomCrop(5)

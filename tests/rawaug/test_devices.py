@@ -10,7 +10,7 @@ from rawaug.kernels.runtime import find_device
 def test_devices_are_found_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert find_device("auto") == find_device("cpu") == torch.device("cpu")
     for name in ("cuda", "gpu", "mps", "cuda:0"):
-        with pytest.raises(ValueError, match=f"device '{name}': 1 needed, this machine has none; use cpu or auto"):
+        with pytest.raises(ValueError, match=f"{name}.*cpu or auto"):
             find_device(name)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert find_device("auto") == find_device("gpu") == torch.device("cuda")

@@ -86,7 +86,7 @@ def test_what_would_move_the_pattern_is_refused() -> None:
     mosaic = torch.zeros(1, 12, 18)
     with pytest.raises(ValueError, match="XTRANS"):
         XTRANS.crop(mosaic, 2, 6, 6, 6)
-    with pytest.raises(ValueError, match="extends beyond the mosaic"):
+    with pytest.raises(ValueError, match="beyond"):
         XTRANS.crop(mosaic, 6, 6, 7, 6)
     with pytest.raises(ValueError, match="XTRANS"):
         XTRANS.turn_keeping(mosaic[:, 2:], 1)

@@ -69,7 +69,7 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=message) as error:
             hdr(pictures, stops, isp="universal-small")
         assert "\n" not in str(error.value)
-    with pytest.raises(FileNotFoundError, match=r"none\.jpg: no such"):
+    with pytest.raises(FileNotFoundError, match=r"none\.jpg"):
         hdr([str(tmp_path / "none.jpg"), first])
     with pytest.raises(ValueError, match="exposure"):
         hdr([first], exposure=5000.0)

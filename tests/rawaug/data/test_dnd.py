@@ -90,31 +90,31 @@ def test_the_command_denoises_every_box_by_its_frames_levels_and_clips(folder: P
 
 
 def test_wrong_submissions_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="a submission must have 1000 boxes, got 3"):
+    with pytest.raises(ValueError, match="1000 boxes"):
         write_dnd_submission(tmp_path / "a", [torch.zeros(1, 6, 8)] * 3)
     for wrong in (torch.full((1, 6, 8), torch.nan), torch.full((1, 6, 8), 1.5), torch.zeros(6, 8)):
-        with pytest.raises(ValueError, match="box 1: must have values in"):
+        with pytest.raises(ValueError, match="box 1"):
             write_dnd_submission(tmp_path / "a", [torch.zeros(1, 6, 8), wrong])
 
 
 def test_what_is_missing_or_wrong_is_reported(tmp_path: Path, mat73: Writer) -> None:
-    with pytest.raises(FileNotFoundError, match=r"info\.mat: no such MATLAB file"):
+    with pytest.raises(FileNotFoundError, match=r"info\.mat"):
         Dnd(tmp_path)
     mat73(tmp_path / "info.mat", {"info": [info(0), info(1)]})
     mat73(tmp_path / "images_raw" / "0001.mat", {"Inoisy": 1000 * frame(0)})
-    with pytest.raises(FileNotFoundError, match=r"0002\.mat: no such frame of DND; 1 of 2 are missing"):
+    with pytest.raises(FileNotFoundError, match=r"0002\.mat.*1 of 2"):
         Dnd(tmp_path)
     mat73(tmp_path / "images_raw" / "0002.mat", {"Inoisy": frame(1)[:5]})
     dnd = Dnd(tmp_path)
-    with pytest.raises(ValueError, match=r"0001\.mat: has values from .* normalised RAW has black at 0"):
+    with pytest.raises(ValueError, match=r"0001\.mat.*black"):
         dnd[0]
-    with pytest.raises(ValueError, match=r"0002\.mat: box 1 of info\.mat extends beyond the frame of 5 x 34"):
+    with pytest.raises(ValueError, match=r"0002\.mat.*box 1"):
         dnd[20]
     mat73(tmp_path / "info.mat", {"info": [info(0), {**info(1), "nlf": {"a": 1.0}}]})
-    with pytest.raises(ValueError, match=r"info\.mat: frame 2 of info is not as published \('b'\)"):
+    with pytest.raises(ValueError, match=r"info\.mat: frame 2"):
         Dnd(tmp_path)
 
 
 def test_there_are_no_pairs(folder: Path) -> None:
-    with pytest.raises(ValueError, match="the clean frames of DND are not public"):
+    with pytest.raises(ValueError, match="public"):
         open_pairs(f"dnd:{folder}")

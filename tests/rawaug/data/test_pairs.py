@@ -43,15 +43,15 @@ def pair(**changes: Any) -> Pair:
     [
         (
             {"srgb": torch.zeros(3, 6, 8)},
-            r"shot: srgb must be torch.uint8 \(3, 6, 8\), got torch.float32 \(3, 6, 8\)",
+            r"shot: srgb .*uint8",
         ),
-        ({"srgb": torch.zeros(3, 6, 6, dtype=torch.uint8)}, r"srgb must be .*got torch.uint8 \(3, 6, 6\)"),
-        ({"raw": torch.zeros(6, 8)}, r"pair shot: raw must be torch.float32"),
-        ({"noisy": torch.zeros(1, 6, 6)}, r"noisy must be torch.float32 \(1, 6, 8\)"),
+        ({"srgb": torch.zeros(3, 6, 6, dtype=torch.uint8)}, r"srgb .*\(3, 6, 6\)"),
+        ({"raw": torch.zeros(6, 8)}, r"raw .*float32"),
+        ({"noisy": torch.zeros(1, 6, 6)}, r"noisy .*\(1, 6, 8\)"),
         ({"srgb": torch.zeros(3, 5, 8, dtype=torch.uint8), "raw": torch.zeros(1, 5, 8)}, "even sides"),
-        ({"color_matrix": torch.eye(4)}, r"color_matrix must be \(3, 3\)"),
-        ({"shot_var": 1e-3, "read_var": 1e-6}, "must be given together, with a noisy mosaic"),
-        ({"shot_var": 1e-3, "noisy": torch.zeros(1, 6, 8)}, "must be given together"),
+        ({"color_matrix": torch.eye(4)}, r"color_matrix .*\(3, 3\)"),
+        ({"shot_var": 1e-3, "read_var": 1e-6}, r"together.*noisy"),
+        ({"shot_var": 1e-3, "noisy": torch.zeros(1, 6, 8)}, "together"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(changes: dict[str, Any], message: str) -> None:
@@ -203,7 +203,7 @@ def test_pairs_are_opened_binned() -> None:
     readable = Readable(binned)
     readable.broken[0] = "damaged"
     assert readable.kept()[0].raw.shape == (1, 72, 112)
-    with pytest.raises(ValueError, match="bin must be at least 1, got 0"):
+    with pytest.raises(ValueError, match=r"^bin"):
         open_pairs("demo:test", bin=0)
     with pytest.raises(ValueError, match="binned"):
         demo_pairs("test", count=1)[0].binned(200)

@@ -281,7 +281,7 @@ def test_the_clean_frame_is_the_mean_at_iso_100_at_the_noisy_exposure(
 def test_what_is_missing_is_named(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
     with pytest.raises(FileNotFoundError, match="RawBench"):
         open_pairs(f"rawbench:{tmp_path / 'none'}")
-    with pytest.raises(ValueError, match="contains no RawBench file"):
+    with pytest.raises(ValueError, match="RawBench"):
         open_pairs(f"rawbench:{tmp_path}")
     bayer_dng(tmp_path / "IMG_0001.ARW", np.full((32, 32), 99, np.uint16))
     with pytest.raises(ValueError, match="Scene_0001_ISO3200_1"):

@@ -253,9 +253,7 @@ def test_the_command_takes_published_levels_or_asks_for_them(blocks: Path, tmp_p
     assert [seen[32 * k] for k in (0, 7, 39)] == [(0.0, 1e-4), (7.0, 1e-4), (39.0, 1e-4)]
     written = read_submission(Path(out))
     assert torch.equal(written[0], (SiddBenchmark(blocks)[0].mosaic + 0.1).clamp(0.0, 1.0)) and written[32].max() == 0.0
-    with pytest.raises(
-        ValueError, match=rf"{HELD_BACK[0]}: its noise cannot be estimated .* put noise_level_functions"
-    ):
+    with pytest.raises(ValueError, match=rf"{HELD_BACK[0]}.*noise_level_functions"):
         submit(str(blocks), out, method)
     submit(str(blocks), out, replace(method, reads_levels=False))
     assert seen[-1] == (0.0, 0.0)
@@ -269,7 +267,7 @@ def test_wrong_submissions_are_refused(tmp_path: Path) -> None:
     for wrong in (torch.zeros(1, SIDE, SIDE + 2), block * 3, block * float("nan")):
         with pytest.raises(ValueError, match="block"):
             write_submission(tmp_path / "a.csv", [block, wrong], SIDE)
-    with pytest.raises(ValueError, match=r"must be a \.csv file"):
+    with pytest.raises(ValueError, match=r"\.csv"):
         write_submission(tmp_path / "a.npz", [block], SIDE)
     assert not list(tmp_path.iterdir())
 
@@ -375,7 +373,7 @@ def test_without_pictures_or_metadata_psnr_r_is_refused(
     write_blocks(tmp_path, raw_of(camera, pictures), None)
     pair = SiddBlocks(tmp_path)[0]
     assert not pair.rendered
-    with pytest.raises(ValueError, match=rf"{SCENES[0]}_00: has no sRGB picture, and its white balance") as refusal:
+    with pytest.raises(ValueError, match=rf"{SCENES[0]}_00.*white balance") as refusal:
         psnr_r(camera, pair)
     assert "\n" not in str(refusal.value)
     shot = tmp_path / SCENES[0]
@@ -386,13 +384,13 @@ def test_without_pictures_or_metadata_psnr_r_is_refused(
     pairs = SiddBlocks(tmp_path)
     assert pairs[0].rendered and psnr_r(camera, pairs[0]) < 60.0 and pairs[0].white_balance == (2.0, 1.0, 1.25)
     assert not pairs[0].levels_from_clean and pairs[32].levels_from_clean and pairs[32].white_balance == (1, 1, 1)
-    with pytest.raises(ValueError, match=f"{SCENES[1]}_00: has no sRGB picture"):
+    with pytest.raises(ValueError, match=f"{SCENES[1]}_00.*picture"):
         psnr_r(camera, pairs[32])
 
 
 def test_pictures_of_something_else_are_refused(tmp_path: Path, camera: DictionaryISP, pictures: Tensor) -> None:
     write_blocks(tmp_path, raw_of(camera, pictures), pictures.flip(1))
-    with pytest.raises(ValueError, match=rf"{SCENES[0]}: its pictures do not show its RAW blocks"):
+    with pytest.raises(ValueError, match=rf"{SCENES[0]}.*blocks"):
         SiddBlocks(tmp_path)[0]
     write_blocks(tmp_path, raw_of(camera, pictures), pictures[..., :8, :8])
     with pytest.raises(ValueError, match="mosaics"):

@@ -46,7 +46,7 @@ def test_the_shipped_denoiser_of_pictures_removes_noise() -> None:
     assert "rawaug-srgb" not in shipped_of_mosaics()
     with pytest.raises(ValueError, match="denoises developed pictures"):
         RawDenoiser.of("rawaug-srgb")
-    with pytest.raises(ValueError, match="denoises RAW"):
+    with pytest.raises(ValueError, match="RAW"):
         PictureDenoiser.of("rawaug-small")
 
 
@@ -130,7 +130,7 @@ def test_files_and_folders_of_pictures(tmp_path: Path, capsys: pytest.CaptureFix
     result = denoise_folder(tmp_path / "in", tmp_path / "out", PictureFiles(PictureDenoiser.of("rawaug-srgb@5")))
     assert [one.out.name for one in result.files] == ["a.png"]
     assert list(result.broken) == [str(tmp_path / "in" / "b.jpg")]
-    with pytest.raises(ValueError, match="exists; give another name"):
+    with pytest.raises(ValueError, match="exists"):
         denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "a.png"))
     with pytest.raises(ValueError, match=r"developed picture.*--linear"):
         denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "c.png"), linear=True)

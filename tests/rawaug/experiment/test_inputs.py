@@ -145,19 +145,19 @@ def test_what_frames_lack_is_found_before_anything_is_fitted() -> None:
         require_usable(recipe, [pair], [])
     require_usable(replace(recipe, noise="camera"), [pair], [])
     twice = replace(recipe, arms={"two": ArmConfig(estimator="noise2noise")})
-    with pytest.raises(ValueError, match=r"arms\.two: needs 2 shots"):
+    with pytest.raises(ValueError, match=r"arms\.two.*2 shots"):
         require_usable(twice, [pair], [])
     supervised = Recipe(arms=ARMS, data=DataConfig())
     with pytest.raises(ValueError, match="small"):
         require_usable(replace(supervised, train=replace(supervised.train, crop=68)), [pair], [])
     require_usable(replace(supervised, train=replace(supervised.train, crop=66)), [pair], [])
-    with pytest.raises(ValueError, match="unknown, so no ISP can be fitted"):
+    with pytest.raises(ValueError, match="white balance"):
         require_usable(supervised, [replace(pair, color_known=False)], [])
     require_usable(replace(supervised, camera="universal", train=replace(supervised.train, crop=66)), [pair], [])
 
 
 def test_settings_of_pairs_need_pairs() -> None:
-    with pytest.raises(ValueError, match=r"data\.noisy: applies to pairs:PATH"):
+    with pytest.raises(ValueError, match=r"data\.noisy"):
         DataConfig(noisy="*_NOISY_*")
     with pytest.raises(ValueError, match="pairs"):
         DataConfig(pairs=None, validation="auto")

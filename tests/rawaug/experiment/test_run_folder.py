@@ -46,13 +46,13 @@ def test_files_of_an_unknown_run_are_not_touched(recipe: Recipe) -> None:
     folder.mkdir(parents=True)
     assert require_free(recipe) == folder  # empty
     (folder / "results.json").write_text("{}")
-    with pytest.raises(ValueError, match="holds files, but not the settings of a run"):
+    with pytest.raises(ValueError, match=r"run\.json"):
         require_free(recipe)
 
 
 @pytest.mark.parametrize("name", ["../mine", "/mine", "a/../../mine", "", "."])
 def test_a_name_stays_within_out(recipe: Recipe, name: str) -> None:
-    with pytest.raises(ValueError, match="must be a folder within"):
+    with pytest.raises(ValueError, match=r"^name"):
         require_free(replace(recipe, name=name))
     assert require_free(replace(recipe, name="sidd/few")) == Path(recipe.out) / "sidd" / "few"
 

@@ -94,7 +94,7 @@ def test_other_patterns_have_no_packed_planes_and_no_network(picture: str) -> No
     look = Look(picture, AugmentConfig(cfa="XTRANS"))
     assert [panel.title.partition(":")[0] for panel in views.raw(look)] == ["XTRANS", "histograms"]
     assert views.pair(look)[0].image.shape == (96, 144, 3)
-    with pytest.raises(ValueError, match="denoises Bayer RAW, not"):
+    with pytest.raises(ValueError, match="Bayer"):
         views.denoise(look)
 
 

@@ -71,7 +71,7 @@ def test_raw_is_never_read_as_the_picture_that_lies_in_it(tmp_path: Path, bayer_
     bayer_dng(tmp_path / "a.dng", np.full((32, 48), 1000, np.uint16))
     (tmp_path / "b.jpg").write_bytes((tmp_path / "a.dng").read_bytes())
     for name in ("a.dng", "b.jpg"):
-        with pytest.raises(ValueError, match=rf"{name}: is camera RAW \(DNG\)"):
+        with pytest.raises(ValueError, match=rf"{name}.*DNG"):
             read_picture(tmp_path / name)
 
 

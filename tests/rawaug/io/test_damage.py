@@ -64,7 +64,7 @@ def overwrite(path: Path, part: float, data: bytes) -> Path:
 @pytest.mark.parametrize("filler", [0, 0x5A])
 def test_a_hole_in_the_stream_is_told(hole: int, part: float, filler: int, whole: Path, tmp_path: Path) -> None:
     damaged = overwrite(without_digests(whole, tmp_path / "a.dng"), part, bytes([filler]) * hole)
-    with pytest.raises(OSError, match=r"a\.dng: is damaged inside"):
+    with pytest.raises(OSError, match=r"a\.dng.*damaged"):
         read_raw(damaged)
 
 

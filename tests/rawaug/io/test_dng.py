@@ -224,11 +224,11 @@ def test_any_camera_name_and_exposure_can_be_written(tmp_path: Path) -> None:
     [
         ({"orientation": 9}, "orientation"),
         ({"white_balance": (0.0, 1.0, 1.5)}, "positive"),
-        ({"white_balance": (1e-12, 1.0, 1.0)}, "does not fit a DNG"),
+        ({"white_balance": (1e-12, 1.0, 1.0)}, "DNG"),
         ({"color_matrix": torch.zeros(3, 3)}, "singular"),
-        ({"white": 65536.0}, "levels must be 0 <= black < white <= 65535"),
-        ({"mosaic": torch.full((1, 4, 4), -0.6)}, "16 bits cannot hold digital numbers from -614 .*raise the black"),
-        ({"mosaic": torch.zeros(1, 5, 4)}, r"the mosaic must be \(1, H, W\) with even sides"),
+        ({"white": 65536.0}, "black < white"),
+        ({"mosaic": torch.full((1, 4, 4), -0.6)}, r"-614 .*black"),
+        ({"mosaic": torch.zeros(1, 5, 4)}, "even sides"),
     ],
 )
 def test_what_no_dng_can_store_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:

@@ -89,7 +89,7 @@ def test_a_file_holds_the_whole_isp(tmp_path: Path, srgb: torch.Tensor) -> None:
 
 
 def test_files_that_are_not_isps_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"nobody: not found.*universal"):
+    with pytest.raises(FileNotFoundError, match=r"nobody.*universal"):
         DictionaryISP.from_pretrained("nobody")
     (tmp_path / "cut.safetensors").write_bytes(b"\x00" * 20)
     with pytest.raises(ValueError, match=r"cut\.safetensors"):
@@ -110,10 +110,10 @@ def test_the_shipped_isps_are_small_and_hold_only_what_is_on() -> None:
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        ('"colour_atoms\\": 3', '"colour_atoms\\": 9', "tensor colour.* does not fit"),
-        ('"gain_atoms\\": 5,', '"gain_atomz\\": 5,', "its configuration is damaged .*gain_atomz"),
-        ('"cfa\\": \\"RGGB', '"cfa\\": \\"RGGG', "its configuration is damaged"),
-        ("stages.gamma.reverse_gamma", "stages.gamma.reverse_gumma", "tensor stages.gamma.reverse_gamma does not fit"),
+        ('"colour_atoms\\": 3', '"colour_atoms\\": 9', "colour"),
+        ('"gain_atoms\\": 5,', '"gain_atomz\\": 5,', r"damaged .*gain_atomz"),
+        ('"cfa\\": \\"RGGB', '"cfa\\": \\"RGGG', "damaged"),
+        ("stages.gamma.reverse_gamma", "stages.gamma.reverse_gumma", "stages.gamma.reverse_gamma"),
     ],
 )
 def test_damaged_files_are_one_line(tmp_path: Path, before: str, after: str, message: str) -> None:
@@ -140,18 +140,18 @@ def test_nothing_is_drawn_from_the_global_state() -> None:
     ("settings", "message"),
     [
         ({"stages": ("tone", "tone")}, "at most once"),
-        ({"stages": ()}, "stages must be one or more names"),
+        ({"stages": ()}, "stages"),
         ({"encoder_widths": (8, 8)}, "must be three"),
-        ({"knee": 1.0}, "knee must be a number from 0.0 to 0.999"),
-        ({"gain_atoms": 10**9}, "gain_atoms must be a whole number from 1 to 1024, got 1000000000"),
-        ({"colour_atoms": 1e29}, "colour_atoms must be a whole number"),
-        ({"encoder_widths": (8, 10**6, 8)}, "encoder_widths must be a whole number from 1 to 256"),
-        ({"encoder_widths": 8}, "encoder_widths must be a list"),
-        ({"stages": ("tone",) * 100}, "stages must be one or more names"),
-        ({"stages": ([],)}, "stages must be one or more names"),
-        ({"knee": float("nan")}, "knee must be a number"),
-        ({"encoders": "yes"}, "encoders must be true or false"),
-        ({"gain_atoms": 0}, "gain_atoms must be a whole number from 1 to 1024, got 0"),
+        ({"knee": 1.0}, r"knee .*0.999"),
+        ({"gain_atoms": 10**9}, r"gain_atoms .*1 to 1024"),
+        ({"colour_atoms": 1e29}, r"colour_atoms .*whole"),
+        ({"encoder_widths": (8, 10**6, 8)}, r"encoder_widths .*1 to 256"),
+        ({"encoder_widths": 8}, r"encoder_widths .*list"),
+        ({"stages": ("tone",) * 100}, "stages"),
+        ({"stages": ([],)}, "stages"),
+        ({"knee": float("nan")}, "knee"),
+        ({"encoders": "yes"}, "encoders"),
+        ({"gain_atoms": 0}, r"gain_atoms .*1 to 1024"),
     ],
 )
 def test_impossible_configurations_are_refused(settings: dict[str, Any], message: str) -> None:

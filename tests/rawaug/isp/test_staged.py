@@ -133,14 +133,14 @@ def test_a_digital_gain_is_that_of_grey(fitted: DictionaryISP, exact_pairs: list
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"white_balance": (2.0, 1.0)}, r"white_balance must be \(3,\)"),
+        ({"white_balance": (2.0, 1.0)}, r"white_balance .*\(3,\)"),
         ({"white_balance": torch.ones(2, 3)}, "white_balance"),
-        ({"white_balance": (0.0, 1.0, 1.6)}, "white_balance must be positive"),
-        ({"digital_gain": 0.0}, "digital_gain must be positive"),
+        ({"white_balance": (0.0, 1.0, 1.6)}, r"white_balance .*positive"),
+        ({"digital_gain": 0.0}, r"digital_gain .*positive"),
         ({"raw_samples": torch.full((1, 1, 3), float("nan"))}, "NaN"),
         ({"digital_gain": torch.ones(2)}, "digital_gain"),
         ({"raw_samples": torch.zeros(1, 4)}, "row, column, value"),
-        ({"raw_samples": torch.tensor([[[32.0, 0.0, 0.1]]])}, "outside the picture, 32 x 48"),
+        ({"raw_samples": torch.tensor([[[32.0, 0.0, 0.1]]])}, r"outside .*32 x 48"),
         ({"raw_samples": torch.tensor([[[0.0, -1.0, 0.1]]])}, "outside the picture"),
     ],
 )

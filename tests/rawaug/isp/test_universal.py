@@ -75,7 +75,7 @@ def test_readings_find_tone_and_camera_as_well(universal: DictionaryISP) -> None
 
 
 def test_a_curve_stands_in_place_of_tone_and_gamma() -> None:
-    with pytest.raises(ValueError, match="replaces tone and gamma"):
+    with pytest.raises(ValueError, match="tone and gamma"):
         DictionaryISP(ISPConfig(stages=("tone", "curve"), tone_atoms=2))
-    with pytest.raises(ValueError, match="with the stage curve"):
+    with pytest.raises(ValueError, match="curve"):
         ISPConfig(stages=("curve", "colour", "gains"))

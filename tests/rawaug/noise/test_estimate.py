@@ -145,13 +145,13 @@ def test_dark_frames_show_banding_black_level_and_ignore_hot_pixels() -> None:
 @pytest.mark.parametrize(
     ("frame", "message"),
     [
-        (torch.rand(1, 3, 64, 64), "a mosaic must have shape"),
-        (torch.rand(2, 1, 64, 64), "a mosaic must have shape"),
+        (torch.rand(1, 3, 64, 64), "shape"),
+        (torch.rand(2, 1, 64, 64), "shape"),
         (torch.rand(1, 8, 8), "too small"),
         (torch.rand(1, 32, 32), "too few blocks"),
         (torch.ones(1, 512, 512), "too few blocks"),
         (torch.zeros(1, 512, 512), "no noise found"),
-        (0.3 + 0.01 * torch.randn(1, 512, 512, generator=torch.Generator().manual_seed(0)), "all of one brightness"),
+        (0.3 + 0.01 * torch.randn(1, 512, 512, generator=torch.Generator().manual_seed(0)), "brightness"),
     ],
 )
 def test_frames_without_the_answer_are_refused(frame: Tensor, message: str) -> None:

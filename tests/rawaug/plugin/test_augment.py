@@ -88,13 +88,13 @@ def test_wrong_settings_are_refused(isp: DictionaryISP) -> None:
         RawAugment(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))
     with pytest.raises(ValueError, match="convex, independent, perturb, chosen"):
         Draw(sampling="random")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"\(lowest, highest\) in stops"):
+    with pytest.raises(ValueError, match=r"stops"):
         Draw(exposure=(1.0, -1.0))
     for exposure in (math.nan, (0.0, math.inf), "1", (1, 2, 3)):
         with pytest.raises(ValueError, match="exposure must be"):
             Draw(exposure=exposure)  # type: ignore[arg-type]
     for noise in (5, 0.01, math.nan, True, [[1, 2], [3, 4]], [math.nan, 1]):
-        with pytest.raises(ValueError, match=r"must be a name or a pair|variances must be finite"):
+        with pytest.raises(ValueError, match=r"pair|variances must be finite"):
             RawAugment.from_pretrained("universal", noise=noise)  # type: ignore[arg-type]
 
 
@@ -221,7 +221,7 @@ def test_kornia_before_it_and_around_it(augment: RawAugment, srgb: Tensor, place
 
 
 def test_camera_noise_is_that_of_the_file(isp: DictionaryISP) -> None:
-    with pytest.raises(ValueError, match="fitted without measuring noise"):
+    with pytest.raises(ValueError, match="noise"):
         RawAugment(isp, noise="camera")
     measured = DictionaryISP()
     measured.info["noise"] = {"shot_var": 2e-3, "read_var": 3e-5, "r2": 0.99}
@@ -286,7 +286,7 @@ def test_saved_with_a_batch_they_replay_every_pair(pairs: RawPairs, tmp_path: Pa
 
 
 def test_replay_refuses_another_picture(pairs: RawPairs) -> None:
-    with pytest.raises(ValueError, match="picture of 22 x 26"):
+    with pytest.raises(ValueError, match="22 x 26"):
         pairs.replay(3, pairs[1].params)
 
 
@@ -294,7 +294,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"none\.safetensors"):
         load_params(tmp_path / "none.safetensors")
     save_file({"a": torch.zeros(1)}, tmp_path / "other.safetensors")
-    with pytest.raises(ValueError, match=r"other.*no rawaug parameters"):
+    with pytest.raises(ValueError, match=r"other.*parameters"):
         load_params(tmp_path / "other.safetensors")
     save_file({"crop": torch.zeros(5)}, tmp_path / "part.safetensors", {"kind": "augment_params"})
     with pytest.raises(ValueError, match=r"part\.safetensors: .* missing"):

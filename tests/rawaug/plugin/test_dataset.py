@@ -258,7 +258,7 @@ def test_an_iterable_needs_a_stream_which_forwards_the_epoch_to_it(augment: RawA
     stream = RawPairStream(dataset, augment, crop=16)
     stream.set_epoch(4)
     assert dataset.epoch == 4
-    with pytest.raises(TypeError, match="Counted has no length"):
+    with pytest.raises(TypeError, match=r"Counted.*length"):
         len(stream)
     with pytest.raises(ValueError, match="identity='name'"):
         next(iter(RawPairStream(Shards(pictures), augment, crop=16, key="jpg", identity="name")))

@@ -80,13 +80,13 @@ def test_settings_go_through_json(config: AugmentConfig) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"draw": {"light": "LED-B9"}}, r"light 'LED-B9' is unknown; .*nearest: LED-B"),
-        ({"draw": {"light": 500}}, "2000 to 10000 kelvin, got 500"),
-        ({"draw": {"tone": "nikon"}}, r"tone 'nikon' is no curve of this ISP"),
-        ({"draw": {"tone": "linear"}, "isp": "gopro-hero"}, "not of a fitted ISP"),
-        ({"draw": {"light": 5000, "sampling": "chosen"}}, "not with sampling 'chosen'"),
-        ({"iso": 800, "noise": (1e-3, 1e-5)}, "does not depend on ISO"),
-        ({"iso": 800, "noise": "upi"}, "does not depend on ISO"),
+        ({"draw": {"light": "LED-B9"}}, r"'LED-B9'.*nearest: LED-B"),
+        ({"draw": {"light": 500}}, "2000 to 10000"),
+        ({"draw": {"tone": "nikon"}}, "'nikon'"),
+        ({"draw": {"tone": "linear"}, "isp": "gopro-hero"}, "fitted"),
+        ({"draw": {"light": 5000, "sampling": "chosen"}}, "'chosen'"),
+        ({"iso": 800, "noise": (1e-3, 1e-5)}, "ISO"),
+        ({"iso": 800, "noise": "upi"}, "ISO"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(settings: dict[str, Any], message: str) -> None:

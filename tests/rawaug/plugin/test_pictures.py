@@ -156,7 +156,7 @@ def test_a_batch_that_is_a_list_of_pictures_is_not_taken_apart() -> None:
         ({"image": RGB, "id": 1}, None, "keys image, id"),
         ({"image": RGB, "id": 1}, "picture", "got 'picture'"),
         ((RGB, 1), 2, "tuples of 2"),
-        ((RGB, 1), "image", "index of the picture"),
+        ((RGB, 1), "image", "index"),
         (RGB, "image", "omit key"),
     ],
 )

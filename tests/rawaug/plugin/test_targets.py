@@ -161,11 +161,11 @@ def test_kair_s_call_gets_camera_noise_on_the_picture_and_its_target_back(univer
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda isp: RawAugment(isp, target=cast(Any, "jpg")), "target 'jpg' is unknown; use one of raw, rgb, srgb"),
-        (lambda isp: RawAugment(isp, target="srgb", cfa="XTRANS"), "demosaics Bayer patterns, not XTRANS"),
+        (lambda isp: RawAugment(isp, target=cast(Any, "jpg")), r"'jpg'.*raw, rgb, srgb"),
+        (lambda isp: RawAugment(isp, target="srgb", cfa="XTRANS"), "XTRANS"),
         (lambda _: Srgb(jpeg=(0, 95)), "within 1 to 100"),
         (lambda _: Srgb(jpeg=(95, 40)), "within 1 to 100"),
-        (lambda _: Srgb(demosaicing="lmmse"), "demosaicing 'lmmse' is unknown; use one of bilinear, malvar, adams"),
+        (lambda _: Srgb(demosaicing="lmmse"), r"'lmmse'.*malvar"),
     ],
 )
 def test_settings_without_meaning_are_refused(universal: DictionaryISP, make: Any, message: str) -> None:

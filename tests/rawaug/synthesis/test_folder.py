@@ -195,7 +195,7 @@ def test_what_cannot_be_is_refused(tmp_path: Path, pictures: Path) -> None:
     with pytest.raises(ValueError, match="'bogus' is unknown"):
         synth(pictures, tmp_path / "out", noise="bogus", workers=0)
     for format, target in (("dng", "srgb"), ("dng", "rgb"), ("png", "raw")):
-        with pytest.raises(ValueError, match=f"format {format} cannot hold target '{target}'; use .*npz, tiff"):
+        with pytest.raises(ValueError, match=f"{format}.*{target}.*npz, tiff"):
             synth(pictures, tmp_path / "out", format=format, target=target, workers=0)  # type: ignore[arg-type]
     synth(pictures, tmp_path / "out", workers=0)
     with pytest.raises(ValueError, match=r"synth\.json: .*made"):

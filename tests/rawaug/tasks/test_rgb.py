@@ -115,7 +115,7 @@ def test_the_recipe_compares_it_with_one_after_the_other(tmp_path: Path, capsys:
 def test_what_it_cannot_compare_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="'AMAZE'"):
         small(tmp_path, demosaicing=["AMAZE"])
-    with pytest.raises(ValueError, match="rawaug-joint: demosaics, too"):
+    with pytest.raises(ValueError, match="rawaug-joint"):
         run(small(tmp_path, untouched=["rawaug-joint"]), test=[a_pair()], validation=[])
     with pytest.raises(ValueError, match=r"denoiser: .*network"):
         run(replace(small(tmp_path), denoiser=DenoiserConfig("UNet")), test=[a_pair()], validation=[])

@@ -100,7 +100,7 @@ def test_a_picture_of_another_shot_is_refused(exact_pair: Callable[..., Pair]) -
     sample_pixels([pair], 100, seed=0)
     mixed_up = replace(pair, srgb=displaced(exact_pair, 2, -4, seed=7).srgb)
     for wrong in (mixed_up, replace(pair, srgb=pair.srgb.flip(-1))):
-        with pytest.raises(ValueError, match=f"{pair.name}: sRGB and RAW hardly correlate"):
+        with pytest.raises(ValueError, match=f"{pair.name}.*correlate"):
             sample_pixels([wrong], 100, seed=0)
 
 
