@@ -27,16 +27,16 @@ from rawaug.bayer.cfa import CFA, pack, require_channels
 BLOCK = 16
 """Side of a block, in cells."""
 
-TILES = 8
+_TILES = 8
 """Number of tiles along each side of the frame; every other tile foretells the rest."""
 
-SURE = 4.0
+_SURE = 4.0
 """Significance threshold of the tiles that agree, in standard deviations; chance reaches it 1 in 30,000 times."""
 
-CLEAR = 5.0
+_CLEAR = 5.0
 """Significance threshold, in standard errors."""
 
-LARGEST = 0.06
+_LARGEST = 0.06
 """The largest relative difference of a sensor's greens; a larger one is a pattern in the scene."""
 
 _CLIPPED = 0.98
@@ -86,7 +86,7 @@ def measure_greens(mosaic: Tensor, cfa: CFA | str) -> GreenDifference | None:
         cfa: its pattern.
 
     Returns:
-        The difference, or None if the frame is smaller than :data:`TILES` blocks either way, or nearly all is clipped.
+        The difference, or None if the frame is smaller than :data:`_TILES` blocks either way, or nearly all is clipped.
 
     Example:
         >>> light = torch.linspace(0.3, 0.4, 512).expand(1, 512, 512)
@@ -95,10 +95,10 @@ def measure_greens(mosaic: Tensor, cfa: CFA | str) -> GreenDifference | None:
         >>> difference.significant, round(difference.share, 3)
         (True, 0.02)
     """
-    if min(mosaic.shape[-2:]) < 2 * BLOCK * TILES:
+    if min(mosaic.shape[-2:]) < 2 * BLOCK * _TILES:
         return None
     blocks = _blocks(mosaic, cfa)
-    if len(blocks.sd) < TILES**2:
+    if len(blocks.sd) < _TILES**2:
         return None
 
     coefficients, covariance, scale = _fit(blocks.terms, blocks.difference, blocks.sd)
@@ -106,7 +106,7 @@ def measure_greens(mosaic: Tensor, cfa: CFA | str) -> GreenDifference | None:
     share = float((blocks.terms @ coefficients).square().mean().sqrt() / level)
     error = float(((blocks.terms @ covariance) * blocks.terms).sum(1).mean().sqrt() / level)
     significant = (
-        CLEAR * error < share < LARGEST  # not by chance, and not a pattern of the scene
+        _CLEAR * error < share < _LARGEST  # not by chance, and not a pattern of the scene
         and scale < _LARGEST_SCALE
         and _halves_agree(blocks, scale)
     )
@@ -206,9 +206,9 @@ def _blocks(mosaic: Tensor, cfa: CFA | str) -> _Blocks:
     v = _powers(_places(columns, mosaic.shape[-1]))
     place = u[:, None, _I] * v[None, :, _J]
     terms = [place * red[..., None], place * green[..., None], place * blue[..., None], torch.ones_like(place[..., :1])]
-    tile_rows = torch.arange(rows) * TILES // rows
-    tile_columns = torch.arange(columns) * TILES // columns
-    tile = tile_rows[:, None] * TILES + tile_columns
+    tile_rows = torch.arange(rows) * _TILES // rows
+    tile_columns = torch.arange(columns) * _TILES // columns
+    tile = tile_rows[:, None] * _TILES + tile_columns
 
     clear = means[8] == 0
     return _Blocks(torch.cat(terms, -1)[clear], difference[clear], sd[clear], green[clear], tile[clear])
@@ -241,7 +241,7 @@ def _fit(terms: Tensor, difference: Tensor, sd: Tensor) -> tuple[Tensor, Tensor,
 
 def _halves_agree(blocks: _Blocks, scale: float) -> bool:
     """Whether each half of the frame, a chessboard of tiles, foretells the other in clearly more tiles than not."""
-    white = (blocks.tile // TILES + blocks.tile % TILES) % 2 == 0
+    white = (blocks.tile // _TILES + blocks.tile % _TILES) % 2 == 0
     prediction = torch.zeros_like(blocks.difference)
     for half in (white, ~white):
         coefficients, _, _ = _fit(blocks.terms[half], blocks.difference[half], blocks.sd[half])
@@ -251,6 +251,6 @@ def _halves_agree(blocks: _Blocks, scale: float) -> bool:
         return (misfit / (2 * scale * blocks.sd)).square().log1p()  # Cauchy's
 
     gain = loss(blocks.difference) - loss(blocks.difference - prediction)
-    gain_of_tiles = torch.zeros(TILES**2, dtype=gain.dtype).index_add(0, blocks.tile, gain)
+    gain_of_tiles = torch.zeros(_TILES**2, dtype=gain.dtype).index_add(0, blocks.tile, gain)
     agreement = gain_of_tiles[blocks.tile.unique()].sign()
-    return float(agreement.sum()) >= SURE * len(agreement) ** 0.5
+    return float(agreement.sum()) >= _SURE * len(agreement) ** 0.5

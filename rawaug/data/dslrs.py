@@ -31,12 +31,12 @@ from rawaug.io.pictures import recode_jpeg
 from rawaug.io.raw import read_raw_and_develop
 from rawaug.seeding import keyed_generator
 
-FRAME = (512, 768)
+_FRAME = (512, 768)
 FRAMES = {"train": 96, "validation": 12, "test": 24}
 """Frames of each camera in a split."""
-LIBRAW_THRESHOLD = 0.75
+_LIBRAW_THRESHOLD = 0.75
 """LibRaw's own ``adjust_maximum_thr``, which InvISP's published script leaves on."""
-JPEG_QUALITY = 90
+_JPEG_QUALITY = 90
 _MIRED = (182.0, 22.0)
 """Mean and standard deviation of daylight's colour temperature."""
 _BALANCE_ERROR = 0.03
@@ -105,7 +105,7 @@ class DslrFrames(LazyPairs):
         split: str = "test",
         camera: str = "canon",
         jpeg_quality: int | None = None,
-        adjust_maximum_thr: float = LIBRAW_THRESHOLD,
+        adjust_maximum_thr: float = _LIBRAW_THRESHOLD,
         seed: int = 0,
     ) -> None:
         if camera not in CAMERAS:
@@ -126,7 +126,7 @@ class DslrFrames(LazyPairs):
     def read(self, index: int) -> Pair:
         dslr = CAMERAS[self.camera]
         generator = keyed_generator(self.seed, "dslrs", self.names[index])
-        scene = draw_window(self._file(index), FRAME, generator, self.max_pixels)
+        scene = draw_window(self._file(index), _FRAME, generator, self.max_pixels)
         shot = take(dslr, scene, generator, self.names[index])
 
         with TemporaryDirectory() as folder:
@@ -198,7 +198,7 @@ def _open(
     split: str = "test",
     camera: str = "canon",
     jpeg_quality: int | None = None,
-    adjust_maximum_thr: float = LIBRAW_THRESHOLD,
+    adjust_maximum_thr: float = _LIBRAW_THRESHOLD,
     seed: int = 0,
 ) -> DslrFrames:
     return DslrFrames(path, split, camera, jpeg_quality, adjust_maximum_thr, seed)
@@ -206,4 +206,4 @@ def _open(
 
 for _camera in CAMERAS:
     DATASETS.register(f"dslr_{_camera}")(partial(_open, camera=_camera))
-    DATASETS.register(f"dslr_{_camera}_jpeg")(partial(_open, camera=_camera, jpeg_quality=JPEG_QUALITY))
+    DATASETS.register(f"dslr_{_camera}_jpeg")(partial(_open, camera=_camera, jpeg_quality=_JPEG_QUALITY))

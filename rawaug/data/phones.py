@@ -39,15 +39,15 @@ from rawaug.data.sidd_scenes import HELD_BACK, PHONES, label_of
 from rawaug.io import encode_srgb
 from rawaug.seeding import keyed_generator
 
-FRAME = (512, 512)
+_FRAME = (512, 512)
 """Height and width of a frame: four patches of 256 x 256."""
 WHITE = 1023
 """The saturated digital number of ten bits."""
 LIGHTS = (3200, 4400, 5500)
 """Colour temperatures in kelvin, SIDD's own."""
-BRIGHTNESS = {"N": (0.0, 1.0), "L": (1.0, 2.5)}
+_BRIGHTNESS = {"N": (0.0, 1.0), "L": (1.0, 2.5)}
 """Normal and low: limits of the exposure in stops below the one that takes white to the sensor's white."""
-TAKEN_FOR_NEUTRAL = 6500.0
+_TAKEN_FOR_NEUTRAL = 6500.0
 """T0, the temperature in kelvin that a renderer falls back on."""
 SHOTS = ("010", "011")
 """The numbers of an instance's two frames, which differ by their noise."""
@@ -266,7 +266,7 @@ class PhoneFrames(LazyPairs):
     """
 
     def __init__(
-        self, path: str | Path = "", split: str = "test", seed: int = 0, size: tuple[int, int] = FRAME
+        self, path: str | Path = "", split: str = "test", seed: int = 0, size: tuple[int, int] = _FRAME
     ) -> None:
         self.path = str(path)
         self.split = split
@@ -359,7 +359,7 @@ def _draw_shot(phone: Phone, generator: torch.Generator) -> tuple[Shot, str]:
     errors = torch.randn(4, generator=generator, dtype=torch.float64).tolist()
 
     brightness = "N" if dim < 0.5 else "L"
-    least, most = BRIGHTNESS[brightness]
+    least, most = _BRIGHTNESS[brightness]
     law = phone.rendering
     shot = Shot(
         kelvin=LIGHTS[int(light * len(LIGHTS))],
@@ -392,7 +392,7 @@ def take(phone: Phone, scene: Tensor, shot: Shot, generator: torch.Generator, na
         >>> pair.raw.shape, pair.srgb.shape, pair.cfa
         (torch.Size([1, 64, 96]), torch.Size([3, 64, 96]), <CFA.RGGB: 'RGGB'>)
     """
-    clean = expose(phone, scene, shot)
+    clean = _expose(phone, scene, shot)
 
     shot_var, read_var = noise_levels(phone, shot.iso)
     electrons = torch.poisson(clean / shot_var, generator=generator)
@@ -417,7 +417,7 @@ def take(phone: Phone, scene: Tensor, shot: Shot, generator: torch.Generator, na
     )
 
 
-def expose(phone: Phone, scene: Tensor, shot: Shot) -> Tensor:
+def _expose(phone: Phone, scene: Tensor, shot: Shot) -> Tensor:
     """Compute the light at the sensor's sites before noise, ``(1, H, W)`` in [0, 1]."""
     matrix = camera_in_light(phone.xyz_to_camera, shot.kelvin)
     matrix = matrix / matrix.sum(dim=1).max()
@@ -443,7 +443,7 @@ def colour_matrix(phone: Phone, shot: Shot) -> Tensor:
 
 def _taken_for(phone: Phone, shot: Shot) -> float:
     """The colour temperature that the renderer takes the light for, in kelvin."""
-    neutral = 1e6 / TAKEN_FOR_NEUTRAL
+    neutral = 1e6 / _TAKEN_FOR_NEUTRAL
     way = phone.rendering.adaptation * (1e6 / shot.kelvin - neutral)
     mired = neutral + way + shot.balance_error
     return min(max(1e6 / mired, 2000.0), 20000.0)

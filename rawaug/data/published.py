@@ -38,7 +38,7 @@ from rawaug.io.raw import RAW_EXTENSIONS
 
 _SPLITS: dict[str, Any] = json.loads(Path(__file__).with_name("fivek.json").read_text(encoding="utf-8"))
 CAMERAS = ("canon", "nikon")
-FIVEK_DNG = re.compile(r"a(\d{4})-.*\.dng", re.IGNORECASE)
+_FIVEK_DNG = re.compile(r"a(\d{4})-.*\.dng", re.IGNORECASE)
 
 
 @DATASETS.register("fivek")
@@ -59,7 +59,7 @@ def fivek_pairs(
 
     file_of: dict[str, Path] = {}
     for file in files_in(path, "FiveK", (".dng",)):
-        match = FIVEK_DNG.fullmatch(file.name)
+        match = _FIVEK_DNG.fullmatch(file.name)
         if match is not None:
             file_of[match[1]] = file
 
@@ -114,8 +114,8 @@ class Rawir(LazyPairs):
 
         self.files = self.of_split(files_in(folder, "RAWIR", (".npy", ".npz")), split)
         if not self.files:
-            raise ValueError(f"{path}: has no pair for {split}; it needs files of {TENTH} RAWs")
-        self.pictures = [picture_beside(file) for file in self.files]
+            raise ValueError(f"{path}: has no pair for {split}; it needs files of {_TENTH} RAWs")
+        self.pictures = [_picture_beside(file) for file in self.files]
         super().__init__([str(file.relative_to(folder).with_suffix("")) for file in self.files])
 
     def of_split(self, files: list[Path], split: str) -> list[Path]:
@@ -162,7 +162,7 @@ def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
     return torch.from_numpy(numbers.astype(np.float32)).permute(2, 0, 1) / white
 
 
-def picture_beside(file: Path) -> Path:
+def _picture_beside(file: Path) -> Path:
     """The picture with the stem of a file, in its folder; FileNotFoundError if there is none."""
     for suffix in WHITE:
         if file.with_suffix(suffix).is_file():
@@ -170,8 +170,8 @@ def picture_beside(file: Path) -> Path:
     raise FileNotFoundError(f"{file}: has no {' or '.join(WHITE)} of the same stem beside it; download it too")
 
 
-TENTH = 10
-_TURN = {"test": (0,), "validation": (1,), "train": tuple(range(2, TENTH))}
+_TENTH = 10
+_TURN = {"test": (0,), "validation": (1,), "train": tuple(range(2, _TENTH))}
 """The places of each split's RAWs in every ten RAWs of a folder."""
 
 
@@ -186,7 +186,7 @@ class Rgb2Raw(Rawir):
         for file in files:
             places = places_in.setdefault(file.parent, {})
             place = places.setdefault(_raw_id(file), len(places))
-            if place % TENTH in _TURN[split]:
+            if place % _TENTH in _TURN[split]:
                 files_of_split.append(file)
         return files_of_split
 
@@ -199,7 +199,7 @@ def _raw_id(file: Path) -> str:
     return file.stem.rpartition("_")[0] or file.stem
 
 
-BLACK, ZURICH_WHITE = 63, 1020
+_BLACK, _ZURICH_WHITE = 63, 1020
 _BITS = 10
 
 
@@ -234,7 +234,7 @@ class Zurich(LazyPairs):
         if numbers.max() >= scale * 2**_BITS:
             raise ValueError(f"{file}: has value {numbers.max()}, more than {_BITS} bits; give a file of this dataset")
 
-        light = (numbers.astype(np.float32) - scale * BLACK) / (scale * (ZURICH_WHITE - BLACK))
+        light = (numbers.astype(np.float32) - scale * _BLACK) / (scale * (_ZURICH_WHITE - _BLACK))
         return Pair(
             name=self.names[index],
             srgb=read_picture(self._picture(file), self.max_pixels),

@@ -32,7 +32,7 @@ from rawaug.io import decode_srgb, read_picture
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.io.raw import XYZ_FROM_SRGB
 
-SPLITS = ("train", "validation", "test")
+_SPLITS = ("train", "validation", "test")
 _SHARES = ("train", "train", "train", "validation", "test")
 """The splits of five pictures of a folder, in turn."""
 _LENS_BLUR = 0.6
@@ -57,7 +57,7 @@ def scene_files(path: str | Path, split: str) -> list[Path]:
         FileNotFoundError: if there is no such folder.
         ValueError: if there is no such split, or it has no picture in this folder.
     """
-    require_split(f"scenes of {path or 'the package'}", split, SPLITS)
+    require_split(f"scenes of {path or 'the package'}", split, _SPLITS)
     if not str(path):
         return _package_files(split)
     folder = Path(path)

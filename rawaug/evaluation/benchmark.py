@@ -45,7 +45,7 @@ STRENGTHS = {
 }
 """(shot_var, read_var) of Google's Pixel at ISO 100, 800 and 3200 by its tags, and of noise two stops stronger."""
 
-SENSOR: dict[str, Any] = {
+_SENSOR: dict[str, Any] = {
     "row_var": 2e-6,
     "black_offset_sd": 5e-4,
     "colour_bias_sd": 5e-4,
@@ -53,12 +53,12 @@ SENSOR: dict[str, Any] = {
     "bits": 12,
     "black_level": 64,
 }
-"""The faults that sensors add to shot and read noise, at the strengths of :data:`OF_SENSORS` or at the caller's."""
+"""The faults that sensors add to shot and read noise, at the strengths of :data:`_OF_SENSORS` or at the caller's."""
 
-OF_SENSORS = ("phone", "strong")
+_OF_SENSORS = ("phone", "strong")
 """The strengths at which sensors as they are are simulated."""
 
-CONDITIONS = TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensors as they are"
+_CONDITIONS = TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensors as they are"
 """What the denoisers are told, and what the sensor does: a table each."""
 
 
@@ -97,7 +97,7 @@ def trials(
         strengths: noise levels by name, see :func:`strengths_of`.
     """
     strengths = strengths or strengths_of()
-    with_faults = set(OF_SENSORS).intersection(strengths) or set(strengths)
+    with_faults = set(_OF_SENSORS).intersection(strengths) or set(strengths)
 
     cases: list[Trial] = []
     for frame in progress(frames, label="noise", unit="frame"):
@@ -127,11 +127,11 @@ def noisy_frame(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real
             in ``rawaug evaluate``.
         levels: the noise levels.
         seed: of the noise.
-        real: whether what sensors add, :data:`SENSOR`, is added.
+        real: whether what sensors add, :data:`_SENSOR`, is added.
     """
     noise: NoiseModel = ShotReadNoise(levels)
     if real:
-        noise = SensorNoise(levels, **SENSOR)
+        noise = SensorNoise(levels, **_SENSOR)
 
     key: tuple[str, ...] = (TEST_NOISE,)
     if strength in STRENGTHS:
@@ -157,7 +157,7 @@ def hash_of(trials: Iterable[Trial]) -> str:
     """Eight digits of the SHA-256 of all noisy inputs, rounded to steps of 2^-12, on which all processors agree."""
     cases = list(trials)
     strengths = _strengths_in(cases)
-    cases.sort(key=lambda trial: (CONDITIONS.index(trial.condition), strengths.index(trial.strength)))
+    cases.sort(key=lambda trial: (_CONDITIONS.index(trial.condition), strengths.index(trial.strength)))
 
     images = []
     for trial in cases:
@@ -198,7 +198,7 @@ def _strengths_in(cases: Iterable[Trial]) -> list[str]:
 def _by_condition(rows: Sequence[Row], strengths: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Mean scores of one denoiser by condition and strength; sensors have some of the strengths alone."""
     scores: dict[str, dict[str, Any]] = {}
-    for condition in CONDITIONS:
+    for condition in _CONDITIONS:
         of_condition = group_rows(rows, "condition").get(condition, [])
         of_strengths = group_rows(of_condition, "strength")
         for strength in strengths:
@@ -251,7 +251,7 @@ def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str
     count = len(result["frames"])
     frames = f"{count} frame{'s' * (count != 1)}"
 
-    for condition in CONDITIONS:
+    for condition in _CONDITIONS:
         of_input = result["rows"]["noisy input"]["scores"][condition]
         strength_of_ssim = display_strength(of_input)
 

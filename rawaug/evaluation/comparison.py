@@ -28,10 +28,10 @@ from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Measured, Trial, own_noise_note
 from rawaug.files import write_json
 
-ALWAYS = "NonLocalMeans"
+_ALWAYS = "NonLocalMeans"
 """The filter that is in every table, as the shipped denoisers of mosaics are."""
 
-ON_PAGE = 4
+_ON_PAGE = 4
 """Largest number of frames on the page."""
 
 
@@ -69,7 +69,7 @@ class Comparison:
 def compare_raw(comparison: Comparison) -> None:
     """Compare denoisers of RAW on the same frozen noise; tables are printed, and written as JSON and as a page."""
     strengths = strengths_of(comparison.noise, comparison.iso)
-    denoisers = open_denoisers(comparison)
+    denoisers = _open_denoisers(comparison)
 
     pairs = open_pairs(comparison.data, split="test")
     pairs = SomePairs(pairs, range(len(pairs))[: comparison.count])
@@ -90,20 +90,20 @@ def compare_raw(comparison: Comparison) -> None:
         rows = [[name, *row] for name, row in cells.items()]
         print_rows(title, ["denoiser", *head], rows)
 
-    notes = notes_of(result)
+    notes = _notes_of(result)
     print("\n".join([*notes, noise]))
 
     if comparison.json:
         write_json(result, comparison.json)
     if comparison.report:
-        page = page_of(comparison, result, denoisers, cases, notes)
+        page = _page_of(comparison, result, denoisers, cases, notes)
         print(f"page: {page.write(Path(comparison.report), settings_of(comparison))}")
 
 
-def open_denoisers(comparison: Comparison) -> list[RawDenoiser]:
+def _open_denoisers(comparison: Comparison) -> list[RawDenoiser]:
     """The denoisers of the table; one whose name is taken goes by its spec."""
     by_name: dict[str, RawDenoiser] = {}
-    for spec in dict.fromkeys((ALWAYS, *shipped_of_mosaics(), *comparison.denoisers)):
+    for spec in dict.fromkeys((_ALWAYS, *shipped_of_mosaics(), *comparison.denoisers)):
         denoiser = denoiser_of(spec, comparison.device).require_mosaic()
         if denoiser.name in by_name:
             denoiser = replace(denoiser, name=spec)
@@ -112,7 +112,7 @@ def open_denoisers(comparison: Comparison) -> list[RawDenoiser]:
     return list(by_name.values())
 
 
-def notes_of(result: dict[str, Any]) -> list[str]:
+def _notes_of(result: dict[str, Any]) -> list[str]:
     """Lines below the tables."""
     summaries = {}
     for name, row in result["rows"].items():
@@ -129,7 +129,7 @@ def notes_of(result: dict[str, Any]) -> list[str]:
     return notes
 
 
-def page_of(
+def _page_of(
     comparison: Comparison,
     result: dict[str, Any],
     denoisers: Sequence[RawDenoiser],
@@ -148,7 +148,7 @@ def page_of(
     page.add("Quality and cost", figures=[chart])
 
     page.add("Pictures", texts=[f"Noise: {strength}, levels told; PSNR of RAW."])
-    for panels in crops(denoisers, cases, ON_PAGE):
+    for panels in crops(denoisers, cases, _ON_PAGE):
         page.add_frame(panels, comparison.crop)
 
     return page

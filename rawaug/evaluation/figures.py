@@ -30,10 +30,10 @@ WINDOW = 64
 PANEL = 256
 """Largest side of a panel, in mosaic pixels: larger frames are shown as a crop of the centre."""
 
-CROP = 192
+_CROP = 192
 """Side of a crop at 100 %, in pixels."""
 
-ACROSS = 4
+_ACROSS = 4
 """Maximum number of panels side by side; more would make the captions too small."""
 
 CURVES = {"loss": "loss", "psnr": "validation PSNR (dB)", "psnr_srgb": "validation PSNR, sRGB (dB)"}
@@ -108,7 +108,7 @@ def crops_at_100(rows: Sequence[Panels]) -> Tensor:
     """A row of crops of each trial, every image's where the clean one has most detail; sRGB ``(3, h, w)``."""
     strips = []
     for row in rows:
-        window = detail_window(row.trial.clean, CROP)
+        window = detail_window(row.trial.clean, _CROP)
         crops = [row.show(image[window]) for image in row.images.values()]
         strips.append(torch.cat(crops, dim=-1))
 
@@ -124,9 +124,9 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def save_picture(rows: Sequence[Panels], path: Path) -> Path:
-    """Write the panels of each row as a picture, at most :data:`ACROSS` side by side; the path."""
+    """Write the panels of each row as a picture, at most :data:`_ACROSS` side by side; the path."""
     counts = [len(row.images) for row in rows]
-    columns = min(ACROSS, max(counts))
+    columns = min(_ACROSS, max(counts))
     heights = [math.ceil(count / columns) for count in counts]
 
     figure = new_figure(2.1 * columns, 2.5 * sum(heights))

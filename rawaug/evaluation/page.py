@@ -33,7 +33,7 @@ from rawaug.evaluation.trials import Trial, evenly_spaced, own_noise_note
 from rawaug.evaluation.verdict import verdict
 from rawaug.io.pictures import encode_png
 
-WHOLE = 640
+_WHOLE = 640
 """Largest width of a whole frame on the page, in pixels."""
 
 ON_PAGE = 12
@@ -114,7 +114,7 @@ class Page:
             if not isinstance(noise, str):
                 noise = json.dumps(noise)
             first_arm = next(iter(results.values()))
-            levels = levels_range(first_arm[0]["plain"])
+            levels = _levels_range(first_arm[0]["plain"])
             terms["Noise"] = f"as captured with the frames, else {noise}; {levels}".rstrip("; ")
 
         self.add(terms={term: text for term, text in terms.items() if text})
@@ -169,8 +169,8 @@ class Page:
         whole = row.show(clean)
         height, width = whole.shape[-2:]
         part = name_part(height, width, crop)
-        if width > WHOLE:
-            whole = F.interpolate(whole[None], scale_factor=WHOLE / width, mode="area")[0]
+        if width > _WHOLE:
+            whole = F.interpolate(whole[None], scale_factor=_WHOLE / width, mode="area")[0]
 
         caption = f"{part}, clean; window at row {pixels * lines.start}, column {pixels * columns.start}"
         figures.append(Figure(encode_png(whole), part, caption=caption))
@@ -224,7 +224,7 @@ def command_line() -> str:
     return shlex.join(["rawaug", *sys.argv[1:]])
 
 
-def levels_range(summary: Mapping[str, Any]) -> str:
+def _levels_range(summary: Mapping[str, Any]) -> str:
     """The lowest and highest noise levels of the images of a summary, in words; empty if none is known."""
     ranges = []
     for key in ("shot_var", "read_var"):

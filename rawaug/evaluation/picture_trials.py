@@ -29,7 +29,7 @@ from rawaug.files import write_json
 from rawaug.version import __version__
 
 PUBLISHED, REGISTERED = "as published", "registered"
-BORDER = 4
+_BORDER = 4
 """Width of the border that is left out of the scores, in pixels."""
 
 
@@ -41,7 +41,7 @@ def picture_trials(pairs: Sequence[Any], registered: bool = False) -> Sequence[T
         if not registered:
             return Trial(noisy, clean, frame=pair.name, domain="srgb", condition=PUBLISHED)
 
-        inner = (..., slice(BORDER, -BORDER), slice(BORDER, -BORDER))
+        inner = (..., slice(_BORDER, -_BORDER), slice(_BORDER, -_BORDER))
         moved = register(noisy[0], clean[0])[None]
         return Trial(noisy[inner], moved[inner], frame=pair.name, domain="srgb", condition=REGISTERED)
 
@@ -55,8 +55,8 @@ def register(noisy: Tensor, clean: Tensor) -> Tensor:
     from scipy.ndimage import shift
 
     offset, *_ = phase_cross_correlation(noisy.mean(0).numpy(), clean.mean(0).numpy(), upsample_factor=50)
-    offset = np.clip(offset, -BORDER + 1.0, BORDER - 1.0)
-    inner = slice(BORDER, -BORDER), slice(BORDER, -BORDER)
+    offset = np.clip(offset, -_BORDER + 1.0, _BORDER - 1.0)
+    inner = slice(_BORDER, -_BORDER), slice(_BORDER, -_BORDER)
 
     planes = []
     for shot, truth in zip(noisy.double().numpy(), clean.double().numpy(), strict=True):
@@ -81,7 +81,7 @@ def picture_scores(denoisers: Sequence[Denoiser], pairs: Sequence[Any]) -> dict[
     return {"pictures": len(pairs), "rows": rows}
 
 
-def print_pictures(data: str, result: Mapping[str, Any]) -> None:
+def _print_pictures(data: str, result: Mapping[str, Any]) -> None:
     """The table of :func:`picture_scores`."""
     rows = []
     for name, by_condition in result["rows"].items():
@@ -113,7 +113,7 @@ def evaluate_pictures(evaluation: Evaluation) -> dict[str, Any]:
 
     pairs = open_picture_pairs(evaluation.data, evaluation.settings.noisy, evaluation.settings.clean)
     scores = picture_scores(denoisers, pairs)
-    print_pictures(evaluation.data, scores)
+    _print_pictures(evaluation.data, scores)
 
     rows = scores["rows"]
     result = {
@@ -136,6 +136,6 @@ def compare_pictures(comparison: Comparison) -> None:
     """Compare denoisers of pictures; the table is printed, and written as JSON."""
     denoisers = [PictureDenoiser.of(spec, comparison.device) for spec in comparison.denoisers]
     result = picture_scores(denoisers, open_picture_pairs(comparison.data))
-    print_pictures(comparison.data, result)
+    _print_pictures(comparison.data, result)
     if comparison.json:
         write_json({"data": comparison.data, **result}, comparison.json)

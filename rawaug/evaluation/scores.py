@@ -24,10 +24,10 @@ from rawaug.progress import progress
 METRICS = ("psnr", "ssim", "psnr_srgb", "ssim_srgb")
 """The scores of a row: PSNR in dB and SSIM, in the trial's domain and after development."""
 
-QUARTER_OF = 4
+_QUARTER_OF = 4
 """Minimum number of images for reporting quartiles."""
 
-SHOWN_FAULTS = 5
+_SHOWN_FAULTS = 5
 """Maximum number of scores without a number that an error names."""
 
 
@@ -251,7 +251,7 @@ def _add_means(result: dict[str, Any], key: str, rows: Sequence[Row], metric: st
 
     if values:
         result[key] = sum(values) / len(values)
-    if len(values) >= QUARTER_OF:
+    if len(values) >= _QUARTER_OF:
         result[f"{key}_worst25"], result[f"{key}_best25"] = worst_and_best_quarter(values)
 
     return faults
@@ -295,7 +295,7 @@ def require_numbers(summaries: Iterable[Mapping[str, Any]]) -> None:
     if not faults:
         return
 
-    texts = faults[:SHOWN_FAULTS]
+    texts = faults[:_SHOWN_FAULTS]
     hidden = len(faults) - len(texts)
     if hidden:
         texts.append(f"and {hidden} more")

@@ -47,7 +47,7 @@ def write_tables(page: Path, parts: Iterable[Mapping[str, Any]]) -> list[Path]:
 
         name = re.sub(r"[^a-z0-9]+", "_", part["heading"].lower()).strip("_") or "table"
         path = page.with_name(f"{page.stem}_{name}.csv")
-        write_csv(path, part["head"], part["rows"])
+        _write_csv(path, part["head"], part["rows"])
         paths.append(path)
 
         path = path.with_suffix(".tex")
@@ -57,7 +57,7 @@ def write_tables(page: Path, parts: Iterable[Mapping[str, Any]]) -> list[Path]:
     return paths
 
 
-def write_csv(path: Path, head: Sequence[str], rows: Mapping[str, Sequence[str]]) -> None:
+def _write_csv(path: Path, head: Sequence[str], rows: Mapping[str, Sequence[str]]) -> None:
     """Write a table with the names of its columns in ``head`` and its cells by the name of a row."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

@@ -47,7 +47,7 @@ def _quarters() -> Columns:
 PLAIN = _columns("plain")
 ENSEMBLE = _columns("self_ensemble")
 QUARTERS = _quarters()
-PRINTED: Columns = {
+_PRINTED: Columns = {
     "PSNR (dB)": ("plain", "psnr"),
     "SSIM": ("plain", "ssim"),
     "PSNR, self-ensemble": ("self_ensemble", "psnr"),
@@ -141,7 +141,7 @@ def _cell(key: str, values: Sequence[float]) -> str:
     if not values:
         return ""
 
-    return format_figure(key, statistics.fmean(values))
+    return _format_figure(key, statistics.fmean(values))
 
 
 def _digits(key: str) -> int:
@@ -160,7 +160,7 @@ def mean_and_spread(values: Sequence[float], digits: int) -> str:
     return f"{mean} ± {statistics.stdev(values):.{digits}f}"
 
 
-def format_figure(key: str, value: float | None) -> str:
+def _format_figure(key: str, value: float | None) -> str:
     """The figure of a metric as tables have it; empty if there is none."""
     if value is None:
         return ""
@@ -172,8 +172,8 @@ def format_figure(key: str, value: float | None) -> str:
 
 def join_figures(scores: Mapping[str, Any], first: str, second: str) -> str:
     """Two figures in a cell; a dash stands for what is no number."""
-    figure = format_figure(first, scores.get(first)) or "-"
-    other = format_figure(second, scores.get(second)) or "-"
+    figure = _format_figure(first, scores.get(first)) or "-"
+    other = _format_figure(second, scores.get(second)) or "-"
     return f"{figure} / {other}"
 
 
@@ -207,7 +207,7 @@ def print_table(results: Runs, title: str, others: Mapping[str, Mapping[str, Any
 
     ``results`` has one entry a seed in an arm's list, ``others`` a summary by name.
     """
-    table = table_of(results, others, PRINTED)
+    table = table_of(results, others, _PRINTED)
     rows = [[method, *cells] for method, cells in table.rows.items()]
     print_rows(title, ["arm", *table.columns], rows)
 
@@ -254,7 +254,7 @@ def print_scores(result: Mapping[str, Any]) -> None:
 
 
 def _figures(scores: Mapping[str, Any], keys: Sequence[str], end: str = "") -> list[str]:
-    return [format_figure(key, scores.get(key + end)) for key in keys]
+    return [_format_figure(key, scores.get(key + end)) for key in keys]
 
 
 def levels_note(summary: Mapping[str, Any]) -> str:

@@ -38,7 +38,7 @@ TEST_NOISE = "test noise"
 _CACHE_MB = 1024
 """Megabytes of trials that stay in memory; others are made again for each pass."""
 
-Case = TypeVar("Case")
+_Case = TypeVar("_Case")
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +155,7 @@ def raw_trial(
     return Trial(noisy, clean, variance, pair.name, levels=levels, cfa=cfa, develop=develop, own=own, **about)
 
 
-def make_trials(cases: Sequence[Case], make: Callable[[Case], Trial]) -> Sequence[Trial]:
+def make_trials(cases: Sequence[_Case], make: Callable[[_Case], Trial]) -> Sequence[Trial]:
     """``make(case)`` of every case, made at its first use and kept in memory, up to a gigabyte."""
     trials: Any = Cached(cases, _CACHE_MB, make)
     return trials
@@ -174,13 +174,13 @@ def evenly_spaced(length: int, most: int) -> list[int]:
 
 # -- the references' own noise -----------------------------------------------------------------------------------------
 
-MUCH = 0.1
+_MUCH = 0.1
 """Threshold for warning of the references' own noise, as a share of the squared error."""
 
-MOST_MEASURED = 12
+_MOST_MEASURED = 12
 """Maximum number of frames whose own noise is measured; a frame of 12 megapixels takes seconds."""
 
-MOST_TARGETS = 3
+_MOST_TARGETS = 3
 """Maximum number of training frames whose own noise is measured."""
 
 _SHOWN = 4
@@ -193,7 +193,7 @@ class Measured(SomePairs):
     Only ``most`` of them are measured, evenly spaced, since each takes seconds.
     """
 
-    def __init__(self, pairs: Sequence[Pair], most: int = MOST_MEASURED) -> None:
+    def __init__(self, pairs: Sequence[Pair], most: int = _MOST_MEASURED) -> None:
         super().__init__(pairs)
         self.measured = set(evenly_spaced(len(pairs), most))
 
@@ -210,7 +210,7 @@ def own_noise_note(summaries: Mapping[str, Mapping[str, Any]]) -> str:
     shares = {}
     for name, scores in summaries.items():
         share = scores.get("own_noise", 0.0)
-        if share > MUCH:
+        if share > _MUCH:
             shares[name] = share
 
     if not shares:
@@ -238,7 +238,7 @@ def added_noise_note(trials: Iterable[Trial]) -> str:
 
     own = fmean(own_variances)
     share = own / fmean(test_variances)
-    if share <= MUCH:
+    if share <= _MUCH:
         return ""
 
     return (
@@ -263,7 +263,7 @@ def training_noise_note(pairs: Sequence[Pair], noise: NoiseModel, arms: Sequence
 
     targets = [pair for pair in pairs if pair.noisy is None]
     shares = []
-    for k in evenly_spaced(len(targets), MOST_TARGETS):
+    for k in evenly_spaced(len(targets), _MOST_TARGETS):
         pair = targets[k]
         levels = pair.own_noise or own_noise(pair.raw, pair.cfa)
         if levels is None:
@@ -272,7 +272,7 @@ def training_noise_note(pairs: Sequence[Pair], noise: NoiseModel, arms: Sequence
         params = noise.sample(1, keyed_generator(0, "training noise", pair.name))
         shares.append((noise_variance(clean, *levels).mean() / noise.variance(clean, params).mean()).item())
 
-    if not shares or fmean(shares) <= MUCH:
+    if not shares or fmean(shares) <= _MUCH:
         return ""
 
     return (

@@ -18,10 +18,10 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any, NamedTuple
 
-MATTERS = 0.05
+_MATTERS = 0.05
 """Minimum gain in dB for preferring a trained arm to a method without training."""
 
-INPUT = "the noisy input"
+_INPUT = "the noisy input"
 """The name of the noisy input where no other method was scored."""
 
 CLEANER_TEST = "bin the references (bin 4), or add the noise of a higher ISO"
@@ -52,7 +52,7 @@ def verdict(results: Mapping[str, Sequence[Mapping[str, Summary]]], others: Mapp
             input.
 
     Returns:
-        The recommendation, which names an arm, one of the others or :data:`INPUT`, or nothing.
+        The recommendation, which names an arm, one of the others or :data:`_INPUT`, or nothing.
     """
     runs_by_arm: dict[str, list[Summary]] = {}
     for arm, runs in results.items():
@@ -68,7 +68,7 @@ def verdict(results: Mapping[str, Sequence[Mapping[str, Summary]]], others: Mapp
 
     rival, scores = _best_rival(others)
     if not rival:
-        rival, scores = INPUT, _of_input(runs[0])
+        rival, scores = _INPUT, _of_input(runs[0])
 
     gain = _mean(runs, "psnr") - scores["psnr"]
     gain_srgb = _gain_srgb(runs, scores)
@@ -77,7 +77,7 @@ def verdict(results: Mapping[str, Sequence[Mapping[str, Summary]]], others: Mapp
     if doubt:
         return Verdict("", f"No recommendation: {doubt}.")
 
-    if gain >= MATTERS:
+    if gain >= _MATTERS:
         use = arm
         reasons = [f"{gain:+.2f} dB over {rival}"]
     elif gain >= 0:
@@ -151,7 +151,7 @@ def _disagreement(arm: str, rival: str, gain: float, gain_srgb: float | None) ->
         return ""
 
     opposed = round(gain, 2) * round(gain_srgb, 2) < 0
-    only_developed = abs(gain) < MATTERS <= gain_srgb
+    only_developed = abs(gain) < _MATTERS <= gain_srgb
     if not (opposed or only_developed):
         return ""
 
@@ -168,7 +168,7 @@ def _kept_noise(arm: str, runs: Sequence[Summary], rival: str, other: Summary) -
     if other["psnr"] > best["psnr"]:
         name, scores = rival, other
 
-    own, test_noise = noise_of_references(scores)
+    own, test_noise = _noise_of_references(scores)
     if own is None:
         return ""
 
@@ -184,13 +184,13 @@ def _kept_noise(arm: str, runs: Sequence[Summary], rival: str, other: Summary) -
 
     gap = abs(_squared_error(best["psnr"]) - _squared_error(other["psnr"]))
     by_keeping = own**2 / (own + test_noise)
-    if abs(best["psnr"] - other["psnr"]) >= MATTERS and gap <= by_keeping:
+    if abs(best["psnr"] - other["psnr"]) >= _MATTERS and gap <= by_keeping:
         return f"{arm} and {rival} differ by no more than a method gains by keeping the references' noise; {decides}"
 
     return ""
 
 
-def noise_of_references(summary: Summary) -> tuple[float | None, float | None]:
+def _noise_of_references(summary: Summary) -> tuple[float | None, float | None]:
     """The mean variance of the references' own noise and that of the noise added to them; None if not known."""
     own_variances = []
     test_variances = []

@@ -18,10 +18,10 @@ from rawaug.training.config import SAME_WEIGHTS
 STAMP = "run.json"
 """The file with the settings of a run."""
 
-FREE = frozenset({"name", "out", "device", "devices", "seeds", "self_ensemble", "views"})
+_FREE = frozenset({"name", "out", "device", "devices", "seeds", "self_ensemble", "views"})
 """Keys that may change when a run is resumed, as they do not change its results."""
 
-FREE_ANYWHERE = SAME_WEIGHTS | {"memory_mb"}
+_FREE_ANYWHERE = SAME_WEIGHTS | {"memory_mb"}
 """Keys in parts of the recipe that may change when a run is resumed."""
 
 _SHOWN = 3
@@ -59,7 +59,7 @@ def require_free(settings: Any, overwrite: bool = False) -> Path:
     now = dict(_flatten(json.loads(json.dumps(asdict(settings)))))
     changes = []
     for key in sorted(before | now):
-        if before.get(key) == now.get(key) or key in FREE or key.rpartition(".")[2] in FREE_ANYWHERE:
+        if before.get(key) == now.get(key) or key in _FREE or key.rpartition(".")[2] in _FREE_ANYWHERE:
             continue
         changes.append(f"{key} {before.get(key)}, now {now.get(key)}")
 

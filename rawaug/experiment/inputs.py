@@ -17,13 +17,13 @@ from rawaug.tasks.settings import HELD_OUT, DataConfig, Recipe
 from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.noisy_frames import noise_of
 
-MOST_HELD_OUT = 16
+_MOST_HELD_OUT = 16
 """Maximum number of frames that are held out for validation; it is a fifth of them, and at least one."""
 
-GIVEN = "given pairs"
+_GIVEN = "given pairs"
 """The value of ``data.pairs``, ``data.validation`` or ``data.test`` in the results of pairs given from Python."""
 
-MARGIN = 6
+_MARGIN = 6
 """Pixels by which a frame is larger than the crops of it, which are turned and shifted to a pattern."""
 
 _NAMED = 6
@@ -56,14 +56,14 @@ class Inputs:
 
         train = "no RAW frames"
         if self.pairs:
-            train = listing(self.pairs, of_pairs, data.pairs)
+            train = _listing(self.pairs, of_pairs, data.pairs)
 
         validate = "no frames: monitored on RAW made from the pictures; the final weights are kept"
         if self.validation:
             source = data.validation
             if self.held_out:
                 source = f"{data.pairs}, held out"
-            validate = listing(self.validation, of_validation, source, MOST_HELD_OUT)
+            validate = _listing(self.validation, of_validation, source, _MOST_HELD_OUT)
 
         isp = f"{recipe.camera}, unchanged"
         if recipe.camera is None:
@@ -72,7 +72,7 @@ class Inputs:
         return [
             f"train     {train}",
             f"validate  {validate}",
-            f"test      {listing(self.test, of_test, data.test)}",
+            f"test      {_listing(self.test, of_test, data.test)}",
             f"pictures  {len(self.pictures)} of {data.pictures}",
             f"ISP       {isp}",
         ]
@@ -93,7 +93,7 @@ class Inputs:
         return inputs, lines
 
 
-def listing(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
+def _listing(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
     """Tell which frames of a dataset are used, as in ``"2 of 8 of demo:train: a, b"``.
 
     Args:
@@ -156,7 +156,7 @@ def _number_held_out(available: int) -> int:
     if available < 2:
         return 0
 
-    return min(max(1, available // 5), MOST_HELD_OUT)
+    return min(max(1, available // 5), _MOST_HELD_OUT)
 
 
 def _require_unseen(test: Sequence[Any], frames: Sequence[Any], part: str) -> None:
@@ -170,7 +170,7 @@ def _open_pictures(data: DataConfig, pairs: Sequence[Pair], crop: int) -> Any:
     """The pictures to make RAW of, those of the pairs or others, cached as far as the recipe says."""
     pictures: Any = PairPictures(pairs)
     if data.pictures != OWN_PICTURES:
-        pictures = open_pictures(data.pictures, crop + MARGIN, data.max_pixels)
+        pictures = open_pictures(data.pictures, crop + _MARGIN, data.max_pixels)
 
     if data.memory_mb:
         pictures = Cached(pictures, data.memory_mb)
@@ -214,8 +214,8 @@ def _dataset(spec: str | None) -> str | None:
 
 
 def name_given_pairs(recipe: Recipe, frames: Mapping[str, Sequence[Pair]]) -> Recipe:
-    """The recipe with :data:`GIVEN` as the name of data that are given; if pairs alone are, some are held out."""
-    names: dict[str, Any] = dict.fromkeys(frames, GIVEN)
+    """The recipe with :data:`_GIVEN` as the name of data that are given; if pairs alone are, some are held out."""
+    names: dict[str, Any] = dict.fromkeys(frames, _GIVEN)
     if "pairs" in frames and "validation" not in frames and recipe.data.validation is not None:
         names["validation"] = HELD_OUT
 
@@ -235,7 +235,7 @@ def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[P
                 f"{pair.name}: its white balance and colour matrix are unknown, so no ISP can be fitted to it; "
                 "use a shipped one: camera: universal"
             )
-        if real and min(pair.raw.shape[-2:]) < recipe.train.crop + MARGIN:
+        if real and min(pair.raw.shape[-2:]) < recipe.train.crop + _MARGIN:
             size = f"{pair.raw.shape[-2]} x {pair.raw.shape[-1]}"
             raise ValueError(f"{pair.name}: a frame of {size} is too small for train.crop={recipe.train.crop}")
 

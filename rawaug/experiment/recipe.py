@@ -18,7 +18,7 @@ They are functions ``run(settings, overwrite)``. ``settings`` is a dataclass of 
 ``shortest()`` gives the settings of a dry run.
 """
 
-DEFAULT_KIND = "raw"
+_DEFAULT_KIND = "raw"
 """The kind of a recipe without the key ``experiment``."""
 
 
@@ -33,7 +33,7 @@ def read_recipe(file: str | Path) -> dict[str, Any]:
 
 def kind_of(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
     """The kind of experiment that a recipe is for; ValueError, which names the file, if there is no such kind."""
-    kind = content.get("experiment", DEFAULT_KIND)
+    kind = content.get("experiment", _DEFAULT_KIND)
     if kind not in kinds():
         raise ValueError(f"{file}: unknown experiment {kind!r:.80}; use one of {', '.join(kinds())}")
 

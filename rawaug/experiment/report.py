@@ -76,25 +76,25 @@ def write_report(report: Report) -> None:
     recipe, task, folder = experiment.recipe, experiment.task, experiment.folder
 
     others: dict[str, dict[str, Any]] = {group: {} for group in report.tables}
-    file = write_results(report, others)
-    methods = choose_methods(report, camera)
+    file = _write_results(report, others)
+    methods = _choose_methods(report, camera)
     others |= score_methods(camera, methods)
-    write_results(report, others)
+    _write_results(report, others)
 
     verdicts = {}
     for group, results in report.tables.items():
         verdicts[group] = verdict(results, others[group])
     commands = usage(experiment, report.tables, verdicts)
 
-    title = title_of(experiment)
-    page = Page(title, lead_of(verdicts))
-    page.add_facts(facts_of(report, others, commands[-1]), next(iter(report.tables.values())))
-    page.add("Methods", terms=methods_of(recipe, methods))
+    title = _title_of(experiment)
+    page = Page(title, _lead_of(verdicts))
+    page.add_facts(_facts_of(report, others, commands[-1]), next(iter(report.tables.values())))
+    page.add("Methods", terms=_methods_of(recipe, methods))
     for group, results in report.tables.items():
         page.add_scores(results, others[group], group)
 
     page.add_curves(curves(experiment))
-    panels = task.panels(shown_methods(report, camera, methods), camera.trials)
+    panels = task.panels(_shown_methods(report, camera, methods), camera.trials)
     for row in panels:
         page.add_frame(row, recipe.data.test_crop)
     page.write(folder / "report.html", asdict(recipe))
@@ -102,10 +102,10 @@ def write_report(report: Report) -> None:
 
     for group, results in report.tables.items():
         print_table(results, ": ".join(filter(None, [title, group])), others[group])
-    say(page.lead, own_noise_note(all_first_runs(report, others)), report.noise_note)
+    say(page.lead, own_noise_note(_all_first_runs(report, others)), report.noise_note)
     print(f"table: {file}\npicture: {picture}\npage: {folder / 'report.html'}")
     say(*reports(experiment.inputs.pictures), *experiment.unreadable, *commands)
-    require_all_numbers(report, others)
+    _require_all_numbers(report, others)
 
 
 def say(*lines: str) -> None:
@@ -118,7 +118,7 @@ def say(*lines: str) -> None:
 # -- scores ------------------------------------------------------------------------------------------------------------
 
 
-def write_results(report: Report, others: Mapping[str, Mapping[str, Any]]) -> Path:
+def _write_results(report: Report, others: Mapping[str, Mapping[str, Any]]) -> Path:
     """Write ``results.json``; the path."""
     experiment = report.experiment
     tables = {}
@@ -135,7 +135,7 @@ def write_results(report: Report, others: Mapping[str, Mapping[str, Any]]) -> Pa
     return path
 
 
-def choose_methods(report: Report, camera: Camera) -> dict[str, list[Any]]:
+def _choose_methods(report: Report, camera: Camera) -> dict[str, list[Any]]:
     """The denoisers that arms are compared with, by table."""
     experiment = report.experiment
     arm = next(iter(experiment.recipe.arms))
@@ -147,7 +147,7 @@ def choose_methods(report: Report, camera: Camera) -> dict[str, list[Any]]:
     return methods
 
 
-def all_first_runs(report: Report, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+def _all_first_runs(report: Report, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
     """The summary of every method by name and table, of an arm that of its first seed."""
     runs = {}
     for group, results in report.tables.items():
@@ -162,7 +162,7 @@ def _with_group(name: str, group: str) -> str:
     return ", ".join(filter(None, [name, group]))
 
 
-def require_all_numbers(report: Report, others: Mapping[str, Mapping[str, Any]]) -> None:
+def _require_all_numbers(report: Report, others: Mapping[str, Mapping[str, Any]]) -> None:
     """Raise ValueError if a score of any table is no number."""
     summaries: list[Mapping[str, Any]] = []
     for group, results in report.tables.items():
@@ -177,7 +177,7 @@ def require_all_numbers(report: Report, others: Mapping[str, Mapping[str, Any]])
 # -- what the page says ------------------------------------------------------------------------------------------------
 
 
-def title_of(experiment: Experiment) -> str:
+def _title_of(experiment: Experiment) -> str:
     """The title of tables and page: what was tested on what."""
     recipe, task = experiment.recipe, experiment.task
     settings = f"real pairs: {len(experiment.inputs.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
@@ -185,7 +185,7 @@ def title_of(experiment: Experiment) -> str:
     return ": ".join(filter(None, [title, task.compared_in]))
 
 
-def lead_of(verdicts: Mapping[str, Verdict]) -> str:
+def _lead_of(verdicts: Mapping[str, Verdict]) -> str:
     """The verdict of every table in a sentence each."""
     sentences = []
     for group, one in verdicts.items():
@@ -194,18 +194,18 @@ def lead_of(verdicts: Mapping[str, Verdict]) -> str:
     return " ".join(sentences)
 
 
-def facts_of(report: Report, others: Mapping[str, Mapping[str, Any]], command: str) -> dict[str, Any]:
+def _facts_of(report: Report, others: Mapping[str, Mapping[str, Any]], command: str) -> dict[str, Any]:
     """What the page states besides the scores, by term; ``command`` is the line that ends a run."""
     task = report.experiment.task
     return {
         "Noise": task.test_noise(),
         "To use it": command.partition(": ")[2],
         "Training frames": report.noise_note,
-        "Own noise": own_noise_note(all_first_runs(report, others)),
+        "Own noise": own_noise_note(_all_first_runs(report, others)),
     }
 
 
-def methods_of(recipe: Recipe, methods: Mapping[str, Sequence[Any]]) -> dict[str, str]:
+def _methods_of(recipe: Recipe, methods: Mapping[str, Sequence[Any]]) -> dict[str, str]:
     """A line on each row of the tables, by its name; ``methods`` are the denoisers beside the arms, by table."""
     names: set[str] = set()
     for of_group in methods.values():
@@ -254,7 +254,7 @@ def curves(experiment: Experiment) -> dict[str, bytes]:
     return plot_curves(logs)
 
 
-def shown_methods(report: Report, camera: Camera, methods: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
+def _shown_methods(report: Report, camera: Camera, methods: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
     """The denoisers whose pictures are shown, by table: the first filter, trained denoisers, and the arms."""
     experiment = report.experiment
     hidden = {spec_label(spec) for spec in experiment.classical[1:]}

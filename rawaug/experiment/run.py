@@ -118,13 +118,13 @@ def prepare(recipe: Recipe, overwrite: bool, frames: dict[str, Sequence[Pair]]) 
     say(*inputs.lines(recipe))
     inputs, unreadable = inputs.read()
     say(*unreadable)
-    inputs = hide_clean_frames(recipe, inputs)
+    inputs = _hide_clean_frames(recipe, inputs)
     require_usable(recipe, inputs.pairs, inputs.validation)
 
     return Experiment(recipe, task, folder, inputs, unreadable, classical, methods, estimators, starts)
 
 
-def hide_clean_frames(recipe: Recipe, inputs: Inputs) -> Inputs:
+def _hide_clean_frames(recipe: Recipe, inputs: Inputs) -> Inputs:
     """The inputs in memory; if no arm sees clean frames, nothing but the test knows one from here on."""
     pairs = list(inputs.pairs)
     validation = inputs.validation

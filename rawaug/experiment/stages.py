@@ -34,11 +34,11 @@ from rawaug.training.estimators import Supervised
 from rawaug.training.loop import train
 from rawaug.training.state import Start
 
-PLAIN, ENSEMBLE = "plain", "self_ensemble"
+_PLAIN, _ENSEMBLE = "plain", "self_ensemble"
 """The kinds of scores of a denoiser, in the order of tables."""
 
 Summaries = dict[str, dict[str, Any]]
-"""By :data:`PLAIN` and :data:`ENSEMBLE`, a summary of scores."""
+"""By :data:`_PLAIN` and :data:`_ENSEMBLE`, a summary of scores."""
 
 Results = dict[str, Any]
 """By arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``; of several tables, by table first."""
@@ -132,7 +132,7 @@ class Camera:
         """The scores of the input itself in a table."""
         if not self._noisy:
             rows = score([self.experiment.task.input], self.trials)
-            self._noisy.update(group_by_table(self.experiment.task, rows))
+            self._noisy.update(_group_by_table(self.experiment.task, rows))
 
         return self._noisy[group]
 
@@ -197,7 +197,7 @@ def train_arm(experiment: Experiment, camera: Camera, arm: str, seed: int) -> De
     recipe, inputs = experiment.recipe, experiment.inputs
     folder = experiment.arm_folder(arm, seed)
     path = folder / "denoiser.safetensors"
-    key = arm_key(experiment, camera, arm, seed)
+    key = _arm_key(experiment, camera, arm, seed)
 
     if path.is_file():
         model, info = denoisers.load(path)
@@ -223,13 +223,13 @@ def train_arm(experiment: Experiment, camera: Camera, arm: str, seed: int) -> De
     )
 
     if is_leader():
-        denoisers.save(model, path, info_of_arm(experiment, camera, arm, seed, key))
+        denoisers.save(model, path, _info_of_arm(experiment, camera, arm, seed, key))
         (folder / "last.pt").unlink(missing_ok=True)
 
     return model
 
 
-def info_of_arm(experiment: Experiment, camera: Camera, arm: str, seed: int, key: str) -> dict[str, Any]:
+def _info_of_arm(experiment: Experiment, camera: Camera, arm: str, seed: int, key: str) -> dict[str, Any]:
     """What the file of an arm's weights says of its training."""
     recipe, inputs, start = experiment.recipe, experiment.inputs, experiment.starts[arm]
     noise: Any = recipe.noise
@@ -249,7 +249,7 @@ def info_of_arm(experiment: Experiment, camera: Camera, arm: str, seed: int, key
     return info
 
 
-def arm_key(experiment: Experiment, camera: Camera, arm: str, seed: int) -> str:
+def _arm_key(experiment: Experiment, camera: Camera, arm: str, seed: int) -> str:
     """Hash the settings and frames that the weights of an arm depend on."""
     recipe, inputs, task = experiment.recipe, experiment.inputs, experiment.task
     data, start = recipe.data, experiment.starts[arm]
@@ -280,24 +280,24 @@ def score_arm(experiment: Experiment, camera: Camera, arm: str, seed: int, netwo
     """The arm's summaries by table; those in its file are kept."""
     recipe, task = experiment.recipe, experiment.task
     path = experiment.arm_folder(arm, seed) / "evaluation.json"
-    key = scores_key(experiment, sha256(path.with_name("denoiser.safetensors")))
+    key = _scores_key(experiment, sha256(path.with_name("denoiser.safetensors")))
 
-    kinds = [PLAIN]
+    kinds = [_PLAIN]
     if recipe.self_ensemble and task.ensembles:
-        kinds.append(ENSEMBLE)
+        kinds.append(_ENSEMBLE)
 
-    tables = read_scores(path, key)
+    tables = _read_scores(path, key)
     missing = [kind for kind in kinds if not _all_have(tables, kind)]
     if not missing:
         print(f"already evaluated: {path}")
 
     for kind in missing:
         views = 1
-        if kind == ENSEMBLE:
+        if kind == _ENSEMBLE:
             views = recipe.views
 
         denoiser = task.denoiser(arm, network, camera.pattern(arm), views)
-        for group, result in score_tables(camera, denoiser, f"evaluate {arm}, {kind}").items():
+        for group, result in _score_tables(camera, denoiser, f"evaluate {arm}, {kind}").items():
             tables.setdefault(group, {})[kind] = result
             name = ", ".join(filter(None, [arm, f"seed {seed}", kind, group]))
             print(f"evaluated {name}: {result.get('psnr', math.nan):.2f} dB: {path}")
@@ -315,7 +315,7 @@ def _all_have(tables: Mapping[str, Summaries], kind: str) -> bool:
     return bool(tables) and all(kind in table for table in tables.values())
 
 
-def read_scores(path: Path, key: str) -> dict[str, Summaries]:
+def _read_scores(path: Path, key: str) -> dict[str, Summaries]:
     """The summaries by table in a file of this key; none if there is no such file."""
     if not path.is_file():
         return {}
@@ -325,17 +325,17 @@ def read_scores(path: Path, key: str) -> dict[str, Summaries]:
         return {}
 
     tables: dict[str, Summaries] = content
-    if PLAIN in content:
+    if _PLAIN in content:
         tables = {"": content}
 
     return tables
 
 
-def score_tables(camera: Camera, denoiser: Any, label: str) -> dict[str, dict[str, Any]]:
+def _score_tables(camera: Camera, denoiser: Any, label: str) -> dict[str, dict[str, Any]]:
     """The summaries of a denoiser by table; those whose images it does not take are left out."""
     task = camera.experiment.task
     trials = (trial for trial in camera.trials if task.can_denoise(denoiser, trial))
-    rows = group_by_table(task, score([denoiser], trials, label))
+    rows = _group_by_table(task, score([denoiser], trials, label))
 
     summaries = {}
     for group, of_group in rows.items():
@@ -344,7 +344,7 @@ def score_tables(camera: Camera, denoiser: Any, label: str) -> dict[str, dict[st
     return summaries
 
 
-def group_by_table(task: Task, rows: Any) -> dict[str, list[Row]]:
+def _group_by_table(task: Task, rows: Any) -> dict[str, list[Row]]:
     """Rows by the table that they belong to."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
@@ -353,7 +353,7 @@ def group_by_table(task: Task, rows: Any) -> dict[str, list[Row]]:
     return groups
 
 
-def scores_key(experiment: Experiment, digest: str) -> str:
+def _scores_key(experiment: Experiment, digest: str) -> str:
     """Hash what the scores of an arm depend on besides the noise and the arm's own settings.
 
     ``digest`` is that of its weights.

@@ -33,7 +33,7 @@ from rawaug.plugin.pictures import trim_to_even
 from rawaug.plugin.targets import Target
 from rawaug.version import __version__
 
-LONGEST_STEM = 200
+_LONGEST_STEM = 200
 """Largest number of bytes of a picture's name in the names of its pairs, which have at most 255."""
 
 _WHITE = 65535
@@ -212,9 +212,9 @@ def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: 
 def _short(name: str) -> str:
     """Shorten a name, and add a hash, if the pairs' file names would become too long."""
     encoded = os.fsencode(name)
-    if len(encoded) <= LONGEST_STEM:
+    if len(encoded) <= _LONGEST_STEM:
         return name
-    return encoded[: LONGEST_STEM - 20].decode("utf-8", "ignore") + f"-{digest(encoded)[:16]}"
+    return encoded[: _LONGEST_STEM - 20].decode("utf-8", "ignore") + f"-{digest(encoded)[:16]}"
 
 
 def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, origin: Origin) -> None:

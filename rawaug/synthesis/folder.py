@@ -32,7 +32,7 @@ from rawaug.synthesis.files import TARGETS, Format, PairMaker, PictureTask, Sett
 from rawaug.synthesis.shards import PER_SHARD, ShardTask
 
 Task = PictureTask | ShardTask
-Outcome = tuple[int, dict[str, str]]
+_Outcome = tuple[int, dict[str, str]]
 """The number of pairs that a task has made, and the reason for each picture that it could not read."""
 
 
@@ -183,7 +183,7 @@ def _run(out: Path, tasks: Sequence[Task], settings: Settings, max_pixels: int, 
 _maker: PairMaker
 
 
-def _run_tasks(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[Outcome]:
+def _run_tasks(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[_Outcome]:
     if workers is None:
         workers = os.cpu_count() or 1
     workers = min(len(tasks), workers)
@@ -230,5 +230,5 @@ def _prepare(settings: Settings, max_pixels: int) -> None:
     _maker = PairMaker(settings, max_pixels)
 
 
-def _make(task: Task) -> Outcome:
+def _make(task: Task) -> _Outcome:
     return task.make(_maker)

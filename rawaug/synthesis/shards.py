@@ -207,10 +207,10 @@ def write_index(out: Path, count: int, settings: Settings) -> None:
     index = {"__kind__": "wids-shard-index-v1", "wids_version": 1, "name": "rawaug pairs", "shardlist": shards}
     write_json(index, out / "index.json")
     with replacing(out / "README.md") as partial:
-        partial.write_text(dataset_card(shards, settings), encoding="utf-8")
+        partial.write_text(_dataset_card(shards, settings), encoding="utf-8")
 
 
-def dataset_card(shards: Sequence[Mapping[str, Any]], settings: Settings) -> str:
+def _dataset_card(shards: Sequence[Mapping[str, Any]], settings: Settings) -> str:
     """Write the text of the dataset card, with the header that Hugging Face reads."""
     from jinja2 import Environment, PackageLoader
 

@@ -36,10 +36,10 @@ from rawaug.training.state import Start
 LIBRAW = ("VNG", "PPG", "AHD", "DCB", "DHT", "AAHD")
 """LibRaw's demosaicings by its names."""
 
-LEAST = 512
+_LEAST = 512
 """Minimum side of a frame for LibRaw's interpolation of X-Trans."""
 
-BLACK, WHITE = 1024, 65535
+_BLACK, _WHITE = 1024, 65535
 """Black and white level of the DNGs that LibRaw demosaics."""
 
 
@@ -66,7 +66,7 @@ def rgb_trial(
     rgb = full_colour(pair)
     squares = bayer.pack(bayer.pattern(cfa).mosaic(rgb), CFA.RGGB)
     noisy, variance, levels = freeze_noise(squares, noise, 0, TEST_NOISE, pair.name)
-    noisy, variance = in_pattern(noisy, cfa), in_pattern(variance, cfa)
+    noisy, variance = _in_pattern(noisy, cfa), _in_pattern(variance, cfa)
 
     follow = {}
     for name, method in (ways or {}).items():
@@ -86,7 +86,7 @@ def rgb_trial(
     )
 
 
-def in_pattern(squares: Tensor, cfa: str) -> Tensor:
+def _in_pattern(squares: Tensor, cfa: str) -> Tensor:
     """Squares of 2 x 2 as a denoiser takes their pattern: packed RAW if it is Bayer's, else the mosaic."""
     if cfa == CFA.RGGB:
         return squares
@@ -151,10 +151,10 @@ def libraw_demosaic(mosaic: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB
     height, width = mosaic.shape[-2:]
     period = bayer.pattern(cfa).period
     rows, columns = _repeat_cells(height, period), _repeat_cells(width, period)
-    mosaic = (mosaic[0][:, rows][..., columns] / headroom).clamp(-BLACK / (WHITE - BLACK), 1.0)
+    mosaic = (mosaic[0][:, rows][..., columns] / headroom).clamp(-_BLACK / (_WHITE - _BLACK), 1.0)
 
     colour = pair.white_balance, pair.white_balance, pair.color_matrix
-    frame = RawFrame(mosaic, cfa, (BLACK,) * 4, WHITE, *colour, pair.camera, name=pair.name)
+    frame = RawFrame(mosaic, cfa, (_BLACK,) * 4, _WHITE, *colour, pair.camera, name=pair.name)
     settings = {
         "demosaic_algorithm": rawpy.DemosaicAlgorithm[method],
         "output_color": rawpy.ColorSpace.raw,
@@ -180,7 +180,7 @@ def _repeat_cells(side: int, period: int) -> Tensor:
     """Numbers of the lines of a side, which go on with its whole cells if LibRaw would find it too small."""
     count = side
     if period != 2:
-        count = max(side, LEAST)
+        count = max(side, _LEAST)
 
     lines = torch.arange(count)
     return torch.where(lines < side, lines, lines % (side // period * period))

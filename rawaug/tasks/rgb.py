@@ -46,7 +46,7 @@ class RgbRecipe(FullColourRecipe):
                 raise ValueError(f"demosaicing {name!r} is unknown; use one of {', '.join(choices)}")
 
 
-class MalvarInput:
+class _MalvarInput:
     """The noisy input, demosaiced by Malvar, He and Cutler's interpolation."""
 
     name, takes = NOISY.name, "raw"
@@ -61,7 +61,7 @@ class RgbTask(FullColourTask):
 
     settings = RgbRecipe
     upscale = 2
-    input = MalvarInput()
+    input = _MalvarInput()
 
     def validation_trials(
         self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel

@@ -21,16 +21,16 @@ from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.srgb_noise import noise_on_srgb
 from rawaug.training.srgb_samples import Told
 
-SHORT_CROP = 256
+_SHORT_CROP = 256
 """Side in pixels of the middles of frames that a dry run uses."""
 
 HELD_OUT = "auto"
 """The value of ``data.validation`` for a part of ``data.pairs``."""
 
-USUAL = "usual"
+_USUAL = "usual"
 """The value of ``data.validation`` that :class:`DataConfig` replaces by the one that suits ``data.pairs``."""
 
-DEMO = "demo:"
+_DEMO = "demo:"
 """The beginning of the names of the built-in, simulated frames."""
 
 _PAIRS = "pairs:"
@@ -85,7 +85,7 @@ class DataConfig(PairSettings):
     pictures: str | list[str] = "demo:"
     memory_mb: int = 0
     max_pixels: int | None = None
-    validation: str | None = USUAL
+    validation: str | None = _USUAL
     validation_count: int | None = None
     validation_crop: int | None = 512
     test: str = "demo:test"
@@ -98,9 +98,9 @@ class DataConfig(PairSettings):
             if getattr(self, key) is not None:
                 require_between(f"data.{key}", getattr(self, key), least, most)
 
-        if self.validation == USUAL:
+        if self.validation == _USUAL:
             self.validation = "demo:validation"
-            if self.pairs is not None and not self.pairs.startswith(DEMO):
+            if self.pairs is not None and not self.pairs.startswith(_DEMO):
                 self.validation = HELD_OUT
 
         if self.validation == HELD_OUT and self.pairs is None:
@@ -306,7 +306,7 @@ class Recipe:
     def shortest(self) -> Recipe:
         """The recipe with one step an arm, on the middles of a few of its frames; networks and precision stay."""
         data = replace(self.data, count=2, select="first", validation_count=1, test_count=1)
-        data = replace(data, validation_crop=SHORT_CROP, test_crop=SHORT_CROP)
+        data = replace(data, validation_crop=_SHORT_CROP, test_crop=_SHORT_CROP)
         train = replace(self.train, steps=1, validate_every=1, checkpoint_every=1, workers=min(self.train.workers, 1))
         if find_device(self.device).type == "cpu":
             train = replace(train, batch=min(train.batch, 4 * self.devices))

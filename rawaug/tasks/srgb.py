@@ -54,7 +54,7 @@ from rawaug.training.stream import PictureCrops, TrainingStream
 BLACK, WHITE = 8192.0, 65535.0
 """Black and white level of the DNG: room for noise below black."""
 
-DEVIATIONS = (0.01, 0.015, 0.022, 0.033, 0.05, 0.075, 0.11, 0.16)
+_DEVIATIONS = (0.01, 0.015, 0.022, 0.033, 0.05, 0.075, 0.11, 0.16)
 """Standard deviations of white noise from which validation chooses a filter's strength."""
 
 REAL = "real"
@@ -252,7 +252,7 @@ class SrgbTask(Task):
         return {"own_noise": own}
 
 
-def level_name(levels: Levels) -> str:
+def _level_name(levels: Levels) -> str:
     """A level's name in tables and files."""
     return f"{levels[0]:g}, {levels[1]:g}"
 
@@ -279,7 +279,7 @@ def srgb_trials(pairs: Sequence[Any], levels: Sequence[Levels], label: str) -> l
 
             raw = Noisy(noisy, variance, level, pair.cfa)
             image = _unpacked_and_developed(noisy, pair)
-            strength = level_name(level)
+            strength = _level_name(level)
             trials.append(Trial(image, clean, None, pair.name, "srgb", strength=strength, raw=raw, ways=ways))
 
     return trials
@@ -304,7 +304,7 @@ def developed(mosaic: Tensor, pair: Pair) -> Tensor:
 def best_filter(spec: Spec, trials: Sequence[Trial]) -> PictureDenoiser:
     """The filter of the deviation with the highest mean PSNR on these trials."""
     best, best_psnr = None, float("-inf")
-    for deviation in DEVIATIONS:
+    for deviation in _DEVIATIONS:
         denoiser = PictureDenoiser.of(spec, name=spec_label(spec), level=deviation)
         psnr = fmean(row.psnr for row in score([denoiser], trials))
         if best is None or psnr > best_psnr:
