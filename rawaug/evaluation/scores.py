@@ -185,7 +185,6 @@ def as_compared(image: Tensor, trial: Trial) -> Tensor:
     if trial.domain == "srgb":
         return image.clamp(0.0, 1.0)
 
-
     return image
 
 
