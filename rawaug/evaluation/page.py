@@ -228,7 +228,10 @@ def _levels_range(summary: Mapping[str, Any]) -> str:
     """The lowest and highest noise levels of the images of a summary, in words; empty if none is known."""
     ranges = []
     for key in ("shot_var", "read_var"):
-        values = [image[key] for image in summary["images"] if key in image]
+        values = []
+        for image in summary["images"]:
+            if key in image:
+                values.append(image[key])
         if values:
             ranges.append(f"{key} {min(values):.2g} to {max(values):.2g}")
 

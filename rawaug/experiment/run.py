@@ -148,7 +148,10 @@ def add_noise(experiment: Experiment, isp: Any, report: Report) -> Camera:
 
     camera = Camera.of(experiment, isp, noise_for(isp, recipe.noise))
     if report.camera is None and is_leader():
-        arms = [name for name, arm in recipe.arms.items() if arm.sees_clean and arm.augmented < 1.0]
+        arms = []
+        for name, arm in recipe.arms.items():
+            if arm.sees_clean and arm.augmented < 1.0:
+                arms.append(name)
         report.noise_note = training_noise_note(experiment.inputs.pairs, camera.noise, arms)
         say(added_noise_note(camera.trials), report.noise_note)
         if recipe.self_supervised:
