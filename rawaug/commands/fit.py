@@ -13,7 +13,8 @@ from rawaug.errors import escape
 from rawaug.files import locked, require_writable
 from rawaug.isp.fit import FitConfig
 from rawaug.noise import MeasuredLevels, camera_law
-from rawaug.training.camera_fit import fit, noise_figures
+from rawaug.training.camera_fit import fit
+from rawaug.training.camera_noise import noise_figures
 
 
 def run(

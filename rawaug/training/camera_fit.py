@@ -7,30 +7,20 @@ if they are given: on the captured noisy mosaic of a pair where it has one, else
 from __future__ import annotations
 
 import time
-from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
-from torch import Tensor
-
-from rawaug.bayer import CFA, crop_to_cfa
 from rawaug.data import RawFolder, open_pairs
 from rawaug.data.folders import Kept, Readable, left_out
 from rawaug.data.pairs import Pair, shared_frame
 from rawaug.evaluation.psnr_r import psnr_r
-from rawaug.io import RawFrame, read_raw
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.own_cameras import Camera, as_camera
-from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_dark_noise, estimate_noise, plot_noise
-from rawaug.noise.estimate import WORST_FIT
+from rawaug.training.camera_noise import CameraNoise, measure_camera_noise
 
-MOST_FRAMES = 32
-"""Maximum number of frames that are measured, as all of them are in memory."""
-_UNKNOWN = "unknown"
 WATCHED_PATCHES = 4
 """Number of patches of a held-out frame that are scored during the fit."""
 
@@ -90,14 +80,14 @@ def fit(
     for key, value in (("cfa", cfa), ("black", black), ("white", white)):
         if value is not None:
             mosaics[key] = value
-    pairs = _pairs(source, camera_jpeg, mosaics)
+    pairs = _open_pairs(source, camera_jpeg, mosaics)
     frames = Readable(pairs)
 
     watch = None
     if held_out is not None:
         watch = _Watch(_held_out_pairs(held_out, pairs, camera_jpeg, mosaics))
 
-    estimate = _measured_noise(frames, noise, dark)  # before the fit: what fails here fails early
+    estimate = _measure_noise(frames, noise, dark)  # before the fit: what fails here fails early
 
     figures = None
     if camera is not None:
@@ -132,7 +122,7 @@ def _held_out_pairs(
     """Open the held-out frames; ValueError if one of them is among those fitted, ``pairs``."""
     if not str(held_out).startswith("pairs:"):
         mosaics = {}
-    others = _pairs(held_out, camera_jpeg, mosaics)
+    others = _open_pairs(held_out, camera_jpeg, mosaics)
 
     shared = shared_frame(others, pairs)
     if shared is not None:
@@ -140,8 +130,8 @@ def _held_out_pairs(
     return others
 
 
-def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> CameraNoise | str | None:
-    """The levels, or why they could not be measured."""
+def _measure_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> CameraNoise | str | None:
+    """Measure the levels; the reason where they cannot be measured."""
     if noise == "off":
         return None
     try:
@@ -153,7 +143,10 @@ def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) 
 
 
 def rendering_of(pairs: Sequence[Pair], frames: int, registered: int) -> str:
-    """What rendering the fit was to, whose tone curve and colours the ISP undoes; registered pairs are no JPEGs."""
+    """Name the renderings that the fit was to, whose tone curve and colours the ISP undoes.
+
+    Registered pairs are no JPEGs of the camera.
+    """
     own = "LibRaw" if isinstance(pairs, RawFolder) else "sRGB of the pairs"
     counts = {own: registered, "JPEG of the camera": frames - registered}
 
@@ -179,7 +172,7 @@ class _Watch:
         return f"held out {blind:.2f} dB, {as_shot:.2f} dB with as-shot gains"
 
 
-def _pairs(
+def _open_pairs(
     source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool, mosaics: Mapping[str, Any]
 ) -> Sequence[Pair]:
     if isinstance(source, (str, Path)):
@@ -201,122 +194,3 @@ def _pairs(
         if not isinstance(pairs, RawFolder):
             raise ValueError(f"{item}: a kind:path dataset cannot be combined with other files; give it alone")
     return RawFolder(map(str, source), camera_jpeg=camera_jpeg)
-
-
-# -- the camera's noise ------------------------------------------------------------------------------------------------
-
-
-class CameraNoise(NamedTuple):
-    law: MeasuredLevels
-    estimates: dict[float | None, NoiseEstimate]
-
-    def plot(self, path: str | Path) -> None:
-        for file, (iso, estimate) in zip(noise_figures(path, self.law), self.estimates.items(), strict=True):
-            plot_noise(estimate, file, title=self.law.camera if iso is None else f"{self.law.camera}, ISO {iso:g}")
-
-
-def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) -> CameraNoise:
-    """(shot_var, read_var) of one camera at each ISO of its files, with the measured points."""
-    by_iso = _by_iso(_frames(pairs))
-    dark_by_iso = None
-    if dark is not None:
-        dark_by_iso = _by_iso(_frames(RawFolder(dark)))
-
-    camera = _UNKNOWN
-    estimates = {}
-    levels = []
-    for iso, frames in by_iso.items():
-        estimate = _measured(iso, frames, dark_by_iso)
-        estimates[iso] = estimate
-        levels.append(IsoLevel(iso, estimate.shot_var, estimate.read_var, round(estimate.r2, 4), len(frames)))
-        for frame in frames:
-            if camera == _UNKNOWN:
-                camera = frame.camera
-
-    return CameraNoise(MeasuredLevels(levels, camera), estimates)
-
-
-def _measured(
-    iso: float | None, frames: Sequence[RawFrame], dark: dict[float | None, list[RawFrame]] | None
-) -> NoiseEstimate:
-    """The line of the frames of one ISO."""
-    where = "" if iso is None else f" at ISO {iso:g}"
-
-    read_var = None
-    if dark is not None:
-        matching = dark.get(iso) or dark.get(None)
-        if matching is None:
-            raise ValueError(f"dark: has no frame{where}; give dark frames at every measured ISO")
-        read_var = estimate_dark_noise(*_aligned(matching)).read_var
-
-    try:
-        estimate = estimate_noise(*_aligned(frames), read_var=read_var)
-    except ValueError as error:
-        raise ValueError(f"noise{where}: {error}") from None
-
-    if estimate.shot_var <= 0.0 or estimate.r2 < WORST_FIT:
-        advice = "use one camera at one ISO" if iso is None else "use unprocessed RAW files with flat areas"
-        raise ValueError(f"noise{where}: the frames do not fit one noise law (R^2 {estimate.r2:.2f}); {advice}")
-    return estimate
-
-
-def _by_iso(frames: Sequence[RawFrame]) -> dict[float | None, list[RawFrame]]:
-    """The frames by ISO, ascending; those of two cameras do not share a law."""
-    cameras = Counter(frame.camera for frame in frames if frame.camera != _UNKNOWN)
-    if len(cameras) > 1:
-        counts = ", ".join(f"{name} ({count})" for name, count in cameras.items())
-        raise ValueError(f"noise: the frames are from {len(cameras)} cameras, {counts}; measure each separately")
-
-    by_iso: dict[float | None, list[RawFrame]] = defaultdict(list)
-    for frame in frames:
-        by_iso[frame.iso].append(frame)
-
-    if None in by_iso and len(by_iso) > 1:
-        raise ValueError(f"noise: {len(by_iso[None])} of {len(frames)} frames have no ISO; measure them separately")
-    return dict(sorted(by_iso.items(), key=lambda item: item[0] or 0.0))
-
-
-def _frames(pairs: Sequence[Pair]) -> list[RawFrame]:
-    """Frames spread over ``pairs``; of :class:`Readable` ones those that can be read. RAW files are not developed."""
-    last = len(pairs) - 1
-    indices = list(range(len(pairs)))
-    if last >= MOST_FRAMES:
-        indices = [round(k * last / (MOST_FRAMES - 1)) for k in range(MOST_FRAMES)]
-
-    if not isinstance(pairs, Readable):
-        return [_frame(pairs, index) for index in indices]
-
-    frames = []
-    for index in indices:
-        frame = pairs.attempt(index, partial(_frame, pairs.pairs))
-        if frame is not None:
-            frames.append(frame)
-
-    if pairs.broken and not frames:
-        raise ValueError(f"noise: none of {len(indices)} frames can be read; {pairs.reasons()[0]}")
-    return frames
-
-
-def _frame(pairs: Sequence[Pair], index: int) -> RawFrame:
-    if isinstance(pairs, RawFolder):
-        return read_raw(pairs.files[index])
-    pair = pairs[index]
-    mosaic = pair.raw if pair.noisy is None else pair.noisy
-    return RawFrame(mosaic, pair.cfa, camera=pair.camera, iso=pair.iso)
-
-
-def _aligned(frames: Sequence[RawFrame]) -> tuple[list[Tensor], str]:
-    cfa, patterns = frames[0].cfa, {frame.cfa for frame in frames}
-    if patterns <= set(CFA):
-        return [crop_to_cfa(frame.mosaic, CFA(frame.cfa), CFA(cfa)) for frame in frames], cfa
-    if len(patterns) > 1:
-        raise ValueError(f"the frames are of several patterns, {', '.join(sorted(patterns))}; measure each separately")
-    return [frame.mosaic for frame in frames], cfa
-
-
-def noise_figures(path: str | Path, law: MeasuredLevels) -> list[Path]:
-    """Where the measured points are drawn: ``path``, with the ISO in its name where there are several."""
-    path = Path(path)
-    if len(law.levels) == 1:
-        return [path]
-    return [path.with_name(f"{path.stem}-iso{level.iso:g}{path.suffix}") for level in law.levels]

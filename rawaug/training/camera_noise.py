@@ -1,0 +1,159 @@
+"""The noise of a camera, measured at each ISO of its files by photon transfer, and by dark frames if there are any."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from torch import Tensor
+
+from rawaug.bayer import CFA, crop_to_cfa
+from rawaug.data import RawFolder
+from rawaug.data.folders import Readable
+from rawaug.data.pairs import Pair
+from rawaug.io import RawFrame, read_raw
+from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_dark_noise, estimate_noise, plot_noise
+from rawaug.noise.estimate import WORST_FIT
+
+MOST_FRAMES = 32
+"""Maximum number of frames that are measured, as all of them are in memory."""
+_UNKNOWN = "unknown"
+"""The camera of files that do not name one."""
+
+
+class CameraNoise(NamedTuple):
+    """The noise of a camera.
+
+    Attributes:
+        law: its levels by ISO.
+        estimates: the measured points by ISO.
+    """
+
+    law: MeasuredLevels
+    estimates: dict[float | None, NoiseEstimate]
+
+    def plot(self, path: str | Path) -> None:
+        """Draw the measured points and the line of each ISO, one file each, see :func:`noise_figures`."""
+        for file, (iso, estimate) in zip(noise_figures(path, self.law), self.estimates.items(), strict=True):
+            title = self.law.camera
+            if iso is not None:
+                title = f"{self.law.camera}, ISO {iso:g}"
+            plot_noise(estimate, file, title=title)
+
+
+def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) -> CameraNoise:
+    """Measure (shot_var, read_var) of one camera at each ISO of its files.
+
+    Args:
+        pairs: the frames, flat areas among them.
+        dark: folder of dark frames to measure the read variance.
+
+    Raises:
+        ValueError: if the frames are of several cameras, have no common noise law, or cannot be read.
+    """
+    by_iso = _group_by_iso(_read_frames(pairs))
+    dark_by_iso = None
+    if dark is not None:
+        dark_by_iso = _group_by_iso(_read_frames(RawFolder(dark)))
+
+    camera = _UNKNOWN
+    estimates = {}
+    levels = []
+    for iso, frames in by_iso.items():
+        estimate = _measure(iso, frames, dark_by_iso)
+        estimates[iso] = estimate
+        levels.append(IsoLevel(iso, estimate.shot_var, estimate.read_var, round(estimate.r2, 4), len(frames)))
+        for frame in frames:
+            if camera == _UNKNOWN:
+                camera = frame.camera
+
+    return CameraNoise(MeasuredLevels(levels, camera), estimates)
+
+
+def _measure(
+    iso: float | None, frames: Sequence[RawFrame], dark: dict[float | None, list[RawFrame]] | None
+) -> NoiseEstimate:
+    """Fit the line of the frames of one ISO."""
+    where = "" if iso is None else f" at ISO {iso:g}"
+
+    read_var = None
+    if dark is not None:
+        matching = dark.get(iso) or dark.get(None)
+        if matching is None:
+            raise ValueError(f"dark: has no frame{where}; give dark frames at every measured ISO")
+        read_var = estimate_dark_noise(*_align(matching)).read_var
+
+    try:
+        estimate = estimate_noise(*_align(frames), read_var=read_var)
+    except ValueError as error:
+        raise ValueError(f"noise{where}: {error}") from None
+
+    if estimate.shot_var <= 0.0 or estimate.r2 < WORST_FIT:
+        advice = "use one camera at one ISO" if iso is None else "use unprocessed RAW files with flat areas"
+        raise ValueError(f"noise{where}: the frames do not fit one noise law (R^2 {estimate.r2:.2f}); {advice}")
+    return estimate
+
+
+def _group_by_iso(frames: Sequence[RawFrame]) -> dict[float | None, list[RawFrame]]:
+    """Group frames by ISO, ascending; ValueError if they are of two cameras, which do not share a law."""
+    cameras = Counter(frame.camera for frame in frames if frame.camera != _UNKNOWN)
+    if len(cameras) > 1:
+        counts = ", ".join(f"{name} ({count})" for name, count in cameras.items())
+        raise ValueError(f"noise: the frames are from {len(cameras)} cameras, {counts}; measure each separately")
+
+    by_iso: dict[float | None, list[RawFrame]] = defaultdict(list)
+    for frame in frames:
+        by_iso[frame.iso].append(frame)
+
+    if None in by_iso and len(by_iso) > 1:
+        raise ValueError(f"noise: {len(by_iso[None])} of {len(frames)} frames have no ISO; measure them separately")
+    return dict(sorted(by_iso.items(), key=lambda item: item[0] or 0.0))
+
+
+def _read_frames(pairs: Sequence[Pair]) -> list[RawFrame]:
+    """Read frames spread over ``pairs``; of :class:`Readable` ones those that can be read. None is developed."""
+    last = len(pairs) - 1
+    indices = list(range(len(pairs)))
+    if last >= MOST_FRAMES:
+        indices = [round(k * last / (MOST_FRAMES - 1)) for k in range(MOST_FRAMES)]
+
+    if not isinstance(pairs, Readable):
+        return [_read_frame(pairs, index) for index in indices]
+
+    frames = []
+    for index in indices:
+        frame = pairs.attempt(index, partial(_read_frame, pairs.pairs))
+        if frame is not None:
+            frames.append(frame)
+
+    if pairs.broken and not frames:
+        raise ValueError(f"noise: none of {len(indices)} frames can be read; {pairs.reasons()[0]}")
+    return frames
+
+
+def _read_frame(pairs: Sequence[Pair], index: int) -> RawFrame:
+    if isinstance(pairs, RawFolder):
+        return read_raw(pairs.files[index])
+    pair = pairs[index]
+    mosaic = pair.raw if pair.noisy is None else pair.noisy
+    return RawFrame(mosaic, pair.cfa, camera=pair.camera, iso=pair.iso)
+
+
+def _align(frames: Sequence[RawFrame]) -> tuple[list[Tensor], str]:
+    cfa, patterns = frames[0].cfa, {frame.cfa for frame in frames}
+    if patterns <= set(CFA):
+        return [crop_to_cfa(frame.mosaic, CFA(frame.cfa), CFA(cfa)) for frame in frames], cfa
+    if len(patterns) > 1:
+        raise ValueError(f"the frames are of several patterns, {', '.join(sorted(patterns))}; measure each separately")
+    return [frame.mosaic for frame in frames], cfa
+
+
+def noise_figures(path: str | Path, law: MeasuredLevels) -> list[Path]:
+    """List the files of the drawn points: ``path``, with the ISO in its name where there are several."""
+    path = Path(path)
+    if len(law.levels) == 1:
+        return [path]
+    return [path.with_name(f"{path.stem}-iso{level.iso:g}{path.suffix}") for level in law.levels]
