@@ -38,7 +38,7 @@ POWERS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 
 
 def affinities(guide: Tensor) -> tuple[Tensor, Tensor]:
-    """Affinities of all n pixels of a prefiltered picture ``(C, h, w)`` with p sampled ones.
+    """Compute affinities of all n pixels of a prefiltered picture ``(C, h, w)`` with p sampled ones.
 
     Returns:
         The affinities ``(n, p)``, and the indices ``(p,)`` of the sampled pixels.
@@ -53,7 +53,7 @@ def affinities(guide: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def eigenvectors(affinity: Tensor, sampled: Tensor) -> tuple[Tensor, Tensor]:
-    """Leading eigenvectors ``(n, m)`` of the filter W, orthonormal, and their eigenvalues ``(m,)``, falling.
+    """Compute leading eigenvectors ``(n, m)`` of the filter W, orthonormal, and their eigenvalues ``(m,)``, falling.
 
     Args:
         affinity: of n pixels with p sampled ones, ``(n, p)``.
@@ -62,8 +62,8 @@ def eigenvectors(affinity: Tensor, sampled: Tensor) -> tuple[Tensor, Tensor]:
     # K = C A^+ C^T = G G^T with the affinities A among the sampled pixels.
     affinity = affinity.double()
     squares, vectors = torch.linalg.eigh(affinity[sampled])
-    kept = squares > 1e-6 * squares[-1]
-    factor = affinity @ (vectors[:, kept] / squares[kept].sqrt())
+    is_leading = squares > 1e-6 * squares[-1]
+    factor = affinity @ (vectors[:, is_leading] / squares[is_leading].sqrt())
 
     scale = torch.ones(len(factor), dtype=torch.float64)
     for _ in range(SCALINGS):
@@ -110,15 +110,16 @@ class GLIDE(Classical):
         height, width = planes.shape[:2]
         result = np.empty_like(planes)
 
-        for top in range(0, height, TILE):
-            for left in range(0, width, TILE):
-                first_row, first_column = max(top - MARGIN, 0), max(left - MARGIN, 0)
-                rows = slice(first_row, min(top + TILE + MARGIN, height))
-                columns = slice(first_column, min(left + TILE + MARGIN, width))
+        for row in range(0, height, TILE):
+            for column in range(0, width, TILE):
+                first_row = max(row - MARGIN, 0)
+                first_column = max(column - MARGIN, 0)
+                rows = slice(first_row, min(row + TILE + MARGIN, height))
+                columns = slice(first_column, min(column + TILE + MARGIN, width))
 
                 tile = self._tile(planes[rows, columns], guide[rows, columns])
-                inner = tile[top - first_row :, left - first_column :][:TILE, :TILE]
-                result[top : top + TILE, left : left + TILE] = inner
+                inner = tile[row - first_row :, column - first_column :][:TILE, :TILE]
+                result[row : row + TILE, column : column + TILE] = inner
         return result
 
     def _tile(self, planes: Planes, guide: Planes) -> Planes:

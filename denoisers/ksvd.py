@@ -29,9 +29,9 @@ ATOMS_A_SIDE = 16
 GAIN = 1.15
 """The published factor of the noise's deviation to which a patch is explained."""
 ROUNDS = 5
+"""Number of times that the dictionary is improved."""
 TRAINING_PATCHES = 4000
-MOST_ATOMS = SIDE**2 // 2
-"""Maximum number of atoms of a patch."""
+"""Number of patches, about, that the dictionary is learned from."""
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -85,6 +85,7 @@ class KSVD(Classical):
     def _plane(self, plane: Planes) -> Planes:
         image = torch.from_numpy(plane)[None]
         every = extract_patches(image, SIDE)[0]
+
         corners = patch_grid(plane.shape[0], plane.shape[1], SIDE, STEP)
         patches = every[:, corners].double().numpy()
         mean = patches.mean(0, keepdims=True)
@@ -100,7 +101,7 @@ class KSVD(Classical):
         return assemble(sums, weights, image, SIDE)[0].numpy()
 
     def _learn(self, patches: Array) -> Array:
-        """The dictionary of a part of the patches ``(d, N)``, evenly spaced."""
+        """Learn a dictionary from a part of the patches ``(d, N)``, evenly spaced."""
         spacing = max(1, patches.shape[1] // TRAINING_PATCHES)
         sample = patches[:, ::spacing]
         dictionary = overcomplete_cosines()
@@ -125,6 +126,6 @@ class KSVD(Classical):
         products = dictionary.T @ patches[:, hard]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # atoms that depend on each other end a pursuit early
-            found = pursuit(gram, products, tol=tolerance, norms_squared=energies[hard])
-        codes[:, hard] = np.asarray(found).reshape(dictionary.shape[1], -1)
+            sparse = pursuit(gram, products, tol=tolerance, norms_squared=energies[hard])
+        codes[:, hard] = np.asarray(sparse).reshape(dictionary.shape[1], -1)
         return codes

@@ -1,4 +1,4 @@
-"""What the filters on patches share: patches of a picture, the most alike of them, and a picture of patches."""
+"""Patches of a picture, for filters that work on them: how they are cut, matched, and put together again."""
 
 from __future__ import annotations
 
@@ -8,24 +8,25 @@ from torch.nn import functional as F
 
 
 def extract_patches(image: Tensor, side: int) -> Tensor:
-    """All patches of an image ``(C, h, w)``, overlapping, ``(C, side^2, N)``, row by row of their corners."""
+    """Cut all patches of an image ``(C, h, w)``, overlapping, ``(C, side^2, N)``, row by row of their corners."""
     patches: Tensor = F.unfold(image[:, None], side)
     return patches
 
 
 def patch_grid(height: int, width: int, side: int, step: int) -> Tensor:
-    """Indices of patches at every ``step``-th row and column, the last ones always included, ``(R,)``.
+    """List the indices of patches at every ``step``-th row and column, the last ones always included, ``(R,)``.
 
     They count the corners of :func:`extract_patches` row by row.
     """
-    rows, columns = height - side + 1, width - side + 1
-    tops = torch.tensor(sorted({*range(0, rows, step), rows - 1}))
-    lefts = torch.tensor(sorted({*range(0, columns, step), columns - 1}))
-    return (tops[:, None] * columns + lefts).flatten()
+    last_row = height - side
+    last_column = width - side
+    rows = torch.tensor(sorted({*range(0, last_row, step), last_row}))
+    columns = torch.tensor(sorted({*range(0, last_column, step), last_column}))
+    return (rows[:, None] * (last_column + 1) + columns).flatten()
 
 
 def assemble(sums: Tensor, weights: Tensor, image: Tensor, side: int) -> Tensor:
-    """The weighted mean of overlapping patches; a pixel that no patch covers keeps its value.
+    """Average overlapping patches by their weights; a pixel that no patch covers keeps its value.
 
     Args:
         sums: weighted sums of the estimates of each patch, ``(C, side^2, N)``.
@@ -52,8 +53,8 @@ def match_patches(guide: Tensor, corners: Tensor, side: int, reach: int, count: 
     Returns:
         Indices of patches ``(R, count)``, the patch itself first. Where the picture has fewer, it is repeated.
     """
-    rows, columns = guide.shape[0] - side + 1, guide.shape[1] - side + 1
-    tops, lefts = corners // columns, corners % columns
+    rows = guide.shape[0] - side + 1
+    columns = guide.shape[1] - side + 1
     distances = []
     indices = []
 
@@ -63,10 +64,11 @@ def match_patches(guide: Tensor, corners: Tensor, side: int, reach: int, count: 
             error = (guide - shifted).square()[None, None]
             distance = F.avg_pool2d(error, side, stride=1)[0, 0].flatten()[corners]
 
-            top, left = tops + down, lefts + right
-            inside = (top >= 0) & (top < rows) & (left >= 0) & (left < columns)
-            distances.append(torch.where(inside, distance, torch.inf))
-            indices.append(torch.where(inside, top * columns + left, corners))
+            row = corners // columns + down
+            column = corners % columns + right
+            is_inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+            distances.append(torch.where(is_inside, distance, torch.inf))
+            indices.append(torch.where(is_inside, row * columns + column, corners))
 
     distance = torch.stack(distances, dim=1)
     index = torch.stack(indices, dim=1)

@@ -7,7 +7,8 @@ the number of patches. It has the singular vectors of Y and the singular values
 .. math:: s_i(X) = \frac{s_i - \epsilon + \sqrt{(s_i + \epsilon)^2 - 4 C}}{2}, \qquad C = 2 c \sqrt{n} \sigma^2
 
 or 0 where the root is not real: large ones, which are the picture, shrink less than small ones. Estimates are averaged
-where patches overlap. A tenth of what was removed is then given back, and all is repeated, with the noise that is left.
+where patches overlap. A tenth of the difference to the noisy picture is then given back, and all is repeated, with the
+noise that is left.
 
 The settings are the published ones for noise of up to 20 / 255. The colours are filtered as luminance and differences;
 patches are matched on the luminance.
@@ -28,11 +29,12 @@ SIDE, STEP, REACH = 6, 2, 12
 PATCHES = 70
 """Number of patches of a group in the first rounds."""
 ROUNDS = 8
+"""Number of rounds."""
 ROUNDS_A_MATCH = 2
 """Groups are formed again every second round, of ten patches fewer."""
 FEWER = 10
 GIVEN_BACK = 0.1
-"""Share of what was removed that is given back before a round."""
+"""Share of the difference to the noisy picture that is given back before a round."""
 NOISE_LEFT = 0.54
 """Factor of the noise that is estimated to be left after a round."""
 WEIGHT = 2.0 * math.sqrt(2.0)
@@ -41,7 +43,7 @@ EPS = 1e-6
 
 
 def shrink(values: Tensor, noise: Tensor, patches: int) -> Tensor:
-    """The singular values of the estimate.
+    """Shrink the singular values of noisy groups to those of the estimate.
 
     Args:
         values: those of the noisy groups ``(..., k)``.
@@ -59,7 +61,7 @@ def shrink(values: Tensor, noise: Tensor, patches: int) -> Tensor:
 
 
 def denoise_groups(groups: Tensor, noise: Tensor) -> Tensor:
-    """The estimates of groups ``(R, d, n)`` of n patches of d values, whose noise has the deviations ``(R,)``."""
+    """Estimate groups ``(R, d, n)`` of n patches of d values, whose noise has the deviations ``(R,)``."""
     mean = groups.mean(2, keepdim=True)
     centred = groups - mean
 
@@ -90,15 +92,16 @@ class WNNM(Classical):
                 groups = match_patches(estimate[0], corners, SIDE, REACH, count)
 
             patches = extract_patches(estimate, SIDE)
-            removed = (noisy_patches - patches).square().mean(1)
-            left = NOISE_LEFT * (self.strength**2 - removed).abs().sqrt()
-            noise = torch.full_like(left, self.strength) if round_index == 0 else left
+            difference = (noisy_patches - patches).square().mean(1)
+            noise = NOISE_LEFT * (self.strength**2 - difference).abs().sqrt()
+            if round_index == 0:
+                noise = torch.full_like(noise, self.strength)
             estimate = self._round(estimate, patches, noise[:, corners], groups)
 
         return from_opponent(estimate.permute(1, 2, 0).numpy())
 
     def _round(self, estimate: Tensor, patches: Tensor, noise: Tensor, groups: Tensor) -> Tensor:
-        """One round on a picture ``(C, h, w)``; ``noise`` is ``(C, R)``, ``groups`` ``(R, n)``."""
+        """Run one round on a picture ``(C, h, w)``; ``noise`` is ``(C, R)``, ``groups`` ``(R, n)``."""
         sums = torch.zeros_like(patches)
         weights = torch.zeros_like(patches[:, :1])
         ones = torch.ones(groups.numel())

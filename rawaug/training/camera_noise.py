@@ -99,14 +99,16 @@ def _measure(
 
 def _group_by_iso(frames: Sequence[RawFrame]) -> dict[float | None, list[RawFrame]]:
     """Group frames by ISO, ascending; ValueError if they are of two cameras, which do not share a law."""
-    cameras = Counter(frame.camera for frame in frames if frame.camera != _UNKNOWN)
-    if len(cameras) > 1:
-        counts = ", ".join(f"{name} ({count})" for name, count in cameras.items())
-        raise ValueError(f"noise: the frames are from {len(cameras)} cameras, {counts}; measure each separately")
-
+    cameras: Counter[str] = Counter()
     by_iso: dict[float | None, list[RawFrame]] = defaultdict(list)
     for frame in frames:
         by_iso[frame.iso].append(frame)
+        if frame.camera != _UNKNOWN:
+            cameras[frame.camera] += 1
+
+    if len(cameras) > 1:
+        counts = ", ".join(f"{name} ({count})" for name, count in cameras.items())
+        raise ValueError(f"noise: the frames are from {len(cameras)} cameras, {counts}; measure each separately")
 
     if None in by_iso and len(by_iso) > 1:
         raise ValueError(f"noise: {len(by_iso[None])} of {len(frames)} frames have no ISO; measure them separately")
@@ -120,16 +122,17 @@ def _read_frames(pairs: Sequence[Pair]) -> list[RawFrame]:
     if last >= MOST_FRAMES:
         indices = [round(k * last / (MOST_FRAMES - 1)) for k in range(MOST_FRAMES)]
 
-    if not isinstance(pairs, Readable):
-        return [_read_frame(pairs, index) for index in indices]
-
     frames = []
     for index in indices:
-        frame = pairs.attempt(index, partial(_read_frame, pairs.pairs))
+        frame: RawFrame | None
+        if isinstance(pairs, Readable):
+            frame = pairs.attempt(index, partial(_read_frame, pairs.pairs))
+        else:
+            frame = _read_frame(pairs, index)
         if frame is not None:
             frames.append(frame)
 
-    if pairs.broken and not frames:
+    if isinstance(pairs, Readable) and pairs.broken and not frames:
         raise ValueError(f"noise: none of {len(indices)} frames can be read; {pairs.reasons()[0]}")
     return frames
 
@@ -137,18 +140,29 @@ def _read_frames(pairs: Sequence[Pair]) -> list[RawFrame]:
 def _read_frame(pairs: Sequence[Pair], index: int) -> RawFrame:
     if isinstance(pairs, RawFolder):
         return read_raw(pairs.files[index])
+
     pair = pairs[index]
-    mosaic = pair.raw if pair.noisy is None else pair.noisy
+    mosaic = pair.noisy
+    if mosaic is None:
+        mosaic = pair.raw
     return RawFrame(mosaic, pair.cfa, camera=pair.camera, iso=pair.iso)
 
 
 def _align(frames: Sequence[RawFrame]) -> tuple[list[Tensor], str]:
-    cfa, patterns = frames[0].cfa, {frame.cfa for frame in frames}
-    if patterns <= set(CFA):
-        return [crop_to_cfa(frame.mosaic, CFA(frame.cfa), CFA(cfa)) for frame in frames], cfa
-    if len(patterns) > 1:
+    """The mosaics of frames, of the first one's pattern, and that pattern; Bayer's four are cropped to it."""
+    cfa = frames[0].cfa
+    patterns = {frame.cfa for frame in frames}
+    is_bayer = patterns <= set(CFA)
+    if len(patterns) > 1 and not is_bayer:
         raise ValueError(f"the frames are of several patterns, {', '.join(sorted(patterns))}; measure each separately")
-    return [frame.mosaic for frame in frames], cfa
+
+    mosaics = []
+    for frame in frames:
+        mosaic = frame.mosaic
+        if is_bayer:
+            mosaic = crop_to_cfa(mosaic, CFA(frame.cfa), CFA(cfa))
+        mosaics.append(mosaic)
+    return mosaics, cfa
 
 
 def noise_figures(path: str | Path, law: MeasuredLevels) -> list[Path]:

@@ -135,6 +135,7 @@ class _AddsNoise(SelfSupervised):
     def __init__(self, alpha: float = 0.5) -> None:
         if not alpha > 0:
             raise ValueError(f"alpha must be positive, got {alpha}")
+
         self.alpha = alpha
 
     def recorrupt(self, crop: NoisyCrop, normals: Tensor) -> tuple[Tensor, Tensor]:
