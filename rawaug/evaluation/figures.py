@@ -66,7 +66,11 @@ class Panels:
 
 
 def panels_of(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOISY) -> Panels:
-    """The trial noisy, denoised by each, and clean; captions say the PSNR. ``noisy`` shows the noisy input."""
+    """The trial noisy, denoised by each, and clean, in pictures.
+
+    Captions say the PSNR, that of the clean image its own noise: the PSNR of a perfect denoiser. ``noisy`` shows the
+    noisy input.
+    """
     panels = Panels(trial)
     clean = as_compared(trial.clean, trial)
 
@@ -82,6 +86,8 @@ def panels_of(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOI
 
     panels.images["clean"] = trial.clean
     panels.captions["clean"] = trial.frame
+    if trial.own:
+        panels.captions["clean"] += f",\nown noise {-10.0 * math.log10(trial.own):.2f} dB"
     return panels
 
 

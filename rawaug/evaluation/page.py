@@ -143,10 +143,10 @@ class Page:
 
         self.add(f"Every image{end}", **_every_image(first_runs(results, others)))
 
-    def add_curves(self, pngs: Mapping[str, bytes]) -> None:
-        """Add pictures of the curves of a training, by title."""
+    def add_curves(self, pngs: Mapping[str, bytes], *notes: str) -> None:
+        """Add pictures of the curves of a training, by title, below notes on them."""
         figures = [Figure(png, title, "curve") for title, png in pngs.items()]
-        self.add("Training", figures=figures)
+        self.add("Training", texts=notes, figures=figures)
 
     def add_frame(self, row: Panels, crop: int | None = None) -> None:
         """Add a frame: its most detailed window in every image, and the whole of the clean one.
@@ -233,7 +233,8 @@ def _levels_range(summary: Mapping[str, Any]) -> str:
             if key in image:
                 values.append(image[key])
         if values:
-            ranges.append(f"{key} {min(values):.2g} to {max(values):.2g}")
+            bounds = dict.fromkeys([f"{min(values):.2g}", f"{max(values):.2g}"])
+            ranges.append(f"{key} {' to '.join(bounds)}")
 
     return ", ".join(ranges)
 

@@ -57,7 +57,10 @@ _PRINTED: Columns = {
 
 
 class Table(NamedTuple):
-    """A table: its columns, cells by row, empty where a figure does not apply, and the best cells of columns."""
+    """A table: its columns, cells by row, empty where a figure does not apply, and the best cells of columns.
+
+    A column has no best cell where its highest score comes of keeping the references' own noise.
+    """
 
     columns: list[str]
     rows: dict[str, list[str]]
@@ -80,8 +83,9 @@ def table_of(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, colu
         if not any(values.values()):
             continue
 
-        for name in _best_rows(key, values):
-            table.best.add((name, len(table.columns)))
+        best = _best_rows(key, values)
+        if not any(_keeps_noise(methods[name]) for name in best):
+            table.best.update((name, len(table.columns)) for name in best)
         table.columns.append(head)
         for name in methods:
             cells.setdefault(name, []).append(_cell(key, values[name]))
@@ -116,6 +120,11 @@ def _best_rows(key: str, values: Mapping[str, Sequence[float]]) -> list[str]:
 
     best = max(means.values())
     return [name for name, mean in means.items() if mean == best]
+
+
+def _keeps_noise(runs: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether a method scores more than a perfect denoiser would, since it has kept the references' own noise."""
+    return any(run["plain"].get("own_noise", 0.0) > 1.0 for run in runs)
 
 
 def first_runs(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:

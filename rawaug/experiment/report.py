@@ -93,7 +93,7 @@ def write_report(report: Report) -> None:
     for group, results in report.tables.items():
         page.add_scores(results, others[group], group)
 
-    page.add_curves(curves(experiment))
+    page.add_curves(curves(experiment), *_notes_on_losses(recipe))
     panels = task.panels(_shown_methods(report, camera, methods), camera.trials)
     for row in panels:
         page.add_frame(row, recipe.data.test_crop)
@@ -252,6 +252,15 @@ def curves(experiment: Experiment) -> dict[str, bytes]:
         logs[arm] = [experiment.arm_folder(arm, seed) / "log.csv" for seed in experiment.seeds]
 
     return plot_curves(logs)
+
+
+def _notes_on_losses(recipe: Recipe) -> list[str]:
+    """A note where the losses of arms are in different units."""
+    weighings = {recipe.loop_of(arm).weigh for arm in recipe.arms}
+    if len(weighings) == 1:
+        return []
+
+    return [f"Losses compare between arms of the same weighting alone (weigh: {', '.join(sorted(weighings))})."]
 
 
 def _shown_methods(report: Report, camera: Camera, methods: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:

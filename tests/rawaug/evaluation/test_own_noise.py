@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +14,9 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Binned, Middles, Pair
 from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.evaluation.figures import panels_of
 from rawaug.evaluation.scores import Row, score, summary
+from rawaug.evaluation.tables import PLAIN, table_of
 from rawaug.evaluation.trials import Measured, Trial, added_noise_note, own_noise_note, training_noise_note, trial_of
 from rawaug.noise import noise_model
 
@@ -53,6 +57,22 @@ def test_shares_are_of_the_squared_error() -> None:
     assert result["own_noise"] == pytest.approx(1.5e-4 / 1.1e-3)
     assert ": mine 14%; " in own_noise_note({"mine": result, "theirs": {"own_noise": 0.09}, "none": {}})
     assert own_noise_note({"theirs": {"own_noise": 0.09}}) == "" and "own_noise" not in summary([])
+
+
+def test_a_score_that_keeps_noise_is_not_the_best_of_a_table() -> None:
+    def runs(psnr: float, share: float) -> list[dict[str, Any]]:
+        return [{"plain": {"images": [], "psnr": psnr, "own_noise": share, "psnr_noisy": 30.0}}]
+
+    honest = {"first": runs(40.0, 0.4), "second": runs(39.0, 0.3)}
+    assert ("first", 0) in table_of(honest, None, PLAIN).best
+    assert not table_of({**honest, "keeps": runs(41.0, 1.2)}, None, PLAIN).best
+
+
+def test_the_clean_picture_states_its_own_noise(reference: Pair) -> None:
+    trial = trial_of(Measured([reference])[0].middle(64), noise_model((1e-2, 1e-4)))
+    assert trial.own is not None
+    caption = panels_of([], trial).captions["clean"]
+    assert f"{-10 * math.log10(trial.own):.2f} dB" in caption and "own noise" in caption
 
 
 def test_noise_as_weak_as_the_references_own_is_said() -> None:
