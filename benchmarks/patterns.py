@@ -19,6 +19,7 @@ from torch import Tensor
 
 from benchmarks.measure import arguments, finish, start
 from denoisers import NonLocalMeans
+from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pairs import Binned, Middles, Pair
@@ -28,7 +29,7 @@ from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial
 from rawaug.noise import anscombe, noise_model
 from rawaug.progress import progress
-from rawaug.tasks.full_colour import libraw_demosaic, mosaic_of
+from rawaug.tasks.full_colour import libraw_demosaic
 from rawaug.tasks.mosaic import mosaic_trial
 
 STRENGTHS = (0.5, 1.0, 1.5)
@@ -44,7 +45,7 @@ class _Colours(NonLocalMeans):
 
 def without_network(trial: Trial, pair: Pair) -> Iterator[tuple[str, Callable[[], Tensor]]]:
     """Names and results, linear camera RGB ``(1, 3, H, W)``."""
-    mosaic, cfa = mosaic_of(trial.noisy, trial.cfa), trial.condition
+    mosaic, cfa = bayer.unpack_if_packed(trial.noisy, trial.cfa), trial.condition
     (demosaic,) = trial.ways.values()
     noisy = demosaic(trial.noisy)
     yield "noisy", lambda: noisy

@@ -12,7 +12,7 @@ import pickle
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import lru_cache, partial, singledispatch
 from pathlib import Path
 from typing import Any
 
@@ -271,29 +271,51 @@ def _facts(opening: bytes, index: int) -> dict[str, str]:
     """Size, pattern, levels, camera and ISO of an item, which is a picture, pair, RAW frame or noisy block."""
     items = _opened(opening)
     item = getattr(items, "read", items.__getitem__)(index)
-    if isinstance(item, PicturePair):
-        return {"sizes": _size(item.noisy)}
-    if not isinstance(item, (Pair, RawFrame)):
-        return {"sizes": _size(item)}
+    return _facts_of(item)
 
-    if isinstance(item, Pair):
-        facts = {"sizes": _size(item.raw)}
-        levels: Any = (item.shot_var, item.read_var)
-    else:
-        facts = {"sizes": _size(item.mosaic)}
-        levels = item.noise_profile
-    facts["cfas"] = str(item.cfa)
 
-    if isinstance(item, RawFrame) and item.white > 1:
-        black = "/".join(f"{level:g}" for level in dict.fromkeys(item.black))
-        facts["levels"] = f"black {black}, white {item.white:g}"
-    elif levels is not None and None not in levels:
-        facts["levels"] = "shot_var {:.1e}, read_var {:.1e}".format(*levels)
+@singledispatch
+def _facts_of(picture: Any) -> dict[str, str]:
+    """What a line says of an item, by kinds of fact: of a picture its size."""
+    return {"sizes": _size(picture)}
 
+
+@_facts_of.register
+def _(pair: PicturePair) -> dict[str, str]:
+    return {"sizes": _size(pair.noisy)}
+
+
+@_facts_of.register
+def _(pair: Pair) -> dict[str, str]:
+    facts = {"sizes": _size(pair.raw), "cfas": str(pair.cfa)}
+    if pair.shot_var is not None and pair.read_var is not None:
+        facts["levels"] = _variances(pair.shot_var, pair.read_var)
+    return facts | _origin(pair)
+
+
+@_facts_of.register
+def _(frame: RawFrame) -> dict[str, str]:
+    facts = {"sizes": _size(frame.mosaic), "cfas": str(frame.cfa)}
+    if frame.white > 1:
+        black = "/".join(f"{level:g}" for level in dict.fromkeys(frame.black))
+        facts["levels"] = f"black {black}, white {frame.white:g}"
+    elif frame.noise_profile is not None:
+        facts["levels"] = _variances(*frame.noise_profile)
+
+    if frame.remarks:
+        facts["tags that are not used"] = "; ".join(frame.remarks)
+    return facts | _origin(frame)
+
+
+def _variances(shot_var: float, read_var: float) -> str:
+    return f"shot_var {shot_var:.1e}, read_var {read_var:.1e}"
+
+
+def _origin(item: Pair | RawFrame) -> dict[str, str]:
+    """The camera and the ISO, where they are known."""
+    facts = {}
     if item.camera != "unknown":
         facts["cameras"] = item.camera
-    if isinstance(item, RawFrame) and item.remarks:
-        facts["tags that are not used"] = "; ".join(item.remarks)
     if item.iso:
         facts["iso"] = f"{item.iso:g}"
     return facts

@@ -171,7 +171,7 @@ def compare(image: Tensor, trial: Trial) -> tuple[float, float, float | None, fl
     """
     result, clean = as_compared(image, trial), as_compared(trial.clean, trial)
     in_domain = psnr(result, clean).item(), ssim(result, clean).item()
-    if trial.develop is None or trial.domain == "srgb":
+    if trial.develop is None:
         return *in_domain, None, None
 
     result, clean = trial.develop(image)[None], trial.develop(trial.clean)[None]
@@ -180,12 +180,10 @@ def compare(image: Tensor, trial: Trial) -> tuple[float, float, float | None, fl
 
 def as_compared(image: Tensor, trial: Trial) -> Tensor:
     """An image of the trial's domain as its scores see it: RAW as the mosaic, sRGB cut to [0, 1]."""
-    if trial.domain == "raw":
-        return bayer.unpack_if_packed(image, trial.cfa)
     if trial.domain == "srgb":
         return image.clamp(0.0, 1.0)
 
-    return image
+    return bayer.unpack_if_packed(image, trial.cfa)
 
 
 # -- means as JSON -----------------------------------------------------------------------------------------------------

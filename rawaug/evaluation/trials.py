@@ -55,8 +55,10 @@ class Trial:
         strength: the name of the noise's strength; rows carry it.
         levels: (shot_var, read_var) that the denoiser is told, if the noise has any.
         cfa: the pattern of packed RAW, or of a mosaic ``(1, 1, H, W)`` in its place.
-        develop: makes sRGB ``(3, H, W)`` of an image like ``noisy`` or ``clean``, the same way for both.
-        raw: for developed pictures, the RAW that they were developed from, which a denoiser of RAW is given.
+        develop: makes sRGB ``(3, H, W)`` of an image like ``noisy`` or ``clean``, the same way for both; None for what
+            is developed already.
+        inputs: inputs of denoisers of other kinds of image, by what they take: for developed pictures, the RAW that
+            they were developed from.
         ways: functions from denoised RAW to ``domain``, by name; a denoiser that gives RAW is scored once for each.
         own: the mean variance of the noise that the reference itself has, if it is known.
         levels_from_clean: whether the levels were measured against the clean frame.
@@ -72,7 +74,7 @@ class Trial:
     levels: Levels | None = None
     cfa: str = CFA.RGGB
     develop: Callable[[Tensor], Tensor] | None = None
-    raw: Noisy | None = None
+    inputs: Mapping[str, Noisy] = field(default_factory=dict)
     ways: Mapping[str, Callable[[Tensor], Tensor]] = field(default_factory=dict)
     own: float | None = None
     levels_from_clean: bool = False
@@ -84,10 +86,7 @@ class Trial:
 
     def input_for(self, denoiser: Any) -> Noisy:
         """The input of this denoiser: a denoiser of RAW gets the RAW that a picture was developed from."""
-        if self.raw is not None and denoiser.takes == "raw":
-            return self.raw
-
-        return self.input
+        return self.inputs.get(denoiser.takes, self.input)
 
 
 def trial_of(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: int = 0, **about: Any) -> Trial:

@@ -103,14 +103,6 @@ def develop(image: Tensor, pair: Pair, exposure: float) -> Tensor:
     return render_rgb(rgb, pair.white_balance, pair.color_matrix, exposure, least=None)
 
 
-def mosaic_of(image: Tensor, cfa: str) -> Tensor:
-    """RAW as a denoiser takes it, packed or not, as the mosaic ``(1, 1, H, W)``."""
-    if image.shape[1] == 1:
-        return image
-
-    return bayer.unpack(image, cfa)
-
-
 def demosaic(image: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB) -> Tensor:
     """RAW as a denoiser gives it to linear camera RGB ``(1, 3, H, W)``.
 
@@ -120,7 +112,7 @@ def demosaic(image: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB) -> Ten
         method: one of :data:`LIBRAW`, or of :func:`rawaug.bayer.demosaic` for Bayer's patterns; others have their own.
         cfa: the pattern.
     """
-    mosaic = mosaic_of(image, cfa)
+    mosaic = bayer.unpack_if_packed(image, cfa)
     if method in LIBRAW:
         return libraw_demosaic(mosaic, pair, method, cfa)
     if cfa in CFA.__members__:

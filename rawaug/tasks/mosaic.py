@@ -21,7 +21,7 @@ from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.seeding import derive_seed
 from rawaug.tasks.base import TASKS
-from rawaug.tasks.full_colour import FullColourRecipe, FullColourTask, mosaic_of, rgb_trial
+from rawaug.tasks.full_colour import FullColourRecipe, FullColourTask, rgb_trial
 from rawaug.training.stream import MosaicCrops, TrainingStream
 
 
@@ -70,8 +70,8 @@ def planes_trial(pair: Pair, cfa: str, noise: NoiseModel) -> Trial:
     y = -rows_before % pattern.period
     x = -columns_before % pattern.period
 
-    raw = mosaic_of(trial.noisy, cfa)[..., y:, x:]
-    variance = mosaic_of(trial.variance, cfa)[..., y:, x:]
+    raw = bayer.unpack_if_packed(trial.noisy, cfa)[..., y:, x:]
+    variance = bayer.unpack_if_packed(trial.variance, cfa)[..., y:, x:]
     clean = pattern.mosaic(trial.clean)[..., y:, x:]
     noisy = with_planes(raw, pattern.shift(y, x))
     return Trial(noisy, clean, variance, pair.name, condition=cfa)

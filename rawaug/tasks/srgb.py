@@ -277,10 +277,10 @@ def srgb_trials(pairs: Sequence[Any], levels: Sequence[Levels], label: str) -> l
             params = noise.sample(1, keyed_generator("developed noise", pair.name, *map(str, level)))
             noisy, variance = noise.apply_with_variance(packed, params)
 
-            raw = Noisy(noisy, variance, level, pair.cfa)
+            inputs: dict[str, Noisy] = {RawDenoiser.takes: Noisy(noisy, variance, level, pair.cfa)}
             image = _unpacked_and_developed(noisy, pair)
             strength = _level_name(level)
-            trials.append(Trial(image, clean, None, pair.name, "srgb", strength=strength, raw=raw, ways=ways))
+            trials.append(Trial(image, clean, None, pair.name, "srgb", strength=strength, inputs=inputs, ways=ways))
 
     return trials
 

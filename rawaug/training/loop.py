@@ -159,7 +159,7 @@ def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> d
         raw_scores.append(score)
         if frame.condition:
             by_condition[frame.condition].append(score)
-        if frame.develop is not None and frame.domain != "srgb":
+        if frame.develop is not None:
             srgb = frame.develop(denoised)[None]
             clean_srgb = frame.develop(frame.clean)[None]
             srgb_scores.append(psnr(srgb, clean_srgb).item())
