@@ -7,6 +7,7 @@ a size and a place. ShotInfo (tag 0x102a) has the exposure in steps of 1/32, thi
 
 from __future__ import annotations
 
+import math
 import struct
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -32,6 +33,7 @@ def read_shot_info(path: Path) -> ShotInfo | None:
         header = file.read(14)
         if header[6:] != _SIGNATURE or header[:2] not in (b"II", b"MM"):
             return None
+
         order = "<" if header[:2] == b"II" else ">"
         (start,) = struct.unpack_from(order + "I", header, 2)
         try:
@@ -41,11 +43,13 @@ def read_shot_info(path: Path) -> ShotInfo | None:
 
     if values is None or len(values) <= _SECONDS:
         return None
-    seconds, f_number = values[_SECONDS], values[_F_NUMBER]
-    return ShotInfo(
-        seconds=2.0 ** -_stops(seconds) if seconds else None,
-        f_number=2.0 ** (_stops(f_number) / 2) if f_number else None,
-    )
+
+    seconds, f_number = None, None
+    if values[_SECONDS]:
+        seconds = 2.0 ** -_stops(values[_SECONDS])
+    if values[_F_NUMBER]:
+        f_number = 2.0 ** (_stops(values[_F_NUMBER]) / 2)
+    return ShotInfo(seconds, f_number)
 
 
 def _find_shot_info(file: BinaryIO, order: str, start: int, end: int, depth: int) -> tuple[int, ...] | None:
@@ -72,5 +76,4 @@ def _stops(value: int) -> float:
     """Canon's steps of 1/32 as stops; 12 and 20 stand for thirds."""
     whole, part = divmod(abs(value), 32)
     part_of_stop = {12: 32 / 3, 20: 64 / 3}.get(part, float(part)) / 32
-    stops = whole + part_of_stop
-    return stops if value >= 0 else -stops
+    return math.copysign(whole + part_of_stop, value)

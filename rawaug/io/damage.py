@@ -23,9 +23,10 @@ _TILE = 256
 """Side of the tiles of NewRawImageDigest."""
 _END = b"\xff\xd9"
 """The marker at the end of a JPEG stream."""
-_CHANGED_BYTES, _MORE = (2, 16), b"\x5a\x33" * 32
-"""How many bytes are changed at the end of the data, more of them if the last two are padding; and what is put behind
-them, for a decoder that reads on."""
+_CHANGED_BYTES = (2, 16)
+"""How many bytes are changed at the end of the data, more of them if the last two are padding."""
+_MORE = b"\x5a\x33" * 32
+"""What is put behind the data, for a decoder that reads on."""
 
 
 def find_fault(path: Path, stored: StoredMosaic, numbers: np.ndarray | None) -> str:
@@ -38,10 +39,13 @@ def find_fault(path: Path, stored: StoredMosaic, numbers: np.ndarray | None) -> 
     """
     if numbers is not None and stored.plain and numbers.shape == stored.size:
         if stored.tiled_digest is not None:
-            return "" if tiled_digest(numbers) == stored.tiled_digest else "its pixels do not match NewRawImageDigest"
+            if tiled_digest(numbers) != stored.tiled_digest:
+                return "its pixels do not match NewRawImageDigest"
+            return ""
         if stored.digest is not None:
-            same = md5(_bytes(numbers), usedforsecurity=False).digest() == stored.digest
-            return "" if same else "its pixels do not match RawImageDigest"
+            if md5(_bytes(numbers), usedforsecurity=False).digest() != stored.digest:
+                return "its pixels do not match RawImageDigest"
+            return ""
 
     if stored.compression == LOSSLESS_JPEG:
         return _find_fault_in_streams(path, stored)
@@ -70,6 +74,7 @@ def _find_fault_in_streams(path: Path, stored: StoredMosaic) -> str:
         for number, (offset, length) in enumerate(stored.segments, 1):
             file.seek(offset)
             stream = file.read(length)
+
             decoded = _decode(stream)
             if decoded is None:
                 return f"part {number} of {count} cannot be decoded"
@@ -118,10 +123,17 @@ def _first_change(stream: bytes, end: int, count: int, decoded: np.ndarray) -> i
     start = max(1, end - count)
     if stream[start - 1] == 0xFF:  # what follows must not become a marker
         start -= 1
-    others = bytes(0x5A if byte != 0x5A else 0x33 for byte in stream[start:end])
+
+    others = bytearray()
+    for byte in stream[start:end]:
+        others.append(0x33 if byte == 0x5A else 0x5A)
+
     try:
-        again = imagecodecs.jpeg8_decode(stream[:start] + others + _MORE + _END)
+        again = imagecodecs.jpeg8_decode(stream[:start] + bytes(others) + _MORE + _END)
     except Exception:  # a kind of stream that only the other decoder takes
         return decoded.size
-    changed = np.flatnonzero(again.ravel() != decoded.ravel())
-    return int(changed[0]) if changed.size else None
+
+    changes = np.flatnonzero(again.ravel() != decoded.ravel())
+    if not changes.size:
+        return None
+    return int(changes[0])

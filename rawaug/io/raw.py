@@ -141,7 +141,8 @@ def develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> Tensor:
     """LibRaw's rendering, uint8 ``(3, H, W)``: see :func:`read_raw_and_develop`; of a monochrome file, too."""
     with opened_raw(Path(path)) as (raw, _):
         pixels = _render(raw, adjust_maximum_thr)
-    height, width = (side // 2 * 2 for side in pixels.shape[:2])
+
+    height, width = _even_sides(pixels)
     return _picture(pixels, height, width)
 
 
@@ -164,7 +165,7 @@ def read_raw_and_develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> t
         pixels = _render(raw, adjust_maximum_thr)
 
     height, width = frame.mosaic.shape[-2:]
-    if (pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2) != (height, width):
+    if _even_sides(pixels) != (height, width):
         raise ValueError(f"{path}: LibRaw renders {pixels.shape[:2]} from a mosaic of {height} x {width}")
     return frame, _picture(pixels, height, width)
 
@@ -178,6 +179,12 @@ def _render(raw: Any, adjust_maximum_thr: float) -> np.ndarray:
     threads = None if _rendering_process == os.getpid() else 1
     with threadpool_limits(threads, "openmp"):
         return np.asarray(raw.postprocess(adjust_maximum_thr=adjust_maximum_thr, **_RENDERING))
+
+
+def _even_sides(pixels: np.ndarray) -> tuple[int, int]:
+    """Height and width of ``(H, W, ...)`` without the last line of an odd side."""
+    height, width = pixels.shape[:2]
+    return height // 2 * 2, width // 2 * 2
 
 
 def _picture(pixels: np.ndarray, height: int, width: int) -> Tensor:
@@ -197,7 +204,10 @@ def read_preview(path: str | Path) -> bytes | np.ndarray | None:
         except rawpy.LibRawError:
             return None
         data = preview.data
-    return data if isinstance(data, bytes) else np.array(data)
+
+    if isinstance(data, bytes):
+        return data
+    return np.array(data)
 
 
 # -- what a file states ------------------------------------------------------------------------------------------------
@@ -212,6 +222,7 @@ def _mosaic_frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
 
     with np.errstate(all="raise"):
         matrix, color_known = _color_matrix(raw)
+
     white_balance = _white_balance(raw)
     daylight = white_balance
     if color_known:
@@ -239,6 +250,7 @@ def _monochrome_frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
     black = np.full((1, 1), raw.black_level_per_channel[0], np.float32)
     if tags.black is not None:
         black = tags.black.astype(np.float32)
+
     white = float(raw.white_level)
     if white <= black.max():
         raise ValueError(f"{path}: white level {white:g} is not above black level {black.max():g}")
@@ -256,7 +268,10 @@ def _monochrome_frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
 
 def _about_the_shot(path: Path, raw: Any, tags: TiffTags) -> dict[str, Any]:
     """The fields of a frame that have nothing to do with its pattern."""
-    remarks = (f"NoiseProfile {tags.noise_fault}",) if tags.noise_fault else ()
+    remarks: tuple[str, ...] = ()
+    if tags.noise_fault:
+        remarks = (f"NoiseProfile {tags.noise_fault}",)
+
     other = getattr(raw, "other", None)  # rawpy 0.27 or newer
     iso = float(getattr(other, "iso_speed", 0))
     return {
@@ -273,8 +288,8 @@ def _about_the_shot(path: Path, raw: Any, tags: TiffTags) -> dict[str, Any]:
 
 def _orientation(raw: Any, tags: TiffTags) -> int:
     """LibRaw's flip; 0 where the file only states numbers that EXIF does not have, which LibRaw takes for turns."""
-    stated = tags.orientations
-    if stated and not any(1 <= number <= 8 for number in stated):
+    exif_orientations = range(1, 9)
+    if tags.orientations and not set(exif_orientations).intersection(tags.orientations):
         return 0
     return int(raw.sizes.flip)
 
@@ -285,21 +300,27 @@ def exposure_of(path: Path, raw: Any) -> Exposure:
     LibRaw gives what a CRW's automatic exposure aimed at; what the camera did is in its ShotInfo.
     """
     other = getattr(raw, "other", None)  # rawpy 0.27 or newer
-    numbers = {name: float(getattr(other, name, 0)) for name in ("shutter_speed", "aperture", "focal_length")}
+    seconds = _plausible(getattr(other, "shutter_speed", 0))
+    f_number = _plausible(getattr(other, "aperture", 0))
+    focal_length = _plausible(getattr(other, "focal_length", 0))
+
     shot_info = read_shot_info(path)
     if shot_info is not None:
-        numbers["shutter_speed"] = shot_info.seconds or numbers["shutter_speed"]
-        numbers["aperture"] = shot_info.f_number or numbers["aperture"]
-    for name, number in numbers.items():
-        if not 0 < number < _LARGEST_NUMBER:
-            numbers[name] = math.nan
+        seconds = _plausible(shot_info.seconds or 0) or seconds
+        f_number = _plausible(shot_info.f_number or 0) or f_number
 
     date = None
-    taken = getattr(other, "timestamp", None)
-    if taken is not None and taken.year > 1970:
-        date = f"{taken:%Y:%m:%d %H:%M:%S}"
-    seconds, f_number, focal_length = (None if math.isnan(number) else number for number in numbers.values())
+    timestamp = getattr(other, "timestamp", None)
+    if timestamp is not None and timestamp.year > 1970:
+        date = f"{timestamp:%Y:%m:%d %H:%M:%S}"
     return Exposure(seconds, f_number, focal_length, date)
+
+
+def _plausible(number: float) -> float | None:
+    """A positive number of a moderate size; None for others."""
+    if not 0 < number < _LARGEST_NUMBER:
+        return None
+    return float(number)
 
 
 def camera_of(raw: Any, tags: TiffTags) -> str:
@@ -349,19 +370,27 @@ def _cell(path: Path, raw: Any, tags: TiffTags) -> tuple[np.ndarray, str]:
     colours = raw.color_desc.decode("ascii", "replace")
     name = None
     if colours == "RGBG":
-        name = pattern_name(["".join(colours[index] for index in row) for row in cell])
+        rows = []
+        for row in cell:
+            rows.append("".join(colours[index] for index in row))
+        name = pattern_name(rows)
     if name is None or (len(cell) == 2 and set(cell.flat) != {0, 1, 2, 3}):
         raise ValueError(f"{path}: has no mosaic of a known pattern but {_kind(raw)}; {KNOWN_PATTERNS}")
-    return cell, CFA(name) if len(cell) == 2 else name
+
+    if len(cell) == 2:
+        name = CFA(name)
+    return cell, name
 
 
 def _stated_cell(raw: Any, tags: TiffTags) -> np.ndarray:
     """The cell of a mosaic; of none that could be known, an empty one."""
     if tags.cfa is not None and len(tags.cfa) == 4:
-        stated = np.array([["RGB".index(colour) for colour in row] for row in tags.cfa])
+        indices = []
+        for row in tags.cfa:
+            indices.append(["RGB".index(colour) for colour in row])
         rows = raw.sizes.top_margin - tags.area[0]
         columns = raw.sizes.left_margin - tags.area[1]
-        return np.roll(stated, (-rows, -columns), axis=(0, 1))
+        return np.roll(np.array(indices), (-rows, -columns), axis=(0, 1))
 
     if raw.raw_pattern is not None and raw.raw_pattern.shape in ((2, 2), (6, 6)):
         size = len(raw.raw_pattern)
@@ -396,12 +425,15 @@ def _cell_levels(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
     if tags.black is None:
         return levels
 
-    rows, columns = (math.lcm(len(cell), side) for side in tags.black.shape)
+    rows = math.lcm(len(cell), tags.black.shape[0])
+    columns = math.lcm(len(cell), tags.black.shape[1])
     exact = _tiled(tags.black.astype(np.float32), rows, columns)
+
     # LibRaw rounds the means of rows and columns as well
     allowed = 2 if tags.black_rows or tags.black_columns else 1
     if exact.shape == (2, 2) and np.abs(exact - levels).max() >= allowed:
         return levels
+
     first_row, first_column = _left_out(raw, tags)
     return np.roll(exact, (-first_row, -first_column), axis=(0, 1))
 
@@ -433,7 +465,9 @@ def _left_out(raw: Any, tags: TiffTags) -> tuple[int, int]:
     """The rows and columns of a DNG's active area that the visible mosaic begins after, 0 or 1 of each."""
     rows = raw.sizes.top_margin - tags.area[0]
     columns = raw.sizes.left_margin - tags.area[1]
-    return (rows, columns) if {rows, columns} <= {0, 1} else (0, 0)
+    if {rows, columns} <= {0, 1}:
+        return rows, columns
+    return 0, 0
 
 
 def _tiled(cell: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -453,11 +487,12 @@ def _mean_levels(black: np.ndarray, cfa: str) -> tuple[float, float, float, floa
 
 def _normalised(numbers: np.ndarray, black: np.ndarray, white: float) -> Tensor:
     """Digital numbers ``(H, W)`` to RAW float32 ``(1, H, W)``, a copy; ``black`` is of a cell, or ``(H, W)``."""
-    height, width = (side // 2 * 2 for side in numbers.shape)
+    height, width = _even_sides(numbers)
     numbers = numbers[:height, :width]
     if black.shape != (2, 2):
         levels = _tiled(black, height, width)
-        return torch.from_numpy(np.minimum((numbers - levels) / (white - levels), 1, dtype=np.float32)[None])
+        mosaic = np.minimum((numbers - levels) / (white - levels), 1, dtype=np.float32)
+        return torch.from_numpy(mosaic[None])
 
     cells = numbers.astype(np.float32).reshape(height // 2, 2, width // 2, 2)
     cells -= black[None, :, None, :]

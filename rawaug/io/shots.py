@@ -49,9 +49,14 @@ def read_shot_exposure(path: str | Path) -> float:
         return read_exposure(path)
 
     frame = read_raw(path)
-    stated = {"exposure time": frame.exposure.seconds, "f-number": frame.exposure.f_number, "ISO": frame.iso}
-    missing = [name for name, value in stated.items() if not value]
+    exposure = {
+        "exposure time": frame.exposure.seconds or 0.0,
+        "f-number": frame.exposure.f_number or 0.0,
+        "ISO": frame.iso or 0.0,
+    }
+    missing = [name for name, value in exposure.items() if not value]
     if missing:
         raise ValueError(f"{path}: does not state its {' or '.join(missing)}; give the exposures with --ev")
-    seconds, f_number, speed = (float(value or 0.0) for value in stated.values())
+
+    seconds, f_number, speed = exposure.values()
     return math.log2(seconds * speed / (100.0 * f_number**2))

@@ -148,7 +148,7 @@ def test_patterns_that_are_not_known_are_refused_in_one_line(
     tmp_path: Path, bayer_dng: Dng, name: str, said: str
 ) -> None:
     path = bayer_dng(tmp_path / "other.dng", **{"numbers": NUMBERS, **not_bayer(name)})
-    with pytest.raises(ValueError, match=rf"other\.dng.*pattern {said}") as caught:
+    with pytest.raises(ValueError, match=rf"other\.dng.*pattern.*{said}") as caught:
         read_raw(path)
     assert "\n" not in str(caught.value)
 
