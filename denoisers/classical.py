@@ -95,7 +95,7 @@ class Classical(ABC):
         return torch.from_numpy(clean).permute(2, 0, 1).to(picture)
 
     def library(self, name: str) -> Any:
-        """The library ``name``, one of :attr:`needs` or a module of one; ImportError in one line if it is not there."""
+        """Import the library ``name``, one of :attr:`needs` or a module of one; ImportError if it is not installed."""
         reason = self.missing()
         if reason is not None:
             raise ImportError(reason)
@@ -162,16 +162,16 @@ _OPPONENT = {
     4: 0.5 * np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]], np.float32),
     3: np.array([[2, 2, 2], [6**0.5, 0, -(6**0.5)], [2**0.5, -(8**0.5), 2**0.5]], np.float32) / 12**0.5,
 }
-"""R, Gr, Gb, B, or R, G, B, to luminance and differences; orthonormal, so that white noise stays white."""
+"""Matrices from R, Gr, Gb, B and from R, G, B to luminance and differences; orthonormal: white noise stays white."""
 
 
 def to_opponent(planes: Planes) -> Planes:
-    """Colours ``(h, w, 4)`` or ``(h, w, 3)`` to luminance, which comes first, and differences of the same shape."""
+    """Turn colours ``(h, w, 4)`` or ``(h, w, 3)`` into luminance, which comes first, and differences."""
     return planes @ _OPPONENT[planes.shape[-1]].T
 
 
 def from_opponent(planes: Planes) -> Planes:
-    """Luminance and differences back to colours of the same shape."""
+    """Turn luminance and differences, of the shape of :func:`to_opponent`, back into colours."""
     return planes @ _OPPONENT[planes.shape[-1]]
 
 
@@ -258,7 +258,7 @@ class Stabilised:
 
 
 def _fit_line(noisy: Tensor, variance: Tensor | None) -> tuple[Tensor, Tensor]:
-    """The levels of a map, each ``(B,)``, which must be a line in the signal."""
+    """Fit the levels of a map, each ``(B,)``; ValueError if it is missing or no line in the signal."""
     if variance is None:
         raise ValueError("give the variance map, or shot_var and read_var")
 

@@ -176,7 +176,7 @@ def load_published(network: nn.Module, path: str | os.PathLike[str], part: str) 
 
 
 def _read_state(path: Path) -> dict[str, Tensor]:
-    """The tensors under ``state_dict`` of a checkpoint, without running what it may hold as code."""
+    """Read the tensors under ``state_dict`` of a checkpoint, without running what it may hold as code."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:

@@ -1,4 +1,4 @@
-"""Hot and dead pixels of a signal whose noise has deviation 1, which networks get repaired.
+"""Hot and dead pixels of a signal whose noise has deviation 1, which are replaced before a network sees it.
 
 A pixel is a defect if it lies beyond all its neighbours of the same colour while the pixels of the other colours beside
 it follow theirs: an edge or a small light moves several colours at once, a defect one alone. It becomes the mean of its
@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 DEVIATIONS = 5.0
-"""How far a defect lies beyond its neighbours at least, in deviations of the noise."""
+"""Minimum distance of a defect from its neighbours, in deviations of the noise."""
 SHARE = 0.15
-"""How far it lies beyond them besides, as a share of their value."""
+"""What is added to this distance, as a share of the neighbours' value."""
 ALONE = 4.0
-"""Factor by which a defect departs more from its neighbours than the pixels of other colours depart from theirs."""
+"""Minimum ratio of a defect's departure from its neighbours to that of the pixels of other colours beside it."""
 
 
 def mend_planes(signal: Tensor) -> Tensor:
@@ -72,14 +72,14 @@ def mend_mosaic(signal: Tensor, planes: Tensor) -> Tensor:
 
 
 def _is_beyond(signal: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Where a signal lies beyond the lowest and the highest of its neighbours by far, as a mask of its shape."""
+    """Mark where a signal lies far beyond the lowest or the highest of its neighbours: a mask of its shape."""
     above = signal > high + SHARE * high.abs() + DEVIATIONS
     below = signal < low - SHARE * low.abs() - DEVIATIONS
     return above | below
 
 
 def _neighbours(image: Tensor, reach: int) -> list[Tensor]:
-    """The pictures ``(B, C, H, W)`` of all neighbours within ``reach``, mirrored at the edges."""
+    """List the pictures ``(B, C, H, W)`` of all neighbours within ``reach``, mirrored at the edges."""
     height, width = image.shape[-2:]
     padded = F.pad(image, (reach,) * 4, mode="reflect")
 

@@ -75,7 +75,7 @@ class Domain(ABC):
         return shot_var * (self.decode(z) - read_var / shot_var.square())
 
     def bound(self, shot_var: Tensor, read_var: Tensor) -> Tensor:
-        """The shot_var ``(B, 1, 1, 1)`` that photons are counted with: at least :attr:`least_shot`."""
+        """Raise shot_var ``(B, 1, 1, 1)``, by which photons are counted, to at least :attr:`least_shot`."""
         return torch.maximum(shot_var.clamp_min(self.least_shot), _LEAST_RATIO * read_var.sqrt())
 
     def relative_deviation(self, y: Tensor, variance: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:

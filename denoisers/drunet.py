@@ -113,7 +113,7 @@ class ResidualUNet(Denoiser):
         self.tail = conv(width, outputs, bias=False)
 
     def block_ends(self) -> list[nn.Conv2d]:
-        """The last layers of all blocks: as in DHDN, blocks stay tame when each starts as the identity."""
+        """List the last layers of all blocks: as in DHDN, blocks stay tame when each starts as the identity."""
         return [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
 
     def is_relative(self, model: Denoiser) -> bool:
@@ -143,7 +143,7 @@ class ResidualUNet(Denoiser):
         return self.head(torch.cat(inputs, dim=1)), self.coarse(self.wide_signal(mean))
 
     def wide_signal(self, mean: Tensor) -> Tensor:
-        """What the last scale sees of the mean over cells ``(B, C, h', w')``: the same less its own mean around.
+        """Subtract from the mean over cells ``(B, C, h', w')`` its own mean around: what the last scale sees.
 
         A mean over a cell has noise of deviation 1 / cell, so it is scaled to 1.
         """

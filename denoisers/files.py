@@ -141,7 +141,7 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
 
 
 def _form(tensor: Tensor | None, absence: str) -> str:
-    """The shape and type of a tensor in words, or a word for its absence."""
+    """Describe the shape and type of a tensor; ``absence`` where there is none."""
     if tensor is None:
         return absence
     return f"{tuple(tensor.shape)} {tensor.dtype}"

@@ -22,7 +22,7 @@ from rawaug.bayer import CFA, demosaicing_stencils
 
 RGB = 3
 REACH = 2
-"""Pixels that D looks at beyond its own."""
+"""Number of pixels that D sees on each side of its own."""
 
 
 @DENOISERS.register("JointDRUNet")
@@ -83,14 +83,14 @@ class JointDRUNet(ResidualUNet):
 
 
 def _full_precision(device: str) -> AbstractContextManager[object]:
-    """No autocast: in bfloat16 the signal would lose the digits that hold its noise."""
+    """Switch autocast off: in bfloat16 the signal would lose the digits that hold its noise."""
     if torch.is_autocast_enabled(device):
         return torch.autocast(device, enabled=False)
     return nullcontext()
 
 
 def _stencils() -> Tensor:
-    """For each colour and site of a cell, the weights that D gives the cell and its neighbours: ``(12, 1, 6, 6)``."""
+    """Lay out the weights of D over a cell and its neighbours, for each colour and site: ``(12, 1, 6, 6)``."""
     interpolating, kinds = demosaicing_stencils(CFA.RGGB, "malvar")
     side = 2 * REACH + 1
     copying = torch.zeros(1, side, side, device="cpu")

@@ -25,7 +25,7 @@ from denoisers.patches import assemble, extract_patches, patch_grid
 SIDE, STEP = 8, 2
 """Side of a patch and distance of the patches that are coded, in packed pixels."""
 ATOMS_A_SIDE = 16
-"""256 atoms in all."""
+"""Number of atoms along each side of the dictionary, 256 in all."""
 GAIN = 1.15
 """The published factor of the noise's deviation to which a patch is explained."""
 ROUNDS = 5
@@ -37,7 +37,7 @@ Array = np.ndarray[Any, np.dtype[np.float64]]
 
 
 def overcomplete_cosines() -> Array:
-    """The dictionary ``(64, 256)`` to begin with, products of sampled cosines; columns have length 1."""
+    """Compute the dictionary ``(64, 256)`` to begin with, products of sampled cosines; columns have length 1."""
     place = np.arange(SIDE)
     waves: Array = np.cos(np.outer(place, np.arange(ATOMS_A_SIDE)) * math.pi / ATOMS_A_SIDE)
     waves[:, 1:] -= waves[:, 1:].mean(0)

@@ -36,7 +36,7 @@ def conv(
     groups: int = 1,
     padding: int | None = None,
 ) -> nn.Conv2d:
-    """A convolution that keeps the sides of a picture or divides them by ``stride``.
+    """Make a convolution that keeps the sides of a picture or divides them by ``stride``.
 
     Its weights are left as they are in memory; :meth:`denoisers.Denoiser.initialise` draws those of the whole network.
 

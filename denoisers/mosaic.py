@@ -59,7 +59,7 @@ def lines_before(pattern: bayer.Pattern) -> tuple[int, int]:
 
 
 def entry_pattern(pattern: bayer.Pattern) -> bayer.Pattern:
-    """The pattern as a network is trained to meet it: from its own origin, or from one line above or to the left."""
+    """Move a pattern to where a network is trained to meet it: its own origin, or one line above or to the left."""
     above, before = lines_before(pattern)
     return pattern.shift(-above, -before)
 
@@ -175,7 +175,7 @@ class MosaicDRUNet(ResidualUNet):
         return torch.where(variance > 0, denoised, raw)
 
     def _at_halves(self, raw: Tensor, planes: Tensor, levels: Levels, clipped: Tensor, halvings: int) -> Tensor:
-        """The recursion of :mod:`denoisers.pyramid`, ``g(y) = f(y) + U k(g(B y) - B f(y))``; B y is a mosaic of RGGB.
+        """Run the recursion of :mod:`denoisers.pyramid`, g(y) = f(y) + U k(g(B y) - B f(y)); B y is a mosaic of RGGB.
 
         Args:
             raw: the mosaic ``(B, 1, H, W)``.
@@ -258,14 +258,14 @@ class BayerAdapter(nn.Module):
 
 
 def _half_variance(halving: bayer.Halving, level: Tensor) -> Tensor:
-    """A level at half the sides, of every pixel ``(B, 1, H/2, W/2)``; the level is of all or of every pixel."""
+    """Bring a level, of all or of every pixel, to half the sides: of every pixel, ``(B, 1, H/2, W/2)``."""
     if level.shape[-1] > 1:
         level = pad_to_multiple(level, 4)
     return F.pixel_shuffle(halving.variance(level), 2)
 
 
 def _by_site(packed: Tensor) -> Tensor:
-    """Weights of R, Gr, Gb, B, ``(n, 4, 3, 3)``, for every colour at every site of a square, ``(n, 12, 3, 3)``."""
+    """Spread weights of R, Gr, Gb, B, ``(n, 4, 3, 3)``, to all colours at all sites of a square, ``(n, 12, 3, 3)``."""
     red, green_in_red, green_in_blue, blue = packed.unbind(1)
     mean = (green_in_red + green_in_blue) / 2
     greens = [mean, green_in_red, green_in_blue, mean]

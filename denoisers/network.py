@@ -139,7 +139,7 @@ class Denoiser(nn.Module, ABC):
         self.config = {**config, **self._shared_config(settings)}
 
     def _shared_config(self, settings: Shared) -> dict[str, Any]:
-        """The shared settings that build the same network again: those that its constructor takes, but the seed."""
+        """Select the shared settings that build the same network again: those of its constructor, but the seed."""
         parameters = type(self).__signature__.parameters
         takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
 
@@ -173,7 +173,7 @@ class Denoiser(nn.Module, ABC):
         """
 
     def base_image(self, packed: Tensor) -> Tensor:
-        """The picture that the correction is added to: ``(B, channels, h, w)`` itself, unless the result is larger."""
+        """Return what the correction is added to: the picture ``(B, channels, h, w)``, unless the result is larger."""
         return packed
 
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
@@ -197,7 +197,7 @@ class Denoiser(nn.Module, ABC):
         return torch.where(variance > 0, denoised, noisy)
 
     def _at_scales(self, noisy: Tensor, variance: Tensor | None, clipped: Tensor, halvings: int) -> Tensor:
-        """The recursion ``g(y) = f(y) + U k(g(B y) - B f(y))``; ``clipped`` is the share of clipped values."""
+        """Run the recursion ``g(y) = f(y) + U k(g(B y) - B f(y))``; ``clipped`` is the share of clipped values."""
         denoised = self._at_one_scale(noisy, variance)
         if not halvings:
             return denoised
@@ -245,14 +245,14 @@ class Denoiser(nn.Module, ABC):
         return denoised.to(noisy.dtype)
 
     def distances(self, signal: Tensor, levels: Levels) -> list[Tensor]:
-        """The distances of a signal from black and from white, up to :data:`NEAR`, if the network takes them."""
+        """Compute the distances of a signal from black and white, up to :data:`NEAR`, if the network takes them."""
         if not self.limits:
             return []
         white = DOMAINS[self.domain].forward(torch.ones_like(levels[0]), *levels)
         return [signal.clamp_max(NEAR), (white - signal).clamp_max(NEAR)]
 
     def _correction(self, signal: Tensor, *maps: Tensor) -> Tensor:
-        """The network's residual of a signal and its maps, padded to what it takes and cropped back."""
+        """Compute the residual of a signal and its maps, padded to what the network takes and cropped back."""
         features = signal
         if maps:
             features = torch.cat([signal, *maps], dim=1)

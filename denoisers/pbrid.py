@@ -1,4 +1,4 @@
-r"""PBRID, a small network of RAW that is told nothing: half-quadratic splitting, unrolled with the same weights.
+r"""PBRID, a small blind network of RAW: half-quadratic splitting, unrolled with the same weights.
 
 The state s has seven channels of the mosaic's full size, which all begin as the noisy mosaic x; the first is the
 estimate. One turn is

@@ -34,7 +34,7 @@ def halve(picture: Tensor) -> Tensor:
 
 
 def halved_variance(variance: Tensor) -> Tensor:
-    """The variance ``(B, C, h/2, w/2)`` of the noise that :func:`halve` leaves of noise of a variance map."""
+    """Compute the variance ``(B, C, h/2, w/2)`` of noise after :func:`halve` from its variance before."""
     share = 0.25
     if variance.shape[1] == PACKED:
         share = bayer.bin_mosaic_variance(2)

@@ -13,7 +13,7 @@ from torch import Tensor
 Run = Callable[[Tensor, Tensor | None], Tensor]
 """``run(noisy, variance) -> denoised``: a network, or anything that is called like one."""
 Each = Callable[[Sequence[Any]], Iterable[Any]]
-"""Iterates over pieces of work, and may show progress, as ``tqdm`` does."""
+"""An iterator over pieces of work, which may show progress, as ``tqdm`` does."""
 
 OVERLAP = 96
 """The default overlap of tiles, in packed pixels."""
@@ -100,7 +100,7 @@ def denoise_tiles(
 
 
 def _tile_starts(size: int, tile: int, overlap: int, stride: int) -> tuple[list[int], int]:
-    """The starts of the tiles along a side, the last of which reaches the end, and their length, at most ``tile``."""
+    """Place tiles along a side, the last up to its end: their starts, and their length, at most ``tile``."""
     step = tile - 2 * overlap
     count = math.ceil((size - 2 * overlap) / step)
     if count > 1:
@@ -112,5 +112,5 @@ def _tile_starts(size: int, tile: int, overlap: int, stride: int) -> tuple[list[
 
 
 def _round_up(number: int, multiple: int) -> int:
-    """The next multiple of ``multiple`` from a number on."""
+    """Round a number up to a multiple."""
     return math.ceil(number / multiple) * multiple

@@ -36,7 +36,7 @@ PUBLISHED_REACH = 310.0 / 255.0
 
 
 def cosine_filters(side: int) -> Tensor:
-    """The orthonormal cosines of a square without the constant one, ``(side^2 - 1, 1, side, side)``."""
+    """Compute the orthonormal cosines of a square without the constant one, ``(side^2 - 1, 1, side, side)``."""
     place = torch.arange(side).double()
     waves = torch.cos(math.pi * (2.0 * place + 1.0) * place[:, None] / (2 * side))
     waves = waves / waves.norm(dim=1, keepdim=True)
@@ -63,13 +63,13 @@ class Diffusion(nn.Module):
         self.register_buffer("cosines", cosine_filters(side), persistent=False)
 
     def filters(self) -> Tensor:
-        """The filters ``(F, 1, side, side)``, each of length 1 and sum 0."""
+        """Compute the filters ``(F, 1, side, side)``, each of length 1 and sum 0."""
         directions = self.combination / self.combination.norm(dim=1, keepdim=True).clamp_min(1e-12)
         cosines = self.get_buffer("cosines").to(directions)
         return torch.einsum("fb,bcyx->fcyx", directions, cosines)
 
     def influence(self, response: Tensor) -> Tensor:
-        """Each filter's function of its responses ``(B, F, h, w)``."""
+        """Apply each filter's function to its responses ``(B, F, h, w)``."""
         knots = torch.arange(0, KNOTS, device=response.device, dtype=response.dtype) / KNOTS_A_GAUSSIAN
         centres = torch.arange(GAUSSIANS, device=response.device, dtype=response.dtype) + MARGIN
         gaussians = torch.exp(-0.5 * (knots - centres[:, None]).square())
@@ -86,7 +86,7 @@ class Diffusion(nn.Module):
         return torch.lerp(table[index], table[index + 1], share)
 
     def forward(self, plane: Tensor, noisy: Tensor) -> Tensor:
-        """A plane ``(B, 1, h, w)`` and the noisy one to the next of the same shape; sides are ``side`` or more."""
+        """Compute the next plane from a plane and the noisy one, all ``(B, 1, h, w)``; sides are ``side`` or more."""
         margin = (self.side // 2,) * 4
         filters = self.filters()
 

@@ -69,7 +69,7 @@ class UNet(Denoiser):
 
 
 def _triple_conv(inputs: int, features: int) -> nn.Sequential:
-    """Three convolutions, each with its leaky ReLU."""
+    """Chain three convolutions, each with its leaky ReLU."""
     return nn.Sequential(
         conv(inputs, features),
         nn.LeakyReLU(LEAK, inplace=True),

@@ -31,8 +31,9 @@ PATCHES = 70
 ROUNDS = 8
 """Number of rounds."""
 ROUNDS_A_MATCH = 2
-"""Groups are formed again every second round, of ten patches fewer."""
+"""Number of rounds after which groups are formed again, of fewer patches."""
 FEWER = 10
+"""Number of patches by which a group shrinks whenever groups are formed again."""
 GIVEN_BACK = 0.1
 """Share of the difference to the noisy picture that is given back before a round."""
 NOISE_LEFT = 0.54

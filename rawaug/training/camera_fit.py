@@ -131,7 +131,7 @@ def _held_out_pairs(
 
 
 def _measure_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> CameraNoise | str | None:
-    """Measure the levels; the reason where they cannot be measured."""
+    """Measure the levels; return the reason where they cannot be measured."""
     if noise == "off":
         return None
     try:

@@ -149,7 +149,7 @@ def _read_frame(pairs: Sequence[Pair], index: int) -> RawFrame:
 
 
 def _align(frames: Sequence[RawFrame]) -> tuple[list[Tensor], str]:
-    """The mosaics of frames, of the first one's pattern, and that pattern; Bayer's four are cropped to it."""
+    """Bring the mosaics of frames to the first one's pattern, and return that too; Bayer's four are cropped to it."""
     cfa = frames[0].cfa
     patterns = {frame.cfa for frame in frames}
     is_bayer = patterns <= set(CFA)

@@ -117,7 +117,7 @@ SAME_WEIGHTS = frozenset({"workers", "compile", "checkpoint_every", "logger"})
 
 
 def weights_key(network: DenoiserConfig, config: TrainConfig, samples: Any, validation: Any) -> str:
-    """A short hash of what the weights of a training depend on: weights with the same key need no new training.
+    """Compute a short hash of what the weights of a training depend on: weights with the same key need no new training.
 
     It leaves out the device, the number of processes, and what is used after the training.
 

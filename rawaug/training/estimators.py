@@ -72,7 +72,7 @@ class Supervised:
         """Raise ValueError if it cannot train this network."""
 
     def correct_network(self, model: Denoiser) -> Denoiser:
-        """The denoiser that a trained network becomes: by default the network itself."""
+        """Return the denoiser that a trained network becomes: by default the network itself."""
         return model
 
 
@@ -174,7 +174,7 @@ class Noisier(_AddsNoise):
             )
 
     def correct_network(self, model: Denoiser) -> Denoiser:
-        """A copy of the network whose last convolution is multiplied, if ``correct`` is set."""
+        """Return a copy of the network whose last convolution is multiplied, if ``correct`` is set."""
         if not self.correct:
             return model
 

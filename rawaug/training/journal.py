@@ -24,6 +24,7 @@ class Journal:
             self._drop_rows_after(start)
 
     def _drop_rows_after(self, step: int) -> None:
+        """Write the file anew without the rows of later steps."""
         head, *rows = self.path.read_text().splitlines(keepends=True)
         earlier = []
         for row in rows:

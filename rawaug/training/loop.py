@@ -119,27 +119,27 @@ def train(
 
 
 def _load_batches(stream: TrainingStream, start: int, config: TrainConfig, fabric: Any) -> DataLoader[Any]:
-    """This process's share of every step from ``start`` on."""
+    """Load this process's share of every step from ``start`` on."""
     sampler = StepSampler(start, config.steps, stream.batch, fabric.global_rank, fabric.world_size)
     pins_memory = fabric.device.type == "cuda"
     return DataLoader(stream, batch_sampler=sampler, num_workers=config.workers, pin_memory=pins_memory)
 
 
 def _place(batch: Any, device: torch.device, layout: torch.memory_format) -> Any:
-    """A batch, a named tuple of tensors, on a device and in a memory format."""
+    """Put a batch, a named tuple of tensors, on a device and in a memory format."""
     tensors = [tensor.to(device, memory_format=layout) for tensor in batch]
     return type(batch)(*tensors)
 
 
 def _status(row: dict[str, float], best_step: int) -> str:
-    """What the progress bar shows after a validation."""
+    """Write what the progress bar shows after a validation."""
     scores = f"loss {row['loss']:.4f}, validation {row['psnr']:.2f} dB (kept: step {best_step})"
     return f"{row['samples_per_second']:.0f} images/s, {scores}"
 
 
 @torch.no_grad()
 def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> dict[str, float]:
-    """Mean PSNR in dB of a network, which denoises large frames in tiles.
+    """Compute the mean PSNR in dB of a network, which denoises large frames in tiles.
 
     Returns:
         ``psnr`` over all frames; ``psnr_srgb`` where every frame can be developed; and ``psnr_CONDITION`` by condition.

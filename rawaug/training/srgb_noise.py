@@ -206,7 +206,7 @@ def noise_on_srgb(spec: Spec) -> SrgbNoise:
 
 
 def _mixing(basis: Tensor, scales: Tensor) -> Tensor:
-    """A root M of the covariance ``|U^T D U|``, U of orthonormal columns that span ``basis`` and D of ``scales``."""
+    """Compute a root M of the covariance ``|U^T D U|``: D of ``scales``, U orthonormal with the span of ``basis``."""
     u = torch.linalg.svd(basis).U
     values, vectors = torch.linalg.eigh((u.mT * scales[:, None] @ u).abs())
     return vectors * values.clamp_min(0.0).sqrt()[:, None]

@@ -198,7 +198,7 @@ def running_average(decay: float) -> Any:
 
 
 def learning_rate_factor(step: int, config: TrainConfig) -> float:
-    """The share of the highest learning rate at a step.
+    """Compute the share of the highest learning rate at a step.
 
     It rises linearly during the warm-up; then it falls as a cosine to 1%, or by half every ``halve_every`` steps.
     """

@@ -212,7 +212,7 @@ class TrainingStream(Dataset[Any]):
         return source.draw(self._generator(index))
 
     def __getitems__(self, indices: Sequence[int]) -> list[Any]:
-        """The samples of a step; those of pictures are made together where their source can."""
+        """Draw the samples of a step; those of pictures together where their source can."""
         of_pictures = list(filter(self._is_of_picture, indices))
         draw_batch = getattr(self.pictures, "draw_batch", None)
 

@@ -34,7 +34,7 @@ _PICTURE = (1, 2, 3)
 
 
 def weigh_loss(loss: Criterion, weigh: str, sample: Sample) -> Criterion:
-    """The loss with light and shade weighed as ``weigh`` says for the noise of a batch ``(B, 4, h, w)``."""
+    """Weigh light and shade in a loss as ``weigh`` says, for the noise of a batch ``(B, 4, h, w)``."""
     return WEIGHINGS[weigh](loss, sample)
 
 
@@ -69,13 +69,13 @@ def _mixed(loss: Criterion, sample: Sample) -> Criterion:
 
 
 def _relative(loss: Criterion, sample: Sample) -> Criterion:
-    """``loss`` in units of the picture's root mean square error, so that weak noise counts as much as strong noise."""
+    """Weigh by the picture's root mean square error, so that weak noise counts as much as strong noise."""
     mean_square = (sample.noisy - sample.clean).square().mean(_PICTURE, keepdim=True)
     return _in_units(loss, mean_square.sqrt().clamp_min(LEAST_ERROR))
 
 
 def _in_units(loss: Criterion, unit: Tensor) -> Criterion:
-    """``loss`` of both pictures divided by a unit."""
+    """Divide both pictures by a unit before the loss."""
 
     def criterion(denoised: Tensor, clean: Tensor) -> Tensor:
         return loss(denoised / unit, clean / unit)
