@@ -153,9 +153,11 @@ def add_noise(experiment: Experiment, isp: Any, report: Report) -> Camera:
             if arm.sees_clean and arm.augmented < 1.0:
                 arms.append(name)
         report.noise_note = training_noise_note(experiment.inputs.pairs, camera.noise, arms)
-        say(added_noise_note(camera.trials), report.noise_note)
+        notes = [added_noise_note(camera.trials), report.noise_note]
         if recipe.self_supervised:
-            say(faintness_note(camera.pairs))
+            notes.append(faintness_note(camera.pairs))
+        for note in filter(None, notes):
+            say(f"note: {note}")
 
     report.camera = camera
     return camera

@@ -153,8 +153,9 @@ def faintness_note(frames: Sequence[NoisyFrame]) -> str:
     if typical < FAINT:
         return ""
     return (
-        f"note: these frames have next to no noise ({typical:.1f} dB PSNR): a denoiser can learn little from them; "
-        "take frames of a higher ISO, or these as clean ones: rawaug run fewshot"
+        f"these frames have next to no noise ({typical:.1f} dB PSNR): a denoiser can learn little from them; take "
+        "frames of a higher ISO, or these as clean ones with stronger noise added: rawaug run fewshot --noise "
+        "cycleisp_sidd"
     )
 
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from rawaug.errors import MissingExtra
-from rawaug.experiment.run import run
+from rawaug.experiment import run as running
+from rawaug.experiment.report import Report
+from rawaug.experiment.run import add_noise, dry_run, run
+from rawaug.experiment.stages import Camera
 from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.config import TrainConfig
 from rawaug.training.launch import require_trainable
@@ -49,3 +53,18 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(MissingExtra, match="matplotlib"):
         require_trainable("cpu", 1, "32-true")
+
+
+def test_a_dry_run_repeats_the_notes_of_the_run(
+    recipe: Recipe, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(running, "added_noise_note", lambda trials: "the references are noisy")
+    monkeypatch.setattr(running, "training_noise_note", lambda *_: "")
+    monkeypatch.setattr(running, "noise_for", lambda *_: None)
+    camera = SimpleNamespace(trials=[], pairs=[], noise=None)
+    monkeypatch.setattr(Camera, "of", lambda *_: camera)
+    experiment: Any = SimpleNamespace(recipe=recipe, inputs=SimpleNamespace(pairs=[]))
+    monkeypatch.setattr(running, "run_kind", lambda *_: add_noise(experiment, None, Report(experiment)))
+
+    dry_run("ablation", SimpleNamespace(name="x", out=recipe.out, shortest=lambda: recipe))
+    assert "note: the references are noisy" in capsys.readouterr().out
