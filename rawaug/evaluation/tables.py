@@ -25,6 +25,9 @@ FIGURES = {
 }
 """Headings by figure: of the mosaic, of its development, and the references' own share of the squared error."""
 
+WITHOUT_BEST = {"own_noise"}
+"""Figures of which the highest is not the best, so that none of their cells is marked."""
+
 Runs = Mapping[str, Sequence[Mapping[str, Any]]]
 """For each arm a list with one entry a seed: summaries by kind, ``plain`` and ``self_ensemble``."""
 
@@ -115,7 +118,7 @@ def _best_rows(key: str, values: Mapping[str, Sequence[float]]) -> list[str]:
         if column:
             means[name] = round(statistics.fmean(column), _digits(key))
 
-    if len(means) < 2 or key == "own_noise":
+    if len(means) < 2 or key in WITHOUT_BEST:
         return []
 
     best = max(means.values())
