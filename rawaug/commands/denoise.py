@@ -10,7 +10,7 @@ from rawaug.commands import YAML
 from rawaug.denoising.corrections import Correction
 from rawaug.denoising.files import DenoisedFolder, denoise_file, denoise_folder
 from rawaug.denoising.sources import Options, kind_of
-from rawaug.errors import escape
+from rawaug.errors import count_of, escape
 from rawaug.files import require_writable, write_json
 from rawaug.registry import Spec
 
@@ -83,6 +83,7 @@ def print_denoised(result: DenoisedFolder[Any]) -> None:
     for done in result.files:
         print(done)
     if result.existing or result.broken:
-        print(f"Denoised {len(result.files)} files; {result.existing} already existed, {len(result.broken)} failed.")
+        files = count_of(len(result.files), "file")
+        print(f"Denoised {files}; {result.existing} already existed, {len(result.broken)} failed.")
     for line in (*result.broken.values(), *result.left_out, *result.remarks):
         print(escape(line))

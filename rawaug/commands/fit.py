@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from rawaug.commands import OPTIONS
 from rawaug.data.pair_folder import MosaicSettings
-from rawaug.errors import escape
+from rawaug.errors import count_of, escape
 from rawaug.files import locked, require_writable
 from rawaug.isp.fit import FitConfig
 from rawaug.noise import MeasuredLevels, camera_law
@@ -68,7 +68,7 @@ def run(
 
     for line in isp.info.get("unreadable", []):
         print(escape(line))
-    print(f"{out}: fitted to {len(isp.info['frames'])} frames in {isp.info['seconds']} s")
+    print(f"{out}: fitted to {count_of(len(isp.info['frames']), 'frame')} in {isp.info['seconds']} s")
     scores = isp.info.get("held_out", [])
     if scores:
         blind, as_shot = scores[-1]["blind"], scores[-1]["as_shot"]

@@ -9,6 +9,7 @@ from typing import Any
 
 import denoisers
 from denoisers.files import FOLDER
+from rawaug.errors import count_of
 from rawaug.files import find_weights, read_header, sha256
 from rawaug.isp.camera_names import camera_key, similar_cameras
 from rawaug.isp.cameras import load_cameras
@@ -176,7 +177,7 @@ def describe_camera(camera: Camera) -> str:
     lines = [f"{camera.name}: camera, {camera.cfa}"]
     grid = f"black {camera.black_level:g}, white {camera.white:g} DN"
     if camera.bits is not None:
-        grid += f", rounded to {camera.bits} bits"
+        grid += f", rounded to {count_of(camera.bits, 'bit')}"
     if camera.white == 1.0:
         grid = "no digital numbers"
     lines.append(f"  {grid}")

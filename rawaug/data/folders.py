@@ -24,7 +24,7 @@ from torch.utils.data import ConcatDataset, Dataset
 
 from rawaug.bayer import turn_back
 from rawaug.data.pairs import LazyPairs, Pair, SomePairs, centre
-from rawaug.errors import escape
+from rawaug.errors import count_of, escape
 from rawaug.files import files_in
 from rawaug.io import read_picture, read_raw, read_raw_and_develop
 from rawaug.io.content import PICTURE_EXTENSIONS as PICTURE_EXTENSIONS
@@ -132,9 +132,10 @@ class PictureFolder(Dataset[Tensor]):
     def report(self) -> str:
         """A text about the files that were skipped so far, with the reasons, and the kinds of files not used."""
         skipped = self.skipped
-        head = f"{escape(self.path)}: none of {len(self)} pictures skipped so far"
+        pictures = count_of(len(self), "picture")
+        head = f"{escape(self.path)}: none of {pictures} skipped so far"
         if skipped:
-            head = f"{escape(self.path)}: {len(skipped)} of {len(self)} pictures skipped"
+            head = f"{escape(self.path)}: {len(skipped)} of {pictures} skipped"
         return "\n".join([head, *map(escape, skipped.values()), *self.left_out])
 
     def _attempt(self, index: int) -> Tensor | None:
@@ -158,7 +159,8 @@ class PictureFolder(Dataset[Tensor]):
         names = [str(self.file(index)) for index in bad[:_MAX_NAMES]]
         if len(bad) > _MAX_NAMES:
             names.append("...")
-        count = f"{len(bad)} of {len(self)} pictures are unusable, more than allowed_share {self.allowed_share:.0%}"
+        pictures = count_of(len(self), "picture")
+        count = f"{len(bad)} of {pictures} unusable, more than allowed_share {self.allowed_share:.0%}"
         raise ValueError(f"{self.path}: {count}: {', '.join(names)}; last: {self._reasons[last]}")
 
 
@@ -254,7 +256,7 @@ class Readable(Sequence[Pair]):
                 yield pair
 
         if self.broken and len(self.broken) == len(self.pairs):
-            raise ValueError(f"none of the {len(self.pairs)} frames can be read; {self.reasons()[0]}")
+            raise ValueError(f"none of the {count_of(len(self.pairs), 'frame')} can be read; {self.reasons()[0]}")
 
     def attempt(self, index: int, read: Callable[[int], T]) -> T | None:
         """``read(index)``, or None if this pair cannot be read."""
@@ -285,7 +287,8 @@ def left_out(pairs: Readable, of: str) -> list[str]:
     if not reasons:
         return []
 
-    return [f"left out of {escape(of)}: {len(reasons)} of {len(pairs)} frames, unreadable", *map(escape, reasons)]
+    frames = count_of(len(pairs), "frame")
+    return [f"left out of {escape(of)}: {len(reasons)} of {frames}, unreadable", *map(escape, reasons)]
 
 
 def skip_broken(pairs: Sequence[Pair], of: str) -> Iterator[Pair]:

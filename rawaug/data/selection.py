@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rawaug.data.pairs import FrameLabel, Pair, lazy, names_of
+from rawaug.errors import count_of
 
 
 def select_pairs(
@@ -47,7 +48,7 @@ def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
     if count not in totals:
         nearest = sorted(totals, key=lambda total: abs(total - count))[:2]
         advice = " or ".join(map(str, sorted(nearest)))
-        raise ValueError(f"data.count: {count} pairs are not whole scenes; use {advice}, or select: first")
+        raise ValueError(f"data.count: {count} is no number of whole scenes; use {advice}, or select: first")
     return order[:count]
 
 
@@ -69,7 +70,7 @@ def one_a_phone(labels: Sequence[FrameLabel], count: int) -> list[int]:
             share += 1
         frames = sorted(frames_of[phone], key=iso_of)
         if share > len(frames):
-            raise ValueError(f"data.count: {count} pairs are {share} of {phone}, which has {len(frames)}")
+            raise ValueError(f"data.count: {count} takes {share} of {phone}, which has {len(frames)}")
         selection.append([frames[(2 * turn + 1) * len(frames) // (2 * share)] for turn in range(share)])
 
     order: list[int] = []
@@ -92,7 +93,7 @@ def _indices_of_names(names: Sequence[str], selection: Sequence[str]) -> list[in
 
         if not matches:
             examples = ", ".join(names[:3])
-            raise ValueError(f"data.select: {name} is not among the {len(names)} frames, such as {examples}")
+            raise ValueError(f"data.select: {name} is not among {count_of(len(names), 'frame')}, such as {examples}")
         for index in matches:
             if index not in indices:
                 indices.append(index)

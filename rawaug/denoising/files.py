@@ -13,6 +13,7 @@ from typing import Generic
 from rawaug.denoising.frames import require_output
 from rawaug.denoising.levels import UnknownNoise
 from rawaug.denoising.sources import PREVIEWS, Files, T
+from rawaug.errors import count_of
 from rawaug.files import one_at_a_time, require_file, require_same_settings, require_writable
 from rawaug.progress import progress
 
@@ -142,7 +143,9 @@ def denoise_folder(
             del result.broken[str(file)]
 
     if len(result.broken) == len(targets):
-        raise ValueError(f"{source}: none of its {len(targets)} files can be denoised; {min(result.broken.values())}")
+        raise ValueError(
+            f"{source}: none of its {count_of(len(targets), 'file')} can be denoised; {min(result.broken.values())}"
+        )
     return result
 
 

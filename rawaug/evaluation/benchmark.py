@@ -21,6 +21,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from rawaug import bayer
 from rawaug.data.pairs import Pair, centre
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
+from rawaug.errors import count_of
 from rawaug.evaluation.figures import Panels, panels_of
 from rawaug.evaluation.scores import METRICS, NOISY, Row, group_rows, score, summary
 from rawaug.evaluation.tables import join_figures
@@ -249,7 +250,7 @@ def _gmac(denoiser: RawDenoiser, trial: Trial) -> float | None:
 def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str, list[str]]]]:
     """Title, columns and cells by denoiser of each condition's table; heads say how many frames could be estimated."""
     count = len(result["frames"])
-    frames = f"{count} frame{'s' * (count != 1)}"
+    frames = count_of(count, "frame")
 
     for condition in _CONDITIONS:
         of_input = result["rows"]["noisy input"]["scores"][condition]

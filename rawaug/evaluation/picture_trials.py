@@ -19,7 +19,7 @@ from torch import Tensor
 
 from rawaug.data.picture_pairs import PicturePair, open_picture_pairs
 from rawaug.denoising.pictures import PictureDenoiser
-from rawaug.errors import extra
+from rawaug.errors import count_of, extra
 from rawaug.evaluation.comparison import Comparison
 from rawaug.evaluation.evaluate import Evaluation
 from rawaug.evaluation.scores import NOISY, Denoiser, group_rows, score, summary
@@ -91,7 +91,7 @@ def _print_pictures(data: str, result: Mapping[str, Any]) -> None:
             cells.append(f"{scores['psnr']:.2f} / {scores['ssim']:.4f}")
         rows.append(cells)
 
-    title = f"PSNR in dB / SSIM, {data}, {result['pictures']} pictures"
+    title = f"PSNR in dB / SSIM, {data}, {count_of(result['pictures'], 'picture')}"
     print_rows(title, ["denoiser", PUBLISHED, REGISTERED], rows)
 
 

@@ -10,7 +10,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from rawaug.errors import escape
+from rawaug.errors import count_of, escape
 from rawaug.evaluation.scores import METRICS
 
 WIDTH = 140
@@ -275,5 +275,5 @@ def levels_note(summary: Mapping[str, Any]) -> str:
     if not flagged:
         return ""
 
-    images = len(summary["images"])
-    return f"* noise levels of {flagged} of {images} images were measured against their clean frames"
+    images = count_of(len(summary["images"]), "image")
+    return f"* noise levels of {flagged} of {images} were measured against their clean frames"

@@ -18,6 +18,8 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any, NamedTuple
 
+from rawaug.errors import count_of
+
 _MATTERS = 0.05
 """Minimum gain in dB for preferring a trained arm to a method without training."""
 
@@ -142,7 +144,7 @@ def _how_sure(runs: Sequence[Summary], rival: Summary, gain: float) -> str:
         frames += 1
         if (image.get("psnr") or 0.0) > (other.get("psnr") or 0.0):
             higher += 1
-    return f"higher on {higher} of {frames} frames, one seed"
+    return f"higher on {higher} of {count_of(frames, 'frame')}, one seed"
 
 
 def _disagreement(arm: str, rival: str, gain: float, gain_srgb: float | None) -> str:

@@ -10,6 +10,7 @@ from rawaug.data import open_pictures
 from rawaug.data.folders import Cached, Readable, left_out
 from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, SomePairs, names_of, shared_frame
 from rawaug.data.selection import select_pairs
+from rawaug.errors import count_of
 from rawaug.files import find_weights
 from rawaug.isp.model import DictionaryISP
 from rawaug.tasks.base import TASKS, Task
@@ -67,7 +68,7 @@ class Inputs:
 
         isp = f"{recipe.camera}, unchanged"
         if recipe.camera is None:
-            isp = f"fitted to {len(self.pairs)} frame{'s' * (len(self.pairs) != 1)}"
+            isp = f"fitted to {count_of(len(self.pairs), 'frame')}"
 
         return [
             f"train     {train}",

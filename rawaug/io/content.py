@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import BinaryIO, Literal, NamedTuple
 
-from rawaug.errors import escape, how_to_install
+from rawaug.errors import count_of, escape, how_to_install
 from rawaug.files import files_below, require_file
 from rawaug.io.directories import PHOTOMETRIC, SUB_DIRECTORIES, DamagedTags, Directory, TiffFile
 
@@ -203,8 +203,7 @@ class LeftOut:
         if len(self.extensions) > _MAX_EXTENSIONS:
             names += f", {len(self.extensions) - _MAX_EXTENSIONS} other extensions"
 
-        plural = "s" if self.count > 1 else ""
-        return f"{self.count} {self.what}{plural} left out ({names}): {self.advice}"
+        return f"{count_of(self.count, self.what)} left out ({names}): {self.advice}"
 
 
 _MAX_EXTENSIONS = 6

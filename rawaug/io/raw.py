@@ -30,7 +30,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from rawaug.bayer import CFA, pattern_name, plane_indices
-from rawaug.errors import extra
+from rawaug.errors import count_of, extra
 from rawaug.io.ciff import read_shot_info
 from rawaug.io.content import RAW_EXTENSIONS as RAW_EXTENSIONS
 from rawaug.io.gain_map import GainMap
@@ -456,7 +456,7 @@ def _line_levels(path: Path, levels: Sequence[float], first: int, count: int) ->
     if not levels:
         return np.zeros(count, np.float32)
     if len(levels) != first + count:
-        lengths = f"black levels of {len(levels)} lines, not {first + count}"
+        lengths = f"black levels of {count_of(len(levels), 'line')}, not {first + count}"
         raise OSError(f"{path}: its TIFF tags are damaged ({lengths})")
     return np.array(levels, np.float32)[first:]
 

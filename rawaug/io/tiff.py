@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from rawaug.errors import extra
+from rawaug.errors import count_of, extra
 from rawaug.io.gain_map import GainMap, parse_gain_maps
 from rawaug.io.isolated import damage_as_os_error
 
@@ -249,7 +249,7 @@ def _noise_profile(pages: list[Any]) -> tuple[tuple[float, float] | None, str]:
 
         values = np.ravel(tag.value).astype(np.float64)
         if len(values) < 2 or len(values) % 2:
-            return None, f"has {len(values)} values, not pairs"
+            return None, f"has {count_of(len(values), 'value')}, not pairs"
 
         shot_vars, read_vars = values[0::2], values[1::2]
         in_range = bool(((values >= 0) & (values <= 1)).all())  # False for NaN, too

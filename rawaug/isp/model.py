@@ -49,9 +49,9 @@ class DictionaryISP(StagedISP):
     def __repr__(self) -> str:
         """Tell the pattern, the stages and the sizes of the dictionaries in a line."""
         config = self.config
-        colours = f"{config.colour_atoms} colour atoms"
+        colours = count_of(config.colour_atoms, "colour atom")
         if config.cameras:
-            colours += f" of {config.cameras} published cameras"
+            colours += f" of {count_of(config.cameras, 'published camera')}"
 
         atoms = f"{colours}, {config.gain_atoms} gain and {config.tone_atoms} tone atoms"
         return f"DictionaryISP, {self.cfa}, stages {' '.join(self.stages)}: {atoms}"

@@ -35,6 +35,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, PATTERNS
+from rawaug.errors import count_of
 from rawaug.files import read_yaml
 from rawaug.isp.cameras import XYZ_TO_SRGB, camera_from_srgb, gains_in_light, load_cameras
 from rawaug.isp.lights import (
@@ -183,7 +184,7 @@ class Camera:
         if not self.full_scale > 0:
             raise self._error("black_level", f"{self.black_level:g} DN is not below white, {self.white:g} DN")
         if self.bits is not None and self.white > 2**self.bits - 1:
-            raise self._error("white_level", f"{self.white:g} DN is more than {self.bits} bits hold")
+            raise self._error("white_level", f"{self.white:g} DN does not fit {count_of(self.bits, 'bit')}")
 
     def _check_levels(self) -> None:
         values = [level.iso for level in self.levels]

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import noise_variance
+from rawaug.errors import count_of
 from rawaug.kernels import fastest
 from rawaug.kernels.reference import normals
 from rawaug.kernels.runtime import eager
@@ -104,7 +105,8 @@ def require_batch(clean: Tensor, params: Params) -> None:
         raise ValueError(f"noise needs packed float32 RAW (B, 4, h, w), got {tuple(clean.shape)} {clean.dtype}")
     for name, value in params.items():
         if value.shape[:1] != clean.shape[:1]:
-            raise ValueError(f"noise parameter {name!r}: {tuple(value.shape)}, but the batch has {len(clean)} pictures")
+            pictures = count_of(len(clean), "picture")
+            raise ValueError(f"noise parameter {name!r}: {tuple(value.shape)}, but the batch has {pictures}")
 
 
 def draw_seeds(batch: int, generator: torch.Generator) -> Tensor:

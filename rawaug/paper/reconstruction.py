@@ -23,6 +23,7 @@ from rawaug.data import open_pairs, open_pictures
 from rawaug.data.folders import Readable, skip_broken
 from rawaug.data.pairs import Pair, SomePairs, centre, names_of, shared_frame
 from rawaug.data.selection import select_pairs
+from rawaug.errors import count_of
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.folder import claim, require_free, run_folder
@@ -247,7 +248,7 @@ class ComparisonRun:
 
         tested_on = f"one of {len(self.scored)} frames left out"
         if settings.test is not None:
-            tested_on = f"{len(self.scored)} frames of {settings.test}"
+            tested_on = f"{count_of(len(self.scored), 'frame')} of {settings.test}"
         print_methods(f"{settings.name}: {tested_on}, seeds: {settings.seeds}, {settings.data}", rows, ceiling)
         return rows
 

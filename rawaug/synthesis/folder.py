@@ -22,6 +22,7 @@ from typing import Any, get_args
 
 import torch
 
+from rawaug.errors import count_of
 from rawaug.files import LOCK, find_weights, locked, require_same_settings, sha256
 from rawaug.io.content import list_pictures
 from rawaug.io.pictures import MAX_PIXELS
@@ -130,7 +131,7 @@ def synth(
     result.seconds = time.perf_counter() - start
     if result.pictures and len(result.broken) == result.pictures:
         reason = min(result.broken.values())
-        raise ValueError(f"{source}: none of its {result.pictures} pictures can be read; {reason}")
+        raise ValueError(f"{source}: none of its {count_of(result.pictures, 'picture')} can be read; {reason}")
     return result
 
 

@@ -14,6 +14,7 @@ from rawaug.bayer import CFA, crop_to_cfa
 from rawaug.data import RawFolder
 from rawaug.data.folders import Readable
 from rawaug.data.pairs import Pair
+from rawaug.errors import count_of
 from rawaug.io import RawFrame, read_raw
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_dark_noise, estimate_noise, plot_noise
 from rawaug.noise.estimate import WORST_FIT
@@ -133,7 +134,7 @@ def _read_frames(pairs: Sequence[Pair]) -> list[RawFrame]:
             frames.append(frame)
 
     if isinstance(pairs, Readable) and pairs.broken and not frames:
-        raise ValueError(f"noise: none of {len(indices)} frames can be read; {pairs.reasons()[0]}")
+        raise ValueError(f"noise: none of {count_of(len(indices), 'frame')} can be read; {pairs.reasons()[0]}")
     return frames
 
 

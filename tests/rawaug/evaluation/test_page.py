@@ -57,7 +57,7 @@ def test_it_stands_alone_and_says_what_was_measured(page: str) -> None:
 
 
 def test_it_opens_with_the_verdict_and_marks_the_best(page: str) -> None:
-    assert "Use real: +2.62 dB over Wavelet, higher on 1 of 1 frames, one seed" in page
+    assert "Use real: +2.62 dB over Wavelet, higher on 1 of 1 frame, one seed" in page
     assert "a U-Net" in page and "else upi; shot_var 0.001" in page
     cells = re.findall(r'<td class="best">([^<]*)', page)
     assert "40.12" in cells and "37.50" not in cells and "41.00" not in cells  # the only self-ensemble is no best one
