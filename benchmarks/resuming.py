@@ -77,9 +77,9 @@ def wrapped(case: Case, kind: Any = DataLoader) -> Any:
     return rawaug.wrap(loader_of(pictures(), case, kind), make_augment())
 
 
-def resumable(case: Case) -> Any:
+def resumable(case: Case, kind: Any = DataLoader) -> Any:
     """``rawaug.resumable`` of a loader of RawPairs."""
-    return rawaug.resumable(loader_of(rawaug.RawPairs(pictures(), make_augment(), crop=16), case))
+    return rawaug.resumable(loader_of(rawaug.RawPairs(pictures(), make_augment(), crop=16), case, kind))
 
 
 class Counted:
@@ -185,6 +185,7 @@ def ways() -> dict[str, Callable[[Case], Any]]:
     except ImportError:
         return rows
     rows["wrap(StatefulDataLoader)"] = lambda case: wrapped(case, StatefulDataLoader)
+    rows["resumable(StatefulDataLoader(RawPairs))"] = lambda case: resumable(case, StatefulDataLoader)
     rows["StatefulDataLoader(RawPairs), epochs numbered"] = lambda case: Counted(case, StatefulDataLoader, True)
     rows["StatefulDataLoader(RawPairs), epochs counted"] = lambda case: Counted(case, StatefulDataLoader)
     return rows

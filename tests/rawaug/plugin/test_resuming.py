@@ -61,6 +61,15 @@ def test_torchdata_goes_on_with_pairs(pinned: bool, expected: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("shuffle", ["no", "generator", "global"])
+def test_torchdata_without_workers_is_exact_where_it_is_made_resumable(shuffle: str) -> None:
+    """By itself it leaves out a draw from its generator, whatever the dataset is."""
+    torchdata = pytest.importorskip("torchdata.stateful_dataloader", reason="pip install rawaug[test]")
+    case = Case(0, None, False, shuffle)
+    assert outcome(lambda: resumable(case, torchdata.StatefulDataLoader)) == "exact"
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
 def test_torchdata_at_the_last_batch_begins_the_next_epoch(augment: RawAugment, srgb: Tensor) -> None:
     torchdata = pytest.importorskip("torchdata.stateful_dataloader", reason="pip install rawaug[test]")
 
