@@ -201,11 +201,10 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
 def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     """RAW files and pictures of no known dataset; FiveK cannot be told from other DNGs."""
     if path.is_file():
-        content = content_of(path)
-        if content.kind == "raw":
-            yield "RAW files", partial(_RawFrames, path)
-        elif content.kind == "picture":
-            yield "pictures", partial(PictureFolder, path, allowed_share=1)
+        kind = content_of(path).kind
+        if kind in _READERS:
+            what, reader = _READERS[kind]
+            yield what, partial(reader, path)
         return
 
     files = list(files_below(path))
@@ -228,6 +227,13 @@ class _RawFrames(Lazy[RawFrame]):
 
     def read(self, index: int) -> RawFrame:
         return read_raw(self.files[index])
+
+
+_READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
+    "raw": ("RAW files", _RawFrames),
+    "picture": ("pictures", partial(PictureFolder, allowed_share=1)),
+}
+"""What files of a kind of content are called, and what reads them."""
 
 
 def _parts(openers: Iterable[tuple[str, Callable[[], Any]]], first: int | None) -> list[PartReport]:

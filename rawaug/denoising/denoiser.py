@@ -102,6 +102,10 @@ class RawDenoiser(ImageDenoiser):
             return _of_filter(spec)
         return _of_file(spec)
 
+    def takes_pattern(self, cfa: str) -> bool:
+        """Whether it denoises mosaics of a pattern: any of Bayer's, and others if its network is of mosaics."""
+        return cfa in CFA.__members__ or self.of_any is not None
+
     def require_mosaic(self) -> RawDenoiser:
         """This denoiser; ValueError if it gives full colour, which cannot be compared with a mosaic."""
         return self

@@ -13,7 +13,6 @@ from typing import Any, ClassVar
 
 from denoisers.mosaic import lines_before, with_planes
 from rawaug import bayer
-from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.trials import Trial, make_trials
 from rawaug.isp.model import DictionaryISP
@@ -128,4 +127,4 @@ class MosaicTask(FullColourTask):
 
     def can_denoise(self, denoiser: Any, trial: Trial) -> bool:
         """Networks of mosaics take any pattern, other denoisers Bayer's."""
-        return denoiser.of_any is not None or trial.condition in CFA.__members__
+        return bool(denoiser.takes_pattern(trial.condition))
