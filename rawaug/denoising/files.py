@@ -115,7 +115,7 @@ def denoise_folder(
     if kind.settings is not None:
         require_same_settings(out / SETTINGS, kind.settings, overwrite)
 
-    result: DenoisedFolder[T] = DenoisedFolder(left_out=listing.lines(), remarks=kind.remarks(listing.files))
+    result: DenoisedFolder[T] = DenoisedFolder(left_out=listing.lines())
     unknown = []
     for file in progress(listing.files, label="denoise", unit="file", leave=True):
         target = targets[file]
@@ -146,6 +146,8 @@ def denoise_folder(
         raise ValueError(
             f"{source}: none of its {count_of(len(targets), 'file')} can be denoised; {min(result.broken.values())}"
         )
+
+    result.remarks = kind.remarks([done.source for done in result.files])
     return result
 
 

@@ -188,7 +188,7 @@ class Files(ABC, Generic[T]):
         """Say what to do with files that are left out, where this kind knows better."""
 
     def remarks(self, files: Sequence[Path]) -> list[str]:
-        """Lines on the results of a folder's files."""
+        """Lines on the results of these files of a folder."""
         return []
 
     @abstractmethod

@@ -172,8 +172,11 @@ def test_a_folder_s_pictures_of_formats_that_are_not_written_become_pngs(
     for name in ("a.bmp", "b.gif", "c.ppm"):
         pillow.fromarray(pixels).save(source / name)
     (source / "d.exr").write_bytes(b"\x76\x2f\x31\x01")
+    frames = [pillow.fromarray(pixels), pillow.fromarray(255 - pixels)]
+    frames[0].save(source / "e.gif", save_all=True, append_images=frames[1:])
 
-    denoise(str(source), str(out), denoiser="NonLocalMeans@10")
+    with pytest.raises(ValueError, match="1 of its files"):
+        denoise(str(source), str(out), denoiser="NonLocalMeans@10")
     assert sorted(file.name for file in out.iterdir()) == ["a.bmp.png", "a.png", "b.gif.png", "c.ppm.png"]
     assert torch.equal(read_picture(out / "a.bmp.png"), read_picture(out / "a.png"))
     assert error(read_picture(out / "b.gif.png") / 255.0) < error(read_picture(source / "b.gif") / 255.0)
