@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -109,6 +110,10 @@ class ISPParams(NamedTuple):
     matrix: Tensor
     gains: Tensor
     tone_weights: Tensor
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> ISPParams:
+        """Apply a function to every tensor."""
+        return ISPParams(*map(change, self))
 
 
 @dataclass

@@ -379,19 +379,13 @@ class Camera:
 
         It is that of the colour temperature on the Planckian or daylight locus whose gains are nearest, in logarithms.
         """
-        anchors = self.anchors()
         mireds = np.linspace(100.0, 500.0, 81)
         lights = torch.stack([light_xyz(f"{1e6 / mired:.6f}") for mired in mireds])
 
-        mired_of_anchor, matrices, from_xyz_of_anchor = [], [], []
-        for anchor in anchors:
-            mired_of_anchor.append(anchor.mired)
-            matrices.append(anchor.matrix)
-            from_xyz_of_anchor.append(anchor.from_xyz)
+        _, anchor_mireds, matrices, _, from_xyz = zip(*self.anchors(), strict=True)
+        weights = torch.from_numpy(weights_in_light(anchor_mireds, mired_of(lights.numpy())))
+        gains = gains_in_light(torch.einsum("bn,nij->bij", weights, torch.stack(from_xyz)), lights).clamp_min(1e-6)
 
-        weights = torch.from_numpy(weights_in_light(mired_of_anchor, mired_of(lights.numpy())))
-        from_xyz = torch.einsum("bn,nij->bij", weights, torch.stack(from_xyz_of_anchor))
-        gains = gains_in_light(from_xyz, lights).clamp_min(1e-6)
         stated = torch.tensor(white_balance, dtype=torch.float64)
         distance = (gains.log() - (stated / stated[1]).log()).square().sum(dim=1)
         nearest = weights[int(distance.argmin())]

@@ -41,7 +41,7 @@ class AugmentParams(NamedTuple):
         Of a batch, ``params.map(lambda t: t[0])`` gives the parameters of the first picture, from ``(B, ...)`` to
         ``(...)``.
         """
-        isp = ISPParams(*map(change, self.isp))
+        isp = self.isp.map(change)
         noise = {name: change(value) for name, value in self.noise.items()}
         extras = {name: change(value) for name, value in self.extras.items()}
         return AugmentParams(isp, noise, change(self.crop), extras)

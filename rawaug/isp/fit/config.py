@@ -133,7 +133,9 @@ class FitConfig:
             if getattr(self, key) not in values:
                 raise ValueError(f"{key} must be {' or '.join(values)}, got {getattr(self, key)!r}")
 
-        if unknown := set(self.isp) - {key.name for key in fields(ISPConfig)}:
-            raise ValueError(f"isp: unknown keys {sorted(unknown)}; use {[key.name for key in fields(ISPConfig)]}")
+        keys = [field.name for field in fields(ISPConfig)]
+        unknown = sorted(set(self.isp).difference(keys))
+        if unknown:
+            raise ValueError(f"isp: unknown keys {unknown}; use {keys}")
         if not any(STAGES[name].makes <= 2 for name in self.isp.get("stages", POINTWISE_STAGES)):
             raise ValueError("isp: a fit needs a stage up to x2, such as tone or gamma")

@@ -74,7 +74,7 @@ def cycle_error(
 def mean_square(isp: DictionaryISP, part: PixelSamples, params: ISPParams) -> Tensor:
     """Compute the mean squared error of every frame ``(F,)`` on its unclipped pixels."""
     count = len(part.srgb)
-    params = ISPParams(*[value.expand(count, *value.shape[1:]) for value in params])
+    params = params.map(lambda tensor: tensor.expand(count, *tensor.shape[1:]))
     error = (isp.reverse_pixels(part.srgb, params, part.coordinates) - part.target) ** 2 * part.known
     return error.sum((1, 2, 3)) / part.known.sum((1, 2, 3)).clamp_min(1.0)
 

@@ -121,6 +121,10 @@ class PixelSamples(NamedTuple):
         """Apply a function to every tensor."""
         return PixelSamples(*map(change, self))
 
+    def of_frames(self, index: Tensor) -> PixelSamples:
+        """Take the pixels of the frames of an index ``(f,)``."""
+        return self.map(lambda tensor: tensor[index])
+
     def pick(self, index: Tensor, frames: Tensor | slice = slice(None)) -> PixelSamples:
         """Pick the pixels of an index ``(p,)`` from every frame, or from those of an index ``(f,)``."""
         return self.map(lambda tensor: tensor[frames].index_select(-1, index))
@@ -134,9 +138,8 @@ class FitFrames(NamedTuple):
 
     def some(self, frames: Sequence[int]) -> FitFrames:
         """Take some of the frames by their numbers."""
-        index = torch.tensor(frames)
         shots = [self.shots[k] for k in frames]
-        return FitFrames(self.pixels.map(lambda tensor: tensor[index]), shots)
+        return FitFrames(self.pixels.of_frames(torch.tensor(frames)), shots)
 
     def split(self, frames: Sequence[int]) -> tuple[FitFrames, FitFrames]:
         """Take some of the frames by their numbers, and the rest."""

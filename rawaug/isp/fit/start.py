@@ -323,7 +323,7 @@ def _second_moments(
     """Compute ``<x x>`` and ``<x y>`` of each frame's channels under gains of 1, and which channels have any pixel."""
     moments: list[Tensor] = []
     for index in torch.arange(len(matrix)).split(LIGHT_FRAMES):
-        part = PixelSamples(*[tensor[index] for tensor in pixels])
+        part = pixels.of_frames(index)
         none = weights.new_empty(len(index), 0)
         tones = isp.typical_tones().expand(len(index), -1)
         params = ISPParams(weights[index], none, matrix[index], torch.ones(len(index), 3), tones)
