@@ -24,7 +24,7 @@ from rawaug.evaluation.benchmark import (
 from rawaug.evaluation.evaluate import denoiser_of
 from rawaug.evaluation.figures import plot_costs
 from rawaug.evaluation.page import Figure, Page
-from rawaug.evaluation.tables import print_rows
+from rawaug.evaluation.tables import print_cells
 from rawaug.evaluation.trials import Measured, Trial, own_noise_note
 from rawaug.files import write_json
 
@@ -87,8 +87,7 @@ def compare_raw(comparison: Comparison) -> None:
     result = {**facts, **benchmark(denoisers, cases)}
 
     for title, head, cells in tables(result):
-        rows = [[name, *row] for name, row in cells.items()]
-        print_rows(title, ["denoiser", *head], rows)
+        print_cells(title, ["denoiser", *head], cells)
 
     notes = _notes_of(result)
     print("\n".join([*notes, noise]))

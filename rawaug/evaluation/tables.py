@@ -77,6 +77,7 @@ def table_of(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, colu
         methods[name] = [{"plain": scores}]
     methods |= results
 
+    keeping_noise = _keeping_noise(methods)
     table = Table([], {}, set())
     cells: dict[str, list[str]] = {}
     for head, (kind, key) in columns.items():
@@ -87,8 +88,9 @@ def table_of(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, colu
             continue
 
         best = _best_rows(key, values)
-        if not any(_keeps_noise(methods[name]) for name in best):
-            table.best.update((name, len(table.columns)) for name in best)
+        if keeping_noise.isdisjoint(best):
+            for name in best:
+                table.best.add((name, len(table.columns)))
         table.columns.append(head)
         for name in methods:
             cells.setdefault(name, []).append(_cell(key, values[name]))
@@ -125,9 +127,15 @@ def _best_rows(key: str, values: Mapping[str, Sequence[float]]) -> list[str]:
     return [name for name, mean in means.items() if mean == best]
 
 
-def _keeps_noise(runs: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether a method scores more than a perfect denoiser would, since it has kept the references' own noise."""
-    return any(run["plain"].get("own_noise", 0.0) > 1.0 for run in runs)
+def _keeping_noise(methods: Runs) -> set[str]:
+    """The methods that score more than a perfect denoiser would, since they keep the references' own noise."""
+    names = set()
+    for name, runs in methods.items():
+        for run in runs:
+            if run["plain"].get("own_noise", 0.0) > 1.0:
+                names.add(name)
+
+    return names
 
 
 def first_runs(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
@@ -214,14 +222,18 @@ def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str
     console.print(table)
 
 
+def print_cells(title: str, head: Sequence[str], cells: Mapping[str, Sequence[str]]) -> None:
+    """Print a table of one section, whose cells are given by the name of their row."""
+    print_rows(title, head, [[name, *row] for name, row in cells.items()])
+
+
 def print_table(results: Runs, title: str, others: Mapping[str, Mapping[str, Any]] | None = None) -> None:
     """Print PSNR and SSIM of every method: in RAW plain and by self-ensemble, and developed.
 
     ``results`` has one entry a seed in an arm's list, ``others`` a summary by name.
     """
     table = table_of(results, others, _PRINTED)
-    rows = [[method, *cells] for method, cells in table.rows.items()]
-    print_rows(title, ["arm", *table.columns], rows)
+    print_cells(title, ["arm", *table.columns], table.rows)
 
     first_arm = next(iter(results.values()))
     note = levels_note(first_arm[0]["plain"])

@@ -209,7 +209,8 @@ def _methods_of(recipe: Recipe, methods: Mapping[str, Sequence[Any]]) -> dict[st
     """A line on each row of the tables, by its name; ``methods`` are the denoisers beside the arms, by table."""
     names: set[str] = set()
     for of_group in methods.values():
-        names.update(one.name for one in of_group)
+        for one in of_group:
+            names.add(one.name)
 
     texts = {}
     for spec in recipe.classical:
