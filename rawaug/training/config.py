@@ -55,6 +55,9 @@ class TrainConfig:
         weigh: loss weighting of light and shade: linear, normalised, stabilised, mixed or relative,
             see :mod:`rawaug.training.weighing`.
         ema: decay of the running average of the weights, which are validated and saved; 0 disables it.
+        start_share: share of the weights that the training started from in those that are validated and saved, from 0
+            up to 1. A fine-tuned network forgets part of what its start knew of other pictures; between both lie
+            networks that know both (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
         clip_norm: gradient norm limit; 0 disables it.
         validate_every: steps between validations; the best weights are kept. A training of no more steps than that is
             validated five times.
@@ -76,6 +79,7 @@ class TrainConfig:
     loss: str | dict[str, Any] = "l1"
     weigh: Weighing = "linear"
     ema: float = 0.99
+    start_share: float = 0.0
     clip_norm: float = 0.1
     validate_every: int = 100
     checkpoint_every: int = 200
@@ -102,6 +106,8 @@ class TrainConfig:
             raise ValueError(f"train.crop must be even and at least 8, got {self.crop}")
         if not 0.0 <= self.ema < 1.0:
             raise ValueError(f"train.ema must be in [0, 1), got {self.ema}")
+        if not 0.0 <= self.start_share < 1.0:
+            raise ValueError(f"train.start_share must be in [0, 1), got {self.start_share}")
 
     @property
     def validation_period(self) -> int:

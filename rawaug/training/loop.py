@@ -100,7 +100,7 @@ def train(
             state.losses = fabric.all_reduce(state.losses, reduce_op="mean")
 
         if validates:
-            scores = validate(estimator.correct_network(state.average_network), validation, fabric.device)
+            scores = validate(estimator.correct_network(state.network_to_keep()), validation, fabric.device)
             state.keep_average(scores["psnr"], choose)
 
             row = {"loss": state.mean_loss(), **scores, "learning_rate": learning_rate}

@@ -91,10 +91,30 @@ class TrainingState:
         if config.channels_last:
             self.layout = torch.channels_last
 
+        self.start: dict[str, Tensor] = {}
+        if config.start_share:
+            self.start = copy.deepcopy(net.state_dict())
+            self.blend = copy.deepcopy(net)
+
     @property
     def average_network(self) -> Any:
-        """The network that is validated and kept."""
+        """The network of the running average."""
         return self.average.module
+
+    @torch.no_grad()
+    def network_to_keep(self) -> Any:
+        """Return the network that is validated and kept: the running average, or a blend of it with the start."""
+        if not self.start:
+            return self.average_network
+
+        average = self.average_network.state_dict()
+        for name, value in self.blend.state_dict().items():
+            if value.is_floating_point():
+                start = self.start[name].to(average[name].device)
+                value.copy_(average[name].lerp(start, self.config.start_share))
+            else:
+                value.copy_(average[name])
+        return self.blend
 
     @property
     def _parts(self) -> dict[str, Any]:
@@ -138,6 +158,8 @@ class TrainingState:
         net = self.net.to(memory_format=self.layout)  # type: ignore[call-overload]
         self.model, self.optimiser = fabric.setup(net, self.optimiser)
         self.average.to(fabric.device)
+        if self.start:
+            self.blend.to(fabric.device)
         self.losses = self.losses.to(fabric.device)
 
         if self.config.compile:
@@ -171,9 +193,9 @@ class TrainingState:
         return mean
 
     def keep_average(self, score: float, choose: bool) -> None:
-        """Keep the running average as it is now if its ``score`` is the highest so far, or ``choose`` is off."""
+        """Keep the network as it is now if its ``score`` is the highest so far, or ``choose`` is off."""
         if score > self.best["psnr"] or not choose:
-            weights = copy.deepcopy(self.average_network.state_dict())
+            weights = copy.deepcopy(self.network_to_keep().state_dict())
             self.best = {"psnr": score, "step": self.step, "net": weights}
 
     def best_network(self, label: str) -> Any:

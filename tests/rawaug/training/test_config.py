@@ -11,7 +11,7 @@ from rawaug.training.config import SAME_WEIGHTS, DenoiserConfig, TrainConfig, we
 
 OTHER: dict[str, Any] = {
     "schedule": "step", "loss": "l2", "weigh": "mixed", "precision": "bf16-mixed", "channels_last": False,
-    "compile": True, "ema": 0.5, "learning_rate": 1e-3, "clip_norm": 1.0, "logger": "csv",
+    "compile": True, "ema": 0.5, "start_share": 0.5, "learning_rate": 1e-3, "clip_norm": 1.0, "logger": "csv",
 }  # fmt: skip
 
 

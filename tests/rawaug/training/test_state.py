@@ -91,6 +91,24 @@ def test_the_average_forgets_at_the_decay_of_the_recipe(decay: float) -> None:
         torch.testing.assert_close(new, old + (1.0 - decay), rtol=0.0, atol=1e-5)
 
 
+def test_the_network_to_keep_lies_between_the_average_and_the_start() -> None:
+    net = first_network(DenoiserConfig("DnCNN", {"width": 4, "depth": 3}), seed=0)
+    start = [weights.clone() for weights in net.parameters()]
+    state = TrainingState(net, TrainConfig(ema=0.0, start_share=0.25))
+    with torch.no_grad():
+        for weights in state.average_network.parameters():
+            weights.add_(1.0)
+
+    state.keep_average(30.0, choose=True)
+    for old, new in zip(start, state.best_network("arm").parameters(), strict=True):
+        torch.testing.assert_close(new, old + 0.75, rtol=0.0, atol=1e-6)
+
+    alone = TrainingState(net, TrainConfig())
+    assert alone.network_to_keep() is alone.average_network
+    with pytest.raises(ValueError, match="start_share"):
+        TrainConfig(start_share=1.0)
+
+
 def test_an_isp_behind_another_pattern_has_the_same_colours() -> None:
     isp = DictionaryISP(ISPConfig(cfa="GRBG"), seed=0)
     other = change_cfa(isp, CFA.RGGB)
