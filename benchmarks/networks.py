@@ -34,8 +34,9 @@ from rawaug.evaluation.scores import group_rows, score
 from rawaug.evaluation.trials import trial_of
 from rawaug.noise import noise_model
 from rawaug.training.config import DenoiserConfig, TrainConfig
+from rawaug.training.crops import PictureCrops
 from rawaug.training.loop import train, validate
-from rawaug.training.stream import PictureCrops, TrainingStream
+from rawaug.training.stream import TrainingStream
 
 SIZES: dict[str, dict[str, Any]] = {
     "UNet": {"width": 16, "scales": 4},

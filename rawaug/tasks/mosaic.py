@@ -21,7 +21,8 @@ from rawaug.plugin.augment import RawAugment
 from rawaug.seeding import derive_seed
 from rawaug.tasks.base import TASKS
 from rawaug.tasks.full_colour import FullColourRecipe, FullColourTask, rgb_trial
-from rawaug.training.stream import MosaicCrops, TrainingStream
+from rawaug.training.crops import MosaicCrops
+from rawaug.training.stream import TrainingStream
 
 
 @dataclass

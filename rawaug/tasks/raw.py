@@ -19,9 +19,10 @@ from rawaug.plugin.dataset import RawPairs
 from rawaug.registry import Spec
 from rawaug.seeding import derive_seed
 from rawaug.tasks.base import TASKS, Task
+from rawaug.training.crops import WATCHED, PictureCrops, RealCrops, Source, freeze_samples
 from rawaug.training.estimators import ESTIMATORS, SelfSupervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, noisy_frame, r2r_trials
-from rawaug.training.stream import WATCHED, PictureCrops, RealCrops, Source, TrainingStream, freeze_samples
+from rawaug.training.stream import TrainingStream
 
 
 @TASKS.register("raw")

@@ -47,9 +47,10 @@ from rawaug.registry import Spec, spec_label, split_spec
 from rawaug.seeding import derive_seed, keyed_generator
 from rawaug.tasks.base import TASKS, Task
 from rawaug.tasks.settings import Recipe
+from rawaug.training.crops import PictureCrops
 from rawaug.training.srgb_noise import noise_on_srgb
 from rawaug.training.srgb_samples import NoisyPictures, SrgbSamples
-from rawaug.training.stream import PictureCrops, TrainingStream
+from rawaug.training.stream import TrainingStream
 
 BLACK, WHITE = 8192.0, 65535.0
 """Black and white level of the DNG: room for noise below black."""

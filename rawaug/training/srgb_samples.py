@@ -12,8 +12,8 @@ from rawaug.data.pairs import Sample
 from rawaug.isp.functional import as_float
 from rawaug.plugin.crops import crop_size, draw_patch
 from rawaug.registry import require_between
+from rawaug.training.crops import PictureCrops
 from rawaug.training.srgb_noise import SrgbNoise
-from rawaug.training.stream import PictureCrops
 
 
 class NoisyPictures:

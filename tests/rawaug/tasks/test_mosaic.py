@@ -24,7 +24,7 @@ from rawaug.seeding import keyed_generator
 from rawaug.tasks.full_colour import full_colour, libraw_demosaic
 from rawaug.tasks.mosaic import MosaicRecipe, mosaic_trial, planes_trial
 from rawaug.tasks.settings import ArmConfig
-from rawaug.training.stream import MosaicCrops
+from rawaug.training.crops import MosaicCrops
 
 
 @pytest.fixture(scope="module")

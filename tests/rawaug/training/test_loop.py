@@ -21,10 +21,11 @@ from rawaug.evaluation.trials import Trial, trial_of
 from rawaug.noise import noise_model
 from rawaug.training import loop
 from rawaug.training.config import DenoiserConfig, TrainConfig
+from rawaug.training.crops import RealCrops
 from rawaug.training.estimators import Supervised
 from rawaug.training.journal import Journal
 from rawaug.training.state import TrainingState, first_network, learning_rate_factor
-from rawaug.training.stream import RealCrops, TrainingStream
+from rawaug.training.stream import TrainingStream
 
 NETWORK = DenoiserConfig("UNet", {"width": 4, "scales": 3, "deviation": True})
 CONFIG = TrainConfig(steps=12, batch=2, crop=32, validate_every=6, checkpoint_every=5, learning_rate=3e-3, warmup=2)

@@ -17,7 +17,8 @@ from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.targets import Srgb, Target
 from rawaug.seeding import keyed_generator
-from rawaug.training.stream import RealCrops, StepSampler, TrainingStream
+from rawaug.training.crops import RealCrops
+from rawaug.training.stream import StepSampler, TrainingStream
 
 
 def colour_pair(cfa: CFA) -> Pair:

@@ -1,0 +1,172 @@
+"""Sources of training samples: crops of real frames, of pictures as RAW, and of pictures as mosaics of any pattern."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from copy import copy
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from denoisers.mosaic import entry_pattern, with_planes
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data.pairs import Pair, Sample
+from rawaug.evaluation.trials import Trial
+from rawaug.noise import NoiseModel
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
+from rawaug.seeding import keyed_generator
+
+WATCHED = 16
+"""Number of samples made from pictures for watching a training without validation pairs."""
+
+
+class Source(Protocol):
+    """A source of samples; one with a ``draw_batch(generators)`` makes those of a step together."""
+
+    def draw(self, generator: torch.Generator) -> Any:
+        """Draw a training sample, a named tuple of tensors ``(C, h, w)``, that depends on ``generator`` alone."""
+        ...
+
+
+def freeze_samples(source: Source, key: str) -> list[Trial]:
+    """Draw :data:`WATCHED` samples of a source as trials, the same for the same ``key``."""
+    trials = []
+    for k in range(WATCHED):
+        sample = source.draw(keyed_generator(key, k))
+        trials.append(Trial(sample.noisy[None], sample.clean[None], sample.variance[None]))
+    return trials
+
+
+def add_noise(clean: Tensor, noise: NoiseModel, generator: torch.Generator) -> Sample:
+    """Draw noise for clean packed RAW ``(1, 4, h, w)``: a sample of ``(4, h, w)``."""
+    params = noise.sample(1, generator)
+    noisy = noise.apply(clean, params)
+    return Sample(noisy[0], clean[0], noise.variance(noisy, params)[0])
+
+
+class RealCrops:
+    """Crops of real RAW pairs, in eight turns that keep the CFA.
+
+    Args:
+        pairs: clean frames, with a noisy capture or without.
+        noise: drawn for frames without a capture.
+        crop: side of the crops in pixels.
+        cfa: the pattern in which all crops are packed.
+    """
+
+    def __init__(self, pairs: Sequence[Pair], noise: NoiseModel, crop: int, cfa: CFA) -> None:
+        self.pairs = [pair.with_levels() for pair in pairs]
+        self.noise = noise
+        self.crop = crop
+        self.cfa = cfa
+
+    def draw(self, generator: torch.Generator) -> Sample:
+        """Draw a sample of packed RAW ``(4, crop / 2, crop / 2)``."""
+        pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
+        if pair.noisy is None:
+            packed = packed_crop(pair.name, [pair.raw], pair.cfa, self.crop, self.cfa, generator)
+            return add_noise(packed, self.noise, generator)
+
+        clean, noisy = packed_crop(pair.name, [pair.raw, pair.noisy], pair.cfa, self.crop, self.cfa, generator)
+        variance = bayer.noise_variance(noisy, torch.tensor(pair.shot_var), torch.tensor(pair.read_var))
+        return Sample(noisy, clean, variance)
+
+
+class PictureCrops:
+    """Samples of :class:`rawaug.RawPairs` in any target; zeros stand for the noise map where there is none."""
+
+    def __init__(self, pairs: RawPairs) -> None:
+        self.pairs = pairs
+
+    def draw(self, generator: torch.Generator) -> Sample:
+        """Draw a sample of one crop, ``(C, h, w)`` as the target has it."""
+        return self.draw_batch([generator])[0]
+
+    def draw_batch(self, generators: Sequence[torch.Generator]) -> list[Sample]:
+        """Draw one crop for each generator, all made together."""
+        indices = [int(torch.randint(len(self.pairs), (), generator=generator)) for generator in generators]
+        pair = self.pairs.draw_batch(indices, generators)
+
+        variance = pair.variance
+        if not variance.numel():
+            variance = torch.zeros_like(pair.noisy)
+        return list(map(Sample, pair.noisy, pair.clean, variance))
+
+
+class MosaicCrops:
+    """Crops of pictures as RAW of a pattern drawn by its share, with the planes of its colours, from any of its cells.
+
+    Args:
+        pictures: a Dataset of pictures.
+        augment: of a Bayer pattern; noise of planes is then of the four sites of every 2 x 2 square.
+        crop: side in pixels.
+        zoom: see :class:`rawaug.RawPairs`.
+        patterns: shares of patterns by name.
+    """
+
+    def __init__(
+        self, pictures: Any, augment: RawAugment, crop: int, zoom: float, patterns: Mapping[str, float]
+    ) -> None:
+        self.crop = crop
+        self.patterns = [entry_pattern(bayer.pattern(name)) for name in patterns]
+        self.shares = torch.tensor(list(patterns.values()))
+
+        margin = max(pattern.period for pattern in self.patterns)
+        self.pairs = []
+        for pattern in self.patterns:
+            of_pattern = copy(augment)
+            of_pattern.pattern = pattern
+            self.pairs.append(RawPairs(pictures, of_pattern, crop + margin, zoom=zoom))
+
+    def draw(self, generator: torch.Generator) -> Sample:
+        """Draw a sample: noisy RAW and planes ``(4, crop, crop)``, clean RAW and variance ``(1, crop, crop)``."""
+        kind = int(torch.multinomial(self.shares, 1, generator=generator))
+        pairs = self.pairs[kind]
+        pattern = self.patterns[kind]
+        pair = pairs.draw(int(torch.randint(len(pairs), (), generator=generator)), generator)
+
+        cell = 2 * torch.randint(pattern.period // 2, (2,), generator=generator)
+        row, column = cell.tolist()
+        window = (..., slice(row, row + self.crop), slice(column, column + self.crop))
+
+        noisy = with_planes(pair.noisy[None], pattern)[0]
+        return Sample(noisy[window], pair.clean[window], pair.variance[window])
+
+
+def packed_crop(
+    name: str, mosaics: Sequence[Tensor], own: CFA, crop: int, cfa: CFA, generator: torch.Generator
+) -> Tensor:
+    """Cut one random part out of all mosaics of a frame, in one of eight turns, and pack it.
+
+    Args:
+        name: of the frame.
+        mosaics: each ``(C, H, W)``, of the pattern ``own``.
+        own: their pattern.
+        crop: side in pixels.
+        cfa: the pattern in which the result is packed.
+        generator: draws the part and the turn.
+
+    Returns:
+        ``(sum of C, 4, crop / 2, crop / 2)``.
+
+    Raises:
+        ValueError: if the frame is too small.
+    """
+    height, width = mosaics[0].shape[-2:]
+    if min(height, width) < crop + 6:
+        raise ValueError(f"{name}: a frame of {height} x {width} is too small for train.crop={crop}")
+
+    mosaics = [bayer.crop_to_cfa(mosaic, own, cfa) for mosaic in mosaics]
+    height, width = mosaics[0].shape[-2:]
+
+    side = crop + 4  # turned, then cut to size, so that lines lost to the CFA do not show
+    row = 2 * int(torch.randint((height - side) // 2 + 1, (), generator=generator))
+    column = 2 * int(torch.randint((width - side) // 2 + 1, (), generator=generator))
+    view = int(torch.randint(bayer.N_VIEWS, (), generator=generator))
+
+    parts = torch.cat([bayer.crop(mosaic, row, column, side, side) for mosaic in mosaics])
+    turned = bayer.pattern(cfa).turn_keeping(parts, view)
+    return bayer.pack(bayer.crop(turned, 0, 0, crop, crop)[:, None], cfa)
