@@ -120,15 +120,15 @@ _LAMPS = np.array(list(LAMPS.values()))
 
 D65 = (0.31271, 0.32902)
 
-COLDEST, WARMEST = 10_000.0, 2_000.0
+_COLDEST, _WARMEST = 10_000.0, 2_000.0
 """Limits of the colour temperature, in kelvin."""
-DAYLIGHT_FROM = 4_000.0
+_DAYLIGHT_FROM = 4_000.0
 """The lowest colour temperature of the daylight locus, in kelvin."""
-DAYLIGHT_SHARE = 0.9
-DAYLIGHT_MIRED = (190.0, 25.0)
+_DAYLIGHT_SHARE = 0.9
+_DAYLIGHT_MIRED = (190.0, 25.0)
 """Mean and standard deviation; as-shot balances of photographs lie between 4,000 and 6,500 K mostly."""
-LAMP_SHARE = 0.1
-DUV_SPREAD = 0.003
+_LAMP_SHARE = 0.1
+_DUV_SPREAD = 0.003
 """Standard deviation of Duv; lamps sold as white keep within 0.006 (ANSI C78.377)."""
 
 
@@ -142,14 +142,14 @@ class LightRange(NamedTuple):
         by_day: share of the draws that are daylight as in most photographs.
     """
 
-    kelvin: tuple[float, float] = (WARMEST, COLDEST)
-    lamps: float = LAMP_SHARE
+    kelvin: tuple[float, float] = (_WARMEST, _COLDEST)
+    lamps: float = _LAMP_SHARE
     among: Array = _LAMPS
     by_day: float = 0.0
 
 
-ALL_LIGHTS = LightRange()
-PHOTOGRAPHS = LightRange(by_day=DAYLIGHT_SHARE)
+_ALL_LIGHTS = LightRange()
+PHOTOGRAPHS = LightRange(by_day=_DAYLIGHT_SHARE)
 """The lights of photographs, most of them taken by day."""
 
 
@@ -164,8 +164,8 @@ def light_range(light: float | str | None) -> LightRange:
             raise ValueError(f"light {light!r} is unknown; use a colour temperature or one of {listed}{near}")
         return PHOTOGRAPHS._replace(lamps=1.0, among=np.array([LAMPS[light]]))
 
-    if not WARMEST <= light <= COLDEST:
-        raise ValueError(f"light must be {WARMEST:g} to {COLDEST:g} kelvin, got {light:g}")
+    if not _WARMEST <= light <= _COLDEST:
+        raise ValueError(f"light must be {_WARMEST:g} to {_COLDEST:g} kelvin, got {light:g}")
     return LightRange((float(light), float(light)), lamps=0.0)
 
 
@@ -199,22 +199,22 @@ def white_point(xy: Array | tuple[float, float]) -> Tensor:
     return torch.from_numpy(_white_point(np.asarray(xy, dtype=np.float64)))
 
 
-def sample_lights(batch: int, generator: torch.Generator, lights: LightRange = ALL_LIGHTS) -> Array:
+def sample_lights(batch: int, generator: torch.Generator, lights: LightRange = _ALL_LIGHTS) -> Array:
     """Draw white points ``(batch, 3)``, XYZ with Y = 1; where both loci are defined, each as often as the other."""
     kelvin, lamps, among, by_day = lights
     uniform = torch.rand(batch, 4, generator=generator, dtype=torch.float64).numpy()
-    duv = DUV_SPREAD * torch.randn(batch, generator=generator, dtype=torch.float64).numpy()
+    duv = _DUV_SPREAD * torch.randn(batch, generator=generator, dtype=torch.float64).numpy()
 
     temperature = 1.0 / (1 / kelvin[1] + (1 / kelvin[0] - 1 / kelvin[1]) * uniform[:, 0])
     on_daylight = uniform[:, 1] < 0.5
     if by_day:
         sunny = torch.rand(batch, generator=generator, dtype=torch.float64).numpy() < by_day
-        mired = torch.normal(*DAYLIGHT_MIRED, (batch,), generator=generator, dtype=torch.float64).numpy()
+        mired = torch.normal(*_DAYLIGHT_MIRED, (batch,), generator=generator, dtype=torch.float64).numpy()
         temperature = np.where(sunny, (1e6 / mired.clip(1.0)).clip(*kelvin), temperature)
         on_daylight |= sunny
-    on_daylight &= temperature >= DAYLIGHT_FROM
+    on_daylight &= temperature >= _DAYLIGHT_FROM
 
-    by_daylight = daylight(np.maximum(temperature, DAYLIGHT_FROM))
+    by_daylight = daylight(np.maximum(temperature, _DAYLIGHT_FROM))
     on_locus = np.where(on_daylight[:, None], by_daylight, planckian(temperature))
     lamp = among[(uniform[:, 3] * len(among)).astype(np.int64)]
     xy = np.where(uniform[:, 2:3] < lamps, lamp, on_locus)

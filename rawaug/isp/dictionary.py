@@ -32,7 +32,7 @@ EXPOSURE = (-0.5, 1.0)
 """Stops, drawn uniformly: what cameras leave between the white of RAW and that of their pictures is not published. With
 these the mean RAW of photographs is 0.136, and 71 % of the cells whose green is clipped have red to spare, as in real
 files; with a ceiling of 1.5 stops 45 %."""
-CAMERAS_MIXED, TONES_MIXED = 2, 3
+CAMERAS_MIXED, _TONES_MIXED = 2, 3
 _ROUNDS = 100
 _STEPS = 400
 
@@ -255,7 +255,7 @@ class CameraSampler:
 
         tones = none = gains[:, :0]
         if self.tone_atoms:
-            atoms, shares = sparse_shares(batch, self.tone_atoms, TONES_MIXED, generator)
+            atoms, shares = sparse_shares(batch, self.tone_atoms, _TONES_MIXED, generator)
             tones = shares.new_zeros(batch, self.tone_atoms).scatter_add_(1, atoms, shares).to(gains)
         return ISPParams(colour_weights, none, matrices, gains, tones)
 

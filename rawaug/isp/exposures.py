@@ -28,7 +28,7 @@ from rawaug.isp.functional import as_display_referred, inverse_gains
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import WhiteBalance
 
-MIDDLE_GREY = 0.18
+_MIDDLE_GREY = 0.18
 """The linear light above which highlights are compressed."""
 
 _CLIPPED, _RAMP = 0.95, 0.1
@@ -100,7 +100,7 @@ def render_exposure(isp: DictionaryISP, raw: Tensor, params: ISPParams, ev: floa
             light = stage.forward(light, params)
     light = light.amax(dim=1, keepdim=True)
 
-    compressed = raw * _compress(light) / light.clamp_min(MIDDLE_GREY)
+    compressed = raw * _compress(light) / light.clamp_min(_MIDDLE_GREY)
     return isp.forward_pixels(compressed, params).clamp(0.0, 1.0)
 
 
@@ -119,10 +119,10 @@ def _compress(light: Tensor) -> Tensor:
     flat = light.flatten(1)
     rank = max(round(_SCENE_WHITE * flat.shape[1]), 1)
     brightest = flat.kthvalue(rank, dim=1).values.clamp_min(1.0)
-    white = ((brightest - MIDDLE_GREY) / (1.0 - MIDDLE_GREY)).reshape(-1, 1, 1, 1)
+    white = ((brightest - _MIDDLE_GREY) / (1.0 - _MIDDLE_GREY)).reshape(-1, 1, 1, 1)
 
-    u = (light.clamp_min(MIDDLE_GREY) - MIDDLE_GREY) / (1.0 - MIDDLE_GREY)
-    return MIDDLE_GREY + (1.0 - MIDDLE_GREY) * u * (1.0 + u / white**2) / (1.0 + u)
+    u = (light.clamp_min(_MIDDLE_GREY) - _MIDDLE_GREY) / (1.0 - _MIDDLE_GREY)
+    return _MIDDLE_GREY + (1.0 - _MIDDLE_GREY) * u * (1.0 + u / white**2) / (1.0 + u)
 
 
 def _require_bracket(pictures: Sequence[Tensor], ev: Sequence[float]) -> None:

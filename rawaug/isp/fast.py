@@ -36,9 +36,9 @@ from rawaug.kernels.runtime import one_thread
 
 NODES = 65
 """Number of nodes of the table along each axis of the sRGB cube."""
-CURVE_NODES = 1025
+_CURVE_NODES = 1025
 """Number of nodes of an inverted tone curve, over the root of linear light."""
-PLACE_NODES = 33
+_PLACE_NODES = 33
 """Number of nodes along each side of a picture between which gains by place are interpolated."""
 
 
@@ -280,7 +280,7 @@ class FastForward(nn.Module):
         matrix, floor, frame, curves, shading = _batch_params(self.isp.ordered_stages, linear, params, place, table)
         if curves.numel():
             table = table[:0]
-            light = torch.linspace(0.0, 1.0, CURVE_NODES).square().to(curves).expand(len(curves), 1, 1, -1)
+            light = torch.linspace(0.0, 1.0, _CURVE_NODES).square().to(curves).expand(len(curves), 1, 1, -1)
             curves = to_code(light, curves)[:, 0, 0]
 
         gains = 1.0 / floor[:, 0]
@@ -338,7 +338,7 @@ def _place_gain(
     forward: bool,
     batch: int = 1,
 ) -> Tensor | None:
-    """Compute the gains by place ``(B, 1, H, W)`` of pictures of a size, between :data:`PLACE_NODES` a side."""
+    """Compute the gains by place ``(B, 1, H, W)`` of pictures of a size, between :data:`_PLACE_NODES` a side."""
     gaining = [stage for stage in stages if stage.has_place_gain]
     if not gaining:
         return None
@@ -349,8 +349,8 @@ def _place_gain(
         places = place.tolist()
     frame = like.new_tensor([mask_frame(row, height, width, (0.0, 0.0)) for row in places])
 
-    down = torch.linspace(0.0, height - 1.0, min(PLACE_NODES, height)).to(like)[:, None]
-    right = torch.linspace(0.0, width - 1.0, min(PLACE_NODES, width)).to(like)
+    down = torch.linspace(0.0, height - 1.0, min(_PLACE_NODES, height)).to(like)[:, None]
+    right = torch.linspace(0.0, width - 1.0, min(_PLACE_NODES, width)).to(like)
     start_y, start_x, down_y, down_x, right_y, right_x = frame[:, :, None, None].unbind(1)
     y = start_y + down * down_y + right * right_y
     x = start_x + down * down_x + right * right_x

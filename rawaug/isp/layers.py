@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 WIDTH = 32
 """Number of features of the networks."""
-LEAST_FACTOR = 0.02
+_LEAST_FACTOR = 0.02
 """Initial entries of L of a Gaussian mask."""
 
 
@@ -60,13 +60,13 @@ class GaussianMask(nn.Module):
     """The sensor's fall-off ``G(p) = exp(-||L^T (p - mu)||^2 / 2)``, precision ``Sigma^-1 = L L^T``.
 
     ``p`` are the coordinates of :func:`frame_coordinates`. A flat mask, L = 0, is a saddle, which gradient descent
-    never leaves; the mask starts with :data:`LEAST_FACTOR` instead, which takes 0.02 % of the light from the corners.
+    never leaves; the mask starts with :data:`_LEAST_FACTOR` instead, which takes 0.02 % of the light from the corners.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.mean = nn.Parameter(torch.zeros(2))
-        self.factor = nn.Parameter(torch.tensor([LEAST_FACTOR, 0.0, LEAST_FACTOR]))  # L11, L21, L22
+        self.factor = nn.Parameter(torch.tensor([_LEAST_FACTOR, 0.0, _LEAST_FACTOR]))  # L11, L21, L22
 
     @property
     def precision(self) -> Tensor:
@@ -86,7 +86,7 @@ class GaussianMask(nn.Module):
     def set(self, mean: Tensor, precision: Tensor) -> None:
         """Set the mean ``(2,)`` and the precision ``(2, 2)``; less curvature than at the start is taken as that."""
         values, vectors = torch.linalg.eigh(precision)
-        root = vectors @ torch.diag(values.clamp_min(LEAST_FACTOR**2).sqrt())
+        root = vectors @ torch.diag(values.clamp_min(_LEAST_FACTOR**2).sqrt())
         lower = torch.linalg.qr(root.T).R.T
 
         self.mean.copy_(mean)

@@ -41,7 +41,7 @@ _BRADFORD = torch.tensor(
 """M, from XYZ to the responses of the cones."""
 
 
-def light_chromaticity(light: str) -> tuple[float, float]:
+def _light_chromaticity(light: str) -> tuple[float, float]:
     """The chromaticity (x, y) of a light by its name or its colour temperature in kelvin; ValueError if unknown."""
     if light in ILLUMINANTS:
         return ILLUMINANTS[light]
@@ -67,7 +67,7 @@ def light_xyz(light: str) -> Tensor:
     """The white point of a light, XYZ ``(3,)`` with Y = 1; that of D65 is the white of sRGB."""
     if light == REFERENCE:
         return SRGB_TO_XYZ.sum(dim=1)
-    return white_point(light_chromaticity(light))
+    return white_point(_light_chromaticity(light))
 
 
 def light_mired(light: str) -> float:

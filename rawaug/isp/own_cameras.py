@@ -49,7 +49,7 @@ from rawaug.isp.lights import (
 )
 from rawaug.registry import suggest
 
-YAML_EXTENSIONS = (".yaml", ".yml")
+_YAML_EXTENSIONS = (".yaml", ".yml")
 """Extensions of a camera's file."""
 
 MatrixKind = Literal["xyz_to_camera", "srgb_to_camera", "camera_to_srgb"]
@@ -471,7 +471,7 @@ class Camera:
 
 def is_camera_file(name: object) -> bool:
     """Whether a name or path is that of a camera's YAML file."""
-    return isinstance(name, (str, Path)) and Path(name).suffix.lower() in YAML_EXTENSIONS
+    return isinstance(name, (str, Path)) and Path(name).suffix.lower() in _YAML_EXTENSIONS
 
 
 def as_camera(camera: str | Path | Camera) -> Camera:

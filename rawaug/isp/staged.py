@@ -37,10 +37,10 @@ S = TypeVar("S", bound=Stage)
 THUMBNAIL = 48
 """Longest side of an encoder's input, in pixels."""
 CLIPPED = 0.98
-SHADOW = 0.01
+_SHADOW = 0.01
 """The share of read noise that is added to a reading used as a variance."""
 ROUNDS = 4
-PULL = 1e-4
+_PULL = 1e-4
 """Strength of the pull of weights to the typical ones, as a share of the readings' mean square."""
 
 
@@ -382,7 +382,7 @@ def _fit_mixtures(
 ) -> ISPParams:
     """Fit the mixture of curves, then that of cameras, under the gains that ``params`` have."""
     target = value * torch.einsum("bck,bc->bk", own, params.gains)
-    weight = ((value < CLIPPED) / (value.clamp_min(0.0) + SHADOW)).sqrt()
+    weight = ((value < CLIPPED) / (value.clamp_min(0.0) + _SHADOW)).sqrt()
     rows = torch.einsum("bck,bcd->bkd", own, params.matrix)
     linear = torch.stack([apply_curves(curve.expand(len(pixels), -1), pixels) for curve in tones.curves], dim=1)
     readings = torch.einsum("bkd,bndk->bnk", rows, linear[:, :, :, 0])
@@ -400,7 +400,7 @@ def _nearest(target: Tensor, readings: Tensor, typical: Tensor) -> Tensor:
     rows = []
     for row, atoms in zip(target.double(), readings.double(), strict=True):
         # A mixture that the readings leave open falls back on the typical weights.
-        pull = (PULL * atoms.square().mean() * atoms.shape[1]).sqrt() * torch.eye(len(atoms)).to(atoms)
+        pull = (_PULL * atoms.square().mean() * atoms.shape[1]).sqrt() * torch.eye(len(atoms)).to(atoms)
         point = torch.cat([row, typical.to(atoms) @ pull])
 
         weights, _ = nearest_in_hull(point[None], torch.cat([atoms, pull], dim=1))
@@ -425,13 +425,13 @@ def _solve(isp: StagedISP, pixels: Tensor, where: Tensor, own: Tensor, value: Te
     x5 = isp.reverse_pixels(pixels, unit, where)[:, :, 0]
     y = value[:, None].expand_as(x5)
     usable = own * (y < CLIPPED)
-    weight = usable / (y.clamp_min(0.0) + SHADOW)
+    weight = usable / (y.clamp_min(0.0) + _SHADOW)
     inverse = torch.ones_like(params.gains)
     for _ in range(ROUNDS):
         inverse = (weight * x5 * y).sum(2) / (weight * x5 * x5).sum(2).clamp_min(1e-12)
-        residual = (y - inverse[..., None] * x5).abs() / (y.clamp_min(0.0) + SHADOW).sqrt()
+        residual = (y - inverse[..., None] * x5).abs() / (y.clamp_min(0.0) + _SHADOW).sqrt()
         typical = residual.masked_fill(usable == 0, torch.nan).nanmedian(dim=2, keepdim=True).values.clamp_min(1e-6)
-        weight = usable / (y.clamp_min(0.0) + SHADOW) / (1.0 + (residual / (2.0 * typical)) ** 2)
+        weight = usable / (y.clamp_min(0.0) + _SHADOW) / (1.0 + (residual / (2.0 * typical)) ** 2)
 
     solvable = (usable.sum(2) > 0) & (inverse > 0)
     gains = torch.where(solvable, 1.0 / inverse.clamp_min(1e-6), params.gains)

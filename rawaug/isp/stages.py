@@ -283,11 +283,11 @@ class ColorCorrection(Stage):
 
     def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x3 = C x2, both ``(B, 3, H, W)``."""
-        return correct_colour(x, require_params(params).matrix)
+        return correct_colour(x, _require_params(params).matrix)
 
     def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x2 = pinv(C) x3, both ``(B, 3, H, W)``."""
-        return correct_colour(x, torch.linalg.pinv(require_params(params).matrix))
+        return correct_colour(x, torch.linalg.pinv(_require_params(params).matrix))
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         """Put the matrices ``(B, 3, 3)`` of ``params`` into ``batch``; ``place`` and ``size`` do not matter."""
@@ -302,11 +302,11 @@ class WhiteBalance(Stage):
 
     def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x4 from x3, both ``(B, 3, H, W)``, by :func:`inverse_gains`."""
-        return inverse_gains(x, require_params(params).gains, self.config.knee)
+        return inverse_gains(x, _require_params(params).gains, self.config.knee)
 
     def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x3 = g x4, both ``(B, 3, H, W)``."""
-        return apply_gains(x, require_params(params).gains)
+        return apply_gains(x, _require_params(params).gains)
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         """Put one over the gains ``(B, 3)`` of ``params`` into ``batch``; ``place`` and ``size`` do not matter."""
@@ -409,7 +409,7 @@ def _bake_attention(tables: Tables, mask: AttentionMask | None) -> Tables:
     return tables._replace(attention=mask.of_colour(tables.cube))
 
 
-def require_params(params: ISPParams | None) -> ISPParams:
+def _require_params(params: ISPParams | None) -> ISPParams:
     """The settings, which every stage after x2 needs; ValueError if there are none yet."""
     if params is None:
         raise ValueError("this stage needs the pictures' parameters; choose them first")

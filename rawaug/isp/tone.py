@@ -29,7 +29,7 @@ from rawaug.kernels.reference import apply_curves
 STEPS = 4
 """Entries of a table for each 8-bit level."""
 NODES = 255 * STEPS + 1
-PIECES = 51
+_PIECES = 51
 """Number of pieces of a curve whose slopes a fit scales."""
 
 
@@ -101,7 +101,7 @@ class ToneCurve(Stage):
             raise ValueError(f"stages: 'curve' replaces tone and gamma, got {' '.join(config.stages)}")
 
         self.dictionary = ToneDictionary(config.tone_atoms)
-        self.slopes: Tensor | None = None  # (K, PIECES), l, during a fit
+        self.slopes: Tensor | None = None  # (K, _PIECES), l, during a fit
 
     def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x2 from sRGB, both ``(B, 3, H, W)``, by each picture's curve."""
@@ -139,7 +139,7 @@ class ToneCurve(Stage):
         curve = (code + toe * (1.0 - code)) ** gamma
         self.dictionary.curves.copy_((curve - curve[0]) / (1.0 - curve[0]))
 
-        self.slopes = torch.zeros(self.config.tone_atoms, PIECES)
+        self.slopes = torch.zeros(self.config.tone_atoms, _PIECES)
 
     @torch.no_grad()
     def start_forward(self) -> None:
@@ -158,7 +158,7 @@ class ToneCurve(Stage):
         if self.slopes is None:
             return self.dictionary.curves
 
-        factors = self.slopes.exp().repeat_interleave((NODES - 1) // PIECES, dim=1)
+        factors = self.slopes.exp().repeat_interleave((NODES - 1) // _PIECES, dim=1)
         rises = self.dictionary.curves.diff(dim=1) * factors
         heights = torch.nn.functional.pad(rises.cumsum(dim=1), (1, 0))
         return heights / heights[:, -1:]

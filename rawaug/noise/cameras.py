@@ -103,7 +103,7 @@ def noise_levels(spec: NoiseSpec | NoiseLevels | NoiseModel, *, iso: Iso = None)
         raise _no_iso(spec)
     levels = FixedLevels.of(spec)
     if 0 < levels.shot_var < levels.read_var:
-        warn_of_swapped_levels(levels.shot_var, levels.read_var)
+        _warn_of_swapped_levels(levels.shot_var, levels.read_var)
     return levels
 
 
@@ -167,7 +167,7 @@ def _no_iso(spec: object) -> ValueError:
 
 
 @cache
-def warn_of_swapped_levels(shot_var: float, read_var: float) -> None:
+def _warn_of_swapped_levels(shot_var: float, read_var: float) -> None:
     """Warn, once for each pair of levels, of more read noise than shot noise at white, which no sensor has."""
     problem = f"noise ({shot_var:g}, {read_var:g}): read_var is above shot_var, as in no sensor"
     warnings.warn(f"{problem}; the order is (shot_var, read_var)", stacklevel=3)

@@ -85,7 +85,7 @@ class NoiseModel(ABC):
         Raises:
             ValueError: if ``clean`` is not packed RAW in float32 or float64, or ``params`` are for another batch size.
         """
-        require_batch(clean, params)
+        _require_batch(clean, params)
         return self.disturb(clean, params).clamp_(max=1.0)
 
     def apply_with_variance(self, clean: Tensor, params: Params) -> tuple[Tensor, Tensor]:
@@ -99,7 +99,7 @@ class NoiseModel(ABC):
             yield keyed_generator(seed, self.stream, device=device)
 
 
-def require_batch(clean: Tensor, params: Params) -> None:
+def _require_batch(clean: Tensor, params: Params) -> None:
     """Raise ValueError unless ``clean`` is ``(B, 4, h, w)`` in float32 or float64 and every parameter has length B."""
     if clean.ndim != 4 or clean.shape[1] != 4 or clean.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"noise needs packed float32 RAW (B, 4, h, w), got {tuple(clean.shape)} {clean.dtype}")
@@ -162,14 +162,14 @@ class ShotReadNoise(ShotReadModel):
     @torch.no_grad()
     def apply(self, clean: Tensor, params: Params) -> Tensor:
         """Make noisy RAW ``(B, 4, h, w)`` in one pass over the pixels; see :meth:`NoiseModel.apply`."""
-        require_batch(clean, params)
+        _require_batch(clean, params)
         return self._add_noise(clean, params, white=1.0)[0]
 
     @eager
     @torch.no_grad()
     def apply_with_variance(self, clean: Tensor, params: Params) -> tuple[Tensor, Tensor]:
         """Make noisy RAW and its variance map, both ``(B, 4, h, w)``, in one pass over the pixels."""
-        require_batch(clean, params)
+        _require_batch(clean, params)
         return self._add_noise(clean, params, white=1.0, mapped=True)
 
     @torch.no_grad()

@@ -63,7 +63,7 @@ def draw_between(value: Range, batch: int, generator: torch.Generator) -> Tensor
 
 
 @cache
-def tukey_lambda_variance(shape: float) -> float:
+def _tukey_lambda_variance(shape: float) -> float:
     """The variance of the Tukey lambda distribution of scale 1; up to a shape of -1/2 it is infinite: ValueError."""
     from scipy.stats import tukeylambda
 
@@ -78,7 +78,7 @@ class TukeyLambdaNoise(PoissonGaussianNoise):
     def __init__(self, levels: NoiseLevels, shape: float | tuple[float, float]) -> None:
         super().__init__(levels)
         self.shape = shape if isinstance(shape, tuple) else (shape, shape)
-        tukey_lambda_variance(min(self.shape))  # raises for an infinite variance
+        _tukey_lambda_variance(min(self.shape))  # raises for an infinite variance
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         """Draw levels, seeds and the shape ``tukey_lambda`` of the tails, each ``(batch,)``."""
@@ -91,7 +91,7 @@ class TukeyLambdaNoise(PoissonGaussianNoise):
         noise = torch.empty_like(like, memory_format=torch.contiguous_format)
         shapes, variances = params["tukey_lambda"].tolist(), params["read_var"].tolist()
         for picture, shape, read_var, generator in zip(noise, shapes, variances, generators, strict=True):
-            scale = math.sqrt(read_var / tukey_lambda_variance(shape))
+            scale = math.sqrt(read_var / _tukey_lambda_variance(shape))
             u = uniform(generator, *picture.shape)
             picture.copy_(_tukey_lambda(u, shape).mul_(scale))
         return noise
@@ -464,7 +464,7 @@ class EldNoise(Compose):
         index = torch.randint(len(self.shapes), (batch,), generator=generator, device=generator.device)
         shape = self.shapes.to(generator.device)[index]
 
-        unit_var = gain.new_tensor([tukey_lambda_variance(value) for value in shape.tolist()])
+        unit_var = gain.new_tensor([_tukey_lambda_variance(value) for value in shape.tolist()])
         return super().sample(batch, generator) | {
             "shot_var": gain / self.law.white_dn,
             "read_var": self.law.sample_scale("tukey_lambda", gain, generator).square() * unit_var,

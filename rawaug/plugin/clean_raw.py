@@ -127,7 +127,7 @@ class RawNoise(PairMaker):
 
     def open_folder(self, path: str | Path, size: tuple[int, int] | None) -> Any:
         """The RAW files of a folder, or the pairs of ``kind:path``; frames smaller than the crop are met on access."""
-        return open_clean_raw(path)
+        return _open_clean_raw(path)
 
     def as_batch(self, inputs: Any, bgr: bool = False) -> Tensor:
         """Frames of one size as ``(B, 4, h, w)``, or mosaics ``(B, 1, H, W)`` of other patterns than Bayer's.
@@ -312,7 +312,7 @@ class RawFiles(Dataset[Any]):
         return self.files[index]
 
 
-def open_clean_raw(path: str | Path) -> Any:
+def _open_clean_raw(path: str | Path) -> Any:
     """The RAW files of a folder, or the pairs of a known dataset, ``kind:path``, whose RAW is clean."""
     from rawaug.data import open_pairs
 

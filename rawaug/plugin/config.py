@@ -15,7 +15,7 @@ from rawaug.plugin.draw import Draw
 from rawaug.plugin.targets import Burst, Srgb, Target
 from rawaug.seeding import keyed_generator
 
-USUAL_NOISE = "auto"
+_USUAL_NOISE = "auto"
 """The noise of the camera where its file states one, else ``cycleisp_sidd``."""
 
 
@@ -43,7 +43,7 @@ class AugmentConfig:
 
     isp: str = "universal"
     camera: str | None = None
-    noise: tuple[float, float] | str = USUAL_NOISE
+    noise: tuple[float, float] | str = _USUAL_NOISE
     iso: float | None = None
     draw: Draw = Draw()
     target: Target | Srgb = "raw"
@@ -59,7 +59,7 @@ class AugmentConfig:
             camera = as_camera(self.camera)
             object.__setattr__(self, "camera", to_json(camera.to_json()))
 
-        if self.noise == USUAL_NOISE:
+        if self.noise == _USUAL_NOISE:
             own = self.own_camera
             noise = "camera" if own is not None and own.levels else USUAL
             object.__setattr__(self, "noise", noise)

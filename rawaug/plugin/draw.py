@@ -58,7 +58,7 @@ class Draw:
         if not self.strength >= 0:
             raise ValueError(f"strength must be at least 0, got {self.strength}")
         if self.exposure is not None:
-            require_range("exposure", self.exposure)
+            _require_range("exposure", self.exposure)
 
     @property
     def exposure_range(self) -> tuple[float, float] | None:
@@ -68,7 +68,7 @@ class Draw:
         return self.exposure
 
 
-def require_range(key: str, limits: Any) -> None:
+def _require_range(key: str, limits: Any) -> None:
     """Refuse what is neither a finite number nor (lowest, highest)."""
     ends = limits if isinstance(limits, (list, tuple)) else (limits, limits)
 

@@ -27,7 +27,7 @@ from rawaug.seeding import rank_key
 
 _COUNTED = -1
 """Stands in place of a pinned epoch."""
-MAX_WORKERS = 512
+_MAX_WORKERS = 512
 
 _BROKEN_OFF = (
     "the state is of the middle of a pass whose workers had fetched more pictures than were used, so it cannot go on "
@@ -184,8 +184,8 @@ class Passes(_Epochs):
     """
 
     def __init__(self) -> None:
-        super().__init__(MAX_WORKERS)
-        self._of_workers = torch.zeros(MAX_WORKERS + 1, dtype=torch.int32).share_memory_()
+        super().__init__(_MAX_WORKERS)
+        self._of_workers = torch.zeros(_MAX_WORKERS + 1, dtype=torch.int32).share_memory_()
         """By W, the passes of W workers that the first of them has begun; 0 for the main process."""
         self._resumed = torch.tensor([-1, 0]).share_memory_()
         """A pass, and the number of its first sample."""

@@ -9,7 +9,7 @@ from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.stages import STAGES
 from rawaug.registry import require_between
 
-PUBLISHED_STEPS = 3000
+_PUBLISHED_STEPS = 3000
 """Steps end to end of the published fit."""
 MOST = 2**31
 """Upper limit of settings that count steps or pixels."""
@@ -98,7 +98,7 @@ class FitConfig:
         if self.method == "staged":
             return self
 
-        steps = PUBLISHED_STEPS if self.joint_steps is None else self.joint_steps
+        steps = _PUBLISHED_STEPS if self.joint_steps is None else self.joint_steps
         encoders: Literal["on", "off"] = "on"
         if self.encoders == "off":
             encoders = "off"

@@ -79,7 +79,7 @@ def mean_square(isp: DictionaryISP, part: PixelSamples, params: ISPParams) -> Te
     return error.sum((1, 2, 3)) / part.known.sum((1, 2, 3)).clamp_min(1.0)
 
 
-def weight_distance(ours: ISPParams, theirs: ISPParams) -> Tensor:
+def _weight_distance(ours: ISPParams, theirs: ISPParams) -> Tensor:
     """Compute ``|w_r - w_f|^2``, the sum over both dictionaries, a scalar."""
     colour = (ours.colour_weights - theirs.colour_weights).square().sum()
     return colour + (ours.gain_weights - theirs.gain_weights).square().sum()
@@ -252,22 +252,27 @@ FRAMES_A_STEP = 4
 ENCODER_PIXELS, ENCODER_RATE = 1024, 1e-3
 FEWEST_FRAMES, FOLDS = 12, 4
 """For encoders with "auto": the minimum number of frames, and the number of folds of the cross-validation."""
-MANY_FRAMES, STEPS, LEARNING_RATE, CONSISTENCY = 50, 1000, 2e-4, 0.01
-"""End-to-end training: frames from which on it is the default, its steps, its rate, and the weight of consistency."""
-PUBLISHED_RATE, PUBLISHED_FRAMES, PUBLISHED_PIXELS = 2e-3, 8, 256
-"""The published fit learns nearly all of it end to end: its rate, and frames and pixels of a step."""
-LOG_WEIGHT = 0.02
+
+_MANY_FRAMES = 50
+"""Minimum number of frames for end-to-end training by default."""
+STEPS, LEARNING_RATE = 1000, 2e-4
+"""Steps and rate of end-to-end training."""
+_CONSISTENCY = 0.01
+"""Weight of the distance between the weights of both directions."""
+PUBLISHED_RATE, PUBLISHED_FRAMES, _PUBLISHED_PIXELS = 2e-3, 8, 256
+"""Rate of the published fit, which learns nearly all of it end to end, and frames and pixels of a step."""
+_LOG_WEIGHT = 0.02
 """Weight of the logarithm of an error beside the squared errors of the other pass."""
 CURVE_POINTS = 13
 """Number of scores of a watched training that an ISP's record has."""
-LOSS_SCALE = 1e4
+_LOSS_SCALE = 1e4
 """Squared errors are near 1e-4, and what encoders get of them would vanish beside the epsilon of Adam, 1e-8."""
 
 Refit = Callable[[FitFrames, str, FitConfig], DictionaryISP]
 """A function that fits an ISP without encoders to some frames; the text names the fit in its progress."""
 
 
-def gain_left_out(frames: FitFrames, folds: int, gain: Callable[[FitFrames, FitFrames, str], float]) -> float:
+def _gain_left_out(frames: FitFrames, folds: int, gain: Callable[[FitFrames, FitFrames, str], float]) -> float:
     """Mean over the frames of ``gain(left out, kept, name of the fold)``, every frame being left out once."""
     count = len(frames.shots)
     total = 0.0
@@ -290,7 +295,7 @@ def with_better_tone(frames: FitFrames, config: FitConfig, refit: Refit) -> tupl
         curve = refit(kept, f", curve{part}", replace(config, tone="curve"))
         return mean_psnr(curve, out, True) - mean_psnr(learned, out, True)
 
-    gain = gain_left_out(frames, min(FOLDS, len(frames.shots)), better)
+    gain = _gain_left_out(frames, min(FOLDS, len(frames.shots)), better)
     return replace(config, tone="curve" if gain > 0 else "learned"), gain
 
 
@@ -316,7 +321,7 @@ def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, des
     mode = config.encoders
     isp.use_encoders(False)
     if mode == "auto" and len(frames.shots) >= FEWEST_FRAMES:
-        gain = gain_left_out(frames, FOLDS, better)
+        gain = _gain_left_out(frames, FOLDS, better)
         isp.info["encoders_gain_db"] = round(gain, 2)
         mode = "on" if gain > 0 else "off"
 
@@ -361,7 +366,7 @@ def _frame_loss(
     ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
     our_error = (mean_square(isp, part, ours) + config.mse_floor).log()
     their_error = (mean_square(isp, part, theirs) + config.mse_floor).log()
-    return (our_error + their_error).sum() + config.consistency * weight_distance(ours, theirs)
+    return (our_error + their_error).sum() + config.consistency * _weight_distance(ours, theirs)
 
 
 def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -384,7 +389,7 @@ def joint_steps(config: FitConfig, frames: int) -> int:
     """The steps of end-to-end training on this number of frames."""
     if config.joint_steps is not None:
         return config.joint_steps
-    return STEPS if frames >= MANY_FRAMES else 0
+    return STEPS if frames >= _MANY_FRAMES else 0
 
 
 def train_jointly(
@@ -415,7 +420,7 @@ def train_jointly(
     published = config.method == "published"
     frames_a_step, pixels, rate = FRAMES_A_STEP, config.batch, LEARNING_RATE
     if published:
-        frames_a_step, pixels, rate = PUBLISHED_FRAMES, min(config.batch, PUBLISHED_PIXELS), PUBLISHED_RATE
+        frames_a_step, pixels, rate = PUBLISHED_FRAMES, min(config.batch, _PUBLISHED_PIXELS), PUBLISHED_RATE
 
     def loss(generator: torch.Generator) -> Tensor:
         losses = []
@@ -426,7 +431,7 @@ def train_jointly(
 
             losses.append(len(srgb) * _joint_loss(isp, part, srgb, raw, config))
 
-        return LOSS_SCALE * torch.stack(losses).sum() / frames_a_step
+        return _LOSS_SCALE * torch.stack(losses).sum() / frames_a_step
 
     tensors = dict(isp.named_parameters())
     descent.run("end to end", loss, tensors, steps, rate, watch=lambda: mean_psnr(isp, watched))
@@ -469,8 +474,8 @@ def _joint_loss(isp: DictionaryISP, part: PixelSamples, srgb: Tensor, raw: Tenso
     back: dict[str, Tensor] = {}
     back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.coordinates, back)
     cycle = cycle_error(isp, part, theirs, back, config)
-    distance = weight_distance(ours, theirs) / len(srgb)
+    distance = _weight_distance(ours, theirs) / len(srgb)
     error = mean_square(isp, part, ours)
     if config.raw_loss == "log":
-        error = LOG_WEIGHT * (error + config.mse_floor).log()
-    return error.mean() + cycle + CONSISTENCY * config.consistency * distance
+        error = _LOG_WEIGHT * (error + config.mse_floor).log()
+    return error.mean() + cycle + _CONSISTENCY * config.consistency * distance

@@ -54,19 +54,19 @@ from rawaug.progress import progress as progress_of
 from rawaug.seeding import derive_seed
 from rawaug.version import __version__
 
-STANDARD_CURVES = ((2.2, 0.0), (2.4, 0.055 / 1.055), (1.0 / 0.45, 0.099 / 1.099))
+_STANDARD_CURVES = ((2.2, 0.0), (2.4, 0.055 / 1.055), (1.0 / 0.45, 0.099 / 1.099))
 """gamma and toe a of a plain gamma camera, of sRGB (IEC 61966-2-1) and of ITU-R BT.709."""
-CURVE_STEPS, CURVE_RATE = 150, 2e-2
+CURVE_STEPS, _CURVE_RATE = 150, 2e-2
 """Default steps and rate of stage 1."""
-DIMMEST = 0.01
+_DIMMEST = 0.01
 """Minimum share of a corner's light that a mask takes for being tried."""
-SHADING_PAYS = 0.5
+_SHADING_PAYS = 0.5
 """Maximum ratio of the squared errors with and without a mask for keeping the mask."""
 FRAMES_A_STEP = 16
 """Maximum number of frames in a step."""
-START_STEPS, START_RATE = 1000, 3e-3
+_START_STEPS, _START_RATE = 1000, 3e-3
 """Steps and rate of the descent that brings the tone near that of the ISP that a fit starts from."""
-MOST_LEFT_OUT = 0.1
+_MOST_LEFT_OUT = 0.1
 """Share of the frames that may be left out because too few of their pixels are not clipped."""
 
 
@@ -145,7 +145,7 @@ def _with_enough_pixels(frames: FitFrames) -> FitFrames:
         return frames
 
     first = frames.shots[bad[0]].name
-    if len(bad) > MOST_LEFT_OUT * len(counts):
+    if len(bad) > _MOST_LEFT_OUT * len(counts):
         raise ValueError(f"{first}: too few unclipped pixels to fit; use a better exposed frame or more pixels")
 
     print(f"note: {len(bad)} of {len(counts)} frames have too few unclipped pixels to fit, such as {first}: left out")
@@ -163,7 +163,7 @@ def _key(config: FitConfig, frames: FitFrames, camera: Camera | None) -> str:
     return digest(settings, frames.pixels.srgb.numpy().tobytes(), frames.pixels.target.numpy().tobytes())
 
 
-def new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
+def _new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
     """Make an ISP of the size that these frames need, drawn from the seed."""
     patterns = {shot.cfa for shot in shots}
     count = min(config.most_atoms, len(shots))
@@ -200,7 +200,7 @@ class _Fit:
             self.known_matrix = torch.stack([camera.matrix_for(shot.white_balance) for shot in self.shots])
 
         self.config, self.descent, self.part = config, descent, part
-        self.isp = new_isp(self.shots, config)
+        self.isp = _new_isp(self.shots, config)
         self.tie = Tie(self.shots)
         self.colour = self._start()
 
@@ -208,7 +208,7 @@ class _Fit:
     def _start(self) -> FrameColour:
         """Least squares under the curve of the standard that fits best."""
         tried = []
-        for curve in STANDARD_CURVES:
+        for curve in _STANDARD_CURVES:
             self._start_coarse(*curve)
             self.colour = FrameColour.from_product(self._least_squares())
             tried.append((self._error(), curve, self.colour))
@@ -244,7 +244,7 @@ class _Fit:
             return
 
         mean, precision = fit_fall_off(self._apply_curve(self.samples), self.samples, self.colour.product())
-        if mode == "auto" and not darkens_corners(mean, precision):
+        if mode == "auto" and not _darkens_corners(mean, precision):
             self._remove(shading)
             return
 
@@ -255,7 +255,7 @@ class _Fit:
 
         shading.mask.set(mean, precision)
         self._descend_on_curve("curve and shading")
-        if mode == "auto" and self._error() > SHADING_PAYS * error:
+        if mode == "auto" and self._error() > _SHADING_PAYS * error:
             self._remove(shading)
             for name, tensor in self._few_numbers().items():
                 tensor.data.copy_(before[name])
@@ -286,7 +286,7 @@ class _Fit:
             return reading_error(predicted, part) + self.tie(self.colour)
 
         steps = CURVE_STEPS if self.config.curve_steps is None else self.config.curve_steps
-        self.descent.run(stage + self.part, loss, tensors, steps, CURVE_RATE)
+        self.descent.run(stage + self.part, loss, tensors, steps, _CURVE_RATE)
 
     # -- stage 2 ----------------------------------------------------------------------------------------------------
 
@@ -339,9 +339,9 @@ class _Fit:
 
         descent = adam(
             tensors,
-            START_RATE,
+            _START_RATE,
             lambda step: ((self.isp.linear(colours) - target) ** 2 / (target + 0.01)).mean(),
-            lambda step: step / START_STEPS,
+            lambda step: step / _START_STEPS,
         )
         for _ in descent:
             pass
@@ -432,8 +432,8 @@ def _curve_of(table: Tensor) -> Callable[[Tensor], Tensor]:
     return lambda x: to_linear(x, table.expand(len(x), -1))
 
 
-def darkens_corners(mean: Tensor, precision: Tensor) -> bool:
-    """Whether a mask of mean ``(2,)`` and precision ``(2, 2)`` takes more than :data:`DIMMEST` of a corner's light."""
+def _darkens_corners(mean: Tensor, precision: Tensor) -> bool:
+    """Whether a mask of mean ``(2,)`` and precision ``(2, 2)`` takes more than :data:`_DIMMEST` of a corner's light."""
     corners = torch.tensor([[0.6, 0.8], [0.6, -0.8], [-0.6, 0.8], [-0.6, -0.8]]) - mean
     exponent = 0.5 * torch.einsum("ki,ij,kj->k", corners, precision, corners)
-    return bool((exponent > DIMMEST).any())
+    return bool((exponent > _DIMMEST).any())

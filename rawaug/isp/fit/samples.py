@@ -22,7 +22,7 @@ from rawaug.isp.functional import as_float, frame_coordinates
 from rawaug.isp.staged import thumbnail
 from rawaug.seeding import keyed_generator
 
-CLIPPED_SRGB = 0.98
+_CLIPPED_SRGB = 0.98
 """The value from which on a picture counts as clipped."""
 CLIPPED_RAW = 0.98
 """The value from which on a reading counts as clipped."""
@@ -218,7 +218,7 @@ def _draw_sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: tor
     pixel = srgb[:, row, column].float() / scale
     reading = raw[0, row, column]
     own = F.one_hot(torch.tensor(cfa.channels)[row % 2, column % 2], 3).T.float()
-    inside = (pixel.amax(0) < CLIPPED_SRGB) & (pixel.amin(0) > 0.0) & (reading < CLIPPED_RAW)
+    inside = (pixel.amax(0) < _CLIPPED_SRGB) & (pixel.amin(0) > 0.0) & (reading < CLIPPED_RAW)
 
     top, left = row // 2 * 2, column // 2 * 2
     corners = []
@@ -229,7 +229,7 @@ def _draw_sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: tor
     cell_raw = torch.stack([red, (green_r + green_b) / 2, blue])
 
     spread = (cell_srgb.amax(0) - cell_srgb.amin(0)).amax(0)
-    is_unclipped = (cell_srgb.amax((0, 1)) < CLIPPED_SRGB) & (cell_raw.amax(0) < CLIPPED_RAW)
+    is_unclipped = (cell_srgb.amax((0, 1)) < _CLIPPED_SRGB) & (cell_raw.amax(0) < CLIPPED_RAW)
     weight = is_unclipped / (1.0 + (spread * 32.0) ** 2)
 
     coordinates = frame_coordinates(height, width)[0, :, row, column]
@@ -246,7 +246,7 @@ def _draw_blocks(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: to
 
     index = torch.randint(blocks.clipped.numel(), (pixels,), generator=generator)
     pixel, reading = blocks.srgb.flatten(1)[:, index], blocks.raw.flatten(1)[:, index]
-    inside = ~blocks.clipped.flatten()[index] & (pixel.amax(0) < CLIPPED_SRGB)
+    inside = ~blocks.clipped.flatten()[index] & (pixel.amax(0) < _CLIPPED_SRGB)
     coordinates = blocks.coordinates[0].flatten(1)[:, index]
     usable = inside.expand(3, -1).float()
     return _samples(pixel, reading, torch.ones_like(usable), usable, coordinates, pixel, reading, inside.float())

@@ -94,7 +94,7 @@ class Tie:
         return TIE * bounded.sum(1).mean()
 
 
-CAMERA_RIDGE = 1e-3
+_CAMERA_RIDGE = 1e-3
 """Weight of a known camera's matrix in the start, as a share of the mean square of the colours."""
 
 
@@ -120,8 +120,8 @@ def least_squares(linear: Tensor, samples: PixelSamples, known_matrix: Tensor | 
     rows = known_matrix.double()
     gains = (rows * cross).sum(2) / torch.einsum("fci,fcij,fcj->fc", rows, moments, rows)
     rows = gains[:, :, None] * rows
-    ridge = CAMERA_RIDGE * power * torch.eye(3).double()
-    return torch.linalg.solve(moments + ridge, cross + CAMERA_RIDGE * power[..., 0] * rows).float()
+    ridge = _CAMERA_RIDGE * power * torch.eye(3).double()
+    return torch.linalg.solve(moments + ridge, cross + _CAMERA_RIDGE * power[..., 0] * rows).float()
 
 
 @torch.no_grad()
@@ -147,12 +147,12 @@ def fit_fall_off(linear: Tensor, samples: PixelSamples, product: Tensor) -> tupl
     return mean.clamp(-0.5, 0.5).float(), precision.float()
 
 
-SPREADS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, torch.inf)
-SPREAD_EPS = 1e-6
+_SPREADS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, torch.inf)
+_SPREAD_EPS = 1e-6
 """Constant under the logarithm, so that a frame that nothing predicts does not decide alone."""
-KNEES = (0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
+_KNEES = (0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
 REACH_ATOMS = 8
-LEAST_DETERMINANT = 0.05
+_LEAST_DETERMINANT = 0.05
 """Of a matrix with rows of l1 norm 1; published cameras have 0.1 and more."""
 
 
@@ -168,13 +168,13 @@ def set_dictionaries(
         shots: the summaries of the frames.
         config: the settings of the fit.
     """
-    set_knee(isp, colour, samples)
-    set_atoms(isp, colour, shots, config)
+    _set_knee(isp, colour, samples)
+    _set_atoms(isp, colour, shots, config)
     set_priors(isp, samples, config)
 
 
 @torch.no_grad()
-def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSummary], config: FitConfig) -> None:
+def _set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSummary], config: FitConfig) -> None:
     """Make the frames' matrices and gains the atoms, or clusters of them where there are more frames than atoms.
 
     Args:
@@ -214,7 +214,7 @@ def plausible_matrices(matrices: Tensor) -> Tensor:
     """
     own = matrices.diagonal(dim1=1, dim2=2)
     others = matrices.abs() - torch.diag_embed(matrices.diagonal(dim1=1, dim2=2).abs())
-    return (own > others.amax(dim=2)).all(dim=1) & (torch.linalg.det(matrices) > LEAST_DETERMINANT)
+    return (own > others.amax(dim=2)).all(dim=1) & (torch.linalg.det(matrices) > _LEAST_DETERMINANT)
 
 
 def reach_atoms(count: int, reach: float) -> Tensor:
@@ -254,21 +254,21 @@ def _spread(colour: FrameColour, balance: Tensor) -> float:
     distance = torch.cdist(log_light(balance), log_light(balance)) ** 2
     distance.fill_diagonal_(torch.inf)
     errors: dict[float, float] = {}
-    for width in SPREADS:
+    for width in _SPREADS:
         logits = torch.where(distance.isinf(), -torch.inf, 0.0)
         if width < torch.inf:
             logits = -distance / (2.0 * width**2)
         square = ((values - logits.softmax(1) @ values) ** 2).sum(1)
-        errors[width] = float((square + SPREAD_EPS).log().sum())
+        errors[width] = float((square + _SPREAD_EPS).log().sum())
 
     return min(errors, key=lambda width: errors[width])
 
 
 @torch.no_grad()
-def set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) -> None:
+def _set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) -> None:
     """Set where highlights begin to be spared: the knee under which all pixels, clipped ones too, come out best."""
     errors: dict[float, float] = {}
-    for knee in KNEES:
+    for knee in _KNEES:
         isp.configure(knee=knee)
         predicted = isp.reverse_pixels(samples.srgb, colour.params(), samples.coordinates).clamp(0.0, 1.0)
         square = (predicted - samples.target) ** 2 * samples.site
@@ -277,9 +277,9 @@ def set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) -> 
     isp.configure(knee=min(errors, key=lambda knee: errors[knee]))
 
 
-LIGHT_PIXELS, LIGHT_FRAMES = 1024, 16
+_LIGHT_PIXELS, _LIGHT_FRAMES = 1024, 16
 """Pixels of a frame, and frames at a time, by which the lights of trained atoms are measured."""
-LIGHT_RIDGE = 1e-2
+_LIGHT_RIDGE = 1e-2
 """Ridge that pulls the neutrals of rarely used atoms to the mean."""
 
 
@@ -296,10 +296,10 @@ def measure_lights(isp: DictionaryISP, frames: FitFrames) -> None:
         share = frame_weights / frame_weights.sum(dim=0).clamp_min(1e-6)
         isp.colour.light.copy_(share.T @ log_light(balance))
 
-    pixels = frames.pixels.pick(torch.arange(min(LIGHT_PIXELS, frames.pixels.srgb.shape[-1])))
+    pixels = frames.pixels.pick(torch.arange(min(_LIGHT_PIXELS, frames.pixels.srgb.shape[-1])))
     errors: dict[float, float] = {}
     neutrals: dict[float, Tensor] = {}
-    for spread in SPREADS:
+    for spread in _SPREADS:
         isp.colour.spread.fill_(spread)
         weights = isp.colour.weights_for(balance)
         matrix = isp.colour.combine(weights)
@@ -310,7 +310,7 @@ def measure_lights(isp: DictionaryISP, frames: FitFrames) -> None:
         isp.colour.neutral.copy_(neutrals[spread])
         inverse = 1.0 / isp.colour.gains_for(balance, weights)
         excess = (has_pixels * (inverse * a - b) ** 2 / a.clamp_min(1e-9)).sum(dim=1)
-        errors[spread] = float((excess + SPREAD_EPS).log().sum())
+        errors[spread] = float((excess + _SPREAD_EPS).log().sum())
 
     spread = min(errors, key=lambda width: errors[width])
     isp.colour.spread.fill_(spread)
@@ -322,7 +322,7 @@ def _second_moments(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute ``<x x>`` and ``<x y>`` of each frame's channels under gains of 1, and which channels have any pixel."""
     moments: list[Tensor] = []
-    for index in torch.arange(len(matrix)).split(LIGHT_FRAMES):
+    for index in torch.arange(len(matrix)).split(_LIGHT_FRAMES):
         part = pixels.of_frames(index)
         none = weights.new_empty(len(index), 0)
         tones = isp.typical_tones().expand(len(index), -1)
@@ -338,7 +338,7 @@ def _second_moments(
 def _solve_mixture(weights: Tensor, wanted: Tensor) -> Tensor:
     """Find values of the atoms ``(N, 3)`` whose mixtures by ``weights`` ``(F, N)`` are near ``wanted`` ``(F, 3)``."""
     mean = wanted.median(dim=0).values
-    normal = weights.T @ weights + LIGHT_RIDGE * torch.eye(weights.shape[1])
+    normal = weights.T @ weights + _LIGHT_RIDGE * torch.eye(weights.shape[1])
     return mean + torch.linalg.solve(normal, weights.T @ (wanted - mean))
 
 
