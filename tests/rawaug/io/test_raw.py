@@ -134,12 +134,12 @@ def not_bayer(name: str) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("6 x 6", r"but a mosaic of other colours \(RGBG, cell 6 x 6\);"),
-        ("RGBE", r"but a mosaic of other colours \(GMCY, cell 2 x 2\);"),
-        ("CYGM of 4 x 4", r"but a mosaic of other colours \(GMCY, cell 4 x 4\);"),
-        ("RGBW of 4 x 4", r"but a mosaic of other colours \(GMCY, cell 4 x 4\);"),
-        ("4 x 4 that begins as RGGB", r"but a mosaic of other colours \(RGBG, cell 4 x 4\);"),
-        ("8 x 2 that begins as RGGB", r"but a mosaic of other colours \(RGBG, cell 2 x 2\);"),
+        ("6 x 6", r"\(RGBG, cell 6 x 6\)"),
+        ("RGBE", r"\(GMCY, cell 2 x 2\)"),
+        ("CYGM of 4 x 4", r"\(GMCY, cell 4 x 4\)"),
+        ("RGBW of 4 x 4", r"\(GMCY, cell 4 x 4\)"),
+        ("4 x 4 that begins as RGGB", r"\(RGBG, cell 4 x 4\)"),
+        ("8 x 2 that begins as RGGB", r"\(RGBG, cell 2 x 2\)"),
         ("monochrome", "but a monochrome picture;"),
         ("linear", "full colour"),
     ],
