@@ -191,6 +191,7 @@ def _plot_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colou
     axis = figure.subplots()
 
     arms = set()
+    lowest = math.inf
     for (arm, _), rows in logs.items():
         steps = []
         values = []
@@ -200,6 +201,7 @@ def _plot_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colou
                 values.append(float(row[key]))
         if not steps:
             continue
+        lowest = min(lowest, *values)
 
         style: dict[str, Any] = {"color": colours[arm], "linewidth": 1.4}
         if len(steps) == 1:
@@ -213,7 +215,7 @@ def _plot_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colou
         return b""
 
     axis.set(xlabel="step", ylabel=title)
-    if key == "loss":
+    if key == "loss" and lowest > 0.0:  # log_mse can be below 0
         axis.set_yscale("log")
     axis.locator_params(axis="x", integer=True)
     axis.legend(fontsize=8)

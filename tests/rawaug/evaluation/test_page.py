@@ -90,6 +90,12 @@ def test_a_curve_of_one_point_is_seen(tmp_path: Path) -> None:
         assert (pixels == (31, 119, 180)).all(axis=2).sum() > legend_alone + 20
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_loss_below_0_is_drawn(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("step,loss,psnr\n4,0.1,30\n8,-0.3,31\n")
+    assert "loss" in plot_curves({"real": [tmp_path / "log.csv"]})
+
+
 def test_its_tables_lie_beside_it_as_csv_and_latex(page: str, tmp_path: Path) -> None:
     with (tmp_path / "new" / "report_scores.csv").open(newline="") as file:
         head, *rows = csv.reader(file)
