@@ -157,3 +157,13 @@ def test_its_own_draws_differ_and_can_be_repeated() -> None:
     assert not torch.equal(drawn.noisy, first(frames).noisy)
     assert rawaug.RawNoise is RawNoise and "upi" not in repr(RawNoise(RowNoise(1e-6)))
     assert np.isfinite(drawn.variance.numpy()).all()
+
+
+def test_only_the_parameters_of_a_pair_are_applied() -> None:
+    noise = RawNoise("upi")
+    frames = torch.full((2, 4, 8, 8), 0.5)
+    params = noise.sample(frames)
+    with pytest.raises(ValueError, match="params"):
+        noise.apply(frames, params.tensors())  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="batch of 2"):
+        noise.apply(frames[:1], params)
