@@ -79,7 +79,7 @@ def main(
     out: str = "phones.safetensors",
     seeds: int = 4,
     start_steps: int = 60,
-    steps: int = 4000,
+    steps: int = 450,
     pixels: int = 2048,
     raw_loss: str = "log",
     score_file: str | None = None,
