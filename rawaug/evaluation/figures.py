@@ -87,7 +87,7 @@ def panels_of(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOI
     panels.images["clean"] = trial.clean
     panels.captions["clean"] = trial.frame
     if trial.own:
-        panels.captions["clean"] += f",\nown noise {-10.0 * math.log10(trial.own):.2f} dB"
+        panels.captions["clean"] += f", own noise {-10.0 * math.log10(trial.own):.2f} dB"
     return panels
 
 
