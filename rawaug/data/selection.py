@@ -70,7 +70,8 @@ def one_a_phone(labels: Sequence[FrameLabel], count: int) -> list[int]:
             share += 1
         frames = sorted(frames_of[phone], key=iso_of)
         if share > len(frames):
-            raise ValueError(f"data.count: {count} takes {share} of {phone}, which has {len(frames)}")
+            pairs = count_of(len(frames), "pair")
+            raise ValueError(f"data.count: {count} takes {share} of {phone}, which has {pairs}")
         selection.append([frames[(2 * turn + 1) * len(frames) // (2 * share)] for turn in range(share)])
 
     order: list[int] = []
