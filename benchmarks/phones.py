@@ -4,7 +4,7 @@ Frames of the five simulated phones (:mod:`rawaug.data.phones`), one of each tra
 several seeds; the published fit learns dictionaries, encoders and both masks on them end to end. It is watched on
 frames of other photographs, drawn with a seed of their own.
 
-``--score FILE`` measures an ISP instead: PSNR_r on frames of test or validation, blind and with as-shot gains.
+``--score-file FILE`` measures an ISP instead: PSNR_r on frames of test or validation, blind and with as-shot gains.
 """
 
 from __future__ import annotations
