@@ -129,7 +129,10 @@ def test_a_folder_of_heic_alone_says_what_to_install(tmp_path: Path, monkeypatch
             look(tmp_path)
 
 
-def test_denoise_asks_the_content(mixed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_denoise_asks_the_content(
+    mixed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(content, "reads_heic", lambda: False)
     (mixed / "d.dng").rename(mixed.parent / "d.jpg")
     assert main(["denoise", str(mixed.parent / "d.jpg"), str(tmp_path / "o.jpg")]) == 2
     assert "DNG" in capsys.readouterr().err
