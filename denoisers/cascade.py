@@ -51,6 +51,8 @@ class CascadeDRUNet(Denoiser):
     defaults: ClassVar[Shared] = {**Denoiser.defaults, "variance_map": False, "domain": "anscombe"}
     growing: ClassVar[frozenset[str]] = frozenset({"blocks"})
     mixed: ClassVar[bool] = True
+    tile: ClassVar[int] = 1152
+    """Side in packed pixels of the tiles of large frames: a cascade keeps more of a tile in memory than others."""
 
     def __init__(
         self,

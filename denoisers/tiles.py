@@ -15,6 +15,9 @@ Run = Callable[[Tensor, Tensor | None], Tensor]
 Each = Callable[[Sequence[Any]], Iterable[Any]]
 """An iterator over pieces of work, which may show progress, as ``tqdm`` does."""
 
+TILE = 1536
+"""Side of a tile in packed pixels, overlap included, where nothing else is said."""
+
 OVERLAP = 96
 """The default overlap of tiles, in packed pixels."""
 
@@ -24,7 +27,7 @@ def denoise_tiles(
     model: Run,
     noisy: Tensor,
     variance: Tensor | None = None,
-    tile: int = 1536,
+    tile: int = TILE,
     overlap: int | None = None,
     each: Each = iter,
 ) -> Tensor:

@@ -25,6 +25,7 @@ from denoisers.classical import FILTERS, Stabilised
 from denoisers.files import DEFAULT, JOINT, find_denoiser, list_shipped
 from denoisers.mosaic import BayerAdapter, MosaicDRUNet, denoise_mosaic
 from denoisers.network import DENOISERS, PACKED
+from denoisers.tiles import TILE
 from rawaug import bayer
 from rawaug.bayer import CFA, crop_to_cfa
 from rawaug.denoising.base import ImageDenoiser, progress_by, read_named
@@ -84,7 +85,7 @@ class RawDenoiser(ImageDenoiser):
     model: Callable[[Levels | None], Model] = field(repr=False)
     cfa: CFA | None = None
     of_any: MosaicDRUNet | None = None
-    tiles: tuple[int, int | None] | None = (1536, None)
+    tiles: tuple[int, int | None] | None = (TILE, None)
 
     def __post_init__(self) -> None:
         if self.views not in (1, 4, 8):
@@ -305,6 +306,7 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any], cfa: CFA
         of_any=of_any,
         info=info,
         reads_levels=bool(reads),
+        tiles=(getattr(evaluated, "tile", TILE), None),
     )
 
 
