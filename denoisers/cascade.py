@@ -11,6 +11,7 @@ was removed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar, Unpack
 
 import torch
@@ -35,7 +36,8 @@ class CascadeDRUNet(Denoiser):
 
     Args:
         width: features of the first scale of both networks.
-        blocks: residual blocks of each scale of the second network; the first has one.
+        blocks: residual blocks of each scale of the second network, one number or one for each scale, the finest first;
+            the first network has one.
         views: turned views, 1, 4 or 8, over which the result is averaged outside of training.
         frozen: keep the weights of the first network in training.
         channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
@@ -50,6 +52,7 @@ class CascadeDRUNet(Denoiser):
 
     defaults: ClassVar[Shared] = {**Denoiser.defaults, "variance_map": False, "domain": "anscombe"}
     growing: ClassVar[frozenset[str]] = frozenset({"blocks"})
+    layerless: ClassVar[frozenset[str]] = frozenset({"views", "frozen"})
     mixed: ClassVar[bool] = True
     tile: ClassVar[int] = 1152
     """Side in packed pixels of the tiles of large frames: a cascade keeps more of a tile in memory than others."""
@@ -57,13 +60,15 @@ class CascadeDRUNet(Denoiser):
     def __init__(
         self,
         width: int = 32,
-        blocks: int = 1,
+        blocks: int | Sequence[int] = 1,
         views: int = 1,
         frozen: bool = True,
         **shared: Unpack[Shared],
     ) -> None:
         if views not in (1, *VIEWS):
             raise ValueError(f"views must be 1, 4 or 8, got {views}")
+        if not isinstance(blocks, int):
+            blocks = tuple(blocks)
         super().__init__({"width": width, "blocks": blocks, "views": views, "frozen": frozen}, **shared)
         if self.domain == "linear" or self.variance_map:
             raise ValueError("a cascade needs the domain ksigma or anscombe, and no noise map")
@@ -140,7 +145,7 @@ class CascadeDRUNet(Denoiser):
 class _CorrectingUNet(ResidualUNet):
     """The second network: the first layer gets what was removed besides."""
 
-    def __init__(self, width: int, blocks: int, **shared: Unpack[Shared]) -> None:
+    def __init__(self, width: int, blocks: int | Sequence[int], **shared: Unpack[Shared]) -> None:
         super().__init__({}, Size(width, SCALES, blocks), limits=True, **shared)
         self.add_layers(self.inputs, self.channels, self.channels)
         self.removed = conv(self.channels, width, bias=False)

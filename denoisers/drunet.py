@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, Unpack
 
 import torch
@@ -22,12 +23,23 @@ class Size(NamedTuple):
     Attributes:
         width: features of the first scale, doubled at each further one.
         scales: number of scales, 1 to 12.
-        blocks: residual blocks of each scale, going down and going up, at most 1000.
+        blocks: residual blocks of each scale, going down and going up, at most 1000: one number for all scales, or one
+            for each, the finest first.
     """
 
     width: int
     scales: int
-    blocks: int
+    blocks: int | Sequence[int]
+
+    @property
+    def blocks_by_scale(self) -> list[int]:
+        """The residual blocks of each scale, the finest first; ValueError if a scale has none of the numbers."""
+        if isinstance(self.blocks, int):
+            return [self.blocks] * self.scales
+
+        if len(self.blocks) != self.scales:
+            raise ValueError(f"blocks must be one number, or one for each of {self.scales} scales, got {self.blocks}")
+        return list(self.blocks)
 
 
 class ResidualBlock(nn.Module):
@@ -78,7 +90,10 @@ class ResidualUNet(Denoiser):
     ) -> None:
         require_width(size.width)
         require_between("scales", size.scales, 1, MOST_SCALES)
-        require_bounded(blocks=size.blocks)
+        for blocks in size.blocks_by_scale:
+            require_bounded(blocks=blocks)
+        if not isinstance(size.blocks, int):
+            size = size._replace(blocks=tuple(size.blocks))
 
         config = {**size._asdict(), "limits": limits, "mend": mend, **config}
         cell = 2 ** (size.scales - 1)
@@ -94,19 +109,20 @@ class ResidualUNet(Denoiser):
             coarse: channels that join at the last scale.
             outputs: channels of the last layer.
         """
-        width, scales, blocks = self.size
+        width, scales, _ = self.size
         sizes = [width * 2**k for k in range(scales)]
+        numbers = self.size.blocks_by_scale
 
         self.head = conv(inputs, width, bias=False)
         self.encoder = nn.ModuleList()
         self.downs = nn.ModuleList()
         self.ups = nn.ModuleList()
         self.decoder = nn.ModuleList()
-        for size in sizes:
+        for size, blocks in zip(sizes, numbers, strict=True):
             self.encoder.append(_residuals(size, blocks))
         for size in sizes[:-1]:
             self.downs.append(conv(size, 2 * size, 2, bias=False, stride=2, padding=0))
-        for size in reversed(sizes[:-1]):
+        for size, blocks in reversed(list(zip(sizes[:-1], numbers[:-1], strict=True))):
             self.ups.append(conv(2 * size, 4 * size, 1, bias=False))
             self.decoder.append(_residuals(size, blocks))
         self.coarse = conv(coarse, sizes[-1], bias=False)
@@ -188,7 +204,8 @@ class DRUNet(ResidualUNet):
     Args:
         width: features of the first scale, doubled at each further one; 64 is published.
         scales: of the pyramid, 1 to 12; 4 is published.
-        blocks: of each scale, going down and going up, at most 1000; 4 is published.
+        blocks: of each scale, going down and going up, at most 1000; 4 is published. One number, or one for each scale,
+            the finest first: where noise is weak, fine scales have the most to do.
         patch: side of the squares of pixels that enter as channels, 1 to 8. 2, as in FFDNet (Zhang et al., TIP 2018),
             takes a quarter of the time, for pictures that were demosaiced.
         light: give the network the mean over a cell besides, as blind ones have it: for developed pictures, whose noise
@@ -206,7 +223,7 @@ class DRUNet(ResidualUNet):
         self,
         width: int = 64,
         scales: int = 4,
-        blocks: int = 4,
+        blocks: int | Sequence[int] = 4,
         limits: bool = False,
         mend: bool = False,
         patch: int = 1,

@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import inspect
 import math
+import operator
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, TypedDict, Unpack
 
 import torch
@@ -82,6 +83,8 @@ class Denoiser(nn.Module, ABC):
     """Whether bfloat16 costs it less than 0.05 dB, and dense convolutions gain by it."""
     growing: ClassVar[frozenset[str]] = frozenset()
     """Settings that may be larger than those of the network whose weights a training starts from."""
+    layerless: ClassVar[frozenset[str]] = frozenset()
+    """Settings that no layer depends on: a training may start from weights that have others."""
     upscale: ClassVar[int] = 1
     """Sides of the result over those of packed RAW: 2 where it is demosaiced, ``(B, 3, 2h, 2w)``."""
 
@@ -320,9 +323,11 @@ class Denoiser(nn.Module, ABC):
         if not self.is_relative(model):
             return False
 
-        for key in self.config.keys() & model.config.keys():
-            grows = key in self.growing and self.config[key] > model.config[key]
-            if self.config[key] != model.config[key] and not grows:
+        for key in (self.config.keys() & model.config.keys()) - self.layerless:
+            own = self.config[key]
+            other = model.config[key]
+            grows = key in self.growing and _is_as_large(own, other)
+            if own != other and not grows:
                 return False
         return True
 
@@ -356,3 +361,14 @@ class Denoiser(nn.Module, ABC):
             weight = torch.empty(module.weight.shape, device="cpu")
             nn.init.normal_(weight, 0.0, gain / math.sqrt(fan_in), generator=generator)
             module.weight.copy_(weight)
+
+
+def _is_as_large(value: int | Sequence[int], other: int | Sequence[int]) -> bool:
+    """Tell whether a setting, one number or one for each scale, is nowhere smaller than another."""
+    values = value
+    others = other
+    if isinstance(values, int):
+        values = [values] * (1 if isinstance(others, int) else len(others))
+    if isinstance(others, int):
+        others = [others] * len(values)
+    return len(values) == len(others) and all(map(operator.ge, values, others))

@@ -356,9 +356,14 @@ def _place_gain(
     x = start_x + down * down_x + right * right_x
     coordinates = torch.stack([y, x], dim=1)
 
-    gain = torch.ones_like(coordinates[:, :1])
-    for stage in gaining:
-        gain = gain * stage.place_gain(coordinates, forward)
+    # One picture at a time: on a GPU the bits of a convolution depend on how many pictures there are.
+    gains = []
+    for picture in coordinates.split(1):
+        gain = torch.ones_like(picture[:, :1])
+        for stage in gaining:
+            gain = gain * stage.place_gain(picture, forward)
+        gains.append(gain)
+    gain = torch.cat(gains)
     return F.interpolate(gain, size, mode="bilinear", align_corners=True)
 
 

@@ -111,6 +111,30 @@ def test_a_cascade_is_saved_and_loaded(base: denoisers.DRUNet, tmp_path: Path) -
     assert torch.allclose(again.eval()(noisy, variance), cascade(noisy, variance), atol=1e-6)
 
 
+def test_blocks_of_each_scale_grow_from_weights_with_fewer_and_change_nothing_at_first(
+    base: denoisers.DRUNet, tmp_path: Path
+) -> None:
+    small = denoisers.CascadeDRUNet(width=4, views=4).eval()
+    small.start_from(base)
+    large = denoisers.CascadeDRUNet(width=4, blocks=[3, 2, 1, 1], views=4).eval()
+    assert large.can_start_from(small)
+    large.start_from(small)
+    assert [len(blocks) for blocks in large.second.encoder] == [3, 2, 1, 1]
+    assert [len(blocks) for blocks in large.second.decoder] == [1, 2, 3]
+
+    noisy, variance = noisy_frame()
+    assert torch.equal(large(noisy, variance), small(noisy, variance))
+    denoisers.save(large, tmp_path / "cascade.safetensors", {})
+    again, _ = denoisers.load(tmp_path / "cascade.safetensors")
+    assert again.config == large.config
+
+    assert not small.can_start_from(large)
+    assert not denoisers.CascadeDRUNet(width=4, blocks=[4, 1, 1, 1]).can_start_from(large)
+    assert denoisers.CascadeDRUNet(width=4, blocks=3, views=1).can_start_from(large)
+    with pytest.raises(ValueError, match="blocks"):
+        denoisers.CascadeDRUNet(width=4, blocks=[3, 2])
+
+
 def test_wrong_settings_and_inputs_are_refused(base: denoisers.DRUNet) -> None:
     for settings, word in (({"views": 3}, "views"), ({"domain": "linear"}, "domain"), ({"width": 0}, "width")):
         with pytest.raises(ValueError, match=word):
