@@ -119,8 +119,8 @@ def test_blocks_of_each_scale_grow_from_weights_with_fewer_and_change_nothing_at
     large = denoisers.CascadeDRUNet(width=4, blocks=[3, 2, 1, 1], views=4).eval()
     assert large.can_start_from(small)
     large.start_from(small)
-    assert [len(blocks) for blocks in large.second.encoder] == [3, 2, 1, 1]
-    assert [len(blocks) for blocks in large.second.decoder] == [1, 2, 3]
+    assert [len(list(blocks.children())) for blocks in large.second.encoder] == [3, 2, 1, 1]
+    assert [len(list(blocks.children())) for blocks in large.second.decoder] == [1, 2, 3]
 
     noisy, variance = noisy_frame()
     assert torch.equal(large(noisy, variance), small(noisy, variance))
