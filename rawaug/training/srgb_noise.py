@@ -132,6 +132,9 @@ class ColouredNoise:
         coloured: share of pictures whose noise is blurred, by a deviation within ``blur`` in pixels.
         blur: lowest and highest deviation of that blur.
         jpeg: limits of the quality.
+        wide: largest share of the variance, 0 to 1, of coloured noise that is blurred more: grain many pixels wide,
+            as strong chroma filters leave it.
+        wide_blur: lowest and highest deviation of the blur of that part.
     """
 
     def __init__(
@@ -140,28 +143,33 @@ class ColouredNoise:
         coloured: float = 0.6,
         blur: tuple[float, float] = (0.3, 1.5),
         jpeg: tuple[int, int] = (75, 99),
+        wide: float = 0.0,
+        wide_blur: tuple[float, float] = (1.5, 6.0),
     ) -> None:
         _require_limits("jpeg", jpeg, 1, 100)
         require_between("sigma", sigma, 0.0, 255.0)
         require_between("coloured", coloured, 0.0, 1.0)
+        require_between("wide", wide, 0.0, 1.0)
         self.sigma = sigma
         self.coloured = coloured
         self.blur = blur
         self.jpeg = jpeg
+        self.wide = wide
+        self.wide_blur = wide_blur
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         """Draw the parameters of pictures.
 
         Returns:
             ``sigma``, ``blur``, ``grey`` (share of what is the same in all colours), ``quality`` (0 for none), ``seed``
-            and ``chroma_420``, all ``(B,)``.
+            and ``chroma_420``, all ``(B,)``; with ``wide``, ``wide_share`` and ``wide_blur`` besides.
         """
         strength, coloured, blur, grey, compressed, chroma = uniform(generator, 6, batch)
         quality = torch.randint(self.jpeg[0], self.jpeg[1] + 1, (batch,), generator=generator)
         low, high = self.blur
         is_coloured = coloured < self.coloured
 
-        return {
+        params = {
             "sigma": strength**1.5 * self.sigma / 255,
             "blur": torch.where(is_coloured, low + (high - low) * blur, 0.0),
             "grey": torch.where(is_coloured, grey, 0.0),
@@ -169,18 +177,34 @@ class ColouredNoise:
             "seed": draw_seeds(batch, generator),
             "chroma_420": chroma < 0.5,
         }
+        if self.wide:
+            share, width = uniform(generator, 2, batch)
+            low, high = self.wide_blur
+            params["wide_share"] = torch.where(is_coloured, self.wide * share, 0.0)
+            params["wide_blur"] = low * (high / low) ** width
+        return params
 
     def apply(self, srgb: Tensor, params: Params) -> Tensor:
         """Add the noise to sRGB ``(B, 3, H, W)``, and compress some of the pictures."""
-        noise = blur(draw_normals(srgb, _generators(params)), params["blur"])
-        noise = noise.lerp(noise.mean(1, keepdim=True), per_picture(params["grey"], srgb))
-        noise = noise / noise.square().mean((1, 2, 3), keepdim=True).sqrt()
+        generators = _generators(params)
+        noise = _unit_noise(srgb, generators, params["blur"], params["grey"])
+        if "wide_share" in params:
+            wide = _unit_noise(srgb, generators, params["wide_blur"], params["grey"])
+            share = per_picture(params["wide_share"], srgb)
+            noise = (1.0 - share).sqrt() * noise + share.sqrt() * wide
         noisy = (srgb + per_picture(params["sigma"], srgb) * noise).clamp_(0.0, 1.0)
 
         is_jpeg = params["quality"] > 0
         if is_jpeg.any():
             noisy[is_jpeg] = compress_jpeg(noisy[is_jpeg], params["quality"][is_jpeg], params["chroma_420"][is_jpeg])
         return noisy
+
+
+def _unit_noise(srgb: Tensor, generators: list[torch.Generator], deviation: Tensor, grey: Tensor) -> Tensor:
+    """Draw normals of the shape of ``srgb``, blur them, mix a share of their mean into all colours, and scale to 1."""
+    noise = blur(draw_normals(srgb, generators), deviation)
+    noise = noise.lerp(noise.mean(1, keepdim=True), per_picture(grey, srgb))
+    return noise / noise.square().mean((1, 2, 3), keepdim=True).sqrt()
 
 
 MODELS: dict[str, type[SrgbNoise]] = {"BSRGAN": BsrganNoise, "Coloured": ColouredNoise, "Gaussian": WhiteNoise}

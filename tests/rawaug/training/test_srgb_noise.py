@@ -135,6 +135,22 @@ def test_coloured_noise_has_the_drawn_deviation_and_is_blurred_and_grey_as_drawn
     assert grey.std(1).max() < 1e-6
 
 
+def test_a_share_of_coloured_noise_is_wide_and_the_deviation_stays() -> None:
+    model = ColouredNoise(sigma=20.0, coloured=0.5, wide=0.8, wide_blur=(2.0, 5.0))
+    drawn = model.sample(2000, torch.Generator().manual_seed(0))
+    of_coloured = drawn["wide_share"][drawn["blur"] > 0]
+    assert 0.75 < of_coloured.max() <= 0.8 and of_coloured.mean().item() == pytest.approx(0.4, rel=0.05)
+    assert drawn["wide_share"][drawn["blur"] == 0].max() == 0
+    assert drawn["wide_blur"].min() >= 2.0 and drawn["wide_blur"].max() <= 5.0
+
+    fine = {"sigma": torch.full((6,), 0.04), "quality": torch.zeros(6, dtype=torch.long), "grey": torch.zeros(6)}
+    fine["blur"] = torch.zeros(6)
+    noise = noise_of(model, **fine, wide_share=torch.full((6,), 0.5), wide_blur=torch.full((6,), 3.0))
+    assert noise.std((1, 2, 3)).sub(0.04).abs().max() < 2e-3
+    far = (noise[..., 3:] * noise[..., :-3]).mean().item() / 0.04**2
+    assert far == pytest.approx(0.5 * math.exp(-0.25 * 3**2 / 3.0**2), abs=0.06)
+
+
 def test_a_network_is_told_nothing_the_deviation_or_a_wrong_one() -> None:
     told, generator = Told(unknown=0.3, exact=0.5, factor=2.0), torch.Generator().manual_seed(0)
     times = torch.tensor([told.sample(generator) for _ in range(4000)])
