@@ -245,6 +245,8 @@ class DRUNet(ResidualUNet):
         super().__init__(config, Size(width, scales, blocks), limits, mend, pyramid, multiple=patch, **shared)
         self.patch = patch
         self.light = light or not self.reads_variance
+        if self.light:
+            self.turns = 2
 
         planes = self.channels * patch**2
         self.add_layers(self.inputs * patch**2 + self.light * planes, planes, planes)

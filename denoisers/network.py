@@ -85,6 +85,8 @@ class Denoiser(nn.Module, ABC):
     """Settings that may be larger than those of the network whose weights a training starts from."""
     layerless: ClassVar[frozenset[str]] = frozenset()
     """Settings that no layer depends on: a training may start from weights that have others."""
+    turns: int = 1
+    """Turned views of a developed picture, 1, 2, 4 or 8, that are averaged where nothing else is asked for."""
     upscale: ClassVar[int] = 1
     """Sides of the result over those of packed RAW: 2 where it is demosaiced, ``(B, 3, 2h, 2w)``."""
 

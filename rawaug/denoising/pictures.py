@@ -4,8 +4,8 @@ r"""What denoises developed pictures, sRGB ``(1, 3, H, W)`` in [0, 1], beside :c
 
 A network f is told the level of the noise, its standard deviation :math:`\sigma`, and the share w of its correction is
 applied; both are estimated from the picture, see :mod:`rawaug.denoising.picture_levels`. The strength s is 1 unless the
-user says otherwise. A network that estimates the level sees the picture twice, upright and turned by a quarter, and the
-mean is taken: half of what the self-ensemble gains, the mean of eight turns as for RAW.
+user says otherwise. A single network that estimates the level sees the picture twice, upright and turned by a quarter,
+and the mean is taken: half of what the self-ensemble gains, the mean of eight turns as for RAW.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class PictureDenoiser(ImageDenoiser):
         run: ``run(srgb, level) -> srgb``, called on ``device``; the level is a standard deviation, white at 1.
         estimate: estimates the level of a picture where none is told.
         level: what it is told every time; None for the estimate.
-        views: 1, 2, 4 or 8 turns of the picture; by default 2 of a network that estimates the level, and 1 of others.
+        views: 1, 2, 4 or 8 turns of the picture; by default as many as the network asks for.
         strength: factor on the estimated level, 0 to 10: 2 removes more, 0.5 less, 0 nothing.
 
     The other attributes are those of :class:`rawaug.denoising.base.ImageDenoiser`.
@@ -125,7 +125,6 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> Pictu
     """A network of sRGB in tiles; one that reads levels is told the picture's."""
     network = network.eval()
     reads_levels = bool(getattr(network, "reads_variance", False))
-    estimates = getattr(network, "light", False)
     return PictureDenoiser(
         name=name,
         network=network,
@@ -133,7 +132,7 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> Pictu
         run=partial(_denoise_at if reads_levels else _denoise_blindly, network),
         estimate=partial(estimate_level, network),
         reads_levels=reads_levels,
-        views=2 if estimates else 1,
+        views=getattr(network, "turns", 1),
     )
 
 
