@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from statistics import fmean
 from typing import Any, Literal, TypeVar
@@ -199,9 +199,10 @@ class Measured(SomePairs):
     def read(self, index: int) -> Pair:
         """The reference at ``index``, with its own noise if it is one of those that are measured."""
         pair = super().read(index)
-        if pair.own_noise is not None or index not in self.measured:
+        if index not in self.measured:
             return pair
-        return replace(pair, own_noise=own_noise(pair.raw, pair.cfa))
+
+        return pair.with_own_noise(own_noise)
 
 
 def own_noise_note(summaries: Mapping[str, Mapping[str, Any]]) -> str:

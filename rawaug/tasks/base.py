@@ -65,6 +65,9 @@ class Task(ABC):
     compared_in: ClassVar[str] = ""
     """The end of the titles of tables: the domain of the scores, if it is not RAW."""
 
+    developed: ClassVar[bool] = False
+    """Whether frames may be pairs of developed pictures."""
+
     input: ClassVar[Any] = NOISY
     """The denoiser that stands for the noisy input in tables."""
 
@@ -97,7 +100,8 @@ class Task(ABC):
             return []
 
         data = self.recipe.data
-        return open_pairs(spec, split, clean, data.max_pixels, **data.settings_of(spec))
+        settings = data.settings_of(spec)
+        return open_pairs(spec, split, clean, data.max_pixels, developed=self.developed, **settings)
 
     def prepare(self, frames: Sequence[Any], part: str) -> Sequence[Any]:
         """Frames of a part, "validation" or "test", counted, binned and cropped as the recipe says; each is read once.
