@@ -88,6 +88,10 @@ class Trial:
         """The input of this denoiser: a denoiser of RAW gets the RAW that a picture was developed from."""
         return self.inputs.get(denoiser.takes, self.input)
 
+    def compared(self, image: Tensor) -> Tensor:
+        """An image in the form of ``domain`` as scores compare it: packed RAW as the mosaic, others as they are."""
+        return bayer.unpack_if_packed(image, self.cfa)
+
 
 def trial_of(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: int = 0, **about: Any) -> Trial:
     """A frame as a test case in the domain ``raw``: its own captured noise, or noise keyed by (seed, name).

@@ -28,10 +28,10 @@ from rawaug.data.pairs import Pair
 from rawaug.data.picture_pairs import PicturePair, is_picture_pairs
 from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser
 from rawaug.denoising.pictures import PictureDenoiser
-from rawaug.evaluation.comparison import Comparison
-from rawaug.evaluation.evaluate import Evaluation
+from rawaug.evaluation.comparison import Comparison, compare_pictures
+from rawaug.evaluation.evaluate import Evaluation, evaluate_pictures
 from rawaug.evaluation.figures import Panels, crops_at_100, panels_of
-from rawaug.evaluation.picture_trials import compare_pictures, evaluate_pictures, picture_trials
+from rawaug.evaluation.picture_trials import picture_trials
 from rawaug.evaluation.scores import score
 from rawaug.evaluation.trials import Trial
 from rawaug.io import RawFrame, develop, write_dng
