@@ -16,8 +16,8 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.folders import Kept
 from rawaug.data.pairs import Binned, Middles, Pair, SomePairs
-from rawaug.evaluation.comparison import Comparison, compare_raw
-from rawaug.evaluation.evaluate import Evaluation, evaluate_raw
+from rawaug.evaluation.comparison import compare_raw
+from rawaug.evaluation.evaluate import evaluate_raw
 from rawaug.evaluation.figures import Panels, panels_of, save_picture
 from rawaug.evaluation.page import select_for_page
 from rawaug.evaluation.scores import NOISY
@@ -124,15 +124,11 @@ class Task(ABC):
 
     # -- one denoiser on a test set, and several
 
-    @staticmethod
-    def evaluate(evaluation: Evaluation) -> dict[str, Any]:
-        """Score a denoiser on a test set, see :mod:`rawaug.evaluation.evaluate`."""
-        return evaluate_raw(evaluation)
+    evaluate = staticmethod(evaluate_raw)
+    """Scores a denoiser on a test set, see :mod:`rawaug.evaluation.evaluate`."""
 
-    @staticmethod
-    def benchmark(comparison: Comparison) -> None:
-        """Compare denoisers on a test set, see :mod:`rawaug.evaluation.comparison`."""
-        compare_raw(comparison)
+    benchmark = staticmethod(compare_raw)
+    """Compares denoisers on a test set, see :mod:`rawaug.evaluation.comparison`."""
 
     # -- networks
 

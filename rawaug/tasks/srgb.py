@@ -28,8 +28,8 @@ from rawaug.data.pairs import Pair
 from rawaug.data.picture_pairs import PicturePair, is_picture_pairs
 from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser
 from rawaug.denoising.pictures import PictureDenoiser
-from rawaug.evaluation.comparison import Comparison, compare_pictures
-from rawaug.evaluation.evaluate import Evaluation, evaluate_pictures
+from rawaug.evaluation.comparison import compare_pictures
+from rawaug.evaluation.evaluate import evaluate_pictures
 from rawaug.evaluation.figures import Panels, crops_at_100, panels_of
 from rawaug.evaluation.picture_trials import picture_trials
 from rawaug.evaluation.scores import score
@@ -112,21 +112,13 @@ class SrgbTask(Task):
     compared_in = "developed sRGB"
     developed = True
     ensembles = False
+    evaluate = staticmethod(evaluate_pictures)
+    benchmark = staticmethod(compare_pictures)
 
     @classmethod
     def reads(cls, data: str) -> bool:
         """Whether the test set is of developed pictures."""
         return is_picture_pairs(data)
-
-    @staticmethod
-    def evaluate(evaluation: Evaluation) -> dict[str, Any]:
-        """Score a denoiser on real pairs."""
-        return evaluate_pictures(evaluation)
-
-    @staticmethod
-    def benchmark(comparison: Comparison) -> None:
-        """Compare denoisers on real pairs."""
-        compare_pictures(comparison)
 
     def stream(
         self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
