@@ -24,7 +24,7 @@ from rawaug.data.formats import READABLE
 from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import DATASETS, PICTURES, Lazy, Pair
-from rawaug.data.picture_pairs import PicturePair, is_picture_pairs, open_picture_pairs
+from rawaug.data.picture_pairs import PicturePair
 from rawaug.data.published import RAWIR_FOLDERS, Rawir, Zurich
 from rawaug.data.sidd import SiddFrames
 from rawaug.data.sidd_benchmark import SiddBenchmark
@@ -157,10 +157,8 @@ def _left_out(folder: Path) -> list[str]:
 def _of_kind(kind: str, spec: str) -> list[tuple[str, Callable[[], Any]]]:
     """How to open ``kind:path``, which may be pairs, pictures, or both."""
     openers: list[tuple[str, Callable[[], Any]]] = []
-    if is_picture_pairs(spec):
-        openers.append((f"pairs of pictures of {spec}", partial(open_picture_pairs, spec)))
-    elif kind in DATASETS:
-        openers.append((f"pairs of {spec}", partial(open_pairs, spec)))
+    if kind in DATASETS:
+        openers.append((f"pairs of {spec}", partial(open_pairs, spec, developed=True)))
     if kind in PICTURES:
         openers.append((f"pictures of {spec}", partial(open_pictures, spec)))
     if not openers:

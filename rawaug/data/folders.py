@@ -26,7 +26,7 @@ from rawaug.bayer import turn_back
 from rawaug.data.pairs import LazyPairs, Pair, SomePairs, centre
 from rawaug.errors import count_of, escape
 from rawaug.files import files_in
-from rawaug.io import read_picture, read_raw, read_raw_and_develop
+from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
 from rawaug.io.content import PICTURE_EXTENSIONS as PICTURE_EXTENSIONS
 from rawaug.io.content import list_pictures
 from rawaug.io.pictures import MAX_PIXELS, recode_jpeg
@@ -317,6 +317,8 @@ class RawFolder(LazyPairs):
         max_pixels: of a JPEG; a larger one is an error of its pair.
     """
 
+    rendering = "LibRaw"
+
     def __init__(
         self,
         path: str | Path | Iterable[str | Path],
@@ -337,6 +339,9 @@ class RawFolder(LazyPairs):
         self.jpeg_quality = jpeg_quality
         self.max_pixels = max_pixels
         super().__init__(_names(self.files))
+
+    def frame(self, index: int) -> RawFrame:
+        return read_raw(self.files[index])
 
     def files_of(self, index: int) -> Sequence[Path]:
         return (self.files[index],)

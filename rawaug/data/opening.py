@@ -12,7 +12,7 @@ from torch.utils.data import ConcatDataset
 from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.pair_folder import require_no_pairs
 from rawaug.data.pairs import DATASETS, PICTURES, Binned, LazyPairs, Pair
-from rawaug.data.picture_pairs import is_picture_pairs
+from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.registry import Registry, check_settings, suggest
 
@@ -25,6 +25,7 @@ def open_pairs(
     as_clean: bool = True,
     max_pixels: int | None = None,
     bin: int = 1,
+    developed: bool = False,
     **settings: Any,
 ) -> Sequence[Pair]:
     """Open RAW-sRGB pairs.
@@ -40,6 +41,8 @@ def open_pairs(
             for :data:`rawaug.io.pictures.MAX_PIXELS`. Pairs given as a sequence keep theirs.
         bin: K makes each site the mean of K x K sites of its colour around it: a reference with about 1 / K^2 of its
             own noise.
+        developed: open pairs of developed pictures, too, such as ``cc15:DIR``, in place of an error; they are
+            :class:`rawaug.data.picture_pairs.PicturePair`.
         settings: of the reader of ``kind``, such as ``cfa="RGGB"`` of ``pairs:``; None leaves it at its default.
 
     Raises:
@@ -51,7 +54,7 @@ def open_pairs(
         4
     """
     if bin != 1:
-        return Binned(open_pairs(spec, split, as_clean, max_pixels, **settings), bin)
+        return Binned(open_pairs(spec, split, as_clean, max_pixels, developed=developed, **settings), bin)
 
     settings = {key: value for key, value in settings.items() if value is not None}
     if not isinstance(spec, (str, Path)):
@@ -65,7 +68,9 @@ def open_pairs(
         return folder
 
     if is_picture_pairs(str(spec)):
-        raise ValueError(f"{spec} is pairs of developed pictures, for rawaug run srgb; give RAW frames")
+        if not developed:
+            raise ValueError(f"{spec} is pairs of developed pictures, for rawaug run srgb; give RAW frames")
+        return open_picture_pairs(str(spec), **settings)
 
     reader = _reader(DATASETS, str(spec), kind, path, "a RAW file or folder")
     path, split_of_spec = _path_and_split(path)
@@ -75,6 +80,12 @@ def open_pairs(
     if max_pixels is not None and isinstance(pairs, LazyPairs):
         pairs.max_pixels = max_pixels
     return pairs
+
+
+def names_dataset(spec: str | Path) -> bool:
+    """Whether ``spec`` is ``kind:path`` rather than the path of RAW files."""
+    kind, _ = _kind_and_path(str(spec))
+    return kind is not None
 
 
 def _as_they_are(pairs: Sequence[Pair], settings: Mapping[str, Any]) -> Sequence[Pair]:

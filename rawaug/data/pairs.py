@@ -141,6 +141,13 @@ class Pair:
         shot_var, read_var = measure_levels(self.raw, self.noisy)
         return replace(self, shot_var=shot_var, read_var=read_var, levels_from_clean=True)
 
+    def with_own_noise(self, estimate: Callable[[Tensor, CFA], tuple[float, float] | None]) -> Pair:
+        """This pair, with the noise levels of ``raw`` itself as ``estimate(raw, cfa)``, unless it states them."""
+        if self.own_noise is not None:
+            return self
+
+        return replace(self, own_noise=estimate(self.raw, self.cfa))
+
     def require_rendered(self) -> None:
         if not self.rendered:
             raise ValueError(
@@ -285,6 +292,17 @@ class LazyPairs(Lazy[Pair]):
     """Maximum number of pixels of sRGB pictures and of mosaics in PNG files."""
     labels: Sequence[FrameLabel] = ()
     """The labels of the frames, if the dataset knows them without reading a frame."""
+    rendering: str = "sRGB of the pairs"
+    """What has rendered the sRGB of registered pairs."""
+
+    def frame(self, index: int) -> RawFrame:
+        """The captured mosaic of a pair, the noisy one where there is one, without its picture."""
+        pair = self[index]
+        mosaic = pair.noisy
+        if mosaic is None:
+            mosaic = pair.raw
+
+        return RawFrame(mosaic, pair.cfa, camera=pair.camera, iso=pair.iso)
 
     def files_of(self, index: int) -> Sequence[Path]:
         """The files that identify a pair; empty if its name identifies it."""

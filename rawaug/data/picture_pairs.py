@@ -11,9 +11,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -34,6 +35,9 @@ EXTENSIONS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 class PicturePair:
     """A shot and its noise-free version, uint8 sRGB ``(3, H, W)`` each."""
 
+    own_noise: ClassVar[None] = None
+    """The noise of developed pictures has no levels."""
+
     name: str
     noisy: Tensor
     clean: Tensor
@@ -43,6 +47,14 @@ class PicturePair:
         noisy = centre(self.noisy, crop, crop, step=1)
         clean = centre(self.clean, crop, crop, step=1)
         return PicturePair(self.name, noisy, clean)
+
+    def binned(self, factor: int, together: bool = False) -> PicturePair:
+        """This pair as it is: binning would average its real noise."""
+        return self
+
+    def with_own_noise(self, estimate: Callable[..., Any]) -> PicturePair:
+        """This pair as it is, see :attr:`own_noise`."""
+        return self
 
 
 class PicturePairs(LazyPairs):

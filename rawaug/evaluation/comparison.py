@@ -1,4 +1,4 @@
-"""``rawaug benchmark`` of RAW from start to end: denoisers by name, tables, JSON and the page."""
+"""``rawaug benchmark`` from start to end: denoisers by name, tables, JSON and, of RAW, the page."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Any
 
 from rawaug.data import open_pairs
 from rawaug.data.pairs import Binned, SomePairs
+from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import RawDenoiser, shipped_of_mosaics
+from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.evaluation.benchmark import (
     TOLD,
     benchmark,
@@ -24,6 +26,7 @@ from rawaug.evaluation.benchmark import (
 from rawaug.evaluation.evaluate import denoiser_of
 from rawaug.evaluation.figures import plot_costs
 from rawaug.evaluation.page import Figure, Page
+from rawaug.evaluation.picture_trials import picture_scores, print_pictures
 from rawaug.evaluation.tables import print_cells
 from rawaug.evaluation.trials import Measured, Trial, own_noise_note
 from rawaug.files import write_json
@@ -97,6 +100,15 @@ def compare_raw(comparison: Comparison) -> None:
     if comparison.report:
         page = _page_of(comparison, result, denoisers, cases, notes)
         print(f"page: {page.write(Path(comparison.report), settings_of(comparison))}")
+
+
+def compare_pictures(comparison: Comparison) -> None:
+    """Compare denoisers of pictures; the table is printed, and written as JSON."""
+    denoisers = [PictureDenoiser.of(spec, comparison.device) for spec in comparison.denoisers]
+    result = picture_scores(denoisers, open_picture_pairs(comparison.data))
+    print_pictures(comparison.data, result)
+    if comparison.json:
+        write_json({"data": comparison.data, **result}, comparison.json)
 
 
 def _open_denoisers(comparison: Comparison) -> list[RawDenoiser]:

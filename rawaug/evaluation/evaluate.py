@@ -1,4 +1,4 @@
-"""One denoiser on a test set, beside classical filters: what ``rawaug evaluate`` measures of RAW."""
+"""One denoiser on a test set, beside classical filters: what ``rawaug evaluate`` measures of RAW and of pictures."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ from rawaug.data import open_pairs
 from rawaug.data.folders import Kept, Readable
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import Binned
+from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import RawDenoiser, denoiser_file
+from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.evaluation.figures import panels_of
 from rawaug.evaluation.page import Page, select_for_page
+from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, print_pictures
 from rawaug.evaluation.scores import NOISY, Row, group_rows, score, summary
 from rawaug.evaluation.tables import print_scores
 from rawaug.evaluation.trials import Measured, Trial, make_trials, own_noise_note, trial_of
@@ -59,7 +62,7 @@ class Evaluation:
     report: str | None = None
     settings: PairSettings = field(default_factory=PairSettings)
 
-    def facts(self, kind: str, file: Path | None) -> dict[str, Any]:
+    def facts(self, kind: str, file: Path | None = None) -> dict[str, Any]:
         """What the result says besides scores: the kind of weights, denoiser or isp, the hash of their file, ..."""
         facts: dict[str, Any] = {"kind": kind, "data": self.data}
         if file is not None:
@@ -131,6 +134,41 @@ def evaluate_raw(evaluation: Evaluation) -> dict[str, Any]:
         }
         print(f"page: {page.write(Path(evaluation.report), settings)}")
 
+    return result
+
+
+def evaluate_pictures(evaluation: Evaluation) -> dict[str, Any]:
+    """Score a denoiser of pictures, beside classical filters; the result, as in the JSON.
+
+    ``plain`` holds the result with the default number of views, where more are asked for.
+    """
+    if evaluation.noise is not None or evaluation.bin != 1 or evaluation.report:
+        raise ValueError(f"{evaluation.data}: has developed pictures; --noise, --bin and --report are for RAW")
+
+    plain = PictureDenoiser.of(evaluation.denoiser, evaluation.device)
+    filters = [PictureDenoiser.of(spec) for spec in evaluation.classical]
+    denoisers = [plain, *filters]
+    main = plain
+    if evaluation.views > 1:
+        main = replace(plain, name=f"{plain.name}, {evaluation.views} views", views=evaluation.views)
+        denoisers.insert(1, main)
+
+    pairs = open_picture_pairs(evaluation.data, evaluation.settings.noisy, evaluation.settings.clean)
+    scores = picture_scores(denoisers, pairs)
+    print_pictures(evaluation.data, scores)
+
+    rows = scores["rows"]
+    result = {
+        **evaluation.facts("denoiser"),
+        **rows[main.name][PUBLISHED],
+        "registered": rows[main.name][REGISTERED],
+    }
+    if evaluation.views > 1:
+        result |= {"self_ensemble": True, "views": evaluation.views, "plain": rows[plain.name][PUBLISHED]}
+    for one in filters:
+        result.setdefault("classical", {})[one.name] = rows[one.name]
+
+    evaluation.write(result)
     return result
 
 

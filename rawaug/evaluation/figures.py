@@ -20,7 +20,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.data.pairs import centre
 from rawaug.errors import escape, extra
-from rawaug.evaluation.scores import NOISY, Denoiser, as_compared, to_domain
+from rawaug.evaluation.scores import NOISY, Denoiser, to_domain
 from rawaug.evaluation.trials import Trial
 from rawaug.metrics import psnr
 
@@ -72,7 +72,7 @@ def panels_of(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOI
     noisy input.
     """
     panels = Panels(trial)
-    clean = as_compared(trial.clean, trial)
+    clean = trial.compared(trial.clean)
 
     titles: dict[str, Denoiser] = {"noisy": noisy}
     for denoiser in denoisers:
@@ -82,7 +82,7 @@ def panels_of(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOI
         denoised = denoiser(trial.input_for(denoiser))
         for name, image in to_domain(title, denoised, trial):
             panels.images[name] = image
-            panels.captions[name] = f"{psnr(as_compared(image, trial), clean).item():.2f} dB"
+            panels.captions[name] = f"{psnr(trial.compared(image), clean).item():.2f} dB"
 
     panels.images["clean"] = trial.clean
     panels.captions["clean"] = trial.frame

@@ -10,23 +10,17 @@ between the noisy picture and the clean one, so that they do not depend on the d
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug.data.picture_pairs import PicturePair, open_picture_pairs
-from rawaug.denoising.pictures import PictureDenoiser
+from rawaug.data.picture_pairs import PicturePair
 from rawaug.errors import count_of, extra
-from rawaug.evaluation.comparison import Comparison
-from rawaug.evaluation.evaluate import Evaluation
 from rawaug.evaluation.scores import NOISY, Denoiser, group_rows, score, summary
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial, make_trials
-from rawaug.files import write_json
-from rawaug.version import __version__
 
 PUBLISHED, REGISTERED = "as published", "registered"
 _BORDER = 4
@@ -81,7 +75,7 @@ def picture_scores(denoisers: Sequence[Denoiser], pairs: Sequence[Any]) -> dict[
     return {"pictures": len(pairs), "rows": rows}
 
 
-def _print_pictures(data: str, result: Mapping[str, Any]) -> None:
+def print_pictures(data: str, result: Mapping[str, Any]) -> None:
     """The table of :func:`picture_scores`."""
     rows = []
     for name, by_condition in result["rows"].items():
@@ -93,49 +87,3 @@ def _print_pictures(data: str, result: Mapping[str, Any]) -> None:
 
     title = f"PSNR in dB / SSIM, {data}, {count_of(result['pictures'], 'picture')}"
     print_rows(title, ["denoiser", PUBLISHED, REGISTERED], rows)
-
-
-def evaluate_pictures(evaluation: Evaluation) -> dict[str, Any]:
-    """Score a denoiser of pictures, beside classical filters; the result, as in the JSON.
-
-    ``plain`` holds the result with the default number of views, where more are asked for.
-    """
-    if evaluation.noise is not None or evaluation.bin != 1 or evaluation.report:
-        raise ValueError(f"{evaluation.data}: has developed pictures; --noise, --bin and --report are for RAW")
-
-    plain = PictureDenoiser.of(evaluation.denoiser, evaluation.device)
-    filters = [PictureDenoiser.of(spec) for spec in evaluation.classical]
-    denoisers = [plain, *filters]
-    main = plain
-    if evaluation.views > 1:
-        main = replace(plain, name=f"{plain.name}, {evaluation.views} views", views=evaluation.views)
-        denoisers.insert(1, main)
-
-    pairs = open_picture_pairs(evaluation.data, evaluation.settings.noisy, evaluation.settings.clean)
-    scores = picture_scores(denoisers, pairs)
-    _print_pictures(evaluation.data, scores)
-
-    rows = scores["rows"]
-    result = {
-        "kind": "denoiser",
-        "data": evaluation.data,
-        "version": __version__,
-        **rows[main.name][PUBLISHED],
-        "registered": rows[main.name][REGISTERED],
-    }
-    if evaluation.views > 1:
-        result |= {"self_ensemble": True, "views": evaluation.views, "plain": rows[plain.name][PUBLISHED]}
-    for one in filters:
-        result.setdefault("classical", {})[one.name] = rows[one.name]
-
-    evaluation.write(result)
-    return result
-
-
-def compare_pictures(comparison: Comparison) -> None:
-    """Compare denoisers of pictures; the table is printed, and written as JSON."""
-    denoisers = [PictureDenoiser.of(spec, comparison.device) for spec in comparison.denoisers]
-    result = picture_scores(denoisers, open_picture_pairs(comparison.data))
-    _print_pictures(comparison.data, result)
-    if comparison.json:
-        write_json({"data": comparison.data, **result}, comparison.json)

@@ -2,7 +2,7 @@
 
 Scores are those of the whole mosaic, and once more of sRGB, after one fixed development of result and clean frame:
 bilinear demosaic, the frame's white balance and colour matrix, one exposure taken from the clean frame, the sRGB curve
-of IEC 61966-2-1. What is developed already is compared as it is, cut to [0, 1].
+of IEC 61966-2-1. What is developed already is compared as it is.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
 
-from rawaug import bayer
 from rawaug.denoising.denoiser import Noisy
 from rawaug.evaluation.trials import Trial
 from rawaug.metrics import psnr, ssim, worst_and_best_quarter
@@ -32,7 +31,7 @@ _SHOWN_FAULTS = 5
 
 
 class Denoiser(Protocol):
-    """A denoiser that can be scored: :class:`rawaug.RawDenoiser`, and whatever denoises developed pictures.
+    """A denoiser that can be scored: :class:`rawaug.RawDenoiser`, and whatever gives developed pictures in [0, 1].
 
     Attributes:
         name: its name in tables.
@@ -169,21 +168,13 @@ def compare(image: Tensor, trial: Trial) -> tuple[float, float, float | None, fl
 
     ``image`` has the form of the trial's domain: ``(1, 4, h, w)`` or ``(1, 3, H, W)``.
     """
-    result, clean = as_compared(image, trial), as_compared(trial.clean, trial)
+    result, clean = trial.compared(image), trial.compared(trial.clean)
     in_domain = psnr(result, clean).item(), ssim(result, clean).item()
     if trial.develop is None:
         return *in_domain, None, None
 
     result, clean = trial.develop(image)[None], trial.develop(trial.clean)[None]
     return *in_domain, psnr(result, clean).item(), ssim(result, clean).item()
-
-
-def as_compared(image: Tensor, trial: Trial) -> Tensor:
-    """An image of the trial's domain as its scores see it: RAW as the mosaic, sRGB cut to [0, 1]."""
-    if trial.domain == "srgb":
-        return image.clamp(0.0, 1.0)
-
-    return bayer.unpack_if_packed(image, trial.cfa)
 
 
 # -- means as JSON -----------------------------------------------------------------------------------------------------

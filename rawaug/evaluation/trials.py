@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from statistics import fmean
 from typing import Any, Literal, TypeVar
@@ -87,6 +87,10 @@ class Trial:
     def input_for(self, denoiser: Any) -> Noisy:
         """The input of this denoiser: a denoiser of RAW gets the RAW that a picture was developed from."""
         return self.inputs.get(denoiser.takes, self.input)
+
+    def compared(self, image: Tensor) -> Tensor:
+        """An image in the form of ``domain`` as scores compare it: packed RAW as the mosaic, others as they are."""
+        return bayer.unpack_if_packed(image, self.cfa)
 
 
 def trial_of(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: int = 0, **about: Any) -> Trial:
@@ -199,9 +203,10 @@ class Measured(SomePairs):
     def read(self, index: int) -> Pair:
         """The reference at ``index``, with its own noise if it is one of those that are measured."""
         pair = super().read(index)
-        if pair.own_noise is not None or index not in self.measured:
+        if index not in self.measured:
             return pair
-        return replace(pair, own_noise=own_noise(pair.raw, pair.cfa))
+
+        return pair.with_own_noise(own_noise)
 
 
 def own_noise_note(summaries: Mapping[str, Mapping[str, Any]]) -> str:

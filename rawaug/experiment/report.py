@@ -36,7 +36,6 @@ class Report:
         experiment: the run.
 
     Attributes:
-        camera: the ISP, noise and trials of the last seed.
         networks: by arm, of the last seed.
         tables: by table and arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``.
         noise_note: a line on training frames with much noise of their own; empty if there are none.
@@ -44,7 +43,6 @@ class Report:
 
     def __init__(self, experiment: Experiment) -> None:
         self.experiment = experiment
-        self.camera: Camera | None = None
         self.networks: dict[str, Denoiser] = {}
         self.tables: dict[str, dict[str, list[Summaries]]] = {}
         self.noise_note = ""
@@ -65,14 +63,17 @@ class Report:
         return results
 
 
-def write_report(report: Report) -> None:
+def write_report(report: Report, camera: Camera) -> None:
     """Write ``results.json``, the picture and the page, and print the tables.
+
+    Args:
+        report: the scores of the arms.
+        camera: the ISP, noise and trials of the last seed.
 
     Raises:
         ValueError: if a score is no number; everything else is written before.
     """
-    experiment, camera = report.experiment, report.camera
-    assert camera is not None
+    experiment = report.experiment
     recipe, task, folder = experiment.recipe, experiment.task, experiment.folder
 
     others: dict[str, dict[str, Any]] = {group: {} for group in report.tables}

@@ -25,7 +25,6 @@ from rawaug.experiment.report import Report, say, write_report
 from rawaug.experiment.stages import Camera, Experiment, Results, fit_isp, is_leader, score_arm, train_arm
 from rawaug.files import LOCK, locked
 from rawaug.noise import noise_model
-from rawaug.plugin.camera_noise import noise_for
 from rawaug.registry import Spec, split_spec
 from rawaug.tasks.base import TASKS
 from rawaug.tasks.settings import Recipe
@@ -75,17 +74,22 @@ def run(
             claim(experiment.recipe, overwrite)
 
         report = Report(experiment)
+        camera: Camera | None = None
         for seed in experiment.seeds:
             isp = fit_isp(experiment, seed)
-            camera = add_noise(experiment, isp, report)
+            if camera is None:
+                camera = Camera.of(experiment, isp)
+                report.noise_note = warn_of_noise(camera)
+            else:
+                camera = camera.with_isp(isp)
 
             for arm in experiment.recipe.arms:
                 network = train_arm(experiment, camera, arm, seed)
                 if leads:
                     report.add(arm, network, score_arm(experiment, camera, arm, seed, network))
 
-        if leads:
-            write_report(report)
+        if leads and camera is not None:
+            write_report(report, camera)
 
         return report.results
 
@@ -139,28 +143,25 @@ def _hide_clean_frames(recipe: Recipe, inputs: Inputs) -> Inputs:
     return replace(inputs, pairs=pairs, validation=validation, pictures=pictures)
 
 
-def add_noise(experiment: Experiment, isp: Any, report: Report) -> Camera:
-    """The noise of a seed, and the frames and trials that have it; those of the first seed, if its law is the same."""
-    recipe = experiment.recipe
-    if report.camera is not None and recipe.noise != "camera":
-        report.camera = report.camera.with_isp(isp)
-        return report.camera
+def warn_of_noise(camera: Camera) -> str:
+    """Print notes on the frames' own noise; the one on training frames is returned, empty if there is none."""
+    if not is_leader():
+        return ""
 
-    camera = Camera.of(experiment, isp, noise_for(isp, recipe.noise))
-    if report.camera is None and is_leader():
-        arms = []
-        for name, arm in recipe.arms.items():
-            if arm.sees_clean and arm.augmented < 1.0:
-                arms.append(name)
-        report.noise_note = training_noise_note(experiment.inputs.pairs, camera.noise, arms)
-        notes = [added_noise_note(camera.trials), report.noise_note]
-        if recipe.self_supervised:
-            notes.append(faintness_note(camera.pairs))
-        for note in filter(None, notes):
-            say(f"note: {note}")
+    recipe, inputs = camera.experiment.recipe, camera.experiment.inputs
+    arms = []
+    for name, arm in recipe.arms.items():
+        if arm.sees_clean and arm.augmented < 1.0:
+            arms.append(name)
 
-    report.camera = camera
-    return camera
+    training_note = training_noise_note(inputs.pairs, camera.noise, arms)
+    notes = [added_noise_note(camera.trials), training_note]
+    if recipe.self_supervised:
+        notes.append(faintness_note(camera.pairs))
+    for note in filter(None, notes):
+        say(f"note: {note}")
+
+    return training_note
 
 
 def find_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:

@@ -24,6 +24,7 @@ from rawaug.experiment.inputs import Inputs
 from rawaug.files import find_weights, fingerprint, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, camera_law
+from rawaug.plugin.camera_noise import noise_for
 from rawaug.progress import progress
 from rawaug.registry import Spec
 from rawaug.tasks.base import Task
@@ -103,28 +104,35 @@ class Camera:
     _watched: dict[CFA, Sequence[Trial]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, experiment: Experiment, isp: DictionaryISP, noise: NoiseModel) -> Camera:
-        """The frames and trials with this noise."""
+    def of(cls, experiment: Experiment, isp: DictionaryISP) -> Camera:
+        """The recipe's noise, which an ISP may have measured, and the frames and trials that have it."""
         task, inputs = experiment.task, experiment.inputs
+        noise = noise_for(isp, experiment.recipe.noise)
         pairs = task.training_frames(inputs.pairs, isp)
         validation = task.training_frames(inputs.validation, isp)
         return cls(experiment, isp, noise, pairs, validation, task.test_trials(inputs.test, isp, noise))
 
     def with_isp(self, isp: DictionaryISP) -> Camera:
-        """The same noise, frames and trials behind the ISP of another seed."""
+        """The camera with the ISP of another seed; frames and trials stay, unless the ISP has measured their noise."""
+        if self.experiment.recipe.noise == "camera":
+            return Camera.of(self.experiment, isp)
+
         return replace(self, isp=isp, _watched={})
 
     def pattern(self, arm: str) -> CFA:
         """The CFA that an arm is trained for."""
         return self.experiment.task.pattern(self.experiment.starts[arm], self.isp)
 
+    def isp_of(self, arm: str) -> DictionaryISP:
+        """The ISP in the CFA that an arm is trained for."""
+        return change_cfa(self.isp, self.pattern(arm))
+
     def validation_trials(self, arm: str) -> Sequence[Trial]:
         """The frozen samples by which the weights of an arm are chosen."""
         cfa = self.pattern(arm)
         if cfa not in self._watched:
             task, pictures = self.experiment.task, self.experiment.inputs.pictures
-            isp = change_cfa(self.isp, cfa)
-            self._watched[cfa] = task.validation_trials(self.validation, pictures, isp, self.noise)
+            self._watched[cfa] = task.validation_trials(self.validation, pictures, self.isp_of(arm), self.noise)
 
         return self._watched[cfa]
 
@@ -205,8 +213,7 @@ def train_arm(experiment: Experiment, camera: Camera, arm: str, seed: int) -> De
             print(f"already trained: {path}")
             return model
 
-    isp = change_cfa(camera.isp, camera.pattern(arm))
-    stream = experiment.task.stream(arm, camera.pairs, inputs.pictures, isp, camera.noise, seed)
+    stream = experiment.task.stream(arm, camera.pairs, inputs.pictures, camera.isp_of(arm), camera.noise, seed)
     model = train(
         stream,
         camera.validation_trials(arm),

@@ -16,8 +16,8 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.folders import Kept
 from rawaug.data.pairs import Binned, Middles, Pair, SomePairs
-from rawaug.evaluation.comparison import Comparison, compare_raw
-from rawaug.evaluation.evaluate import Evaluation, evaluate_raw
+from rawaug.evaluation.comparison import compare_raw
+from rawaug.evaluation.evaluate import evaluate_raw
 from rawaug.evaluation.figures import Panels, panels_of, save_picture
 from rawaug.evaluation.page import select_for_page
 from rawaug.evaluation.scores import NOISY
@@ -65,6 +65,9 @@ class Task(ABC):
     compared_in: ClassVar[str] = ""
     """The end of the titles of tables: the domain of the scores, if it is not RAW."""
 
+    developed: ClassVar[bool] = False
+    """Whether frames may be pairs of developed pictures."""
+
     input: ClassVar[Any] = NOISY
     """The denoiser that stands for the noisy input in tables."""
 
@@ -97,7 +100,8 @@ class Task(ABC):
             return []
 
         data = self.recipe.data
-        return open_pairs(spec, split, clean, data.max_pixels, **data.settings_of(spec))
+        settings = data.settings_of(spec)
+        return open_pairs(spec, split, clean, data.max_pixels, developed=self.developed, **settings)
 
     def prepare(self, frames: Sequence[Any], part: str) -> Sequence[Any]:
         """Frames of a part, "validation" or "test", counted, binned and cropped as the recipe says; each is read once.
@@ -120,15 +124,11 @@ class Task(ABC):
 
     # -- one denoiser on a test set, and several
 
-    @staticmethod
-    def evaluate(evaluation: Evaluation) -> dict[str, Any]:
-        """Score a denoiser on a test set, see :mod:`rawaug.evaluation.evaluate`."""
-        return evaluate_raw(evaluation)
+    evaluate = staticmethod(evaluate_raw)
+    """Scores a denoiser on a test set, see :mod:`rawaug.evaluation.evaluate`."""
 
-    @staticmethod
-    def benchmark(comparison: Comparison) -> None:
-        """Compare denoisers on a test set, see :mod:`rawaug.evaluation.comparison`."""
-        compare_raw(comparison)
+    benchmark = staticmethod(compare_raw)
+    """Compares denoisers on a test set, see :mod:`rawaug.evaluation.comparison`."""
 
     # -- networks
 

@@ -24,15 +24,14 @@ from torch import Tensor, nn
 from denoisers.files import DEFAULT
 from rawaug import bayer
 from rawaug.bayer import CFA, noise_variance
-from rawaug.data.folders import Kept
-from rawaug.data.pairs import Middles, Pair, SomePairs
-from rawaug.data.picture_pairs import PicturePair, PicturePairs, is_picture_pairs, open_picture_pairs
+from rawaug.data.pairs import Pair
+from rawaug.data.picture_pairs import PicturePair, is_picture_pairs
 from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser
 from rawaug.denoising.pictures import PictureDenoiser
-from rawaug.evaluation.comparison import Comparison
-from rawaug.evaluation.evaluate import Evaluation
+from rawaug.evaluation.comparison import compare_pictures
+from rawaug.evaluation.evaluate import evaluate_pictures
 from rawaug.evaluation.figures import Panels, crops_at_100, panels_of
-from rawaug.evaluation.picture_trials import compare_pictures, evaluate_pictures, picture_trials
+from rawaug.evaluation.picture_trials import picture_trials
 from rawaug.evaluation.scores import score
 from rawaug.evaluation.trials import Trial
 from rawaug.io import RawFrame, develop, write_dng
@@ -111,43 +110,15 @@ class SrgbTask(Task):
 
     settings = SrgbRecipe
     compared_in = "developed sRGB"
+    developed = True
     ensembles = False
+    evaluate = staticmethod(evaluate_pictures)
+    benchmark = staticmethod(compare_pictures)
 
     @classmethod
     def reads(cls, data: str) -> bool:
         """Whether the test set is of developed pictures."""
         return is_picture_pairs(data)
-
-    @staticmethod
-    def evaluate(evaluation: Evaluation) -> dict[str, Any]:
-        """Score a denoiser on real pairs."""
-        return evaluate_pictures(evaluation)
-
-    @staticmethod
-    def benchmark(comparison: Comparison) -> None:
-        """Compare denoisers on real pairs."""
-        compare_pictures(comparison)
-
-    def open(self, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Any]:
-        """Open frames, or real pairs of developed pictures."""
-        if isinstance(spec, str) and is_picture_pairs(spec):
-            return open_picture_pairs(spec)
-
-        return super().open(spec, split, clean)
-
-    def prepare(self, frames: Sequence[Any], part: str) -> Sequence[Any]:
-        """Frames as of RAW; real pairs are counted and cropped alone."""
-        if not isinstance(frames, PicturePairs):
-            return super().prepare(frames, part)
-
-        data = self.recipe.data
-        count = getattr(data, f"{part}_count")
-        crop = getattr(data, f"{part}_crop")
-        pairs: Sequence[Any] = SomePairs(frames, range(len(frames))[:count])
-        if crop is not None:
-            pairs = Middles(pairs, crop)
-
-        return Kept(pairs)
 
     def stream(
         self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
@@ -247,7 +218,7 @@ class SrgbTask(Task):
         """The mean variance of the own noise of the test frames, in RAW, where it is known."""
         own = {}
         for pair in test:
-            if isinstance(pair, Pair) and pair.own_noise is not None:
+            if pair.own_noise is not None:
                 own[pair.name] = noise_variance(pair.raw, *pair.own_noise).mean().item()
 
         return {"own_noise": own}
@@ -259,29 +230,39 @@ def _level_name(levels: Levels) -> str:
 
 
 def srgb_trials(pairs: Sequence[Any], levels: Sequence[Levels], label: str) -> list[Trial]:
-    """Every frame at every level as LibRaw develops it, in the domain ``srgb``, with the RAW before; a pair of pictures
-    as it is.
-    """
+    """The trials of frames in the domain ``srgb``: RAW at every level, pairs of pictures as they are."""
     trials: list[Trial] = []
     for pair in progress(pairs, label=label, unit="frame"):
         if isinstance(pair, PicturePair):
-            (trial,) = picture_trials([pair])
-            trials.append(replace(trial, condition="", strength=REAL))
-            continue
+            trials.append(_real_trial(pair))
+        else:
+            trials += _drawn_trials(pair, levels)
 
-        clean = developed(pair.raw, pair)
-        packed = bayer.pack(pair.raw[None], pair.cfa)
-        ways = {"then LibRaw": partial(_unpacked_and_developed, pair=pair)}
+    return trials
 
-        for level in levels:
-            noise = noise_model(level)
-            params = noise.sample(1, keyed_generator("developed noise", pair.name, *map(str, level)))
-            noisy, variance = noise.apply_with_variance(packed, params)
 
-            inputs: dict[str, Noisy] = {RawDenoiser.takes: Noisy(noisy, variance, level, pair.cfa)}
-            image = _unpacked_and_developed(noisy, pair)
-            strength = _level_name(level)
-            trials.append(Trial(image, clean, None, pair.name, "srgb", strength=strength, inputs=inputs, ways=ways))
+def _real_trial(pair: PicturePair) -> Trial:
+    """A pair of pictures as it is published."""
+    (trial,) = picture_trials([pair])
+    return replace(trial, condition="", strength=REAL)
+
+
+def _drawn_trials(pair: Pair, levels: Sequence[Levels]) -> list[Trial]:
+    """A RAW frame at every level as LibRaw develops it, with the RAW before."""
+    clean = developed(pair.raw, pair)
+    packed = bayer.pack(pair.raw[None], pair.cfa)
+    ways = {"then LibRaw": partial(_unpacked_and_developed, pair=pair)}
+
+    trials = []
+    for level in levels:
+        noise = noise_model(level)
+        params = noise.sample(1, keyed_generator("developed noise", pair.name, *map(str, level)))
+        noisy, variance = noise.apply_with_variance(packed, params)
+
+        inputs: dict[str, Noisy] = {RawDenoiser.takes: Noisy(noisy, variance, level, pair.cfa)}
+        image = _unpacked_and_developed(noisy, pair)
+        strength = _level_name(level)
+        trials.append(Trial(image, clean, None, pair.name, "srgb", strength=strength, inputs=inputs, ways=ways))
 
     return trials
 

@@ -14,7 +14,8 @@ from typing import Any, Literal
 
 from rawaug.data import RawFolder, open_pairs
 from rawaug.data.folders import Kept, Readable, left_out
-from rawaug.data.pairs import Pair, shared_frame
+from rawaug.data.opening import names_dataset
+from rawaug.data.pairs import LazyPairs, Pair, lazy, shared_frame
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
@@ -142,13 +143,12 @@ def _measure_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -
         return str(error)
 
 
-def rendering_of(pairs: Sequence[Pair], frames: int, registered: int) -> str:
+def rendering_of(pairs: LazyPairs, frames: int, registered: int) -> str:
     """Name the renderings that the fit was to, whose tone curve and colours the ISP undoes.
 
     Registered pairs are no JPEGs of the camera.
     """
-    own = "LibRaw" if isinstance(pairs, RawFolder) else "sRGB of the pairs"
-    counts = {own: registered, "JPEG of the camera": frames - registered}
+    counts = {pairs.rendering: registered, "JPEG of the camera": frames - registered}
 
     return ", ".join(f"{name} ({count} of {frames})" for name, count in counts.items() if count)
 
@@ -174,23 +174,29 @@ class _Watch:
 
 def _open_pairs(
     source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool, mosaics: Mapping[str, Any]
-) -> Sequence[Pair]:
+) -> LazyPairs:
     if isinstance(source, (str, Path)):
         source = [source]
     if not hasattr(source, "__getitem__") or not len(source):
         raise ValueError("nothing to fit; give one or more files, folders or pairs")
 
-    if isinstance(source[0], Pair):
-        if mosaics:
-            raise ValueError(f"{', '.join(mosaics)} can only be given for pairs:PATH; each Pair has its own")
-        return source  # type: ignore[return-value]
-    if not isinstance(source[0], (str, Path)):
+    if isinstance(source[0], (str, Path)):
+        return _open_named(source, camera_jpeg, mosaics)  # type: ignore[arg-type]
+    if not isinstance(source[0], Pair):
         raise ValueError(f"a fit takes files, folders or Pairs, got {type(source[0]).__name__}; see docs/fit.md")
+    if mosaics:
+        raise ValueError(f"{', '.join(mosaics)} can only be given for pairs:PATH; each Pair has its own")
+    return lazy(source)  # type: ignore[arg-type]
 
+
+def _open_named(source: Sequence[str | Path], camera_jpeg: bool, mosaics: Mapping[str, Any]) -> LazyPairs:
+    """Open files and folders as one folder, or a single dataset."""
     for item in source:
         pairs = open_pairs(str(item), split="train", as_clean=False, **mosaics)
-        if len(source) == 1 and not isinstance(pairs, RawFolder):
-            return pairs
-        if not isinstance(pairs, RawFolder):
+        if not names_dataset(item):
+            continue
+        if len(source) > 1:
             raise ValueError(f"{item}: a kind:path dataset cannot be combined with other files; give it alone")
+        return lazy(pairs)
+
     return RawFolder(map(str, source), camera_jpeg=camera_jpeg)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -13,9 +13,9 @@ from torch import Tensor
 from rawaug.bayer import CFA, crop_to_cfa
 from rawaug.data import RawFolder
 from rawaug.data.folders import Readable
-from rawaug.data.pairs import Pair
+from rawaug.data.pairs import Pair, lazy
 from rawaug.errors import count_of
-from rawaug.io import RawFrame, read_raw
+from rawaug.io import RawFrame
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_dark_noise, estimate_noise, plot_noise
 from rawaug.noise.estimate import WORST_FIT
 
@@ -123,13 +123,15 @@ def _read_frames(pairs: Sequence[Pair]) -> list[RawFrame]:
     if last >= MOST_FRAMES:
         indices = [round(k * last / (MOST_FRAMES - 1)) for k in range(MOST_FRAMES)]
 
+    read: Callable[[int], RawFrame | None]
+    if isinstance(pairs, Readable):
+        read = partial(pairs.attempt, read=lazy(pairs.pairs).frame)
+    else:
+        read = lazy(pairs).frame
+
     frames = []
     for index in indices:
-        frame: RawFrame | None
-        if isinstance(pairs, Readable):
-            frame = pairs.attempt(index, partial(_read_frame, pairs.pairs))
-        else:
-            frame = _read_frame(pairs, index)
+        frame = read(index)
         if frame is not None:
             frames.append(frame)
 
@@ -138,31 +140,18 @@ def _read_frames(pairs: Sequence[Pair]) -> list[RawFrame]:
     return frames
 
 
-def _read_frame(pairs: Sequence[Pair], index: int) -> RawFrame:
-    if isinstance(pairs, RawFolder):
-        return read_raw(pairs.files[index])
-
-    pair = pairs[index]
-    mosaic = pair.noisy
-    if mosaic is None:
-        mosaic = pair.raw
-    return RawFrame(mosaic, pair.cfa, camera=pair.camera, iso=pair.iso)
-
-
 def _align(frames: Sequence[RawFrame]) -> tuple[list[Tensor], str]:
     """Bring the mosaics of frames to the first one's pattern, and return that too; Bayer's four are cropped to it."""
     cfa = frames[0].cfa
     patterns = {frame.cfa for frame in frames}
-    is_bayer = patterns <= set(CFA)
-    if len(patterns) > 1 and not is_bayer:
+    if len(patterns) == 1:
+        return [frame.mosaic for frame in frames], cfa
+    if not patterns <= set(CFA):
         raise ValueError(f"the frames are of several patterns, {', '.join(sorted(patterns))}; measure each separately")
 
     mosaics = []
     for frame in frames:
-        mosaic = frame.mosaic
-        if is_bayer:
-            mosaic = crop_to_cfa(mosaic, CFA(frame.cfa), CFA(cfa))
-        mosaics.append(mosaic)
+        mosaics.append(crop_to_cfa(frame.mosaic, CFA(frame.cfa), CFA(cfa)))
     return mosaics, cfa
 
 

@@ -12,9 +12,7 @@ import pytest
 
 from rawaug.errors import MissingExtra
 from rawaug.experiment import run as running
-from rawaug.experiment.report import Report
-from rawaug.experiment.run import add_noise, dry_run, run
-from rawaug.experiment.stages import Camera
+from rawaug.experiment.run import dry_run, run, warn_of_noise
 from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.config import TrainConfig
 from rawaug.training.launch import require_trainable
@@ -60,11 +58,9 @@ def test_a_dry_run_repeats_the_notes_of_the_run(
 ) -> None:
     monkeypatch.setattr(running, "added_noise_note", lambda trials: "the references are noisy")
     monkeypatch.setattr(running, "training_noise_note", lambda *_: "")
-    monkeypatch.setattr(running, "noise_for", lambda *_: None)
-    camera = SimpleNamespace(trials=[], pairs=[], noise=None)
-    monkeypatch.setattr(Camera, "of", lambda *_: camera)
-    experiment: Any = SimpleNamespace(recipe=recipe, inputs=SimpleNamespace(pairs=[]))
-    monkeypatch.setattr(running, "run_kind", lambda *_: add_noise(experiment, None, Report(experiment)))
+    experiment = SimpleNamespace(recipe=recipe, inputs=SimpleNamespace(pairs=[]))
+    camera: Any = SimpleNamespace(experiment=experiment, trials=[], pairs=[], noise=None)
+    monkeypatch.setattr(running, "run_kind", lambda *_: warn_of_noise(camera))
 
     dry_run("ablation", SimpleNamespace(name="x", out=recipe.out, shortest=lambda: recipe))
     assert "note: the references are noisy" in capsys.readouterr().out

@@ -22,7 +22,7 @@ from rawaug.experiment.run import run
 from rawaug.io.pictures import write_picture
 from rawaug.metrics import psnr
 from rawaug.tasks.settings import ArmConfig, DataConfig
-from rawaug.tasks.srgb import REAL, SrgbRecipe, best_filter, developed, srgb_trials
+from rawaug.tasks.srgb import REAL, SrgbRecipe, SrgbTask, best_filter, developed, srgb_trials
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.srgb_samples import Told
 
@@ -148,6 +148,17 @@ def test_real_pairs_choose_the_weights_and_are_scored(tmp_path: Path) -> None:
     assert 20 < float(row["psnr"]) < 40
     with pytest.raises(ValueError, match=r"data\.validation"):
         run(replace(recipe, data=replace(recipe.data, test=seen)), True)
+
+
+def test_real_pairs_are_cropped_but_keep_their_noise(tmp_path: Path) -> None:
+    noisy = torch.rand(3, 64, 80, generator=torch.Generator().manual_seed(0))
+    write_picture(tmp_path / "a_real.png", noisy)
+    write_picture(tmp_path / "a_mean.png", torch.full_like(noisy, 0.5))
+    data = DataConfig(pairs=None, pictures="tiny:", test=f"cc15:{tmp_path}", test_crop=32, bin=2)
+    task = SrgbTask(replace(RECIPE, data=data))
+    (pair,) = task.prepare(task.open(data.test, "test", True), "test")
+    expected = (255 * noisy[:, 16:48, 24:56]).round()
+    assert torch.equal(pair.noisy.float(), expected) and pair.clean.shape == expected.shape
 
 
 @pytest.mark.usefixtures("tiny")
