@@ -42,9 +42,12 @@ def test_a_denoised_crw_has_the_means_of_its_source(source: Path, tmp_path: Path
     )
 
 
-def test_a_dng_that_is_written_again_gets_the_same_matched_curve(source: Path, tmp_path: Path) -> None:
-    # without the preview, by which the curve is matched, the means differ by a tenth
+def test_the_curve_is_matched_to_the_preview_of_the_source(source: Path, tmp_path: Path) -> None:
+    # without the preview the means differ by a tenth; RawTherapee's other matrix for this CRW takes 0.8 %
     first, second = tmp_path / "first.dng", tmp_path / "second.dng"
     write_dng(first, read_raw(source), source)
     write_dng(second, read_raw(first), first)
-    np.testing.assert_allclose(mean_colour(second), mean_colour(first), rtol=1e-4)
+
+    developed = mean_colour(first)
+    np.testing.assert_allclose(developed, mean_colour(source), rtol=0.015)
+    np.testing.assert_allclose(mean_colour(second), developed, rtol=1e-4)
