@@ -22,7 +22,8 @@ def mean_colour(path: Path, profile: Path | None = None) -> np.ndarray:
     """The mean of red, green and blue as RawTherapee develops a file, by its default profile or by another."""
     out = path.with_suffix(".tif")
     options = ["-d"] if profile is None else ["-p", str(profile)]
-    subprocess.run(["rawtherapee-cli", "-q", "-o", out, "-b16", "-t", "-Y", *options, "-c", path], check=True)
+    command = ["rawtherapee-cli", "-q", "-o", str(out), "-b16", "-t", "-Y", *options, "-c", str(path)]
+    subprocess.run(command, check=True)
     picture = tifffile.imread(out)
     return np.asarray(picture[..., :3].mean((0, 1), dtype=np.float64))
 
