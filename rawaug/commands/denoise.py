@@ -49,7 +49,7 @@ def run(
         strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing; of pictures, a factor on
             the estimated level of the noise: 2 removes more, 0.5 less.
         linear: demosaic too, to a linear DNG of full colour; by default with rawaug-joint.
-        self_ensemble: average eight views of a network, at eight times the cost (rawaug-srgb averages two as it is).
+        self_ensemble: average eight views of a network, at eight times the cost.
         greens: auto makes the two greens of a Bayer sensor agree where they clearly differ, since demosaicing makes a
             maze of the difference; keep leaves them.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
