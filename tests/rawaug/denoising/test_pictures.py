@@ -93,14 +93,22 @@ def test_a_self_ensemble_denoises_a_turned_picture_to_the_turned_result() -> Non
     assert error(upright[0]) < error(two(Noisy(noisy()[None]))[0])
 
 
-def test_the_shipped_network_sees_a_picture_upright_and_turned_by_a_quarter() -> None:
+def test_a_single_network_that_estimates_the_level_sees_a_picture_upright_and_turned_by_a_quarter(
+    tmp_path: Path,
+) -> None:
+    network = denoisers.from_pretrained("rawaug-srgb").get_submodule("first")
+    assert isinstance(network, denoisers.DRUNet)
+    denoisers.save(network, tmp_path / "single.safetensors", {})
+    name = f"{tmp_path / 'single.safetensors'}@10"
+
     seen = noisy()[None, :, :48]
-    two, one = PictureDenoiser.of("rawaug-srgb@10"), PictureDenoiser.of("rawaug-srgb@10", views=1)
+    two, one = PictureDenoiser.of(name), PictureDenoiser.of(name, views=1)
     upright = one(Noisy(seen))
     turned = bayer.turn_back(one(Noisy(bayer.turn(seen, 5))), 5)
     assert torch.allclose(two(Noisy(seen)), (upright + turned) / 2, atol=1e-5)
     assert (upright - turned).abs().max() > 1e-3
     assert PictureDenoiser.of("NonLocalMeans@10").views == 1
+    assert PictureDenoiser.of("rawaug-srgb").views == 1, "a mean of two networks"
 
 
 def test_bfloat16_changes_a_picture_by_less_than_two_codes() -> None:
