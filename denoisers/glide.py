@@ -9,15 +9,14 @@ of eigenvectors are those of least estimated error
 
 .. math:: \sum_{i \le m} (1 - s_i^k)^2 b_i^2 + \sigma^2 s_i^{2k} + \sum_{i > m} b_i^2
 
-where :math:`b_i^2 = (v_i^T y)^2 - \sigma^2` is what the noisy picture shows of the clean one.
+where :math:`b_i^2 = (v_i^T y)^2 - \sigma^2` is what the noisy picture shows of the clean one. With all eigenvectors and
+k = 0 the picture stays as it is, at an error of :math:`n \sigma^2`. So do pixels whose row cannot be scaled to 1.
 
 Pictures are cut into tiles, since the samples of a whole frame would not fit in memory. The colours are filtered as
 luminance and differences, all by affinities of the four planes together.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 import torch
@@ -33,6 +32,8 @@ WIDTH = 1.25
 """h, in deviations of the noise."""
 SCALINGS = 30
 """Rounds of Sinkhorn's scaling."""
+LEAST_SUM = 1e-6
+"""Least sum of a row that the scaling can bring to 1: the extension of affinities has entries below 0."""
 POWERS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 """The powers k that are tried."""
 
@@ -49,11 +50,16 @@ def affinities(guide: Tensor) -> tuple[Tensor, Tensor]:
     count = min(max(round(SHARE * pixels), LEAST), MOST, pixels)
     sampled = torch.linspace(0, pixels - 1, count).round().long().unique()
     distances = torch.cdist(features, features[sampled]).square() / features.shape[1]
+    # A factor for each pixel makes no difference to Sinkhorn's scaling. Without it all affinities of a colour that is
+    # unlike every sample would underflow, and the pixel would become 0.
+    distances = distances - distances.amin(dim=1, keepdim=True)
     return torch.exp(-distances / WIDTH**2), sampled
 
 
 def eigenvectors(affinity: Tensor, sampled: Tensor) -> tuple[Tensor, Tensor]:
     """Compute leading eigenvectors ``(n, m)`` of the filter W, orthonormal, and their eigenvalues ``(m,)``, falling.
+
+    The rows of pixels that the filter does not reach are 0.
 
     Args:
         affinity: of n pixels with p sampled ones, ``(n, p)``.
@@ -68,7 +74,8 @@ def eigenvectors(affinity: Tensor, sampled: Tensor) -> tuple[Tensor, Tensor]:
     scale = torch.ones(len(factor), dtype=torch.float64)
     for _ in range(SCALINGS):
         row_sums = scale * (factor @ (factor.T @ scale))
-        scale = scale / row_sums.clamp_min(1e-12).sqrt()
+        is_reached = row_sums > LEAST_SUM
+        scale = torch.where(is_reached, scale / row_sums.clamp_min(LEAST_SUM).sqrt(), 0.0)
     balanced = scale[:, None] * factor
 
     values, rotation = torch.linalg.eigh(balanced.T @ balanced)
@@ -85,8 +92,8 @@ def filter_plane(plane: Tensor, vectors: Tensor, values: Tensor, noise: float) -
     whole = (plane.double().square().sum() - len(plane) * noise**2).clamp_min(0.0)
     missing = (whole - energy.cumsum(0)).clamp_min(0.0)
 
-    best_error = math.inf
-    best = torch.zeros_like(plane)
+    best_error = len(plane) * noise**2
+    best = plane
     for power in POWERS:
         factors = values.clamp(0.0, 1.0) ** power
         error = ((1.0 - factors).square() * energy + noise**2 * factors.square()).cumsum(0) + missing
@@ -125,11 +132,13 @@ class GLIDE(Classical):
     def _tile(self, planes: Planes, guide: Planes) -> Planes:
         affinity, sampled = affinities(torch.from_numpy(guide).permute(2, 0, 1))
         vectors, values = eigenvectors(affinity, sampled)
+        is_reached = vectors.square().sum(dim=1) > 0.0
 
         opponent = to_opponent(planes)
         cleaned = np.empty_like(opponent)
         for channel in range(opponent.shape[2]):
             plane = torch.from_numpy(np.ascontiguousarray(opponent[..., channel]))
-            pixels = filter_plane(plane.flatten(), vectors, values, self.strength)
+            pixels = plane.flatten().clone()
+            pixels[is_reached] = filter_plane(pixels[is_reached], vectors[is_reached], values, self.strength)
             cleaned[..., channel] = pixels.reshape(plane.shape).numpy()
         return from_opponent(cleaned)

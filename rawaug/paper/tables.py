@@ -6,8 +6,9 @@ Each part is a recipe of its own, which runs in a folder below that of the whole
 
 from __future__ import annotations
 
+import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -167,12 +168,14 @@ def read_tables(folder: Path) -> dict[str, Table]:
         tables["table2"] = dslr_table((nikon or {}).get("rows", {}), (canon or {}).get("rows", {}))
 
     runs = []
+    curves: dict[str, Curve] = {}
     for part in ("table3", "few", "unsupervised"):
         results = read_part(folder, part, "results")
         if results is not None:
             runs.append(results)
+            curves |= read_curves(folder / part, results["results"])
     if runs:
-        tables["table3"] = denoising_table(runs)
+        tables["table3"] = denoising_table(runs, curves)
 
     stages = read_part(folder, "ablation", "ablation")
     if stages is not None:
@@ -186,6 +189,30 @@ def read_part(folder: Path, part: str, stem: str) -> Any:
     if not path.is_file():
         return None
     return json.loads(path.read_text())
+
+
+class Curve(NamedTuple):
+    """A training as its log has it: the last step, and the mean losses between validations."""
+
+    steps: int
+    losses: list[float]
+
+
+def read_curves(folder: Path, arms: Iterable[str]) -> dict[str, Curve]:
+    """The trainings of the arms of a recipe with their first seed; arms without a log are left out."""
+    curves = {}
+    for arm in arms:
+        logs = sorted(folder.glob(f"seed*/{arm}/log.csv"))
+        if not logs:
+            continue
+
+        with logs[0].open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        if rows:
+            losses = [float(row["loss"]) for row in rows]
+            curves[arm] = Curve(int(rows[-1]["step"]), losses)
+
+    return curves
 
 
 def reconstruction_table(rows: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -231,8 +258,13 @@ def dslr_table(nikon: Mapping[str, Mapping[str, Any]], canon: Mapping[str, Mappi
     return table
 
 
-def denoising_table(runs: Sequence[Mapping[str, Any]]) -> Table:
-    """Table 3 from the results of the recipes that train, with the self-ensemble where there is one."""
+def denoising_table(runs: Sequence[Mapping[str, Any]], curves: Mapping[str, Curve]) -> Table:
+    """Table 3 from the results of the recipes that train, with the self-ensemble where there is one.
+
+    Args:
+        runs: the results of the recipes.
+        curves: by arm, how its training went.
+    """
     table: Table = {}
     for results in runs:
         for arm, seeds in results["results"].items():
@@ -241,7 +273,7 @@ def denoising_table(runs: Sequence[Mapping[str, Any]]) -> Table:
                 summary = scores.get("self_ensemble", scores["plain"])
                 psnr.append(summary.get("psnr"))
                 ssim.append(summary.get("ssim"))
-            add_denoiser(table, arm, psnr, ssim)
+            add_denoiser(table, arm, psnr, ssim, curves.get(arm))
 
             noisy = seeds[0]["plain"]
             if "Noisy" not in table:
@@ -257,12 +289,22 @@ def denoising_table(runs: Sequence[Mapping[str, Any]]) -> Table:
     return ordered
 
 
-def add_denoiser(table: Table, name: str, psnr: Sequence[float], ssim: Sequence[float]) -> None:
+def add_denoiser(
+    table: Table, name: str, psnr: Sequence[float], ssim: Sequence[float], curve: Curve | None = None
+) -> None:
     """Add a row of table 3 under the paper's name, if it has one; the first figures of a name stay."""
     names = {**published.DENOISER_NAMES, "noisy": "Noisy"}
     label = names.get(name, name)
     paper = published.TABLE_3.get(label, (None, None))
-    figures = {"PSNR": list(psnr), "PSNR, paper": paper[0], "SSIM": list(ssim), "SSIM, paper": paper[1]}
+    figures: dict[str, Any] = {
+        "PSNR": list(psnr),
+        "PSNR, paper": paper[0],
+        "SSIM": list(ssim),
+        "SSIM, paper": paper[1],
+    }
+    if curve is not None:
+        figures["steps"] = curve.steps
+        figures["loss still falling"] = still_falling(curve.losses)
     table.setdefault(label, figures)
 
 
@@ -286,7 +328,7 @@ def row_name(name: str) -> str:
 
 
 def still_falling(curve: Sequence[float] | None) -> float | None:
-    """By how many percent the loss of the last tenth of a training is below that of the tenth before."""
+    """By how many percent the loss of the last part of a training is below that of the part before."""
     if curve is None or len(curve) < 2:
         return None
     return 100.0 * (curve[-2] - curve[-1]) / curve[-2]
@@ -389,7 +431,8 @@ NOTES = {
     "percent says that the training was too short.",
     "table2": "Rows 'own rendering' are InvISP's protocol: RAW from the picture that the network itself rendered, "
     "stored as a JPEG. 'Balanced' is InvISP's figure, of demosaiced, white-balanced, gamma-compressed RAW.",
-    "table3": "Networks are averaged over the views of the self-ensemble, as in the paper.",
+    "table3": "Networks are averaged over the views of the self-ensemble, as in the paper. A loss that is still "
+    "falling by more than a few percent says that the training was too short.",
     "ablation": "Images between the stages of the way from sRGB to RAW, each frame by a fit to the others.",
 }
 ORDERED_BY = {"table1": ["PSNR_r", "PSNR_d"], "table2": ["Nikon PSNR_r", "Canon PSNR_r"], "table3": ["PSNR"]}

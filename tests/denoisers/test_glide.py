@@ -46,6 +46,15 @@ def test_an_edge_gains() -> None:
     assert (cleaned - clean).square().mean() < 0.3 * (noisy - clean).square().mean()
 
 
+def test_a_picture_of_more_colours_than_samples_is_not_spoilt() -> None:
+    pytest.importorskip("skimage", reason="scikit-image is not installed")
+    generator = torch.Generator().manual_seed(0)
+    clean = 60.0 * torch.rand(4, 32, 32, generator=generator) ** 2
+    noisy = clean + torch.randn(clean.shape, generator=generator)
+    cleaned = GLIDE()(noisy[None] * 0.01, torch.full((1, 4, 32, 32), 1e-4))[0] / 0.01
+    assert (cleaned - clean).square().mean() < 1.1 * (noisy - clean).square().mean()
+
+
 def test_tiles_fit_together(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("skimage", reason="scikit-image is not installed")
     monkeypatch.setattr("denoisers.glide.TILE", 16)

@@ -151,6 +151,8 @@ _SPREADS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, torch.inf)
 _SPREAD_EPS = 1e-6
 """Constant under the logarithm, so that a frame that nothing predicts does not decide alone."""
 _KNEES = (0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
+_FRAMES_AT_ONCE = 16
+"""Frames whose pixels pass the stages at a time, so that memory does not grow with their number."""
 REACH_ATOMS = 8
 _LEAST_DETERMINANT = 0.05
 """Of a matrix with rows of l1 norm 1; published cameras have 0.1 and more."""
@@ -270,15 +272,35 @@ def _set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) ->
     errors: dict[float, float] = {}
     for knee in _KNEES:
         isp.configure(knee=knee)
-        predicted = isp.reverse_pixels(samples.srgb, colour.params(), samples.coordinates).clamp(0.0, 1.0)
+        predicted = _reverse_in_parts(isp, samples, colour.params()).clamp(0.0, 1.0)
         square = (predicted - samples.target) ** 2 * samples.site
         errors[knee] = float((square.sum((1, 2, 3)) / samples.site.sum((1, 2, 3)) + 1e-6).log().sum())
 
     isp.configure(knee=min(errors, key=lambda knee: errors[knee]))
 
 
-_LIGHT_PIXELS, _LIGHT_FRAMES = 1024, 16
-"""Pixels of a frame, and frames at a time, by which the lights of trained atoms are measured."""
+def _reverse_in_parts(isp: DictionaryISP, samples: PixelSamples, params: ISPParams) -> Tensor:
+    """Compute x5 ``(F, 3, 1, P)`` of all frames, some at a time: the networks need far more memory than x5.
+
+    Args:
+        isp: whose reverse pass is taken.
+        samples: the pixels of F frames.
+        params: a setting for each frame, or one for all.
+    """
+    count = len(samples.srgb)
+    params = params.map(lambda tensor: tensor.expand(count, *tensor.shape[1:]))
+
+    parts: list[Tensor] = []
+    for index in torch.arange(count).split(_FRAMES_AT_ONCE):
+        part = samples.of_frames(index)
+        of_part = ISPParams(*[tensor[index] for tensor in params])
+        parts.append(isp.reverse_pixels(part.srgb, of_part, part.coordinates))
+
+    return torch.cat(parts)
+
+
+_LIGHT_PIXELS = 1024
+"""Pixels of a frame by which the lights of trained atoms are measured."""
 _LIGHT_RIDGE = 1e-2
 """Ridge that pulls the neutrals of rarely used atoms to the mean."""
 
@@ -321,17 +343,14 @@ def _second_moments(
     isp: DictionaryISP, pixels: PixelSamples, weights: Tensor, matrix: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute ``<x x>`` and ``<x y>`` of each frame's channels under gains of 1, and which channels have any pixel."""
-    moments: list[Tensor] = []
-    for index in torch.arange(len(matrix)).split(_LIGHT_FRAMES):
-        part = pixels.of_frames(index)
-        none = weights.new_empty(len(index), 0)
-        tones = isp.typical_tones().expand(len(index), -1)
-        params = ISPParams(weights[index], none, matrix[index], torch.ones(len(index), 3), tones)
-        x = isp.reverse_pixels(part.srgb, params, part.coordinates)
-        square, cross = (x * x * part.known).mean((2, 3)), (x * part.target * part.known).mean((2, 3))
-        moments.append(torch.stack([square, cross]))
+    count = len(matrix)
+    none = weights.new_empty(count, 0)
+    tones = isp.typical_tones().expand(count, -1)
+    params = ISPParams(weights, none, matrix, torch.ones(count, 3), tones)
 
-    a, b = torch.cat(moments, dim=1)
+    x = _reverse_in_parts(isp, pixels, params)
+    a = (x * x * pixels.known).mean((2, 3))
+    b = (x * pixels.target * pixels.known).mean((2, 3))
     return a, b, (a > 0).float()
 
 
@@ -348,7 +367,7 @@ def set_priors(isp: DictionaryISP, samples: PixelSamples, config: FitConfig) -> 
     with torch.no_grad():
         plain = isp.params_from_weights(colour_weights[None], torch.ones(1, isp.config.gain_atoms))
         plain = plain._replace(gains=torch.ones(1, 3))
-        x = isp.reverse_pixels(samples.srgb, plain, samples.coordinates)
+        x = _reverse_in_parts(isp, samples, plain)
         a = (samples.known * (x * x)).mean((2, 3))
         b = (samples.known * (x * samples.target)).mean((2, 3))
 

@@ -40,6 +40,9 @@ def folder(tmp_path: Path) -> Path:
     ensemble = {"psnr": 40.5, "ssim": 0.955}
     results = {"ours": [{"plain": plain, "self_ensemble": ensemble}], "dhdn": [{"plain": plain}]}
     write(run, "table3", "results", {"results": results, "others": {"WNNM": {"psnr": 38.0, "ssim": 0.9}}})
+    log = run / "table3" / "seed0" / "ours" / "log.csv"
+    log.parent.mkdir(parents=True)
+    log.write_text("step,loss,psnr\n300,0.02,38\n600,0.015,40\n")
     write(run, "few", "results", {"results": {"ours_f": [{"plain": plain}]}, "others": {}})
     stages = {"blind": [[20.0 + k, 21.0 + k, 22.0 + k] for k in range(6)]}
     write(run, "ablation", "ablation", {"stages": stages})
@@ -59,6 +62,8 @@ def test_our_figures_stand_beside_the_papers(folder: Path) -> None:
     third = found["table3"]
     assert list(third) == ["Noisy", "WNNM", "DHDN", "Ours-f", "Ours"], "the paper's order"
     assert third["Ours"]["PSNR"] == [40.5] and third["DHDN"]["PSNR"] == [40.0] and third["Noisy"]["SSIM"] == [0.7]
+    assert third["Ours"]["steps"] == 600 and third["Ours"]["loss still falling"] == pytest.approx(25.0)
+    assert "steps" not in third["DHDN"], "without a log nothing is said of the training"
     assert found["ablation"]["Y, blind"]["x5 shading"] == 26.0
     assert found["ablation"]["UV, paper"]["x4 gains"] == 47.59
 

@@ -24,6 +24,7 @@ from rawaug.isp.fit.start import (
     fit_fall_off,
     least_squares,
     reach_atoms,
+    set_dictionaries,
     set_priors,
 )
 from rawaug.isp.model import DictionaryISP
@@ -124,6 +125,26 @@ def test_the_knee_spares_highlights_only_where_the_camera_did(exact_pairs: list[
                               pair.white_balance, pair.color_matrix))  # fmt: skip
         knees.append(fit_isp(pairs, QUICK, progress=False).config.knee or 1.0)
     assert knees[0] > knees[1]
+
+
+def test_many_frames_pass_the_networks_a_few_at_a_time(
+    exact_pair: Callable[..., Pair], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = [exact_pair(f"shot{k}", (1.7, 1.0, 1.6), k % 2) for k in range(40)]
+    samples, shots = sample_pixels(frames, 512, seed=0)
+    colour = FrameColour.from_product(torch.eye(3).expand(len(frames), 3, 3))
+    isp = DictionaryISP(ISPConfig(colour_atoms=4, gain_atoms=4))
+    counts: list[int] = []
+    reverse_pixels = isp.reverse_pixels
+
+    def counted(x: torch.Tensor, *args: Any) -> torch.Tensor:
+        counts.append(len(x))
+        return reverse_pixels(x, *args)
+
+    monkeypatch.setattr(isp, "reverse_pixels", counted)
+    set_dictionaries(isp, colour, samples, shots, FitConfig(prior_steps=1))
+    assert max(counts) < len(frames) // 2  # a network's activations are some ten times as large as its picture
+    assert sum(counts) % len(frames) == 0  # and each frame passes every time
 
 
 CURVE = FitConfig(steps=0, pixels=2048, batch=512, prior_steps=100)
