@@ -33,7 +33,7 @@ class Size(NamedTuple):
 
     @property
     def blocks_by_scale(self) -> list[int]:
-        """The residual blocks of each scale, the finest first; ValueError if a scale has none of the numbers."""
+        """The residual blocks of each scale, the finest first; ValueError unless there is a number for each scale."""
         if isinstance(self.blocks, int):
             return [self.blocks] * self.scales
 

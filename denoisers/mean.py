@@ -2,9 +2,9 @@ r"""The mean of two DRUNets: their errors are partly different ones, and the mea
 
 .. math:: d = (1 - w) f(y) + w g(y)
 
-f and g are told the same level. Where they were trained on different noise, the mean is better than either on most
-kinds of noise, and never as wrong as the one that does not know it. Two networks gain what two turned views of one do,
-at the same time for a picture.
+f and g are told the same level. As the squared error is convex, that of the mean is never above the mean of theirs, and
+below both where they are nearly as good as each other. On noise that one of them was not trained on, the mean lies
+between them.
 """
 
 from __future__ import annotations

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 import inspect
 import math
-import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, TypedDict, Unpack
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -367,10 +367,7 @@ class Denoiser(nn.Module, ABC):
 
 def _is_as_large(value: int | Sequence[int], other: int | Sequence[int]) -> bool:
     """Tell whether a setting, one number or one for each scale, is nowhere smaller than another."""
-    values = value
-    others = other
-    if isinstance(values, int):
-        values = [values] * (1 if isinstance(others, int) else len(others))
-    if isinstance(others, int):
-        others = [others] * len(values)
-    return len(values) == len(others) and all(map(operator.ge, values, others))
+    values = np.atleast_1d(value)
+    others = np.atleast_1d(other)
+    can_compare = 1 in (len(values), len(others)) or len(values) == len(others)
+    return can_compare and bool((values >= others).all())

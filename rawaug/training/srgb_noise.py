@@ -154,6 +154,8 @@ class ColouredNoise:
         self.coloured = coloured
         self.blur = blur
         self.jpeg = jpeg
+        if not 0.0 < wide_blur[0] <= wide_blur[1]:
+            raise ValueError(f"wide_blur must be (lowest, highest) with 0 < lowest <= highest, got {wide_blur}")
         self.wide = wide
         self.wide_blur = wide_blur
 

@@ -112,6 +112,8 @@ def test_limits_that_nobody_means_are_refused() -> None:
         (WhiteNoise, {"sigma": (20.0, 10.0)}, r"sigma must be \(lowest, highest\) within 0 to 255"),
         (BsrganNoise, {"jpeg": (0, 95)}, "jpeg must be"),
         (BsrganNoise, {"poisson": 1.5}, "poisson must be"),
+        (ColouredNoise, {"wide": 1.5}, "wide must be"),
+        (ColouredNoise, {"wide_blur": (0.0, 3.0)}, "wide_blur must be"),
     ]
     for model, settings, said in wrong:
         with pytest.raises(ValueError, match=said):
