@@ -39,6 +39,9 @@ _ACROSS = 4
 CURVES = {"loss": "loss", "psnr": "validation PSNR (dB)", "psnr_srgb": "validation PSNR, sRGB (dB)"}
 """Columns of a log that are plotted, with the titles of their plots."""
 
+LINE_STYLES = ("-", "--", "-.", ":")
+"""Line styles of the arms of a training, so that a curve under another one is still seen."""
+
 Log = Sequence[Mapping[str, str]]
 """The rows of a training's ``log.csv``."""
 
@@ -170,22 +173,24 @@ def plot_curves(logs: Mapping[str, Sequence[Path]]) -> dict[str, bytes]:
     The loss is the mean since the row before. A curve of one point is a dot. What no log has is left out.
     """
     rows: dict[tuple[str, int], Log] = {}
-    colours = {}
+    styles = {}
     for k, (arm, paths) in enumerate(logs.items()):
-        colours[arm] = f"C{k % 10}"
+        styles[arm] = {"color": f"C{k % 10}", "linestyle": LINE_STYLES[k % len(LINE_STYLES)]}
         for seed, path in enumerate(paths):
             rows[arm, seed] = read_log(path)
 
     pictures = {}
     for key, title in CURVES.items():
-        png = _plot_curve(key, title, rows, colours)
+        png = _plot_curve(key, title, rows, styles)
         if png:
             pictures[title] = png
 
     return pictures
 
 
-def _plot_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colours: Mapping[str, str]) -> bytes:
+def _plot_curve(
+    key: str, title: str, logs: Mapping[tuple[str, int], Log], styles: Mapping[str, Mapping[str, Any]]
+) -> bytes:
     """A curve for each log, the arm in the legend; empty if no log has the key."""
     figure = new_figure(5.2, 3.6)
     axis = figure.subplots()
@@ -203,7 +208,7 @@ def _plot_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colou
             continue
         lowest = min(lowest, *values)
 
-        style: dict[str, Any] = {"color": colours[arm], "linewidth": 1.4}
+        style: dict[str, Any] = {**styles[arm], "linewidth": 1.4}
         if len(steps) == 1:
             style["marker"] = "o"
         if arm not in arms:
@@ -227,6 +232,8 @@ def plot_costs(rows: Mapping[str, tuple[float | None, float, float]]) -> bytes:
 
     ``rows`` has GMAC and the two PSNR by the name of a denoiser.
     """
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     figure = new_figure(8.4, 3.6)
     axes = figure.subplots(1, 2)
 
@@ -238,6 +245,9 @@ def plot_costs(rows: Mapping[str, tuple[float | None, float, float]]) -> bytes:
             else:
                 axes[k].plot(gmac, psnr_values[k], "o", **style)
         axes[k].set(xlabel="GMAC a megapixel", xscale="log", title=f"PSNR, {title} (dB)")
+        axes[k].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes[k].xaxis.set_major_formatter("{x:g}")
+        axes[k].xaxis.set_minor_formatter(NullFormatter())
 
     figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     return _png(figure)

@@ -68,7 +68,6 @@ class Page:
         self.title = title
         self.lead = lead
         self.parts: list[dict[str, Any]] = []
-        self._has_pictures = False
 
     def add(self, heading: str = "", **content: Any) -> None:
         """Add a part.
@@ -175,10 +174,9 @@ class Page:
         caption = f"{part}, clean; window at row {pixels * lines.start}, column {pixels * columns.start}"
         figures.append(Figure(encode_png(whole), part, caption=caption))
 
-        heading = ""
-        if not self._has_pictures:
-            heading = "Pictures"
-            self._has_pictures = True
+        heading = "Pictures"
+        if any(part["heading"] == heading for part in self.parts):
+            heading = ""
         name = ", ".join(filter(None, [row.trial.frame, row.trial.condition]))
         self.add(heading, name=name, figures=figures)
 
