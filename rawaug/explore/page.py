@@ -208,22 +208,19 @@ def _tab(gr: Any, name: str, outputs: dict[str, Any]) -> Any:
 
 def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, Any], tabs: dict[str, Any]) -> None:
     opened = gr.State(next(iter(VIEWS)))
+    quiet = {"show_progress": "hidden", "api_visibility": "private"}
+
+    for name, tab in tabs.items():
+        tab.select(lambda chosen=name: chosen, None, opened, **quiet)
 
     def redraw(tab: str, *values: Any) -> list[Any]:
         changes = show(tab, dict(zip(controls, values, strict=True)))
         return [changes.get(name, gr.skip()) for name in outputs]
 
-    def select(tab: str, *values: Any) -> list[Any]:
-        return [tab, *redraw(tab, *values)]
-
-    # One after the other: the late answer to a tab's opening must not replace that to a newer setting.
-    quiet = {"show_progress": "hidden", "api_visibility": "private", "concurrency_id": "draw"}
-    inputs, results = list(controls.values()), list(outputs.values())
-
-    triggers = [page.load, *(control.change for control in inputs)]
-    gr.on(triggers, redraw, [opened, *inputs], results, trigger_mode="always_last", **quiet)
-    for name, tab in tabs.items():
-        tab.select(partial(select, name), inputs, [opened, *results], **quiet)
+    # One event draws everything, so that no late answer to an older one replaces a newer picture.
+    inputs = list(controls.values())
+    triggers = [page.load, opened.change, *(control.change for control in inputs)]
+    gr.on(triggers, redraw, [opened, *inputs], list(outputs.values()), trigger_mode="always_last", **quiet)
 
     isp, noise, draw_exposure = controls["isp"], controls["noise"], controls["draw_exposure"]
     dependent = [controls["camera"], controls["light"], controls["tone"], noise]

@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from itertools import product
 from os import SEEK_END
 from pathlib import Path
@@ -109,7 +110,10 @@ def write_dng(
     """
     path = Path(path)
     _require_colour(frame, path)
-    numbers = digital_numbers(frame, path) if rgb is None else linear_numbers(frame, rgb, path)
+    if rgb is not None:
+        layout, numbers = _FULL_COLOUR, linear_numbers(frame, rgb, path)
+    else:
+        layout, numbers = _LAYOUTS.get(frame.cfa, _MOSAIC), digital_numbers(frame, path)
 
     carried = Carried()
     if source is not None:
@@ -120,17 +124,17 @@ def write_dng(
         directories["ExifTag"] = _exif(frame, carried.byte_order)
     directories = {name: entries for name, entries in directories.items() if entries}
 
-    tags = _tags(frame, numbers, carried, baseline_exposure)
+    tags = _tags(frame, layout, numbers, carried, baseline_exposure)
     extra_tags: list[tuple[Any, ...]] = [(code, *tag, True) for code, tag in sorted(tags.items())]
     extra_tags += [(name, LONG, 1, 0, True) for name in directories]
 
     with replacing(path) as partial:
         with tag_damage(Path(source)) if source is not None else nullcontext():
-            _write_pixels(partial, numbers, frame.cfa, carried, extra_tags)
+            _write_pixels(partial, numbers, layout.photometric, carried, extra_tags)
         _append_directories(partial, directories, carried)
 
 
-def _tags(frame: RawFrame, numbers: np.ndarray, carried: Carried, baseline_exposure: float) -> Tags:
+def _tags(frame: RawFrame, layout: _Layout, numbers: np.ndarray, carried: Carried, baseline_exposure: float) -> Tags:
     tags = _camera(frame)
     if DNG_VERSION not in carried.tags:
         tags |= _color(frame, baseline_exposure)
@@ -138,24 +142,21 @@ def _tags(frame: RawFrame, numbers: np.ndarray, carried: Carried, baseline_expos
     tags[_SUBFILE_TYPE] = (LONG, 1, 0)
     tags[_ORIENTATION] = (SHORT, 1, _EXIF_ORIENTATIONS[frame.orientation])
 
-    height, width, *colours = numbers.shape
+    height, width = numbers.shape[:2]
     if _CROP_SIZE not in tags and min(height, width) > 4 * _PADDING:
         tags[_CROP_ORIGIN] = (LONG, 2, (_PADDING, _PADDING))
         tags[_CROP_SIZE] = (LONG, 2, (width - 2 * _PADDING, height - 2 * _PADDING))
-
-    if not colours:
+    if numbers.ndim == 2:
         tags[_NEW_RAW_DIGEST] = (BYTE, 16, tiled_digest(numbers))
-        if frame.cfa != MONOCHROME:
-            return tags | _of_mosaic(frame)
 
-    for code in _OF_MOSAICS:
+    for code in layout.inapplicable:
         tags.pop(code, None)
-    if colours:
-        return tags | _of_full_colour(frame)
-    return tags | _of_one_plane(frame)
+    return tags | layout.tags(frame)
 
 
-def _write_pixels(path: Path, numbers: np.ndarray, cfa: str, carried: Carried, tags: Sequence[tuple[Any, ...]]) -> None:
+def _write_pixels(
+    path: Path, numbers: np.ndarray, photometric: int, carried: Carried, tags: Sequence[tuple[Any, ...]]
+) -> None:
     with extra("raw"):
         import imagecodecs
         import tifffile
@@ -163,11 +164,10 @@ def _write_pixels(path: Path, numbers: np.ndarray, cfa: str, carried: Carried, t
     height, width, *colours = numbers.shape
     if colours:
         columns = np.ascontiguousarray(numbers)
-        photometric, planes = LINEAR_PHOTOMETRIC, "contig"
+        planes = "contig"
     else:
         # even and odd columns of a mosaic are components: their colours differ
         columns = numbers.reshape(height, width // 2, 2)
-        photometric = _GREY if cfa == MONOCHROME else CFA_PHOTOMETRIC
         planes = None
 
     stream = imagecodecs.jpeg8_encode(columns, lossless=True, predictor=1, bitspersample=16)
@@ -324,6 +324,28 @@ def _of_full_colour(frame: RawFrame) -> Tags:
         50717: (LONG, 3, (LINEAR_WHITE,) * 3),
         **_opcodes(OPCODE_LIST_2, maps),
     }
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How one kind of pixels is stored.
+
+    Attributes:
+        photometric: what the pixels mean, in TIFF's numbers.
+        tags: the levels and the pattern of a frame.
+        inapplicable: tags of a source that say nothing of such pixels.
+    """
+
+    photometric: int
+    tags: Callable[[RawFrame], Tags]
+    inapplicable: Sequence[int] = ()
+
+
+_MOSAIC = _Layout(CFA_PHOTOMETRIC, _of_mosaic)
+_ONE_PLANE = _Layout(_GREY, _of_one_plane, _OF_MOSAICS)
+_FULL_COLOUR = _Layout(LINEAR_PHOTOMETRIC, _of_full_colour, _OF_MOSAICS)
+_LAYOUTS = {MONOCHROME: _ONE_PLANE}
+"""Layouts of frames that are no mosaics, by their patterns."""
 
 
 def xyz_to_camera(frame: RawFrame) -> np.ndarray:
