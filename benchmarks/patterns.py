@@ -70,7 +70,7 @@ def scores_of(pair: Pair, cfa: str, noise: Any, networks: list[RawDenoiser]) -> 
     trial = mosaic_trial(pair, cfa, noise)
     found = {name: make() for name, make in without_network(trial, pair)}
     for one in networks:
-        if one.of_any is not None or cfa in CFA.__members__:
+        if one.takes_pattern(cfa):
             found[one.name] = next(image for _, image in to_domain(one.name, one(trial.input), trial))
     scored = {name: compare(image, trial) for name, image in found.items()}
     return {name: (rgb, srgb or 0.0) for name, (rgb, _, srgb, _) in scored.items()}

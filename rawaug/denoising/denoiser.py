@@ -58,7 +58,6 @@ class RawDenoiser(ImageDenoiser):
         model: ``model(levels)`` is the function f that denoises a piece of packed RAW; levels may be None.
         network: the network that computes, if it is one of PyTorch's.
         cfa: the pattern that it was trained for; None if it works on any of Bayer's.
-        of_any: a network that takes mosaics of every pattern, with the planes of their colours.
         info: what its file says of its training.
         reads_levels: whether noise levels make a difference.
         tiles: side and overlap of the pieces, in packed pixels, None being the default of
@@ -84,7 +83,6 @@ class RawDenoiser(ImageDenoiser):
 
     model: Callable[[Levels | None], Model] = field(repr=False)
     cfa: CFA | None = None
-    of_any: MosaicDRUNet | None = None
     tiles: tuple[int, int | None] | None = (TILE, None)
 
     def __post_init__(self) -> None:
@@ -104,8 +102,8 @@ class RawDenoiser(ImageDenoiser):
         return _of_file(spec)
 
     def takes_pattern(self, cfa: str) -> bool:
-        """Whether it denoises mosaics of a pattern: any of Bayer's, and others if its network is of mosaics."""
-        return cfa in CFA.__members__ or self.of_any is not None
+        """Whether it denoises mosaics of a pattern: any of Bayer's; a :class:`MosaicDenoiser` takes others, too."""
+        return cfa in CFA.__members__
 
     def require_mosaic(self) -> RawDenoiser:
         """This denoiser; ValueError if it gives full colour, which cannot be compared with a mosaic."""
@@ -115,6 +113,12 @@ class RawDenoiser(ImageDenoiser):
         """Raise ValueError if full colour is wanted and this denoiser gives a mosaic, or the other way round."""
         if linear:
             raise ValueError(f"--linear: {self.name} denoises the mosaic and does not demosaic; use {JOINT}")
+
+    def require_preview(self, preview: Path) -> None:
+        """Raise ValueError if LibRaw cannot develop the results to previews as it does a mosaic."""
+
+    def require_grey(self, name: str) -> None:
+        """Raise ValueError if the monochrome frame of this name cannot be denoised as a mosaic."""
 
     @torch.inference_mode()
     def __call__(self, noisy: Noisy) -> Tensor:
@@ -149,17 +153,8 @@ class RawDenoiser(ImageDenoiser):
         return tuple(packed.shape)
 
     def _of_mosaic(self, noisy: Noisy) -> Tensor:
-        if self.of_any is None:
-            advice = "give --denoiser rawaug-xtrans, or weights of rawaug run any"
-            raise ValueError(f"{self.name}: is for Bayer mosaics, not {noisy.cfa}; {advice}")
-        if self.views > 1 or self.tiles is None:
-            raise ValueError(f"the self-ensemble: is for Bayer mosaics, not {noisy.cfa}; omit it")
-        if noisy.variance is None:
-            raise ValueError(f"{self.name}: needs the variance of the noise")
-
-        pieces = partial(denoisers.denoise_tiles, self.of_any, tile=2 * self.tiles[0], each=progress_by("tile"))
-        run = partial(denoise_mosaic, pieces, cfa=noisy.cfa)
-        return self._run(run, noisy.image, noisy.variance, noisy.image.shape)
+        advice = "give --denoiser rawaug-xtrans, or weights of rawaug run any"
+        raise ValueError(f"{self.name}: is for Bayer mosaics, not {noisy.cfa}; {advice}")
 
     def _run(self, run: Model, image: Tensor, variance: Tensor | None, expected: Sequence[int]) -> Tensor:
         """``run`` on the device and in the precision of this denoiser, its result checked."""
@@ -194,6 +189,33 @@ class RawDenoiser(ImageDenoiser):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MosaicDenoiser(RawDenoiser):
+    """A denoiser of mosaics of every pattern, X-Trans and Quad-Bayer too.
+
+    Attributes:
+        of_any: the network, which takes a mosaic with the planes of its colours. Packed RAW goes through ``network``.
+
+    The other attributes are those of :class:`RawDenoiser`, by whose ``of`` it is made.
+    """
+
+    of_any: MosaicDRUNet = field(repr=False)
+
+    def takes_pattern(self, cfa: str) -> bool:
+        """Whether it denoises mosaics of a pattern: of every one."""
+        return True
+
+    def _of_mosaic(self, noisy: Noisy) -> Tensor:
+        if self.views > 1 or self.tiles is None:
+            raise ValueError(f"the self-ensemble: is for Bayer mosaics, not {noisy.cfa}; omit it")
+        if noisy.variance is None:
+            raise ValueError(f"{self.name}: needs the variance of the noise")
+
+        pieces = partial(denoisers.denoise_tiles, self.of_any, tile=2 * self.tiles[0], each=progress_by("tile"))
+        run = partial(denoise_mosaic, pieces, cfa=noisy.cfa)
+        return self._run(run, noisy.image, noisy.variance, noisy.image.shape)
+
+
+@dataclass(frozen=True, kw_only=True)
 class JointDenoiser(RawDenoiser):
     """A denoiser that demosaics, too: packed RAW ``(1, 4, h, w)`` to linear camera RGB ``(1, 3, 2h, 2w)``.
 
@@ -215,6 +237,14 @@ class JointDenoiser(RawDenoiser):
         """Raise ValueError if a mosaic is wanted."""
         if not linear:
             raise ValueError(f"--denoiser {self.name}: demosaics too, to a linear DNG; add --linear")
+
+    def require_preview(self, preview: Path) -> None:
+        """ValueError: LibRaw has nothing to demosaic."""
+        raise ValueError(f"--preview {preview}: --linear does not support it; open the linear DNG in a RAW developer")
+
+    def require_grey(self, name: str) -> None:
+        """ValueError: a monochrome frame has no colours to find."""
+        raise ValueError(f"{name}: is monochrome; there is nothing to demosaic, omit --linear")
 
     def _result_shape(self, packed: Tensor) -> tuple[int, ...]:
         height, width = packed.shape[-2:]
@@ -286,10 +316,9 @@ def _of_file(spec: str | Path) -> RawDenoiser:
 
 def _of_network(name: str, network: nn.Module, info: Mapping[str, Any], cfa: CFA | None) -> RawDenoiser:
     """A network; one that does not say so takes a variance if its ``forward`` has two arguments."""
-    of_any = None
     if isinstance(network, MosaicDRUNet):
-        of_any = network
-        network = BayerAdapter(of_any)
+        packed = _of_network(name, BayerAdapter(network), info, cfa)
+        return MosaicDenoiser(of_any=network, **vars(packed))
 
     reads = getattr(network, "reads_variance", None)
     if reads is None:
@@ -303,7 +332,6 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any], cfa: CFA
         model=lambda levels: evaluated,
         network=evaluated,
         cfa=cfa,
-        of_any=of_any,
         info=info,
         reads_levels=bool(reads),
         tiles=(getattr(evaluated, "tile", TILE), None),

@@ -144,20 +144,12 @@ class FrameDenoiser:
         frame = replace(frame, mosaic=image, noise_profile=rest)
         return DenoisedFrame(frame, None, levels, noise_source, below_zero, corrected)
 
-    def require_preview(self, preview: Path) -> None:
-        """Raise ValueError if LibRaw cannot develop the results to previews as it does a mosaic."""
-        if self.usual.demosaics:
-            raise ValueError(
-                f"--preview {preview}: --linear does not support it; open the linear DNG in a RAW developer"
-            )
-
 
 def _as_mosaic(frame: RawFrame, denoiser: RawDenoiser) -> RawFrame:
     """The frame as a denoiser takes it: a monochrome one is the mosaic of a grey scene."""
     if frame.cfa != MONOCHROME:
         return frame
-    if denoiser.demosaics:
-        raise ValueError(f"{frame.name}: is monochrome; there is nothing to demosaic, omit --linear")
+    denoiser.require_grey(frame.name)
     return replace(frame, cfa=CFA.RGGB)
 
 

@@ -261,7 +261,7 @@ class RawFiles(Files[Denoised]):
         return file.with_suffix(".dng")
 
     def require_preview(self, preview: Path) -> None:
-        self.denoiser.require_preview(preview)
+        self.denoiser.usual.require_preview(preview)
 
     def denoise(self, source: Path, out: Path, preview: Path | None = None, isolate: bool = False) -> Denoised:
         start = time.perf_counter()
