@@ -137,7 +137,7 @@ def write_dng(
 def _tags(frame: RawFrame, layout: _Layout, numbers: np.ndarray, carried: Carried, baseline_exposure: float) -> Tags:
     tags = _camera(frame)
     if DNG_VERSION not in carried.tags:
-        tags |= _color(frame, baseline_exposure)
+        tags |= _version(frame, baseline_exposure) | layout.colour(frame)
     tags |= carried.tags
     tags[_SUBFILE_TYPE] = (LONG, 1, 0)
     tags[_ORIENTATION] = (SHORT, 1, _EXIF_ORIENTATIONS[frame.orientation])
@@ -253,8 +253,8 @@ def _camera(frame: RawFrame) -> Tags:
     return tags
 
 
-def _color(frame: RawFrame, baseline_exposure: float) -> Tags:
-    """Tags that are only written if the source is not a DNG."""
+def _version(frame: RawFrame, baseline_exposure: float) -> Tags:
+    """Tags that, like those of colour, are only written if the source is not a DNG."""
     needed = 3 if frame.gain_maps else 1
     tags: Tags = {
         DNG_VERSION: (BYTE, 4, bytes((1, 4, 0, 0))),
@@ -263,13 +263,21 @@ def _color(frame: RawFrame, baseline_exposure: float) -> Tags:
         **_opcodes(OPCODE_LIST_2, [m for m in frame.gain_maps if m.on_mosaic]),
         **_opcodes(OPCODE_LIST_3, [m for m in frame.gain_maps if not m.on_mosaic]),
     }
-    if frame.cfa != MONOCHROME:
-        tags[_COLOR_MATRIX] = (SRATIONAL, 9, _rationals(xyz_to_camera(frame).ravel()))
-        tags[_AS_SHOT_NEUTRAL] = (RATIONAL, 3, _rationals([1 / gain for gain in frame.white_balance]))
-        tags[_ILLUMINANT] = (SHORT, 1, _D65)
     if frame.exposure.date:
         tags[306] = (ASCII, 0, frame.exposure.date)
     return tags
+
+
+def _colour(frame: RawFrame) -> Tags:
+    return {
+        _COLOR_MATRIX: (SRATIONAL, 9, _rationals(xyz_to_camera(frame).ravel())),
+        _AS_SHOT_NEUTRAL: (RATIONAL, 3, _rationals([1 / gain for gain in frame.white_balance])),
+        _ILLUMINANT: (SHORT, 1, _D65),
+    }
+
+
+def _no_colour(frame: RawFrame) -> Tags:
+    return {}
 
 
 def _opcodes(code: int, maps: Sequence[GainMap]) -> Tags:
@@ -333,17 +341,19 @@ class _Layout:
     Attributes:
         photometric: what the pixels mean, in TIFF's numbers.
         tags: the levels and the pattern of a frame.
+        colour: its colours.
         inapplicable: tags of a source that say nothing of such pixels.
     """
 
     photometric: int
     tags: Callable[[RawFrame], Tags]
+    colour: Callable[[RawFrame], Tags] = _colour
     inapplicable: Sequence[int] = ()
 
 
 _MOSAIC = _Layout(CFA_PHOTOMETRIC, _of_mosaic)
-_ONE_PLANE = _Layout(_GREY, _of_one_plane, _OF_MOSAICS)
-_FULL_COLOUR = _Layout(LINEAR_PHOTOMETRIC, _of_full_colour, _OF_MOSAICS)
+_ONE_PLANE = _Layout(_GREY, _of_one_plane, _no_colour, _OF_MOSAICS)
+_FULL_COLOUR = _Layout(LINEAR_PHOTOMETRIC, _of_full_colour, inapplicable=_OF_MOSAICS)
 _LAYOUTS = {MONOCHROME: _ONE_PLANE}
 """Layouts of frames that are no mosaics, by their patterns."""
 
