@@ -52,7 +52,7 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Features ``(B, C, h, w)`` to features of the same shape."""
-        return x + self.conv2(self.conv1(x).relu_())
+        return self.conv2(self.conv1(x).relu_()).add_(x)
 
 
 class ResidualUNet(Denoiser):
@@ -186,7 +186,7 @@ class ResidualUNet(Denoiser):
         x = lowest(x + coarse)
         for up, blocks in zip(self.ups, self.decoder, strict=True):
             finer = F.pixel_shuffle(up(x), 2)
-            x = blocks(finer + skips.pop())
+            x = blocks(finer.add_(skips.pop()))
         return x
 
 

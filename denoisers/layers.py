@@ -6,6 +6,7 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from rawaug.registry import require_between
 
@@ -70,13 +71,19 @@ def pad_to_multiple(image: Tensor, stride: int) -> Tensor:
     # An exported network pads any size, also where the picture that it is traced with needs no padding.
     is_traced = torch.compiler.is_compiling() or torch.onnx.is_in_onnx_export()
 
-    for axis in (-2, -1):
-        size = image.shape[axis]
-        padding = -size % stride
-        if is_traced or padding:
-            period = 2 * (size - 1)
-            place = torch.remainder(torch.arange(size + padding, device=image.device), period)
-            image = image.index_select(axis, torch.minimum(place, period - place))
+    height, width = image.shape[-2:]
+    if not is_traced:
+        below, beside = -height % stride, -width % stride
+        if below == beside == 0:
+            return image
+        if below < height and beside < width:
+            return F.pad(image, (0, beside, 0, below), mode="reflect")
+
+    # torch's own padding reflects once at most, which is not enough for a picture smaller than the stride.
+    for axis, size in ((-2, height), (-1, width)):
+        period = 2 * (size - 1)
+        place = torch.remainder(torch.arange(size + -size % stride, device=image.device), period)
+        image = image.index_select(axis, torch.minimum(place, period - place))
     return image
 
 

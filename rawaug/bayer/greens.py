@@ -127,7 +127,7 @@ def balance_greens(mosaic: Tensor, cfa: CFA | str, difference: GreenDifference) 
     Returns:
         A new mosaic ``(1, H, W)``.
     """
-    row_means, column_means, _ = _neighbours(mosaic)
+    row_means, column_means = _neighbours(mosaic)
     height, width = mosaic.shape[-2:]
     down = _powers(torch.linspace(-1, 1, height).to(mosaic))
     along = _powers(torch.linspace(-1, 1, width).to(mosaic))
@@ -149,13 +149,23 @@ def balance_greens(mosaic: Tensor, cfa: CFA | str, difference: GreenDifference) 
     return balanced
 
 
-def _neighbours(mosaic: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Average the next sites in the row, in the column and on the diagonals of each site, ``(1, H, W)`` each."""
-    padded = F.pad(mosaic, (1, 1, 1, 1), mode="reflect")  # about the border sites: the pattern stays
+def _neighbours(mosaic: Tensor) -> tuple[Tensor, Tensor]:
+    """Average the next sites in the row, and those in the column, of each site, ``(1, H, W)`` each."""
+    padded = _pad_by_one(mosaic)
+    row = (padded[:, 1:-1, :-2] + padded[:, 1:-1, 2:]) / 2
+    column = (padded[:, :-2, 1:-1] + padded[:, 2:, 1:-1]) / 2
+    return row, column
+
+
+def _diagonals(mosaic: Tensor) -> Tensor:
+    """Average the next sites on the diagonals of each site, ``(1, H, W)``."""
+    padded = _pad_by_one(mosaic)
     row = (padded[..., :-2] + padded[..., 2:]) / 2
-    column = (padded[:, :-2] + padded[:, 2:]) / 2
-    diagonals = (row[:, :-2] + row[:, 2:]) / 2
-    return row[:, 1:-1], column[..., 1:-1], diagonals
+    return (row[:, :-2] + row[:, 2:]) / 2
+
+
+def _pad_by_one(mosaic: Tensor) -> Tensor:
+    return F.pad(mosaic, (1, 1, 1, 1), mode="reflect")  # about the border sites: the pattern stays
 
 
 def _powers(x: Tensor) -> Tensor:
@@ -187,8 +197,7 @@ def _blocks(mosaic: Tensor, cfa: CFA | str) -> _Blocks:
     packed = pack(mosaic, cfa)
     clipped = (packed >= _CLIPPED).any(0, keepdim=True).to(packed)
     # Each green less the mean of the other kind around it, so that a slope of the light is no difference.
-    diagonals = _neighbours(mosaic)[2]
-    excess = pack(mosaic - diagonals, cfa)[1:3]
+    excess = pack(mosaic - _diagonals(mosaic), cfa)[1:3]
 
     # Means are weighted by a tent, as texture that a block cuts off would count as a difference.
     planes = torch.cat([packed, excess, excess.square(), clipped])

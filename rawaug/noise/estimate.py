@@ -185,10 +185,11 @@ def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
         raise ValueError(f"a mosaic of {tuple(frame.shape[-2:])} is too small to estimate noise from")
 
     floor, ceiling = -math.inf, 1.0
-    if _piles_up(frame):
-        floor = float(frame.min())
-    if _piles_up(-frame):
-        ceiling = min(float(frame.max()), 1.0)
+    lowest, highest = frame.aminmax()
+    if _piles_up(frame, lowest, highest):
+        floor = float(lowest)
+    if _piles_up(frame, highest, lowest):
+        ceiling = min(float(highest), 1.0)
 
     planes, channels = _planes(frame.reshape(1, *frame.shape[-2:]).float(), cfa)
     tiles = planes.unfold(-2, BLOCK, BLOCK).unfold(-2, BLOCK, BLOCK).reshape(len(channels), -1, BLOCK, BLOCK)
@@ -225,16 +226,16 @@ def _planes(mosaic: Tensor, cfa: CFA | str) -> tuple[Tensor, Tensor]:
     return F.pixel_unshuffle(mosaic[:, :height, :width], period), plane_indices(cfa).flatten()
 
 
-def _piles_up(frame: Tensor) -> bool:
-    """Whether the lowest value is frequent, and at least as frequent as the next."""
-    lowest = frame.min()
-    above = frame[frame > lowest]
-    if above.numel() == 0:
+def _piles_up(frame: Tensor, extreme: Tensor, opposite: Tensor) -> bool:
+    """Whether one extreme value, the lowest or the highest, is frequent, and at least as frequent as the next."""
+    at_extreme = frame == extreme
+    count = int(torch.count_nonzero(at_extreme))
+    if count < max(10, frame.numel() // 100_000) or count == frame.numel():
         return False
 
-    count = frame.numel() - above.numel()
-    next_count = int((above == above.min()).sum())
-    return count >= max(10, frame.numel() // 100_000, next_count)
+    ends = frame.masked_fill(at_extreme, float(opposite)).aminmax()
+    next_value = min(ends, key=lambda end: float((end - extreme).abs()))
+    return count >= int(torch.count_nonzero(frame == next_value))
 
 
 def _split_levels(blocks: _Blocks) -> list[_Blocks]:
