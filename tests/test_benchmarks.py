@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import augment, binning, crops, denoise, measure, patterns, pictures, sensors, synth
+from benchmarks import augment, binning, crops, denoise, ingredients, measure, patterns, pictures, sensors, synth
+from denoisers.network import DENOISERS
 from rawaug.data.demo import FRAME
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import NOISY
@@ -73,6 +74,54 @@ def test_binning_scores_the_same_noise_on_both_kinds_of_reference(tmp_path: Path
     squares, around = (figures[way] for way in binning.WAYS)
     assert squares["noisy"] == pytest.approx(around["noisy"], abs=0.1)
     assert around["rawaug-small"] > squares["rawaug-small"] + 0.1
+
+
+@pytest.mark.parametrize("name", ingredients.ARMS)
+def test_every_arm_begins_as_the_identity_and_all_of_its_layers_learn(name: str) -> None:
+    arm = ingredients.ARMS[name]
+    network = DENOISERS[arm.network](**arm.settings)
+    noisy = torch.rand(1, 4, 48, 40, generator=torch.Generator().manual_seed(0))
+    variance = 1e-3 * noisy + 1e-5
+    if not arm.settings.get("mend"):
+        torch.testing.assert_close(network(noisy, variance), noisy)
+
+    torch.nn.init.normal_(network.tail.weight, 0.0, 0.1)
+    for end in network.block_ends():
+        torch.nn.init.normal_(end.weight, 0.0, 0.1)
+    network(noisy, variance).square().mean().backward()
+    assert all(weight.grad.abs().max() > 0 for weight in network.parameters())
+
+
+def test_a_repeated_network_is_given_what_it_has_corrected() -> None:
+    once = ingredients.RepeatedDRUNet(repeats=1, width=4, scales=2)
+    twice = ingredients.RepeatedDRUNet(repeats=2, width=4, scales=2)
+    torch.nn.init.normal_(once.tail.weight, 0.0, 0.1)
+    twice.load_state_dict(once.state_dict())
+    features = torch.rand(1, once.inputs - 4, 16, 16)
+
+    first = once.residual(features)
+    again = torch.cat([features[:, :4] + first, features[:, 4:], first], dim=1)
+    second = first + once.tail(once.body(again))
+    torch.testing.assert_close(twice.residual(features), second)
+
+
+def test_ingredients_are_trained_once_for_a_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ingredients, "MIDDLE", 32)
+    monkeypatch.setattr(ingredients, "PROBE", 1)
+    table = tmp_path / "table.json"
+    command = [str(table), "--minutes", "0", "--precision", "32-true", "--arms", "the same, blind", "--seeds"]
+    ingredients.main([*command, "1"])
+    first = json.loads(table.read_text())
+    assert first["the same, blind"]["steps"] == ingredients.POINTS
+
+    ingredients.main([*command, "2"])
+    both = json.loads(table.read_text())["the same, blind"]["runs"]
+    assert both["0"] == first["the same, blind"]["runs"]["0"], "what stands in the table is not trained again"
+    assert [point["step"] for point in both["1"]["curve"]] == [1, 2, 3, 4, 5]
+    assert both["1"]["curve"][-1]["psnr_phone"] != both["0"]["curve"][-1]["psnr_phone"]
+    assert "±" in capsys.readouterr().out
 
 
 def test_patterns_are_compared_in_full_colour(tmp_path: Path) -> None:
