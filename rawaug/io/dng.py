@@ -137,7 +137,7 @@ def write_dng(
 def _tags(frame: RawFrame, layout: _Layout, numbers: np.ndarray, carried: Carried, baseline_exposure: float) -> Tags:
     tags = _camera(frame)
     if DNG_VERSION not in carried.tags:
-        tags |= _version(frame, baseline_exposure) | layout.colour(frame)
+        tags |= _converted(frame, baseline_exposure) | layout.colour(frame)
     tags |= carried.tags
     tags[_SUBFILE_TYPE] = (LONG, 1, 0)
     tags[_ORIENTATION] = (SHORT, 1, _EXIF_ORIENTATIONS[frame.orientation])
@@ -253,8 +253,8 @@ def _camera(frame: RawFrame) -> Tags:
     return tags
 
 
-def _version(frame: RawFrame, baseline_exposure: float) -> Tags:
-    """Tags that, like those of colour, are only written if the source is not a DNG."""
+def _converted(frame: RawFrame, baseline_exposure: float) -> Tags:
+    """The tags, besides those of colour, that a frame gets whose source is not a DNG."""
     needed = 3 if frame.gain_maps else 1
     tags: Tags = {
         DNG_VERSION: (BYTE, 4, bytes((1, 4, 0, 0))),
@@ -269,6 +269,7 @@ def _version(frame: RawFrame, baseline_exposure: float) -> Tags:
 
 
 def _colour(frame: RawFrame) -> Tags:
+    """The matrix and the white balance of a frame whose source is not a DNG."""
     return {
         _COLOR_MATRIX: (SRATIONAL, 9, _rationals(xyz_to_camera(frame).ravel())),
         _AS_SHOT_NEUTRAL: (RATIONAL, 3, _rationals([1 / gain for gain in frame.white_balance])),
@@ -277,6 +278,7 @@ def _colour(frame: RawFrame) -> Tags:
 
 
 def _no_colour(frame: RawFrame) -> Tags:
+    """A monochrome picture has neither."""
     return {}
 
 
