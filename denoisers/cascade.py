@@ -42,7 +42,8 @@ class CascadeDRUNet(Denoiser):
         frozen: keep the weights of the first network in training.
         channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
-    A training starts from a DRUNet, whose weights both networks take, or from a cascade.
+    A training starts from a DRUNet, whose weights both networks take, or from a cascade: of one with more blocks it
+    takes the first of each scale.
 
     Example:
         >>> noisy = torch.rand(1, 4, 33, 50)
@@ -51,8 +52,7 @@ class CascadeDRUNet(Denoiser):
     """
 
     defaults: ClassVar[Shared] = {**Denoiser.defaults, "variance_map": False, "domain": "anscombe"}
-    growing: ClassVar[frozenset[str]] = frozenset({"blocks"})
-    layerless: ClassVar[frozenset[str]] = frozenset({"views", "frozen"})
+    layerless: ClassVar[frozenset[str]] = frozenset({"views", "frozen", "blocks"})
     mixed: ClassVar[bool] = True
     tile: ClassVar[int] = 1152
     """Side in packed pixels of the tiles of large frames: a cascade keeps more of a tile in memory than others."""
@@ -113,6 +113,11 @@ class CascadeDRUNet(Denoiser):
             self.second.load_state_dict(model.state_dict(), strict=False)
         else:
             super().start_from(model)
+
+    @property
+    def core(self) -> Denoiser:
+        """The first network, from which networks of other kinds start."""
+        return self.first
 
     def _denoise(self, noisy: Tensor, variance: Tensor | None) -> Tensor:
         """Run the first network and correct its result."""

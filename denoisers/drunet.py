@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.layers import MOST_SCALES, conv, require_bounded, require_width
+from denoisers.layers import MOST_SCALES, can_fuse, conv, fused_conv, require_bounded, require_width
 from denoisers.network import DENOISERS, Denoiser, Shared
 from rawaug.registry import require_between
 
@@ -52,6 +52,8 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Features ``(B, C, h, w)`` to features of the same shape."""
+        if can_fuse(x):
+            return fused_conv(fused_conv(x, self.conv1), self.conv2, added=x)
         return self.conv2(self.conv1(x).relu_()).add_(x)
 
 

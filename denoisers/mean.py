@@ -9,6 +9,7 @@ between them.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import ClassVar, Unpack
 
@@ -63,6 +64,14 @@ class MeanDRUNet(Denoiser):
         self.share = share
         self.first = first
         self.second = second
+
+    def with_share(self, share: float) -> MeanDRUNet:
+        """Return a mean of the same two networks with another share of the second one."""
+        require_between("share", share, 0.0, 1.0)
+        other = copy.copy(self)
+        other.share = share
+        other.config = {**self.config, "share": share}
+        return other
 
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
         """Denoise ``(B, channels, H, W)``; the result has the same shape and is not clipped.

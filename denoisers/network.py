@@ -333,6 +333,11 @@ class Denoiser(nn.Module, ABC):
                 return False
         return True
 
+    @property
+    def core(self) -> Denoiser:
+        """The network whose weights one of another kind starts from: this one, unless it is made of several."""
+        return self
+
     def start_from(self, model: Denoiser) -> None:
         """Take the weights of a network that this one can start from; layers beyond those stay as they are."""
         is_complete = type(self) is type(model) and self.config == model.config

@@ -1,7 +1,8 @@
-r"""How strong the noise of a developed picture is, and how sure it is that there is any.
+r"""How strong the noise of a developed picture is, how sure it is that there is any, and whether a camera finished it.
 
 .. math:: \sigma = \sqrt{K r_{25}}, \qquad
-   w = \frac{1}{1 + e^{-z}}, \qquad z = a + b \ln(255\, r_{25}) - c \ln(r_{75} / r_{50})
+   w = S(a + b \ln(255\, r_{25}) - c \ln(r_{75} / r_{50})), \qquad
+   u = S(e\, (t - \rho_{RGB} - \rho_2)), \qquad S(z) = \frac{1}{1 + e^{-z}}
 
 A network f that is told the level of the noise, its standard deviation, also works where the level is unknown. What it
 then takes away, :math:`x - f(x, 0)`, tells the level: :math:`r_q` is the q-th percentile of its deviation over squares
@@ -11,6 +12,12 @@ are alike, though, and the network does best when it is told the geometric mean 
 Noise lies evenly over a picture and texture does not, so the ratio of two percentiles tells them apart: w is the share
 of the network's correction that is applied, near 1 for a noisy picture and smaller for a clean one. A low level would
 not do instead, since a network that is told next to nothing takes the level for unknown.
+
+u says how sure it is that nobody has finished the picture since it was developed from RAW. Demosaicing makes the noise
+of neighbours alike, but hardly that of pixels two apart, and the colour correction matrix makes that of different
+colours unlike; the denoising, the sharpening and the conversion to luma and chroma in a camera make both alike again.
+:math:`\rho_2` is the correlation at a distance of two pixels and :math:`\rho_{RGB}` the mean one of two colours, both
+of what is removed, in the half of the squares with the least of it.
 
 The constants are chosen on noisy pictures (CC15, developed frames, drawn noise) and on clean photographs.
 """
@@ -30,6 +37,8 @@ USUAL_LEVEL = 20.0 / 255.0
 """The usual level K, a standard deviation on the scale where white is 1."""
 OFFSET, BY_LEVEL, BY_UNEVENNESS = 4.0, 0.6, 11.0
 """The constants a, b and c of the share."""
+STEEPNESS, MOST_CORRELATION = 30.0, 0.34
+"""The constants e and t: where the two correlations add up to more than t, the picture was finished."""
 
 _PARTS, _PART, _SQUARE = 3, 256, 16
 """Parts along each side of a picture that are looked at, their side, and the side of their squares, in pixels."""
@@ -43,10 +52,12 @@ class PictureLevel(NamedTuple):
     Args:
         level: its standard deviation, on the scale where white is 1.
         share: how much of the correction is applied, from 0 for a clean picture to 1 for a noisy one.
+        unfinished: how sure it is that nobody finished the picture after its development, from 0 to 1.
     """
 
     level: float
     share: float
+    unfinished: float = 0.0
 
 
 @torch.inference_mode()
@@ -58,12 +69,22 @@ def estimate_level(network: Any, srgb: Tensor) -> PictureLevel:
     if not getattr(network, "light", False):
         return PictureLevel(white_level(srgb), 1.0)
 
-    quartile, median, upper_quartile = _removed_deviations(network, srgb).clamp_min(_SMALLEST)
+    squares = _removed_squares(network, srgb)
+    percentiles = torch.tensor([0.25, 0.5, 0.75], device=srgb.device)
+    deviations = squares.power.sqrt().quantile(percentiles)
+    quartile, median, upper_quartile = deviations.clamp_min(_SMALLEST)
+
     unevenness = (upper_quartile / median).log()
-    logit = OFFSET + BY_LEVEL * (255.0 * quartile).log() - BY_UNEVENNESS * unevenness
+    share = OFFSET + BY_LEVEL * (255.0 * quartile).log() - BY_UNEVENNESS * unevenness
+
+    even = squares.power <= median.square()
+    power = squares.power[even].sum().clamp_min(_SMALLEST**2)
+    of_colours = squares.of_colours[even].sum() / power
+    two_apart = squares.two_apart[even].sum() / power
+    unfinished = STEEPNESS * (MOST_CORRELATION - of_colours - two_apart.clamp_min(0.0))
 
     level = (USUAL_LEVEL * quartile).sqrt()
-    return PictureLevel(float(level), float(logit.sigmoid()))
+    return PictureLevel(float(level), float(share.sigmoid()), float(unfinished.sigmoid()))
 
 
 def white_level(srgb: Tensor) -> float:
@@ -74,18 +95,42 @@ def white_level(srgb: Tensor) -> float:
     return float(estimate_sigma(srgb[0].cpu().numpy(), channel_axis=0, average_sigmas=True))
 
 
-def _removed_deviations(network: Any, srgb: Tensor) -> Tensor:
-    """The quartiles ``(3,)`` of the deviation, over small squares, of what the network removes at an unknown level."""
+class _Squares(NamedTuple):
+    """Means over small squares, each ``(N,)``, of products of what a network removes.
+
+    Attributes:
+        power: its square, the mean of the colours.
+        of_colours: the product of two colours, the mean of the three pairs.
+        two_apart: the product of pixels that are two apart, the mean of rows and columns and of the colours.
+    """
+
+    power: Tensor
+    of_colours: Tensor
+    two_apart: Tensor
+
+
+def _removed_squares(network: Any, srgb: Tensor) -> _Squares:
+    """Measure what the network removes at an unknown level, in squares of the parts of a picture."""
     side = min(_SQUARE, *srgb.shape[-2:])
 
-    powers = []
+    parts = []
     for part in _spread_parts(srgb):
-        correction = part - network(part, torch.zeros_like(part))
-        power = correction.float().square().mean(1)
-        powers.append(F.avg_pool2d(power, side).flatten())
+        removed = (part - network(part, torch.zeros_like(part))).float()
+        power = removed.square().mean(1, keepdim=True)
 
-    deviations = torch.cat(powers).sqrt()
-    return deviations.quantile(torch.tensor([0.25, 0.5, 0.75], device=deviations.device))
+        colours = removed.shape[1]
+        of_all = removed.mean(1, keepdim=True).square()
+        of_colours = (colours * of_all - power) / (colours - 1)
+
+        below = F.pad(removed, (0, 0, 0, 2))[..., 2:, :]
+        beside = F.pad(removed, (0, 2))[..., 2:]
+        two_apart = (removed * (below + beside) / 2).mean(1, keepdim=True)
+
+        products = torch.cat([power, of_colours, two_apart], dim=1)
+        parts.append(F.avg_pool2d(products, side).flatten(2))
+
+    power, of_colours, two_apart = torch.cat(parts, dim=2)[0]
+    return _Squares(power, of_colours, two_apart)
 
 
 def _spread_parts(srgb: Tensor) -> Iterator[Tensor]:

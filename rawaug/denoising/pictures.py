@@ -3,7 +3,8 @@ r"""What denoises developed pictures, sRGB ``(1, 3, H, W)`` in [0, 1], beside :c
 .. math:: d = x + w\, (f(x, s \sigma) - x)
 
 A network f is told the level of the noise, its standard deviation :math:`\sigma`, and the share w of its correction is
-applied; both are estimated from the picture, see :mod:`rawaug.denoising.picture_levels`. The strength s is 1 unless the
+applied; both are estimated from the picture, see :mod:`rawaug.denoising.picture_levels`, as is the share of the second
+network in a mean of two. The strength s is 1 unless the
 user says otherwise. A single network that estimates the level sees the picture twice, upright and turned by a quarter,
 and the mean is taken: half of what the self-ensemble gains, the mean of eight turns as for RAW.
 """
@@ -20,6 +21,7 @@ from torch import Tensor, nn
 
 import denoisers
 from denoisers.classical import FILTERS
+from denoisers.mean import MeanDRUNet
 from rawaug import bayer
 from rawaug.denoising.base import ImageDenoiser, Noisy, progress_by, read_named
 from rawaug.denoising.picture_levels import PictureLevel, estimate_level, white_level
@@ -43,9 +45,10 @@ class PictureDenoiser(ImageDenoiser):
     is told this level, in units of 1/255, every time.
 
     Attributes:
-        run: ``run(srgb, level) -> srgb``, called on ``device``; the level is a standard deviation, white at 1.
+        run: ``run(srgb, noise) -> srgb``, called on ``device`` with the noise that is told or estimated.
         estimate: estimates the level of a picture where none is told.
         level: what it is told every time; None for the estimate.
+        is_mean: whether it is the mean of two networks, whose shares depend on the picture, whatever level is told.
         views: 1, 2, 4 or 8 turns of the picture; by default as many as the network asks for.
         strength: factor on the estimated level, 0 to 10: 2 removes more, 0.5 less, 0 nothing.
 
@@ -61,9 +64,10 @@ class PictureDenoiser(ImageDenoiser):
     default: ClassVar[str] = "rawaug-srgb"
     files: ClassVar[str] = "or a .safetensors of rawaug run srgb or of FFDNet's authors"
 
-    run: Callable[[Tensor, float], Tensor] = field(repr=False)
+    run: Callable[[Tensor, PictureLevel], Tensor] = field(repr=False)
     estimate: Callable[[Tensor], PictureLevel] = field(repr=False)
     level: float | None = None
+    is_mean: bool = False
 
     def __post_init__(self) -> None:
         if self.views not in TURNS:
@@ -107,15 +111,18 @@ class PictureDenoiser(ImageDenoiser):
     def _denoise(self, srgb: Tensor) -> Tensor:
         """One turn of the picture at the level that is told, or at the one that is estimated."""
         if not self.reads_levels:
-            return self.run(srgb, 0.0)
-        if self.level is not None:
-            return self.run(srgb, self.level)
-        if self.strength == 0.0:
+            return self.run(srgb, PictureLevel(0.0, 1.0))
+        if self.level is None and self.strength == 0.0:
             return srgb
 
-        noise = self.estimate(srgb)
-        denoised = self.run(srgb, self.strength * noise.level)
-        return torch.lerp(srgb, denoised, noise.share)
+        if self.level is None:
+            noise = self.estimate(srgb)
+            noise = noise._replace(level=self.strength * noise.level)
+        elif self.is_mean:
+            noise = self.estimate(srgb)._replace(level=self.level, share=1.0)
+        else:
+            noise = PictureLevel(self.level, 1.0)
+        return torch.lerp(srgb, self.run(srgb, noise), noise.share)
 
 
 # -- by what it is made of ---------------------------------------------------------------------------------------------
@@ -125,13 +132,22 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> Pictu
     """A network of sRGB in tiles; one that reads levels is told the picture's."""
     network = network.eval()
     reads_levels = bool(getattr(network, "reads_variance", False))
+    is_mean = isinstance(network, MeanDRUNet)
+
+    run: Callable[..., Tensor] = _denoise_blindly
+    if is_mean:
+        run = _denoise_by_mean
+    elif reads_levels:
+        run = _denoise_at
+
     return PictureDenoiser(
         name=name,
         network=network,
         info=info,
-        run=partial(_denoise_at if reads_levels else _denoise_blindly, network),
+        run=partial(run, network),
         estimate=partial(estimate_level, network),
         reads_levels=reads_levels,
+        is_mean=is_mean,
         views=getattr(network, "turns", 1),
     )
 
@@ -140,8 +156,8 @@ def _of_filter(spec: Spec) -> PictureDenoiser:
     """A classical filter of white noise on the three colours, which is told scikit-image's estimate of its level."""
     denoiser = FILTERS.make(spec)
 
-    def run(srgb: Tensor, level: float) -> Tensor:
-        deviation = max(_LOWEST, level)
+    def run(srgb: Tensor, noise: PictureLevel) -> Tensor:
+        deviation = max(_LOWEST, noise.level)
         planes = (srgb[0] / deviation).permute(1, 2, 0).contiguous().numpy()
         return torch.from_numpy(deviation * denoiser.denoise(planes)).permute(2, 0, 1)[None].float()
 
@@ -166,12 +182,18 @@ def _split_level(spec: str) -> tuple[str, float | None]:
     return name, level
 
 
-def _denoise_blindly(network: nn.Module, srgb: Tensor, level: float) -> Tensor:
+def _denoise_blindly(network: nn.Module, srgb: Tensor, noise: PictureLevel) -> Tensor:
     """The picture denoised by a network that reads no level."""
     return denoisers.denoise_tiles(network, srgb, each=progress_by("tile"))
 
 
-def _denoise_at(network: nn.Module, srgb: Tensor, level: float) -> Tensor:
+def _denoise_at(network: nn.Module, srgb: Tensor, noise: PictureLevel) -> Tensor:
     """The picture denoised by a network that is told the deviation of its noise, 0 for unknown."""
-    variance = srgb.new_full((1, 1, 1, 1), level**2).expand_as(srgb)
+    variance = srgb.new_full((1, 1, 1, 1), noise.level**2).expand_as(srgb)
     return denoisers.denoise_tiles(network, srgb, variance, tile=_TILE, each=progress_by("tile")).float()
+
+
+def _denoise_by_mean(network: MeanDRUNet, srgb: Tensor, noise: PictureLevel) -> Tensor:
+    """The picture denoised by the mean of two networks: the second alone where nobody has finished the picture."""
+    share = network.share + (1.0 - network.share) * noise.unfinished
+    return _denoise_at(network.with_share(share), srgb, noise)

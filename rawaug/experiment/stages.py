@@ -246,7 +246,7 @@ def _info_of_arm(experiment: Experiment, camera: Camera, arm: str, seed: int, ke
     steps = recipe.loop_of(arm).steps
     cfa = str(camera.pattern(arm))
     info = {"key": key, "cfa": cfa, "noise": noise, "steps": steps, "seed": seed, "arm": arm}
-    if not recipe.arms[arm].sees_clean:
+    if recipe.arms[arm].estimator != "supervised":
         info["estimator"] = recipe.arms[arm].estimator
     if start is not None:
         info["start"] = recipe.network_of(arm).start

@@ -145,8 +145,9 @@ class ArmConfig:
             Coloured, or {name, settings}, see :mod:`rawaug.training.srgb_noise`.
         srgb_share: share of the samples that have ``srgb_noise``; the rest have the camera's.
         told: of sRGB targets: what a network that reads a level of noise is told of it; null for nothing.
-        estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
-            and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
+        estimator: training target, a name or {name, settings}: supervised uses clean frames; distilled uses
+            what another denoiser makes of the noisy ones; noisier, noise2noise, r2r and neighbor2neighbor use noisy
+            frames only, see :mod:`rawaug.training.estimators`.
         denoiser: this arm's network, in place of the recipe's; ``{start: rawaug-small}`` fine-tunes a shipped one.
         learning_rate: in place of ``train.learning_rate``; null takes that one.
         weigh: in place of ``train.weigh``; null takes that one.

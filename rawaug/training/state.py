@@ -62,6 +62,8 @@ def first_network(config: DenoiserConfig, seed: int) -> Denoiser:
 
     network = denoisers.build(config.name, **settings)
     if not network.can_start_from(start):
+        start = start.core
+    if not network.can_start_from(start):
         raise ValueError(
             f"denoiser.start: {config.start} is a {type(start).__name__} with {start.config}, not a "
             f"{config.name} with {network.config}; leave denoiser.name and denoiser.settings out to take the file's"

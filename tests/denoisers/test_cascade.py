@@ -13,6 +13,8 @@ import denoisers
 from denoisers.domains import fit_levels
 from denoisers.ensemble import to_view
 from rawaug.bayer import CFA, noise_variance
+from rawaug.training.config import DenoiserConfig
+from rawaug.training.state import first_network
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -128,11 +130,31 @@ def test_blocks_of_each_scale_grow_from_weights_with_fewer_and_change_nothing_at
     again, _ = denoisers.load(tmp_path / "cascade.safetensors")
     assert again.config == large.config
 
-    assert not small.can_start_from(large)
-    assert not denoisers.CascadeDRUNet(width=4, blocks=[4, 1, 1, 1]).can_start_from(large)
-    assert denoisers.CascadeDRUNet(width=4, blocks=3, views=1).can_start_from(large)
     with pytest.raises(ValueError, match="blocks"):
         denoisers.CascadeDRUNet(width=4, blocks=[3, 2])
+
+
+def test_a_cascade_of_fewer_blocks_takes_the_first_of_each_scale(base: denoisers.DRUNet) -> None:
+    large = denoisers.CascadeDRUNet(width=4, blocks=[3, 2, 1, 1]).eval()
+    large.start_from(base)
+    small = denoisers.CascadeDRUNet(width=4, blocks=[2, 1, 1, 0], views=4).eval()
+    assert small.can_start_from(large)
+
+    small.start_from(large)
+    for name, weight in small.state_dict().items():
+        assert torch.equal(weight, large.state_dict()[name]), name
+
+
+def test_a_network_of_another_kind_starts_from_the_first_of_a_cascade(base: denoisers.DRUNet, tmp_path: Path) -> None:
+    cascade = denoisers.CascadeDRUNet(width=4).eval()
+    cascade.start_from(base)
+    denoisers.save(cascade, tmp_path / "cascade.safetensors", {})
+
+    settings = {**base.config, "blocks": 2}
+    network = first_network(DenoiserConfig("DRUNet", settings, str(tmp_path / "cascade.safetensors")), seed=0)
+    assert torch.equal(network.state_dict()["tail.weight"], base.tail.weight)
+    with pytest.raises(ValueError, match="start"):
+        first_network(DenoiserConfig("UNet", {"width": 4}, str(tmp_path / "cascade.safetensors")), seed=0)
 
 
 def test_wrong_settings_and_inputs_are_refused(base: denoisers.DRUNet) -> None:

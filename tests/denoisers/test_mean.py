@@ -31,6 +31,17 @@ def test_the_result_is_the_mean_by_the_share() -> None:
         torch.testing.assert_close(network(noisy, variance), (1 - share) * first + share * second)
 
 
+def test_another_share_leaves_the_network_as_it_is() -> None:
+    noisy = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    variance = torch.full_like(noisy, 1e-3)
+    network = two_networks(0.25)
+    other = network.with_share(1.0)
+    torch.testing.assert_close(other(noisy, variance), network.second(noisy, variance))
+    assert (network.share, network.config["share"], other.config["share"]) == (0.25, 0.25, 1.0)
+    with pytest.raises(ValueError, match="share"):
+        network.with_share(1.5)
+
+
 def test_it_is_saved_and_loaded_and_takes_one_turn_where_a_single_network_takes_two(tmp_path: Path) -> None:
     network = two_networks()
     denoisers.save(network, tmp_path / "mean.safetensors", {})

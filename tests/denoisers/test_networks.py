@@ -17,7 +17,8 @@ from torch.nn import functional as F
 import denoisers
 from denoisers import DHDN, PMRID, CycleISPDenoiser, Denoiser, DnCNN, DRUNet, NAFNet, UNet
 from denoisers.defects import mend_planes
-from denoisers.layers import pad_to_multiple
+from denoisers.drunet import ResidualBlock
+from denoisers.layers import can_fuse, pad_to_multiple
 
 Make = Callable[..., Any]
 
@@ -478,3 +479,28 @@ def test_a_pyramid_is_built_again_and_a_defect_stays_small() -> None:
     hot[0, 2, 10, 11] = 0.9
     changed = net(hot, 1e-3 * hot + 1e-5) - net(noisy, 1e-3 * noisy + 1e-5)
     assert changed.abs().max() < 0.1
+
+
+def test_a_fused_block_gives_what_its_layers_give_one_by_one() -> None:
+    block = ResidualBlock(8).eval()
+    generator = torch.Generator().manual_seed(0)
+    for layer in (block.conv1, block.conv2):
+        layer.weight.data.normal_(0.0, 0.1, generator=generator)
+    features = torch.randn(2, 8, 20, 24, generator=generator)
+    expected = features + block.conv2(block.conv1(features).relu())
+
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        for layout in (torch.contiguous_format, torch.channels_last):
+            given = features.bfloat16().to(memory_format=layout)
+            assert can_fuse(given)
+            kept = given.clone()
+            assert (block(given).float() - expected).abs().max() < 0.02 * expected.abs().max()
+            assert torch.equal(given, kept)
+
+
+def test_layers_are_not_fused_where_gradients_or_other_types_are_wanted() -> None:
+    features = torch.rand(1, 8, 16, 16)
+    assert not can_fuse(features.bfloat16())
+    with torch.no_grad():
+        assert not can_fuse(features)
+        assert not can_fuse(features.bfloat16().to("meta"))

@@ -13,15 +13,17 @@ from torch import Tensor
 
 import denoisers
 from rawaug import bayer
+from rawaug.bayer.demosaicing import demosaic
 from rawaug.commands.denoise import run as denoise
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.files import denoise_folder
-from rawaug.denoising.picture_levels import estimate_level
+from rawaug.denoising.picture_levels import PictureLevel, estimate_level
 from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.denoising.sources import PictureFiles, kind_of
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, register
 from rawaug.io.pictures import read_picture, write_picture
+from rawaug.plugin.finishing import blur
 
 pytest.importorskip("OpenImageIO")
 
@@ -83,6 +85,36 @@ def test_even_noise_is_removed_and_texture_in_places_is_kept() -> None:
 
     assert even.share > 0.8
     assert uneven.share < 0.3
+
+
+def test_noise_that_was_only_demosaiced_is_told_from_noise_that_was_finished() -> None:
+    generator = torch.Generator().manual_seed(0)
+    gains = torch.tensor([2.0, 1.0, 1.0, 1.6])[:, None, None]  # of the white balance
+    noise = 0.02 * gains * torch.randn(1, 4, 128, 128, generator=generator)
+    mosaic = bayer.unpack(0.4 + noise, bayer.CFA.RGGB)
+    matrix = torch.tensor([[1.7, -0.5, -0.2], [-0.2, 1.6, -0.4], [0.0, -0.6, 1.6]])
+    demosaiced = torch.einsum("ij,bjhw->bihw", matrix, demosaic(mosaic, bayer.CFA.RGGB, "malvar"))
+    luma = demosaiced.mean(1, keepdim=True)
+    finished = luma + blur(demosaiced - luma, torch.tensor([3.0]))
+
+    network = denoisers.from_pretrained("rawaug-srgb")
+    assert estimate_level(network, demosaiced).unfinished > 0.6
+    assert estimate_level(network, finished).unfinished < 0.2
+
+
+def test_a_picture_that_nobody_finished_gets_the_second_network_alone() -> None:
+    denoiser = PictureDenoiser.of("rawaug-srgb")
+    network = denoisers.from_pretrained("rawaug-srgb")
+    assert isinstance(network, denoisers.MeanDRUNet)
+    picture = noisy()[None]
+    variance = torch.full_like(picture, 0.03**2)
+
+    def result(unfinished: float) -> Tensor:
+        with torch.inference_mode():
+            return denoiser.run(picture, PictureLevel(0.03, 1.0, unfinished))
+
+    torch.testing.assert_close(result(1.0), network.second(picture, variance), atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(result(0.0), network(picture, variance), atol=1e-5, rtol=0.0)
 
 
 def test_a_self_ensemble_denoises_a_turned_picture_to_the_turned_result() -> None:
