@@ -1,13 +1,14 @@
 r"""How strong the noise of a developed picture is, how sure it is that there is any, and whether a camera finished it.
 
-.. math:: \sigma = \sqrt{K r_{25}}, \qquad
+.. math:: \sigma = \sqrt{(1 - u / 2) K r_{25}}, \qquad
    w = S(a + b \ln(255\, r_{25}) - c \ln(r_{75} / r_{50})), \qquad
    u = S(e\, (t - \rho_{RGB} - \rho_2)), \qquad S(z) = \frac{1}{1 + e^{-z}}
 
 A network f that is told the level of the noise, its standard deviation, also works where the level is unknown. What it
 then takes away, :math:`x - f(x, 0)`, tells the level: :math:`r_q` is the q-th percentile of its deviation over squares
 of 16 x 16 pixels. Texture raises the upper percentiles, so the lower quartile follows the noise. Noise and fine detail
-are alike, though, and the network does best when it is told the geometric mean of that quartile and a usual level K.
+are alike, though, and the network does best when it is told the geometric mean of that quartile and a usual level K,
+half of K where u is 1.
 
 Noise lies evenly over a picture and texture does not, so the ratio of two percentiles tells them apart: w is the share
 of the network's correction that is applied, near 1 for a noisy picture and smaller for a clean one. A low level would
@@ -81,10 +82,11 @@ def estimate_level(network: Any, srgb: Tensor) -> PictureLevel:
     power = squares.power[even].sum().clamp_min(_SMALLEST**2)
     of_colours = squares.of_colours[even].sum() / power
     two_apart = squares.two_apart[even].sum() / power
-    unfinished = STEEPNESS * (MOST_CORRELATION - of_colours - two_apart.clamp_min(0.0))
+    correlation = of_colours + two_apart.clamp_min(0.0)
+    unfinished = (STEEPNESS * (MOST_CORRELATION - correlation)).sigmoid()
 
-    level = (USUAL_LEVEL * quartile).sqrt()
-    return PictureLevel(float(level), float(share.sigmoid()), float(unfinished.sigmoid()))
+    level = ((1.0 - unfinished / 2.0) * USUAL_LEVEL * quartile).sqrt()
+    return PictureLevel(float(level), float(share.sigmoid()), float(unfinished))
 
 
 def white_level(srgb: Tensor) -> float:
