@@ -2,7 +2,7 @@ r"""How strong the noise of a developed picture is, how sure it is that there is
 
 .. math:: \sigma = \sqrt{(1 - u / 2) K r_{25}}, \qquad
    w = S(a + b \ln(255\, r_{25}) - c \ln(r_{75} / r_{50})), \qquad
-   u = S(e\, (t - \rho_{RGB} - \rho_2)), \qquad S(z) = \frac{1}{1 + e^{-z}}
+   u = S(e\, (\rho_1 - t_1))\, S(e\, (t_2 - \rho_2 - \rho_{RGB})), \qquad S(z) = \frac{1}{1 + e^{-z}}
 
 A network f that is told the level of the noise, its standard deviation, also works where the level is unknown. What it
 then takes away, :math:`x - f(x, 0)`, tells the level: :math:`r_q` is the q-th percentile of its deviation over squares
@@ -17,8 +17,8 @@ not do instead, since a network that is told next to nothing takes the level for
 u says how sure it is that nobody has finished the picture since it was developed from RAW. Demosaicing makes the noise
 of neighbours alike, but hardly that of pixels two apart, and the colour correction matrix makes that of different
 colours unlike; the denoising, the sharpening and the conversion to luma and chroma in a camera make both alike again.
-:math:`\rho_2` is the correlation at a distance of two pixels and :math:`\rho_{RGB}` the mean one of two colours, both
-of what is removed, in the half of the squares with the least of it.
+:math:`\rho_1` and :math:`\rho_2` are the correlations at a distance of one and of two pixels, :math:`\rho_{RGB}` the
+mean one of two colours, all of what is removed, in the half of the squares with the least of it.
 
 The constants are chosen on noisy pictures (CC15, developed frames, drawn noise) and on clean photographs.
 """
@@ -38,8 +38,8 @@ USUAL_LEVEL = 20.0 / 255.0
 """The usual level K, a standard deviation on the scale where white is 1."""
 OFFSET, BY_LEVEL, BY_UNEVENNESS = 4.0, 0.6, 11.0
 """The constants a, b and c of the share."""
-STEEPNESS, MOST_CORRELATION = 30.0, 0.34
-"""The constants e and t: where the two correlations add up to more than t, the picture was finished."""
+STEEPNESS, LEAST_OF_NEIGHBOURS, MOST_OF_OTHERS = 30.0, 0.25, 0.34
+"""The constants e, t1 and t2: below t1 the picture was never demosaiced, above t2 it was finished."""
 
 _PARTS, _PART, _SQUARE = 3, 256, 16
 """Parts along each side of a picture that are looked at, their side, and the side of their squares, in pixels."""
@@ -80,10 +80,10 @@ def estimate_level(network: Any, srgb: Tensor) -> PictureLevel:
 
     even = squares.power <= median.square()
     power = squares.power[even].sum().clamp_min(_SMALLEST**2)
-    of_colours = squares.of_colours[even].sum() / power
-    two_apart = squares.two_apart[even].sum() / power
-    correlation = of_colours + two_apart.clamp_min(0.0)
-    unfinished = (STEEPNESS * (MOST_CORRELATION - correlation)).sigmoid()
+    neighbours = squares.one_apart[even].sum() / power
+    others = squares.two_apart[even].sum().clamp_min(0.0) / power + squares.of_colours[even].sum() / power
+    was_demosaiced = (STEEPNESS * (neighbours - LEAST_OF_NEIGHBOURS)).sigmoid()
+    unfinished = was_demosaiced * (STEEPNESS * (MOST_OF_OTHERS - others)).sigmoid()
 
     level = ((1.0 - unfinished / 2.0) * USUAL_LEVEL * quartile).sqrt()
     return PictureLevel(float(level), float(share.sigmoid()), float(unfinished))
@@ -103,11 +103,13 @@ class _Squares(NamedTuple):
     Attributes:
         power: its square, the mean of the colours.
         of_colours: the product of two colours, the mean of the three pairs.
-        two_apart: the product of pixels that are two apart, the mean of rows and columns and of the colours.
+        one_apart: the product of neighbours, the mean of rows and columns and of the colours.
+        two_apart: the same of pixels that are two apart.
     """
 
     power: Tensor
     of_colours: Tensor
+    one_apart: Tensor
     two_apart: Tensor
 
 
@@ -124,15 +126,17 @@ def _removed_squares(network: Any, srgb: Tensor) -> _Squares:
         of_all = removed.mean(1, keepdim=True).square()
         of_colours = (colours * of_all - power) / (colours - 1)
 
-        below = F.pad(removed, (0, 0, 0, 2))[..., 2:, :]
-        beside = F.pad(removed, (0, 2))[..., 2:]
-        two_apart = (removed * (below + beside) / 2).mean(1, keepdim=True)
+        products = [power, of_colours, _times_shifted(removed, 1), _times_shifted(removed, 2)]
+        parts.append(F.avg_pool2d(torch.cat(products, dim=1), side).flatten(2))
 
-        products = torch.cat([power, of_colours, two_apart], dim=1)
-        parts.append(F.avg_pool2d(products, side).flatten(2))
+    return _Squares(*torch.cat(parts, dim=2)[0])
 
-    power, of_colours, two_apart = torch.cat(parts, dim=2)[0]
-    return _Squares(power, of_colours, two_apart)
+
+def _times_shifted(removed: Tensor, distance: int) -> Tensor:
+    """Multiply the pixels of ``(1, 3, h, w)`` by those below and beside: the mean of both and of the colours."""
+    below = F.pad(removed, (0, 0, 0, distance))[..., distance:, :]
+    beside = F.pad(removed, (0, distance))[..., distance:]
+    return (removed * (below + beside) / 2).mean(1, keepdim=True)
 
 
 def _spread_parts(srgb: Tensor) -> Iterator[Tensor]:
