@@ -90,6 +90,9 @@ def verdict(results: Mapping[str, Sequence[Mapping[str, Summary]]], others: Mapp
         reasons = [f"{arm}, the best arm, scores {-gain:.2f} dB less"]
 
     reasons.append(_how_sure(runs, scores, gain))
+    if use == arm:
+        for other in _arms_as_good(arm, runs_by_arm):
+            reasons.append(f"{other} is as good within the noise of the seeds")
     if gain_srgb is not None:
         reasons.append(f"{gain_srgb:+.2f} dB after development")
 
@@ -145,6 +148,21 @@ def _how_sure(runs: Sequence[Summary], rival: Summary, gain: float) -> str:
         if (image.get("psnr") or 0.0) > (other.get("psnr") or 0.0):
             higher += 1
     return f"higher on {higher} of {count_of(frames, 'frame')}, one seed"
+
+
+def _arms_as_good(arm: str, runs_by_arm: Mapping[str, Sequence[Summary]]) -> list[str]:
+    """The other arms whose mean is lower than that of ``arm`` by no more than the larger deviation of the seeds."""
+    as_good = []
+    for other, runs in runs_by_arm.items():
+        if other == arm or min(len(runs), len(runs_by_arm[arm])) < 2:
+            continue
+
+        deficit = _mean(runs_by_arm[arm], "psnr") - _mean(runs, "psnr")
+        spread = max(stdev(run["psnr"] for run in both) for both in (runs, runs_by_arm[arm]))
+        if deficit <= spread:
+            as_good.append(other)
+
+    return as_good
 
 
 def _disagreement(arm: str, rival: str, gain: float, gain_srgb: float | None) -> str:

@@ -250,6 +250,8 @@ def dslr_table(nikon: Mapping[str, Mapping[str, Any]], canon: Mapping[str, Mappi
         paper = published.TABLE_2.get(published.ISP_NAMES.get(name, ""), (None, None))
         cells: dict[str, Any] = {}
         for camera, rows, figure in (("Nikon", nikon, paper[0]), ("Canon", canon, paper[1])):
+            if not rows:
+                continue
             row = rows.get(name, {})
             cells[f"{camera} PSNR_r"] = row.get("psnr_r")
             cells[f"{camera} PSNR_r, paper"] = figure

@@ -67,6 +67,17 @@ def test_the_verdict_says_whether_the_gain_is_more_than_noise(
     assert re.match(said, why) and why.startswith(f"Use {chosen}: ")
 
 
+@pytest.mark.parametrize(("psnr", "is_named"), [(40.0, True), (39.5, False)])
+def test_the_verdict_names_arms_that_are_as_good_within_the_noise_of_the_seeds(psnr: float, is_named: bool) -> None:
+    def runs(mean: float) -> list[dict[str, Any]]:
+        return [{"plain": {"psnr": mean + change, "images": []}} for change in (-0.1, 0.1)]
+
+    arms = {"real": runs(psnr), "uniform": runs(40.1)}
+    use, sentence = verdict(arms, {"NLM": {"psnr": 38.0, "images": []}})
+    assert use == "uniform"
+    assert ("real is as good" in sentence) == is_named
+
+
 def test_the_table_names_every_arm(capsys: pytest.CaptureFixture[str]) -> None:
     assert (mean_and_spread([40.123], 2), mean_and_spread([40.0, 41.0], 2)) == ("40.12", "40.50 ± 0.71")
     scores = {"psnr": 40.0, "ssim": 0.95, "psnr_noisy": 33.0, "ssim_noisy": 0.8}

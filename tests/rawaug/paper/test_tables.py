@@ -57,7 +57,8 @@ def test_our_figures_stand_beside_the_papers(folder: Path) -> None:
     assert found["table1"]["unet (U-Net)"]["loss still falling"] == pytest.approx(10.0)
 
     second = found["table2"]["invisp, own rendering"]
-    assert second["Canon PSNR_r"] == [44.0] and second["Canon balanced"] == [45.0] and second["Nikon PSNR_r"] is None
+    assert second["Canon PSNR_r"] == [44.0] and second["Canon balanced"] == [45.0]
+    assert not any(column.startswith("Nikon") for column in second), "a camera that was not run"
 
     third = found["table3"]
     assert list(third) == ["Noisy", "WNNM", "DHDN", "Ours-f", "Ours"], "the paper's order"
