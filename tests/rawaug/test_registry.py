@@ -17,7 +17,7 @@ from rawaug.training.losses import LOSSES
 def test_every_kind_finds_the_things_in_its_package() -> None:
     assert {"NonLocalMeans", "Wavelet", "TotalVariation", "BM3D", "KSVD", "WNNM", "GLIDE"} == set(FILTERS)
     assert {"demo", "fivek", "rawir", "sidd", "siddplus", "zurich"} <= set(DATASETS)
-    assert {"supervised", "noisier", "noise2noise", "r2r", "neighbor2neighbor"} == set(ESTIMATORS)
+    assert {"supervised", "distilled", "noisier", "noise2noise", "r2r", "neighbor2neighbor"} == set(ESTIMATORS)
     assert {"l1", "l2", "rms", "log_mse"} == set(LOSSES)
     assert {name: method.name for name, method in BASELINES.items()} == {name: name for name in BASELINES}
 
