@@ -33,7 +33,7 @@ class Distilled(Supervised):
 
     Args:
         teacher: the name of a shipped denoiser, or a file, that takes and gives what the trained network does.
-        share: of the teacher in the target, above 0 up to 1; the rest is the clean picture.
+        share: of the teacher in the target, from 0 to 1; the rest is the clean picture.
     """
 
     def __init__(self, teacher: str = "rawaug-best", share: float = 1.0) -> None:
