@@ -4,9 +4,9 @@ r"""What denoises developed pictures, sRGB ``(1, 3, H, W)`` in [0, 1], beside :c
 
 A network f is told the level of the noise, its standard deviation :math:`\sigma`, and the share w of its correction is
 applied; both are estimated from the picture, see :mod:`rawaug.denoising.picture_levels`, as is the share of the second
-network in a mean of two. The strength s is 1 unless the
-user says otherwise. A single network that estimates the level sees the picture twice, upright and turned by a quarter,
-and the mean is taken: half of what the self-ensemble gains, the mean of eight turns as for RAW.
+network in a mean of two. The strength s is 1 unless the user says otherwise. A single network that estimates the level
+sees the picture twice, upright and turned by a quarter, and the mean is taken: half of what the self-ensemble gains,
+the mean of eight turns as for RAW.
 """
 
 from __future__ import annotations
@@ -48,7 +48,6 @@ class PictureDenoiser(ImageDenoiser):
         run: ``run(srgb, noise) -> srgb``, called on ``device`` with the noise that is told or estimated.
         estimate: estimates the level of a picture where none is told.
         level: what it is told every time; None for the estimate.
-        is_mean: whether it is the mean of two networks, whose shares depend on the picture, whatever level is told.
         views: 1, 2, 4 or 8 turns of the picture; by default as many as the network asks for.
         strength: factor on the estimated level, 0 to 10: 2 removes more, 0.5 less, 0 nothing.
 
@@ -67,7 +66,6 @@ class PictureDenoiser(ImageDenoiser):
     run: Callable[[Tensor, PictureLevel], Tensor] = field(repr=False)
     estimate: Callable[[Tensor], PictureLevel] = field(repr=False)
     level: float | None = None
-    is_mean: bool = False
 
     def __post_init__(self) -> None:
         if self.views not in TURNS:
@@ -118,7 +116,7 @@ class PictureDenoiser(ImageDenoiser):
         if self.level is None:
             noise = self.estimate(srgb)
             noise = noise._replace(level=self.strength * noise.level)
-        elif self.is_mean:
+        elif isinstance(self.network, MeanDRUNet):  # whose shares depend on the picture, whatever level is told
             noise = self.estimate(srgb)._replace(level=self.level, share=1.0)
         else:
             noise = PictureLevel(self.level, 1.0)
@@ -132,10 +130,9 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> Pictu
     """A network of sRGB in tiles; one that reads levels is told the picture's."""
     network = network.eval()
     reads_levels = bool(getattr(network, "reads_variance", False))
-    is_mean = isinstance(network, MeanDRUNet)
 
     run: Callable[..., Tensor] = _denoise_blindly
-    if is_mean:
+    if isinstance(network, MeanDRUNet):
         run = _denoise_by_mean
     elif reads_levels:
         run = _denoise_at
@@ -147,7 +144,6 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> Pictu
         run=partial(run, network),
         estimate=partial(estimate_level, network),
         reads_levels=reads_levels,
-        is_mean=is_mean,
         views=getattr(network, "turns", 1),
     )
 

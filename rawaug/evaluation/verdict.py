@@ -152,15 +152,19 @@ def _how_sure(runs: Sequence[Summary], rival: Summary, gain: float) -> str:
 
 def _arms_as_good(arm: str, runs_by_arm: Mapping[str, Sequence[Summary]]) -> list[str]:
     """The other arms whose mean is lower than that of ``arm`` by no more than the larger deviation of the seeds."""
-    as_good = []
-    for other, runs in runs_by_arm.items():
-        if other == arm or min(len(runs), len(runs_by_arm[arm])) < 2:
-            continue
+    scores = {}
+    for name, runs in runs_by_arm.items():
+        if len(runs) > 1:
+            scores[name] = [run["psnr"] for run in runs]
+    if arm not in scores:
+        return []
 
-        deficit = _mean(runs_by_arm[arm], "psnr") - _mean(runs, "psnr")
-        spread = max(stdev(run["psnr"] for run in both) for both in (runs, runs_by_arm[arm]))
-        if deficit <= spread:
-            as_good.append(other)
+    best = scores.pop(arm)
+    as_good = []
+    for name, others in scores.items():
+        spread = max(stdev(best), stdev(others))
+        if fmean(best) - fmean(others) <= spread:
+            as_good.append(name)
 
     return as_good
 

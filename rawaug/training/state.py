@@ -61,14 +61,15 @@ def first_network(config: DenoiserConfig, seed: int) -> Denoiser:
         return start.train()
 
     network = denoisers.build(config.name, **settings)
+    source = start
     if not network.can_start_from(start):
-        start = start.core
-    if not network.can_start_from(start):
+        source = start.core
+    if not network.can_start_from(source):
         raise ValueError(
             f"denoiser.start: {config.start} is a {type(start).__name__} with {start.config}, not a "
             f"{config.name} with {network.config}; leave denoiser.name and denoiser.settings out to take the file's"
         )
-    network.start_from(start)
+    network.start_from(source)
     return network.train()
 
 
