@@ -1,6 +1,7 @@
 """RAW denoisers: networks, classical methods, self-ensemble, tiles, files of weights.
 
-Every one is called as ``model(noisy, variance=None) -> denoised``, all ``(B, 4, h, w)`` packed RAW (R, Gr, Gb, B).
+Each of them is called as ``model(noisy, variance=None) -> denoised``. All three tensors are packed RAW ``(B, 4, h, w)``
+in the order R, Gr, Gb, B.
 """
 
 from denoisers.cascade import CascadeDRUNet

@@ -2,11 +2,11 @@ r"""A cascade of two DRUNets: the second corrects the result of the first, and s
 
 .. math:: a = f(y), \qquad d = T_k^{-1}(T_k a + g(T_k a,\ T y - T a))
 
-T is the Anscombe transform for the levels of the noise, and T_k the one for levels that are k times as high. f leaves
-a little noise, which has the width of a few pixels and looks like texture to a network that meets it beside all the
-noise of y. g meets it alone, told that the noise has k times its variance. Without any training, with g = f, two steps
-are better than one in strong noise and worse at base ISO, where texture goes with the noise; trained, g decides by what
-was removed.
+T is the Anscombe transform for the levels of the noise, and T_k is the one for levels that are k times as high. f
+leaves a little noise, which is a few pixels wide and looks like texture to a network that meets it together with all
+the noise of y. g meets it alone and is told that the noise has k times its variance. Without any training, with g = f,
+two steps are better than one in strong noise; they are worse at base ISO, where texture is removed along with the
+noise. A trained g decides by what was removed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from denoisers.network import DENOISERS, NEAR, Denoiser, Shared
 from rawaug import bayer
 
 REMAINING = 0.05
-"""Share of the noise's variance that the second network is told to remove: k above."""
+"""The second network is told to remove this share of the noise's variance: it is k above."""
 
 SCALES = 4
 
@@ -42,8 +42,8 @@ class CascadeDRUNet(Denoiser):
         frozen: keep the weights of the first network in training.
         channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
-    A training starts from a DRUNet, whose weights both networks take, or from a cascade: of one with more blocks it
-    takes the first of each scale.
+    A training starts from a DRUNet, whose weights both networks take, or from a cascade. If that cascade has more
+    blocks, the first ones of each scale are taken.
 
     Example:
         >>> noisy = torch.rand(1, 4, 33, 50)
@@ -55,7 +55,7 @@ class CascadeDRUNet(Denoiser):
     layerless: ClassVar[frozenset[str]] = frozenset({"views", "frozen", "blocks"})
     mixed: ClassVar[bool] = True
     tile: ClassVar[int] = 1152
-    """Side in packed pixels of the tiles of large frames: a cascade keeps more of a tile in memory than others."""
+    """Tiles of large frames have this side in packed pixels; a cascade keeps more of a tile in memory than others."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class CascadeDRUNet(Denoiser):
         return denoised
 
     def residual(self, features: Tensor) -> Tensor:
-        """Compute the correction of the second network: see there."""
+        """Compute the correction of the second network; see its own method."""
         return self.second.residual(features)
 
     def can_start_from(self, model: Denoiser) -> bool:
@@ -148,7 +148,7 @@ class CascadeDRUNet(Denoiser):
 
 
 class _CorrectingUNet(ResidualUNet):
-    """The second network: the first layer gets what was removed besides."""
+    """The second network, whose first layer also gets what was removed."""
 
     def __init__(self, width: int, blocks: int | Sequence[int], **shared: Unpack[Shared]) -> None:
         super().__init__({}, Size(width, SCALES, blocks), limits=True, **shared)

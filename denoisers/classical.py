@@ -1,8 +1,8 @@
 """Classical denoisers of packed RAW, and :class:`Stabilised`, which fits them to shot noise.
 
-Each is made for white Gaussian noise of one level, ``y = x + sigma n``, and filters ``y / sigma`` here, with
-``sigma = sqrt(mean variance)`` of the picture. RAW noise depends on the signal: wrapped in :class:`Stabilised`, the
-filter sees noise of one level everywhere; alone it works at the mean level. The work is done on the CPU.
+Each filter is made for white Gaussian noise of one level, ``y = x + sigma n``, and filters ``y / sigma`` here, with
+``sigma = sqrt(mean variance)`` of the picture. RAW noise depends on the signal. Wrapped in :class:`Stabilised`, a
+filter sees noise of one level everywhere; alone, it works at the mean level. The work is done on the CPU.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rawaug.errors import how_to_install
 from rawaug.registry import Registry
 
 FILTERS = Registry("classical filter", "rawaug.filters", "denoisers")
-"""The filters by name: subclasses of :class:`Classical`."""
+"""This maps names to filters, which are subclasses of :class:`Classical`."""
 
 Planes = np.ndarray[Any, np.dtype[np.float32]]
 
@@ -36,17 +36,17 @@ class Classical(ABC):
     """
 
     smallest: ClassVar[int] = 2
-    """The shortest side, in packed pixels, that the method takes."""
+    """The method takes no side shorter than this, in packed pixels."""
     needs: ClassVar[tuple[str, ...]] = ()
-    """Libraries that not every installation has."""
+    """The method needs these libraries, which not every installation has."""
     extra: ClassVar[str] = "train"
-    """The extra of rawaug that brings them."""
+    """This extra of rawaug installs them."""
     licence: ClassVar[str] = ""
-    """A note on the licences of the libraries that it needs."""
+    """This is a note on the licences of the libraries that the method needs."""
 
     @classmethod
     def missing(cls) -> str | None:
-        """Say in a line which library is missing and how to install it; None where all are there."""
+        """Say in a line which library is missing and how to install it; return None if none is missing."""
         for name in cls.needs:
             if find_spec(name) is None:
                 return f"{name} is not installed; {cls.licence}{how_to_install(cls.extra)}"
@@ -62,7 +62,7 @@ class Classical(ABC):
         """Estimate the picture ``(h, w, 4)`` beneath white noise of deviation 1; the result has the same shape."""
 
     def __call__(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
-        """Denoise ``(B, 4, h, w)`` by the mean of each picture's variance; one without noise is returned as it is.
+        """Denoise ``(B, 4, h, w)`` by each picture's mean variance; a picture without noise is returned as it is.
 
         Raises:
             ValueError: if ``variance`` is missing, or ``noisy`` is not packed RAW or too small for the method.
@@ -86,7 +86,7 @@ class Classical(ABC):
         return torch.stack(denoised)
 
     def _denoise_picture(self, picture: Tensor, sigma: float) -> Tensor:
-        """Denoise one picture ``(4, h, w)`` of white noise of a standard deviation, in units of that deviation."""
+        """Denoise one picture ``(4, h, w)`` with white noise of a given deviation, in units of that deviation."""
         if sigma == 0:
             return picture
 
@@ -95,7 +95,7 @@ class Classical(ABC):
         return torch.from_numpy(clean).permute(2, 0, 1).to(picture)
 
     def library(self, name: str) -> Any:
-        """Import the library ``name``, one of :attr:`needs` or a module of one; ImportError if it is not installed."""
+        """Import the library ``name``, one of :attr:`needs` or a module of one; raise ImportError if it is missing."""
         reason = self.missing()
         if reason is not None:
             raise ImportError(reason)
@@ -109,7 +109,7 @@ class NonLocalMeans(Classical):
     needs = ("skimage",)
 
     def denoise(self, planes: Planes) -> Planes:
-        """Filter ``(h, w, 4)``, patches compared over all four planes at once."""
+        """Filter ``(h, w, 4)``; patches are compared over all four planes at once."""
         denoise_nl_means = self.library("skimage.restoration").denoise_nl_means
         settings = {"patch_size": 5, "patch_distance": 6, "fast_mode": True, "channel_axis": -1}
         return denoise_nl_means(planes, h=0.8 * self.strength, sigma=1.0, **settings)
@@ -126,7 +126,7 @@ class Wavelet(Classical):
         denoise_wavelet = self.library("skimage.restoration").denoise_wavelet
         height, width, channels = planes.shape
 
-        # VisuShrink cuts at sigma sqrt(2 log n); the factor is taken out, since on photographs it smooths too much.
+        # VisuShrink cuts at sigma sqrt(2 log n). The factor is taken out, since it smooths photographs too much.
         sigma = 3 * self.strength / np.sqrt(2 * np.log(height * width))
         levels = min(4, min(height, width).bit_length() - 1)
         settings: dict[str, Any] = {
@@ -162,7 +162,7 @@ _OPPONENT = {
     4: 0.5 * np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]], np.float32),
     3: np.array([[2, 2, 2], [6**0.5, 0, -(6**0.5)], [2**0.5, -(8**0.5), 2**0.5]], np.float32) / 12**0.5,
 }
-"""Matrices from R, Gr, Gb, B and from R, G, B to luminance and differences; orthonormal: white noise stays white."""
+"""These turn R, Gr, Gb, B and R, G, B into luminance and differences; they are orthonormal: white noise stays white."""
 
 
 def to_opponent(planes: Planes) -> Planes:
@@ -188,7 +188,7 @@ class BM3D(Classical):
         """Filter ``(h, w, 4)``, or sRGB ``(h, w, 3)``, in luminance and differences of colour."""
         bm3d = self.library("bm3d")
         deviations = [self.strength] * planes.shape[-1]
-        # Blocks are matched on the first channel: let that be the luminance, whose noise is lowest.
+        # Blocks are matched on the first channel, so that is the luminance, whose noise is lowest.
         cleaned = bm3d.bm3d(to_opponent(planes), sigma_psd=deviations)
         return from_opponent(cleaned)
 
@@ -197,7 +197,7 @@ class Transform(Protocol):
     """A variance-stabilising transform: after ``forward`` the noise has variance 1; ``inverse`` is free of bias."""
 
     def forward(self, y: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
-        """Transform RAW ``(B, 4, h, w)`` of var(y) = shot_var y + read_var, both ``(B,)``, to unit variance."""
+        """Transform RAW ``(B, 4, h, w)`` with var(y) = shot_var y + read_var, both ``(B,)``, to unit variance."""
 
     def inverse(self, z: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
         """Transform an estimate ``(B, 4, h, w)`` in this domain back to RAW."""
@@ -208,7 +208,7 @@ class Stabilised:
 
     Args:
         denoiser: one of the classes above, or any ``denoiser(noisy, variance)``.
-        transform: what :class:`Transform` says, e.g. the module ``rawaug.noise.anscombe``.
+        transform: a :class:`Transform`, e.g. the module ``rawaug.noise.anscombe``.
 
     Example:
         >>> from denoisers import TotalVariation
@@ -241,7 +241,7 @@ class Stabilised:
             shot_var, read_var: the levels, numbers or ``(B,)``.
 
         Raises:
-            ValueError: if neither the map nor both levels are passed, or the map is no such line.
+            ValueError: if neither the map nor both levels are passed, or the map does not have this form.
         """
         if shot_var is None or read_var is None:
             shot_var, read_var = _fit_line(noisy, variance)
@@ -258,7 +258,7 @@ class Stabilised:
 
 
 def _fit_line(noisy: Tensor, variance: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Fit the levels of a map, each ``(B,)``; ValueError if it is missing or no line in the signal."""
+    """Fit the levels of a map, each ``(B,)``; raise ValueError if it is missing or not linear in the signal."""
     if variance is None:
         raise ValueError("give the variance map, or shot_var and read_var")
 

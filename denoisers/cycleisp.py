@@ -1,8 +1,8 @@
 r"""CycleISP's denoiser of RAW and the layers that all three of its networks share (Zamir et al., CVPR 2020).
 
 A block is ``v + merge([f s, f c])`` with ``f = conv(prelu(conv(v)))``, ``s = sigmoid(conv([max_c f, mean_c f]))`` over
-space and ``c``, a weight a channel, the sigmoid of two layers on f's mean. Layers are named nearly as in the files of
-weights that its authors publish, which :func:`load_published` reads.
+space, and ``c``, one weight for each channel, the sigmoid of two layers on the mean of f. Layers have nearly the names
+that they have in the authors' published files of weights, which :func:`load_published` reads.
 
 Source: Zamir et al., "CycleISP: Real Image Restoration via Improved Data Synthesis", CVPR 2020.
 """
@@ -21,13 +21,13 @@ from denoisers.layers import conv, require_bounded, require_width
 from denoisers.network import DENOISERS, Denoiser, Shared
 
 RENAMED = (("head.0.", "head."), ("SA.spatial.conv.", "spatial."), ("CA.conv_du.", "channel."), ("conv1x1.", "merge."))
-"""Parts of the names of layers in the published checkpoints, and what they are called here."""
+"""These parts of layers' names in the published checkpoints are called otherwise here."""
 UNUSED = ("blur.", "merge.0.")
-"""Layers, renamed, that the checkpoints hold though the published pass does not use them."""
+"""The checkpoints hold these layers (renamed), though the published pass does not use them."""
 
 
 class DualAttentionBlock(nn.Module):
-    """A residual block whose features pass through attention over space and over channels; see the module."""
+    """A residual block whose features pass through attention over space and over channels; the module explains it."""
 
     def __init__(self, features: int, reduction: int, act: nn.PReLU) -> None:
         super().__init__()
@@ -38,7 +38,7 @@ class DualAttentionBlock(nn.Module):
         self.merge = conv(2 * features, features, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features ``(B, C, h, w)`` to features of the same shape."""
+        """Map features ``(B, C, h, w)`` to features of the same shape."""
         f = self.body(x)
 
         extremes = torch.cat([f.amax(1, keepdim=True), f.mean(1, keepdim=True)], dim=1)
@@ -66,14 +66,14 @@ class ResidualGroup(nn.Module):
         self.body.append(conv(features, features))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features ``(B, C, h, w)`` to features of the same shape."""
+        """Map features ``(B, C, h, w)`` to features of the same shape."""
         return x + self.body(x)
 
 
 class Trunk(nn.Module):
     """The layers that all three of CycleISP's networks have: a first convolution, groups and a last convolution.
 
-    One PReLU, with a slope for each feature, is used all over.
+    All layers share one PReLU, which has a slope for each feature.
 
     Args:
         inputs: channels that come in.
@@ -128,7 +128,7 @@ class CycleISPDenoiser(Denoiser):
         self.trunk = Trunk(self.inputs, width, groups, blocks, reduction)
         self.trunk.tail = nn.Sequential(last)
 
-        # As in DHDN: thirty-two residual blocks one after another stay tame when each starts as the identity.
+        # As in DHDN, a chain of thirty-two residual blocks stays stable if each starts as the identity.
         ends = [module.merge for module in self.modules() if isinstance(module, DualAttentionBlock)]
         self.initialise(self.seed, last, *ends)
 

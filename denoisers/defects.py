@@ -1,8 +1,8 @@
-"""Hot and dead pixels of a signal whose noise has deviation 1, which are replaced before a network sees it.
+"""Hot and dead pixels, which are replaced before a network sees the signal; its noise has deviation 1.
 
-A pixel is a defect if it lies beyond all its neighbours of the same colour while the pixels of the other colours beside
-it follow theirs: an edge or a small light moves several colours at once, a defect one alone. It becomes the mean of its
-neighbours without their lowest and highest.
+A pixel is a defect if it lies beyond all its neighbours of the same colour, while the pixels of other colours next to
+it agree with their own neighbours: an edge or a small light changes several colours at once, but a defect changes only
+one. The defect is replaced by the mean of its neighbours, leaving out the lowest and the highest.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 DEVIATIONS = 5.0
-"""Minimum distance of a defect from its neighbours, in deviations of the noise."""
+"""A defect is at least this far from its neighbours, in deviations of the noise."""
 SHARE = 0.15
-"""What is added to this distance, as a share of the neighbours' value."""
+"""This share of the neighbours' value is added to that distance."""
 ALONE = 4.0
-"""Minimum ratio of a defect's departure from its neighbours to that of the pixels of other colours beside it."""
+"""A defect departs from its neighbours at least this many times as far as the pixels of other colours next to it."""
 
 
 def mend_planes(signal: Tensor) -> Tensor:
@@ -44,7 +44,7 @@ def mend_planes(signal: Tensor) -> Tensor:
 def mend_mosaic(signal: Tensor, planes: Tensor) -> Tensor:
     """Replace the hot and dead pixels of a mosaic ``(B, 1, H, W)``, whose noise has deviation 1.
 
-    A pixel is compared with the pixels of its colour within two of it, and with the pixels that touch it.
+    A pixel is compared with the pixels of its colour that are at most two away, and with the pixels that touch it.
 
     Args:
         signal: the mosaic.

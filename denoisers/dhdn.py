@@ -12,7 +12,7 @@ from denoisers.layers import conv, require_width
 from denoisers.network import DENOISERS, Denoiser, Shared
 
 LEVELS = 4
-"""Number of levels of DHDN's pyramid."""
+"""DHDN's pyramid has this many levels."""
 
 
 class DCRBlock(nn.Module):
@@ -27,7 +27,7 @@ class DCRBlock(nn.Module):
         self.activation = nn.PReLU()
 
     def forward(self, features: Tensor) -> Tensor:
-        """Features ``(B, C, h, w)`` to features of the same shape."""
+        """Map features ``(B, C, h, w)`` to features of the same shape."""
         dense = torch.cat([features, self.first(features)], dim=1)
         dense = torch.cat([dense, self.second(dense)], dim=1)
         return features + self.activation(self.third(dense))
@@ -37,10 +37,10 @@ class DCRBlock(nn.Module):
 class DHDN(Denoiser):
     """The densely connected hierarchical network (Park, Yu and Jeong, CVPR Workshops 2019).
 
-    A U-Net of four levels, features C, 2C, 4C, 8C, with two densely connected residual blocks a level on the way down
-    and on the way up. Down: max-pooling and a 1 x 1 convolution; up: a 1 x 1 convolution and pixel shuffle; skips by
-    concatenation at every level, the lowest included. With C = 128 and three channels it has 168.2 M parameters and
-    takes 1,020 GMAC for 256 x 256 pixels; it is blind (``variance_map=False``).
+    It is a U-Net of four levels with C, 2C, 4C and 8C features. Each level has two densely connected residual blocks on
+    the way down and two on the way up. Max-pooling and a 1 x 1 convolution lead down; a 1 x 1 convolution and a pixel
+    shuffle lead up. Skips are concatenated at every level, the lowest included. With C = 128 and three channels the
+    network has 168.2 M parameters and takes 1,020 GMAC for 256 x 256 pixels; it is blind (``variance_map=False``).
 
     Args:
         width: features of the first level, even. 16 (2.6 M parameters) suits a CPU; 128 is the published width.
@@ -66,13 +66,13 @@ class DHDN(Denoiser):
             self.encoder.append(_level(size))
         for size in sizes[:-1]:
             self.down.append(_pointwise(size, 2 * size))
-        # What comes up and the skip have a level's features each, so its decoder works on twice as many.
+        # What comes up and the skip each have a level's features, so the level's decoder works on twice as many.
         for size in reversed(sizes[:-1]):
             self.up.append(_pointwise(4 * size, 4 * size))
             self.decoder.append(_level(2 * size))
         self.last = conv(2 * width, self.channels, size=1)
 
-        # Fourteen residual blocks one after another stay tame when each starts as the identity (Goyal et al. 2017).
+        # A chain of fourteen residual blocks stays stable if each starts as the identity (Goyal et al. 2017).
         ends = [module.third for module in self.modules() if isinstance(module, DCRBlock)]
         self.initialise(self.seed, self.last, *ends)
 

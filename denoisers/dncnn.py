@@ -14,8 +14,8 @@ from denoisers.network import DENOISERS, Denoiser, Shared
 class DnCNN(Denoiser):
     """A chain of 3 x 3 convolutions that predicts the noise (Zhang et al., "Beyond a Gaussian Denoiser", TIP 2017).
 
-    Convolution and ReLU, then ``depth - 2`` times convolution, batch normalisation and ReLU, then a convolution.
-    Nothing is padded but the convolutions' zeros. The paper's network is blind: ``variance_map=False``.
+    A convolution and a ReLU come first, then ``depth - 2`` times a convolution, batch normalisation and a ReLU, then a
+    last convolution. The only padding is the convolutions' zeros. The paper's network is blind: ``variance_map=False``.
 
     Args:
         width: features.

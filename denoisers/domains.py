@@ -8,10 +8,10 @@ ksigma      :math:`u = y / s + r / s^2`, scaled to ISO 1600  variance u: one cam
 anscombe    :math:`z = 2 \sqrt{u + 3/8}`                     variance 1 everywhere
 ==========  ===============================================  ====================================================
 
-The network gives the transformed *clean* signal, so the algebraic inverse has no bias. Below ``u = 0`` the root goes on
-as its tangent. Photons are counted with s of at least the domain's ``least_shot``; a noise map then holds the noise's
-deviation relative to that. Sources: Wang et al., ECCV 2020 (k-sigma; its anchor is ISO 1600 of a Reno-10x with white at
-959); Starck, Murtagh and Bijaoui 1998 (generalised Anscombe transform).
+The network returns the transformed *clean* signal, so the algebraic inverse has no bias. Below ``u = 0`` the root is
+continued by its tangent. Photons are counted with an s of at least the domain's ``least_shot``; a noise map then holds
+the noise's deviation relative to that. Sources: Wang et al., ECCV 2020 (k-sigma; its anchor is ISO 1600 of a Reno-10x
+with white at 959); Starck, Murtagh and Bijaoui 1998 (generalised Anscombe transform).
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from torch import Tensor
 from rawaug.bayer import noise_variance
 
 Levels = tuple[Tensor, Tensor]
-"""shot_var and read_var, ``(B, 1, 1, 1)``, or of every pixel ``(B, 1, H, W)``."""
+"""These are shot_var and read_var, ``(B, 1, 1, 1)``, or ``(B, 1, H, W)`` if each pixel has its own."""
 
 _LEAST_RATIO = 1e-3
-"""Minimum of shot_var as a multiple of sqrt(read_var): keeps r / s^2 within what float32 resolves."""
+"""shot_var is at least this multiple of sqrt(read_var), which keeps r / s^2 within what float32 resolves."""
 
 _PICTURE = (1, 2, 3)
-"""The axes of a picture in a batch ``(B, C, h, w)``."""
+"""These are the axes of a picture in a batch ``(B, C, h, w)``."""
 
 
 def fit_levels(noisy: Tensor, variance: Tensor) -> Levels:
     """Fit shot_var and read_var, each ``(B, 1, 1, 1)``, to a noise map ``(B, C, h, w)`` by least squares.
 
-    Neither is negative. Channels that ``noisy`` has beyond the map's C, such as planes of colours, do not count.
+    Neither is negative. Channels that ``noisy`` has beyond the map's C, such as planes of colours, are ignored.
     """
     if torch.onnx.is_in_onnx_export() and noisy.dtype is torch.float32:
-        # ONNX Runtime adds up one value after the other: of a megapixel in float32 that is wrong by a thousandth.
+        # ONNX Runtime adds up one value after the other. In float32, the sum over a megapixel is wrong by a thousandth.
         shot_var, read_var = fit_levels(noisy.double(), variance.double())
         return shot_var.float(), read_var.float()
 
@@ -60,7 +60,7 @@ def fit_levels(noisy: Tensor, variance: Tensor) -> Levels:
 
 
 class Domain(ABC):
-    """A transform of RAW ``(B, C, h, w)`` of shot_var and read_var ``(B, 1, 1, 1)``, and its inverse."""
+    """A transform of RAW ``(B, C, h, w)`` with shot_var and read_var ``(B, 1, 1, 1)``, and its inverse."""
 
     least_shot: ClassVar[float]
 
@@ -79,9 +79,9 @@ class Domain(ABC):
         return torch.maximum(shot_var.clamp_min(self.least_shot), _LEAST_RATIO * read_var.sqrt())
 
     def relative_deviation(self, y: Tensor, variance: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
-        """Divide the noise's deviation by the one that the transform takes it for.
+        """Divide the noise's deviation by the one that the transform assumes.
 
-        The quotient, of the shape of ``y``, is 1, and below 1 where shot_var is below its bound.
+        The quotient has the shape of ``y``. It is 1, or below 1 where shot_var is below its bound.
 
         Args:
             y: RAW ``(B, C, h, w)``.
@@ -101,13 +101,13 @@ class Domain(ABC):
 
 
 class KSigma(Domain):
-    """PMRID's domain: every noise becomes that of ISO 1600. White grows with 1 / s, so ``least_shot`` is high."""
+    """PMRID's domain, where every noise becomes that of ISO 1600. White grows with 1 / s, so ``least_shot`` is high."""
 
     least_shot = 6e-4
     gain = 5.995267e-4 * 1600 + 8.68861e-3
-    """Variance that a digital number of light adds at ISO 1600: the paper's k."""
+    """One digital number of light adds this variance at ISO 1600: it is the paper's k."""
     floor = 7.11772e-7 * 1600**2 + 6.514934e-4 * 1600 + 0.11492713
-    """Variance at black at ISO 1600, in digital numbers: the paper's sigma squared."""
+    """Black has this variance at ISO 1600, in digital numbers: it is the paper's sigma squared."""
     scale = 256.0 / 959.0
 
     def encode(self, u: Tensor) -> Tensor:
@@ -120,13 +120,13 @@ class KSigma(Domain):
 
 
 class Anscombe(Domain):
-    """The generalised Anscombe transform: noise of deviation 1, white at 13 (ISO 25,600) to 400 (ISO 100)."""
+    """The generalised Anscombe transform; noise has deviation 1, and white is at 13 (ISO 25,600) to 400 (ISO 100)."""
 
     least_shot = 1e-5
     offset = 0.375
 
     def encode(self, u: Tensor) -> Tensor:
-        """Take the root of u + 3/8 of counts ``(B, C, h, w)``; below u = 0 follow its tangent."""
+        """Take the root of u + 3/8 for counts u, ``(B, C, h, w)``; below u = 0 follow its tangent."""
         root = 2.0 * (u.clamp_min(0.0) + self.offset).sqrt()
         tangent = u.clamp_max(0.0) / math.sqrt(self.offset)
         return root + tangent
@@ -140,4 +140,4 @@ class Anscombe(Domain):
 
 
 DOMAINS = MappingProxyType({"ksigma": KSigma(), "anscombe": Anscombe()})
-"""The transforms by name; ``linear`` needs none."""
+"""This maps names to transforms; ``linear`` needs none."""

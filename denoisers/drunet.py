@@ -14,7 +14,7 @@ from denoisers.network import DENOISERS, Denoiser, Shared
 from rawaug.registry import require_between
 
 CONTEXT = 4
-"""Side of the squares, in cells, whose mean is subtracted from the signal of the last scale."""
+"""The signal of the last scale is taken less its mean over squares of this side, in cells."""
 
 
 class Size(NamedTuple):
@@ -33,7 +33,7 @@ class Size(NamedTuple):
 
     @property
     def blocks_by_scale(self) -> list[int]:
-        """The residual blocks of each scale, the finest first; ValueError unless there is a number for each scale."""
+        """The residual blocks of each scale, the finest first; raise ValueError unless each scale has a number."""
         if isinstance(self.blocks, int):
             return [self.blocks] * self.scales
 
@@ -51,7 +51,7 @@ class ResidualBlock(nn.Module):
         self.conv2 = conv(width, width, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features ``(B, C, h, w)`` to features of the same shape."""
+        """Map features ``(B, C, h, w)`` to features of the same shape."""
         if can_fuse(x):
             return fused_conv(fused_conv(x, self.conv1), self.conv2, added=x)
         return self.conv2(self.conv1(x).relu_()).add_(x)
@@ -60,10 +60,11 @@ class ResidualBlock(nn.Module):
 class ResidualUNet(Denoiser):
     """Base of :class:`DRUNet` and of the networks that start from its weights, for other inputs or other results.
 
-    Its subclasses choose what the first layer and the last scale see, and what the last layer gives: their constructors
-    call :meth:`add_layers`, add layers of their own, and draw all first weights by :meth:`initialise`, once.
+    Its subclasses choose what the first layer and the last scale see, and what the last layer gives. Their constructors
+    call :meth:`add_layers`, add layers of their own, and draw all initial weights once, by :meth:`initialise`.
 
-    A blind network, ``light``, gets the mean over a cell of the last scale as well, since noise depends on light.
+    A blind network, or one with ``light``, also gets the mean over a cell of the last scale, since noise depends on
+    light.
 
     Args:
         config: the network's settings besides its size, ``limits``, ``mend`` and the shared ones.
@@ -73,7 +74,7 @@ class ResidualUNet(Denoiser):
     """
 
     mixed: ClassVar[bool] = True
-    growing: ClassVar[frozenset[str]] = frozenset({"blocks"})  # a new block is the identity at first
+    growing: ClassVar[frozenset[str]] = frozenset({"blocks"})  # a new block starts as the identity
     light: bool = False
 
     head: nn.Conv2d
@@ -131,7 +132,7 @@ class ResidualUNet(Denoiser):
         self.tail = conv(width, outputs, bias=False)
 
     def block_ends(self) -> list[nn.Conv2d]:
-        """List the last layers of all blocks: as in DHDN, blocks stay tame when each starts as the identity."""
+        """List the last layers of all blocks: as in DHDN, blocks stay stable if each starts as the identity."""
         return [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
 
     def is_relative(self, model: Denoiser) -> bool:
@@ -161,9 +162,9 @@ class ResidualUNet(Denoiser):
         return self.head(torch.cat(inputs, dim=1)), self.coarse(self.wide_signal(mean))
 
     def wide_signal(self, mean: Tensor) -> Tensor:
-        """Subtract from the mean over cells ``(B, C, h', w')`` its own mean around: what the last scale sees.
+        """Subtract from the mean over cells ``(B, C, h', w')`` its own local mean, for the last scale to see.
 
-        A mean over a cell has noise of deviation 1 / cell, so it is scaled to 1.
+        The mean over a cell has noise of deviation 1 / cell, so it is scaled to 1.
         """
         around = F.interpolate(F.avg_pool2d(mean, CONTEXT), mean.shape[-2:], mode="bilinear")
         return self.cell * (mean - around)
@@ -196,23 +197,24 @@ class ResidualUNet(Denoiser):
 class DRUNet(ResidualUNet):
     """A U-Net of residual blocks without biases (Zhang et al., "Plug-and-Play Image Restoration", TPAMI 2021).
 
-    A block is ``x + conv(ReLU(conv(x)))``; convolutions 2 x 2 of stride 2 go down, a pointwise convolution and a pixel
-    shuffle up (the source has transposed convolutions), skips are added. Without biases a network that is trained at
-    some noise levels denoises at others too (Mohan et al., ICLR 2020). Here the first scale sees the signal less its
-    mean over a cell of the last scale (8 x 8 pixels), interpolated, and the last scale sees that mean less its own over
-    4 x 4 cells: light and shade are then the same problem, bfloat16 has digits for the noise, not for the brightness,
-    and noise wider than a cell is seen, too. A blind network is given the mean as well, since noise depends on light.
+    A block is ``x + conv(ReLU(conv(x)))``. Convolutions 2 x 2 of stride 2 lead down, and a pointwise convolution and a
+    pixel shuffle lead up (the source has transposed convolutions); skips are added. Without biases, a network that is
+    trained at some noise levels also denoises at others (Mohan et al., ICLR 2020). Here the first scale sees the signal
+    less its interpolated mean over a cell of the last scale (8 x 8 pixels), and the last scale sees that mean less its
+    own mean over 4 x 4 cells. Light and shade are then the same problem, bfloat16 spends its digits on the noise and
+    not on the brightness, and noise wider than a cell is seen, too. A blind network is also given the mean, since noise
+    depends on light.
 
     Args:
         width: features of the first scale, doubled at each further one; 64 is published.
         scales: of the pyramid, 1 to 12; 4 is published.
         blocks: of each scale, going down and going up, at most 1000; 4 is published. One number, or one for each scale,
             the finest first: where noise is weak, fine scales have the most to do.
-        patch: side of the squares of pixels that enter as channels, 1 to 8. 2, as in FFDNet (Zhang et al., TIP 2018),
-            takes a quarter of the time, for pictures that were demosaiced.
-        light: give the network the mean over a cell besides, as blind ones have it: for developed pictures, whose noise
-            depends on light by a curve that a noise map of one level does not tell. A variance of 0 then stands for a
-            level that is not known.
+        patch: side of the squares of pixels that enter as channels, 1 to 8. A side of 2, as in FFDNet (Zhang et al.,
+            TIP 2018), takes a quarter of the time and is for pictures that were demosaiced.
+        light: also give the network the mean over a cell, as blind ones have it. This is for developed pictures, whose
+            noise depends on light by a curve that a noise map of one level cannot show. A variance of 0 then stands for
+            an unknown level.
         limits, mend, pyramid, channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
     Example:
@@ -235,7 +237,7 @@ class DRUNet(ResidualUNet):
     ) -> None:
         require_between("patch", patch, 1, 8)
 
-        # Files name these settings only where they differ from their defaults.
+        # A file names these settings only if they differ from their defaults.
         config: dict[str, Any] = {}
         if patch != 1:
             config["patch"] = patch

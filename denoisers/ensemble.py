@@ -13,11 +13,11 @@ from denoisers.tiles import Each, Run
 from rawaug import bayer
 
 VIEWS = (4, bayer.N_VIEWS)
-"""The numbers of views that there are: the flips, and the flips with and without a quarter turn."""
+"""There are these numbers of views: the flips, and the flips with and without a quarter turn."""
 
 
 def to_view(packed: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
-    """Turn packed RAW ``(B, 4, h, w)`` and keep its CFA: a side is one cell longer where the pattern has moved."""
+    """Turn packed RAW ``(B, 4, h, w)`` and keep its CFA; a side is one cell longer where the pattern has moved."""
     rows, columns = cfa.turn(view).shift_to(cfa)
     turned = bayer.turn(bayer.unpack(packed, cfa), view)
     return bayer.pack(F.pad(turned, (columns, columns, rows, rows), mode="reflect"), cfa)
@@ -39,9 +39,9 @@ def from_view(image: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
 class SelfEnsemble(nn.Module):
     """A denoiser averaged over views of the mosaic, ``mean of T^-1 f(T y)``: ``views`` times the work.
 
-    T, a flip or quarter turn, turns the *mosaic*. Where this moves the pattern, one line is added on either side by
-    reflection without repeating the edge, so that the network meets its own pattern again, and cropped from the result.
-    Sources: Timofte et al., CVPR 2016; for mosaics Liu et al., CVPRW 2019.
+    T, a flip or quarter turn, turns the *mosaic*. Where this moves the pattern, one line is added on either side, by
+    reflection without repeating the edge, so that the network meets its own pattern again. The lines are cropped from
+    the result. Sources: Timofte et al., CVPR 2016; for mosaics Liu et al., CVPRW 2019.
 
     Args:
         model: ``model(noisy, variance) -> denoised``, packed RAW; a network, or any such callable.
@@ -72,7 +72,7 @@ class SelfEnsemble(nn.Module):
         self.stride: int = getattr(model, "stride", 1)
 
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
-        """Denoise ``(B, 4, h, w)``, h, w >= 2; ``variance``, if any, is turned alike."""
+        """Denoise ``(B, 4, h, w)``, h, w >= 2; ``variance``, if any, is turned in the same way."""
         turned: dict[int, Tensor] = {}
         views_of_shape: dict[torch.Size, list[int]] = defaultdict(list)
         for view in range(self.views):
@@ -90,6 +90,6 @@ class SelfEnsemble(nn.Module):
             denoised = self.model(batch, batch_variance).chunk(len(views))
             for view, picture in zip(views, denoised, strict=True):
                 count += 1
-                # A running mean: equal views give their value back to the last bit.
+                # With a running mean, equal views give their value back to the last bit.
                 mean = mean + (from_view(picture, self.cfa, view) - mean) / count
         return mean

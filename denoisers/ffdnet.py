@@ -16,8 +16,8 @@ from denoisers.network import DENOISERS, Denoiser
 class FFDNet(Denoiser):
     """FFDNet (Zhang, Zuo and Zhang, TIP 2018), of sRGB by default; its normalisations are folded into the convolutions.
 
-    It computes ``x - S(f([sigma, S^-1(x)]))`` with the pixel shuffle S, the deviation sigma of each channel as a plane
-    and 3 x 3 convolutions f, all at half the sides, for white noise of the level that a call passes.
+    It computes ``x - S(f([sigma, S^-1(x)]))``. S is the pixel shuffle, sigma is the deviation of each channel as a
+    plane, and f are 3 x 3 convolutions, all at half the sides. The noise is white and has the level that a call passes.
 
     Args:
         width: features of each layer but the last.

@@ -1,9 +1,9 @@
 """Networks by name, and files of their weights.
 
-A file is safetensors with string metadata that say how to build the network again: ``{"format": "rawaug", "kind":
+A file is safetensors whose string metadata says how to build the network again: ``{"format": "rawaug", "kind":
 "denoiser", "model": "UNet", "config": <JSON: the constructor's arguments>, "info": <JSON: anything else>}``. Nothing in
 it is code; a file can only name the classes in :data:`denoisers.network.DENOISERS`. Shipped weights have a model card
-beside them, and ``recipes/base.yaml`` trained them.
+next to them, and ``recipes/base.yaml`` trained them.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from rawaug.files import parse_object, read_tensors, write_tensors
 
 FORMAT, KIND = "rawaug", "denoiser"
 MOST_WEIGHTS = 2**30
-"""Maximum number of weights, 4 GiB of them; a larger network is refused before it takes memory."""
+"""A network has at most this many weights (4 GiB); a larger one is refused before it takes memory."""
 FOLDER = Path(__file__).parent / "weights"
-"""The folder of the shipped weights and their cards."""
+"""This folder holds the shipped weights and their cards."""
 DEFAULT = "rawaug-small"
-"""The default denoiser."""
+"""This is the default denoiser."""
 JOINT = "rawaug-joint"
-"""The default network that demosaics and denoises."""
+"""This is the default network that demosaics and denoises."""
 
 
 def build(name: str, **config: Any) -> Denoiser:
@@ -49,7 +49,7 @@ def build(name: str, **config: Any) -> Denoiser:
 
 def outline(name: str, config: dict[str, Any]) -> Denoiser:
     """Make the network of :func:`build` on the meta device, where its weights take no memory."""
-    DENOISERS[name]  # imports the module that has it, which may make tensors, while they are real
+    DENOISERS[name]  # imports its module, which may make tensors, while tensors are still real
     with torch.device("meta"):
         network: Denoiser = DENOISERS.make({"name": name, "settings": config})
 
@@ -60,7 +60,7 @@ def outline(name: str, config: dict[str, Any]) -> Denoiser:
 
 
 def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) -> None:
-    """Write a registered network and a JSON-serialisable ``info`` to ``path``, whole or not at all.
+    """Write a registered network and a JSON-serialisable ``info`` to ``path``, completely or not at all.
 
     Raises:
         ValueError: if the class is not registered, or ``info`` is not JSON-serialisable.
@@ -88,7 +88,7 @@ def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) ->
 
     tensors = {}
     for key, value in model.state_dict().items():
-        # A PReLU that is used all over stands under several keys, which share its memory: each gets a copy.
+        # A PReLU that several layers share stands under several keys with the same memory, so each key gets a copy.
         tensors[key] = value.detach().cpu().clone()
     write_tensors(tensors, metadata, path)
 
@@ -118,14 +118,14 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
     try:
         config = parse_object(metadata.get("config", ""))
         info = parse_object(metadata.get("info", ""))
-        # An outline, as the file's tensors may not fit it. Float32, whatever the default is.
+        # This is an outline, as the file's tensors may not fit it. It is float32, whatever the default is.
         model = outline(metadata.get("model", ""), config).float()
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
     weights = {}
     for key, value in tensors.items():
-        if value.dtype == torch.float16:  # half of the bytes in a file
+        if value.dtype == torch.float16:  # takes half of the bytes in a file
             value = value.float()
         weights[key] = value
 
@@ -141,7 +141,7 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
 
 
 def _form(tensor: Tensor | None, absence: str) -> str:
-    """Describe the shape and type of a tensor; ``absence`` where there is none."""
+    """Describe the shape and type of a tensor; return ``absence`` if there is none."""
     if tensor is None:
         return absence
     return f"{tuple(tensor.shape)} {tensor.dtype}"
@@ -153,7 +153,7 @@ def list_shipped() -> list[str]:
 
 
 def find_denoiser(name: str | Path) -> Path:
-    """Find the file of a denoiser by its path or by the name of a shipped one; FileNotFoundError if there is none."""
+    """Find the file of a denoiser by its path or by a shipped one's name; raise FileNotFoundError if there is none."""
     path = Path(name)
     if not path.suffix:
         path = FOLDER / f"{name}.safetensors"

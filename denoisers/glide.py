@@ -1,11 +1,11 @@
 r"""Global image denoising, GLIDE (Talebi and Milanfar, TIP 2014).
 
-Every pixel is estimated from all others, :math:`\hat z = W y`, by one filter of which the leading eigenvectors are
-enough, :math:`\hat z = V_m S_m^k V_m^T y`. The affinity of two pixels is :math:`\exp(-|p_i - p_j|^2 / h^2)` of their
-colours p in a picture that was prefiltered by non-local means, whose patches need not be compared again. It is computed
-between all pixels and a hundredth of them, evenly spaced, and extended to the rest (Nyström). Sinkhorn's scaling makes
-W symmetric with rows of sum 1, so that its eigenvalues lie in [0, 1] and constants stay. The power k and the number m
-of eigenvectors are those of least estimated error
+Every pixel is estimated from all others, :math:`\hat z = W y`, by one filter, whose leading eigenvectors are enough:
+:math:`\hat z = V_m S_m^k V_m^T y`. The affinity of two pixels is :math:`\exp(-|p_i - p_j|^2 / h^2)` of their colours p
+in a picture that was prefiltered by non-local means, so that patches need not be compared again. Affinities are
+computed between all pixels and a hundredth of them, evenly spaced, and extended to the rest (Nyström). Sinkhorn's
+scaling makes W symmetric, with rows that sum to 1, so that its eigenvalues lie in [0, 1] and constants do not change.
+The power k and the number m of eigenvectors minimise the estimated error
 
 .. math:: \sum_{i \le m} (1 - s_i^k)^2 b_i^2 + \sigma^2 s_i^{2k} + \sum_{i > m} b_i^2
 
@@ -25,17 +25,17 @@ from torch import Tensor
 from denoisers.classical import FILTERS, Classical, NonLocalMeans, Planes, from_opponent, to_opponent
 
 TILE, MARGIN = 128, 8
-"""Side of a tile and how far it reaches beyond what is kept of it, in packed pixels."""
+"""A tile has this side and reaches this far beyond what is kept of it, in packed pixels."""
 SHARE, LEAST, MOST = 0.01, 64, 400
-"""Share of the pixels that are sampled, and their least and largest number."""
+"""This share of the pixels is sampled, with a least and a largest number."""
 WIDTH = 1.25
-"""h, in deviations of the noise."""
+"""This is h, in deviations of the noise."""
 SCALINGS = 30
-"""Rounds of Sinkhorn's scaling."""
+"""Sinkhorn's scaling runs this many rounds."""
 LEAST_SUM = 1e-6
-"""Least sum of a row that the scaling can bring to 1: the extension of affinities has entries below 0."""
+"""The scaling can bring a row to 1 if its sum is at least this: the extension of affinities has entries below 0."""
 POWERS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-"""The powers k that are tried."""
+"""These powers k are tried."""
 
 
 def affinities(guide: Tensor) -> tuple[Tensor, Tensor]:
@@ -50,7 +50,7 @@ def affinities(guide: Tensor) -> tuple[Tensor, Tensor]:
     count = min(max(round(SHARE * pixels), LEAST), MOST, pixels)
     sampled = torch.linspace(0, pixels - 1, count).round().long().unique()
     distances = torch.cdist(features, features[sampled]).square() / features.shape[1]
-    # A factor for each pixel makes no difference to Sinkhorn's scaling. Without it all affinities of a colour that is
+    # A factor for each pixel makes no difference to Sinkhorn's scaling. Without it, all affinities of a colour that is
     # unlike every sample would underflow, and the pixel would become 0.
     distances = distances - distances.amin(dim=1, keepdim=True)
     return torch.exp(-distances / WIDTH**2), sampled
@@ -59,7 +59,7 @@ def affinities(guide: Tensor) -> tuple[Tensor, Tensor]:
 def eigenvectors(affinity: Tensor, sampled: Tensor) -> tuple[Tensor, Tensor]:
     """Compute leading eigenvectors ``(n, m)`` of the filter W, orthonormal, and their eigenvalues ``(m,)``, falling.
 
-    The rows of pixels that the filter does not reach are 0.
+    Pixels that the filter does not reach have rows of 0.
 
     Args:
         affinity: of n pixels with p sampled ones, ``(n, p)``.
@@ -86,7 +86,7 @@ def eigenvectors(affinity: Tensor, sampled: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def filter_plane(plane: Tensor, vectors: Tensor, values: Tensor, noise: float) -> Tensor:
-    """Filter a plane of pixels ``(n,)`` by the power and the number of eigenvectors of least estimated error."""
+    """Filter a plane of pixels ``(n,)``; the power and the number of eigenvectors minimise the estimated error."""
     coefficients = vectors.T @ plane.double()
     energy = (coefficients.square() - noise**2).clamp_min(0.0)
     whole = (plane.double().square().sum() - len(plane) * noise**2).clamp_min(0.0)

@@ -1,9 +1,9 @@
 r"""Demosaicing and denoising at once: ``rgb = D(noisy) + residual``, of twice the sides of packed RAW.
 
 Domain: packed RAW ``(B, 4, h, w)``, R, Gr, Gb, B of an RGGB mosaic, to linear camera RGB ``(B, 3, 2h, 2w)``. D is
-Malvar, He and Cutler's linear interpolation (ICASSP 2004), of the transformed signal, whose noise is white. One stencil
-for each colour and each site of a cell makes it a convolution of stride 2. One network for both is the idea of Gharbi
-et al., "Deep Joint Demosaicking and Denoising", SIGGRAPH Asia 2016.
+Malvar, He and Cutler's linear interpolation (ICASSP 2004) of the transformed signal, whose noise is white. With one
+stencil for each colour and each site of a cell, it is a convolution of stride 2. The idea of one network for both is
+from Gharbi et al., "Deep Joint Demosaicking and Denoising", SIGGRAPH Asia 2016.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from rawaug.bayer import CFA, demosaicing_stencils
 
 RGB = 3
 REACH = 2
-"""Number of pixels that D sees on each side of its own."""
+"""D sees this many pixels on each side of its own."""
 
 
 @DENOISERS.register("JointDRUNet")
 class JointDRUNet(ResidualUNet):
     """:class:`denoisers.DRUNet` with a head for full colour: ``D(noisy + tail(x)) + detail(x)``.
 
-    Its features x give a correction of packed RAW, as in DRUNet, which D makes full colour, and what D cannot know, as
-    twelve planes that a pixel shuffle puts in place. The last layer of either starts at zero: an untrained network is
-    D, and one that starts from a DRUNet's weights is that network followed by D.
+    Its features x give two things: a correction of packed RAW, as in DRUNet, which D turns into full colour; and what D
+    cannot know, as twelve planes that a pixel shuffle puts in place. The last layer of either starts at zero, so that
+    an untrained network is D, and one that starts from a DRUNet's weights is that network followed by D.
 
     Args:
         width, scales, blocks, limits, mend, domain, seed: see :class:`denoisers.DRUNet`.
@@ -78,12 +78,12 @@ class JointDRUNet(ResidualUNet):
         with _full_precision(packed.device.type):
             stencils = self.get_buffer("stencils")
             mosaic = F.pixel_shuffle(packed.to(stencils), 2)
-            padded = F.pad(mosaic, (REACH,) * 4, mode="reflect")  # about the border sites: the pattern stays
+            padded = F.pad(mosaic, (REACH,) * 4, mode="reflect")  # about the border sites, so the pattern stays
             return F.pixel_shuffle(F.conv2d(padded, stencils, stride=2), 2)
 
 
 def _full_precision(device: str) -> AbstractContextManager[object]:
-    """Switch autocast off: in bfloat16 the signal would lose the digits that hold its noise."""
+    """Switch autocast off, since in bfloat16 the signal would lose the digits that hold its noise."""
     if torch.is_autocast_enabled(device):
         return torch.autocast(device, enabled=False)
     return nullcontext()

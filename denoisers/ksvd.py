@@ -1,11 +1,11 @@
 r"""K-SVD: sparse patches over a dictionary that is learned from the noisy picture (Elad and Aharon, TIP 2006).
 
 Patches y of 8 x 8 are coded by orthogonal matching pursuit with as few atoms as leave :math:`|y - D x|^2 \le (1.15
-\sigma)^2 \cdot 64`. The dictionary D, 256 atoms that begin as overcomplete cosines, is learned from a part of the
-patches: each atom in turn becomes the direction that best explains what the patches that use it leave of the others
-(Aharon et al., TSP 2006; one power iteration of the rank-one problem, as Rubinstein et al. 2008). Estimates are
-averaged where patches overlap. The published share of the noisy picture in this mean, 30 / 255 over sigma, is left out,
-because RAW has no fixed range.
+\sigma)^2 \cdot 64`. The dictionary D has 256 atoms, which begin as overcomplete cosines and are learned from a part of
+the patches. Each atom in turn becomes the direction that best explains what the other atoms leave of the patches that
+use it (Aharon et al., TSP 2006; with one power iteration of the rank-one problem, as in Rubinstein et al. 2008).
+Estimates are averaged where patches overlap. The published share of the noisy picture in this mean, 30 / 255 over
+sigma, is left out, because RAW has no fixed range.
 
 The pursuit is scikit-learn's. The colours are filtered as luminance and differences, each with a dictionary of its own.
 """
@@ -23,21 +23,21 @@ from denoisers.classical import FILTERS, Classical, Planes, from_opponent, to_op
 from denoisers.patches import assemble, extract_patches, patch_grid
 
 SIDE, STEP = 8, 2
-"""Side of a patch and distance of the patches that are coded, in packed pixels."""
+"""A patch has this side, and the patches that are coded are this far apart, in packed pixels."""
 ATOMS_A_SIDE = 16
-"""Number of atoms along each side of the dictionary, 256 in all."""
+"""The dictionary has this many atoms along each side, 256 in all."""
 GAIN = 1.15
-"""The published factor of the noise's deviation to which a patch is explained."""
+"""A patch is explained up to this published multiple of the noise's deviation."""
 ROUNDS = 5
-"""Number of times that the dictionary is improved."""
+"""The dictionary is improved this many times."""
 TRAINING_PATCHES = 4000
-"""Number of patches, about, that the dictionary is learned from."""
+"""The dictionary is learned from about this many patches."""
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 
 
 def overcomplete_cosines() -> Array:
-    """Compute the dictionary ``(64, 256)`` to begin with, products of sampled cosines; columns have length 1."""
+    """Compute the initial dictionary ``(64, 256)`` of products of sampled cosines; its columns have length 1."""
     place = np.arange(SIDE)
     waves: Array = np.cos(np.outer(place, np.arange(ATOMS_A_SIDE)) * math.pi / ATOMS_A_SIDE)
     waves[:, 1:] -= waves[:, 1:].mean(0)
@@ -117,7 +117,7 @@ class KSVD(Classical):
         energies = (patches**2).sum(0)
         codes = np.zeros((dictionary.shape[1], patches.shape[1]))
 
-        # A patch that is explained by its mean needs no atom, and most patches of smooth pictures are.
+        # A patch that its mean explains needs no atom, and most patches of smooth pictures are of this kind.
         hard = np.flatnonzero(energies > tolerance)
         if hard.size == 0:
             return codes

@@ -1,4 +1,4 @@
-"""What the networks are built of: convolutions whose weights are drawn later, padding, and limits of their size."""
+"""The parts of the networks: convolutions whose weights are drawn later, padding, and limits on their size."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from torch.nn import functional as F
 from rawaug.registry import require_between
 
 PACKED = 4
-"""Channels of packed RAW: R, Gr, Gb, B."""
+"""Packed RAW has this many channels: R, Gr, Gb, B."""
 
 MOST_FEATURES = 2**16
-"""Maximum number of features of a layer: a few bytes of a file or a recipe can ask for any."""
+"""A layer has at most this many features, as a few bytes of a file or a recipe can ask for any number."""
 MOST_LAYERS = 1000
-"""Maximum number of layers or blocks that one setting may ask for."""
+"""One setting may ask for at most this many layers or blocks."""
 MOST_SCALES = 12
-"""Maximum number of scales of a U-Net."""
+"""A U-Net has at most this many scales."""
 
 LEAK = 0.2
-"""Negative slope of the leaky ReLUs."""
+"""This is the negative slope of the leaky ReLUs."""
 HE_GAIN = math.sqrt(2.0 / (1.0 + LEAK**2))
-"""Gain that keeps the deviation of features through a convolution and its leaky ReLU."""
+"""This gain keeps the deviation of features through a convolution and its leaky ReLU."""
 RESIDUAL_GAIN = math.sqrt(1.0 / 3.0)
-"""Gain of networks that add up dozens of residuals of separable convolutions, which HE_GAIN would let grow."""
+"""Networks that add up dozens of residuals of separable convolutions use this gain; HE_GAIN would let them grow."""
 
 
 def conv(
@@ -39,7 +39,7 @@ def conv(
 ) -> nn.Conv2d:
     """Make a convolution that keeps the sides of a picture or divides them by ``stride``.
 
-    Its weights are left as they are in memory; :meth:`denoisers.Denoiser.initialise` draws those of the whole network.
+    Its weights are left as they are in memory; :meth:`denoisers.Denoiser.initialise` draws the whole network's weights.
 
     Args:
         inputs: channels that come in, a multiple of ``groups``.
@@ -67,7 +67,7 @@ def conv(
 
 
 def can_fuse(features: Tensor) -> bool:
-    """Tell whether :func:`fused_conv` takes these features: bfloat16 on a CPU with oneDNN, and no gradient is kept."""
+    """Tell whether :func:`fused_conv` takes these features: bfloat16 on a CPU with oneDNN, without gradients."""
     if torch.is_grad_enabled() or features.dtype is not torch.bfloat16 or features.device.type != "cpu":
         return False
     if torch.compiler.is_compiling() or torch.onnx.is_in_onnx_export():
@@ -78,15 +78,15 @@ def can_fuse(features: Tensor) -> bool:
 def fused_conv(features: Tensor, layer: nn.Conv2d, added: Tensor | None = None) -> Tensor:
     """Run a convolution without bias and, in the same pass over memory, what follows it.
 
-    That is a ReLU, or the addition of features of the result's shape. The sum is rounded once, not twice. On a CPU a
-    convolution of few features waits for memory, and three passes take half as long again as one.
+    What follows is a ReLU, or the addition of features of the result's shape. The sum is rounded once, not twice. On a
+    CPU, a convolution of few features waits for memory, and three passes take half as long again as one.
 
     Args:
         features: ``(B, C, h, w)`` that :func:`can_fuse` accepts.
         layer: a convolution of ungrouped channels.
         added: what is added to the result; None for a ReLU.
     """
-    run = torch.ops.mkldnn._convolution_pointwise  # what torch.compile makes of these layers, without a compiler
+    run = torch.ops.mkldnn._convolution_pointwise  # torch.compile makes this of the layers; no compiler is needed
     weight = layer.weight.to(features.dtype)
     geometry = (layer.padding, layer.stride, layer.dilation, 1)
     if added is None:
@@ -96,7 +96,7 @@ def fused_conv(features: Tensor, layer: nn.Conv2d, added: Tensor | None = None) 
 
 def pad_to_multiple(image: Tensor, stride: int) -> Tensor:
     """Pad ``(B, C, h, w)`` below and on the right to multiples of ``stride``, by reflection without the edge."""
-    # An exported network pads any size, also where the picture that it is traced with needs no padding.
+    # An exported network pads any size, even if the picture that it is traced with needs no padding.
     is_traced = torch.compiler.is_compiling() or torch.onnx.is_in_onnx_export()
 
     height, width = image.shape[-2:]
@@ -107,7 +107,7 @@ def pad_to_multiple(image: Tensor, stride: int) -> Tensor:
         if below < height and beside < width:
             return F.pad(image, (0, beside, 0, below), mode="reflect")
 
-    # torch's own padding reflects once at most, which is not enough for a picture smaller than the stride.
+    # torch's own padding reflects at most once, which is not enough for a picture smaller than the stride.
     for axis, size in ((-2, height), (-1, width)):
         period = 2 * (size - 1)
         place = torch.remainder(torch.arange(size + -size % stride, device=image.device), period)
@@ -123,6 +123,6 @@ def require_width(width: int, multiple: int = 1) -> None:
 
 
 def require_bounded(**layers: int) -> None:
-    """Refuse more layers than :data:`MOST_LAYERS`, which no machine would build; each by the name of its setting."""
+    """Refuse more layers than :data:`MOST_LAYERS`, which no machine would build; names are those of the settings."""
     for key, number in layers.items():
         require_between(key, number, 0, MOST_LAYERS)

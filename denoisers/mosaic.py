@@ -1,14 +1,14 @@
 r"""One network for mosaics of every pattern: it sees the mosaic, and which colour each of its pixels has.
 
-Domain: ``(B, 4, H, W)``, the mosaic, white = 1, and planes that are 1 at the sites of a colour (:func:`with_planes`),
-to the mosaic ``(B, 1, H, W)``. A site's values enter the first layer by place and colour,
+Domain: from ``(B, 4, H, W)``, which is the mosaic with white = 1 and planes that are 1 at the sites of a colour
+(:func:`with_planes`), to the mosaic ``(B, 1, H, W)``. A site's values enter the first layer by place and colour,
 
 .. math:: u_{c s} = m_{c s} \, (z_s - \bar z_c), \qquad z'_s = z_s + \sum_c m_{c s} \, r_{c s},
 
-with s one of the four pixels of a 2 x 2 square, m the planes, z the transformed signal, :math:`\bar z_c` the mean of a
-colour over a cell of the last scale and r the last layer's result. For RGGB these are packed RAW's planes, with zeros
-between them, so that a network may begin as a :class:`denoisers.DRUNet` of packed RAW; of X-Trans eight squares of nine
-hold a red, two greens and a blue as well. At half its sides every mosaic becomes one of RGGB.
+where s is one of the four pixels of a 2 x 2 square, m are the planes, z is the transformed signal, :math:`\bar z_c` is
+the mean of a colour over a cell of the last scale, and r is the last layer's result. For RGGB these are packed RAW's
+planes with zeros between them, so that a network may begin as a :class:`denoisers.DRUNet` of packed RAW. In X-Trans,
+eight squares of nine also hold a red, two greens and a blue. At half its sides, every mosaic becomes one of RGGB.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from rawaug import bayer
 
 RGB = 3
 SITES = 4
-"""Pixels of a 2 x 2 square."""
+"""A 2 x 2 square has this many pixels."""
 SPREAD = RGB * SITES
-"""Channels of a plane that is spread by colour and site."""
+"""A plane that is spread by colour and site has this many channels."""
 
 _ENTRIES = ("RGGB", "XTRANS", "QUAD-RGGB+1+1")
-"""The phases in which a network meets the patterns: most of the 2 x 2 squares then hold all three colours."""
+"""A network meets the patterns in these phases, where most of the 2 x 2 squares hold all three colours."""
 _PERIOD = 6
-"""Largest period of these patterns in pixels."""
+"""This is the largest period of these patterns in pixels."""
 
 
 def lines_before(pattern: bayer.Pattern) -> tuple[int, int]:
-    """Count the lines that a mosaic of the pattern lacks, above and on the left, to begin as networks meet it.
+    """Count the lines that a mosaic lacks above and on the left to begin as networks meet its pattern.
 
     Raises:
         ValueError: if no network meets the pattern.
@@ -59,13 +59,13 @@ def lines_before(pattern: bayer.Pattern) -> tuple[int, int]:
 
 
 def entry_pattern(pattern: bayer.Pattern) -> bayer.Pattern:
-    """Move a pattern to where a network is trained to meet it: its own origin, or one line above or to the left."""
+    """Move a pattern to the origin where networks are trained to meet it: its own, or one line above or to the left."""
     above, before = lines_before(pattern)
     return pattern.shift(-above, -before)
 
 
 def with_planes(mosaic: Tensor, pattern: bayer.Pattern) -> Tensor:
-    """Put the planes of its colours behind a mosaic ``(B, 1, H, W)``: ``(B, 4, H, W)``."""
+    """Append to a mosaic ``(B, 1, H, W)`` the planes of its colours, which makes ``(B, 4, H, W)``."""
     planes = pattern.planes(*mosaic.shape[-2:]).to(mosaic)
     return torch.cat([mosaic, planes.expand(len(mosaic), -1, -1, -1)], dim=1)
 
@@ -73,7 +73,7 @@ def with_planes(mosaic: Tensor, pattern: bayer.Pattern) -> Tensor:
 def denoise_mosaic(run: Callable[[Tensor, Tensor], Tensor], mosaic: Tensor, variance: Tensor, cfa: str) -> Tensor:
     """Denoise a mosaic of any pattern and phase.
 
-    Where the network is trained to meet the pattern one line earlier, the mosaic gets a mirrored line above or on the
+    If the network is trained to meet the pattern one line earlier, the mosaic gets a mirrored line above or on the
     left, which is cropped from the result.
 
     Args:
@@ -98,8 +98,8 @@ def denoise_mosaic(run: Callable[[Tensor, Tensor], Tensor], mosaic: Tensor, vari
 class MosaicDRUNet(ResidualUNet):
     """:class:`denoisers.DRUNet` for mosaics of every pattern: Bayer's in all phases, X-Trans, Quad-Bayer.
 
-    It starts from the weights of a DRUNet of packed RAW with the same settings, if asked to: on RGGB it is then that
-    network, but for the borders and a mean over both greens.
+    If asked to, it starts from the weights of a DRUNet of packed RAW with the same settings. On RGGB it is then that
+    network, except for the borders and a mean over both greens.
 
     Args:
         width, scales, blocks, limits, mend, domain, pyramid, seed: see :class:`denoisers.DRUNet`.
@@ -139,7 +139,7 @@ class MosaicDRUNet(ResidualUNet):
     def start_from(self, model: Denoiser) -> None:
         """Take the weights of a network of this class, or of a DRUNet of packed RAW, spreading its planes by site.
 
-        Blocks beyond those stay as they are.
+        Blocks beyond those of the other network stay as they are.
         """
         state = model.state_dict()
         if not isinstance(model, MosaicDRUNet):
@@ -179,10 +179,10 @@ class MosaicDRUNet(ResidualUNet):
 
         Args:
             raw: the mosaic ``(B, 1, H, W)``.
-            planes: of its colours, ``(B, 3, H, W)``.
-            levels: of its noise.
+            planes: the planes of its colours, ``(B, 3, H, W)``.
+            levels: the levels of its noise.
             clipped: the share of clipped values, ``(B, 1, H, W)``.
-            halvings: times that the sides are halved from here on.
+            halvings: how many times the sides are halved from here on.
         """
         denoised = self._of_mosaic(raw, planes, levels)
         if not halvings:
@@ -258,7 +258,7 @@ class BayerAdapter(nn.Module):
 
 
 def _half_variance(halving: bayer.Halving, level: Tensor) -> Tensor:
-    """Bring a level, of all or of every pixel, to half the sides: of every pixel, ``(B, 1, H/2, W/2)``."""
+    """Bring a level, one for all pixels or one each, to half the sides: one each, ``(B, 1, H/2, W/2)``."""
     if level.shape[-1] > 1:
         level = pad_to_multiple(level, 4)
     return F.pixel_shuffle(halving.variance(level), 2)

@@ -45,7 +45,7 @@ class NAFBlock(nn.Module):
         self.gamma = nn.Parameter(torch.zeros(1, width, 1, 1))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features ``(B, C, h, w)`` to features of the same shape."""
+        """Map features ``(B, C, h, w)`` to features of the same shape."""
         y = self.conv2(self.conv1(self.norm1(x)))
         y = _gate(y)
         attention = self.attention(y.mean((2, 3), keepdim=True))
@@ -59,10 +59,11 @@ class NAFBlock(nn.Module):
 class NAFNet(Denoiser):
     r"""A U-Net without activation functions (Chen et al., "Simple Baselines for Image Restoration", ECCV 2022).
 
-    A block is two residuals: layer norm, pointwise c to 2c, depthwise 3 x 3, simple gate :math:`a \odot b`, simplified
-    channel attention, pointwise; and layer norm, pointwise c to 2c, simple gate, pointwise; each enters with a learned
-    factor that starts at 0. Convolutions 2 x 2 of stride 2 go down, pixel shuffles go up, skips are added. The channel
-    attention averages over the whole input: a tile and the whole picture differ a little.
+    A block has two residuals. The first is layer norm, pointwise c to 2c, depthwise 3 x 3, simple gate :math:`a \odot
+    b`, simplified channel attention, pointwise; the second is layer norm, pointwise c to 2c, simple gate, pointwise.
+    Each enters with a learned factor that starts at 0. Convolutions 2 x 2 of stride 2 lead down, pixel shuffles lead
+    up, and skips are added. The channel attention averages over the whole input, so a tile and the whole picture differ
+    a little.
 
     Args:
         width: features of the first scale, doubled at each further one; 32 and 64 are published.

@@ -1,12 +1,12 @@
 r"""The base of every network: ``denoised = noisy + residual([noisy, noise map])``.
 
-Domain: packed RAW, float, white = 1, not clipped at black; any height and width from 2 on. A network that pools ``s``
-times needs sides that are multiples of its ``stride = 2^s``: the picture is padded below and on the right by reflection
-without repeating the edge (as often as needed, so a 2 x 2 picture passes too), and the result is cropped back. With
-``pyramid`` it denoises at half the sides too (:mod:`denoisers.pyramid`).
+Domain: packed RAW in float, white = 1, not clipped at black, of any height and width from 2 on. A network that pools
+``s`` times needs sides that are multiples of its ``stride = 2^s``: the picture is padded below and on the right by
+reflection without repeating the edge (as often as needed, so that even a 2 x 2 picture passes), and the result is
+cropped back. With ``pyramid`` it also denoises at half the sides (:mod:`denoisers.pyramid`).
 
 The noise map is the standard deviation by default. UPI's is the variance, whose values of 1e-5 to 1e-2 move the first
-layer little: after 400 steps at a learning rate of 1e-3 the U-Net of width 8 had taken 12 % off the l1 error with the
+layer little: after 400 steps at a learning rate of 1e-3, the U-Net of width 8 had taken 12 % off the l1 error with the
 deviation and 6 % with the variance. The residual's last convolution starts at zero, so that an untrained network is the
 identity.
 """
@@ -32,10 +32,10 @@ from denoisers.pyramid import MOST_HALVINGS, double, halve, halved_variance, smo
 from rawaug.registry import Registry, require_between
 
 DENOISERS = Registry("denoiser", "rawaug.denoisers", "denoisers")
-"""The networks by name: subclasses of :class:`Denoiser`."""
+"""This maps names to networks, which are subclasses of :class:`Denoiser`."""
 
 NEAR = 8.0
-"""The distance up to which a network sees its limits, in standard deviations of the noise."""
+"""A network sees its limits up to this distance, in standard deviations of the noise."""
 
 
 class Shared(TypedDict, total=False):
@@ -54,21 +54,24 @@ class Denoiser(nn.Module, ABC):
     A network's constructor takes its own settings and ``**shared``, and hands the latter on.
 
     Args:
-        config: the network's own settings. With those of the shared ones that its constructor takes, except the seed,
-            they are kept with the weights as :attr:`config`, so that the same network can be built again.
-        stride: inside, the sides of a picture are padded to multiples of this.
+        config: the network's own settings. They are kept with the weights as :attr:`config`, together with the shared
+            settings that its constructor takes, except the seed, so that the same network can be built again.
+        stride: the sides of a picture are padded to multiples of this internally.
         limits: feed, as two times ``channels`` more inputs, how far the transformed signal is above 0 and below white,
-            at most :data:`NEAR`: where photons are few, and where the sensor clips. Not in the domain ``linear``.
+            at most :data:`NEAR`: it shows where photons are few, and where the sensor clips. Not available in the
+            domain ``linear``.
         mend: replace hot and dead pixels of packed RAW before the network (:func:`denoisers.defects.mend_planes`). Not
-            in the domain ``linear``.
-        pyramid: times, 0 to 4, that the sides are halved to denoise there too, where wide noise is narrow, and to take
-            what is wide from there; a quarter to a third more work. Not where the result is demosaiced.
-        channels: of the picture, 1 to 65536; 4, packed RAW, by default.
+            available in the domain ``linear``.
+        pyramid: how many times, 0 to 4, the sides are halved to denoise there too, where wide noise is narrow, and to
+            take what is wide from there; it is a quarter to a third more work. Not available if the result is
+            demosaiced.
+        channels: channels of the picture, 1 to 65536; by default 4, which is packed RAW.
         variance_map: feed the noise map as ``channels`` more inputs; calls must then pass ``variance``.
-        deviation: feed the standard deviation, sqrt(variance), in place of the variance; matters to a noise map only.
+        deviation: feed the standard deviation, sqrt(variance), instead of the variance; it matters only with a noise
+            map.
         domain: ``linear``, or a transform of :mod:`denoisers.domains`; calls must then pass ``variance``, a map
             ``shot_var max(noisy, 0) + read_var``.
-        seed: the network draws its first weights from it.
+        seed: seed of the initial weights.
 
     Raises:
         TypeError: if there is no such setting.
@@ -76,22 +79,22 @@ class Denoiser(nn.Module, ABC):
     """
 
     defaults: ClassVar[Shared] = Shared(channels=PACKED, variance_map=True, deviation=True, domain="linear", seed=0)
-    """The shared settings where a call leaves them out."""
+    """The shared settings have these values if a call leaves them out."""
     __signature__: ClassVar[inspect.Signature]
 
     mixed: ClassVar[bool] = False
-    """Whether bfloat16 costs it less than 0.05 dB, and dense convolutions gain by it."""
+    """This says whether bfloat16 costs the network less than 0.05 dB and speeds up dense convolutions."""
     growing: ClassVar[frozenset[str]] = frozenset()
-    """Settings that may be larger than those of the network whose weights a training starts from."""
+    """These settings may be larger than those of the network whose weights a training starts from."""
     layerless: ClassVar[frozenset[str]] = frozenset()
-    """Settings that no layer depends on: a training may start from weights that have others."""
+    """No layer depends on these settings, so a training may start from weights that have others."""
     turns: int = 1
-    """Turned views of a developed picture, 1, 2, 4 or 8, that are averaged where nothing else is asked for."""
+    """This many turned views of a developed picture, 1, 2, 4 or 8, are averaged if nothing else is asked for."""
     upscale: ClassVar[int] = 1
-    """Sides of the result over those of packed RAW: 2 where it is demosaiced, ``(B, 3, 2h, 2w)``."""
+    """The result's sides are this many times those of packed RAW: 2 if it is demosaiced, ``(B, 3, 2h, 2w)``."""
 
     def __init_subclass__(cls) -> None:
-        """Let ``help`` and recipes see the shared settings by name, in place of ``**shared``."""
+        """Show ``help`` and recipes the shared settings by name, instead of ``**shared``."""
         own = inspect.signature(cls.__init__).parameters
         parameters = []
         for name, parameter in own.items():
@@ -144,7 +147,7 @@ class Denoiser(nn.Module, ABC):
         self.config = {**config, **self._shared_config(settings)}
 
     def _shared_config(self, settings: Shared) -> dict[str, Any]:
-        """Select the shared settings that build the same network again: those of its constructor, but the seed."""
+        """Select the shared settings that build the same network again: those of its constructor, except the seed."""
         parameters = type(self).__signature__.parameters
         takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
 
@@ -174,7 +177,7 @@ class Denoiser(nn.Module, ABC):
     def residual(self, features: Tensor) -> Tensor:
         """Compute the correction ``(B, channels, h, w)`` from features ``(B, inputs, h, w)``.
 
-        The sides are multiples of ``stride``. A network with :attr:`upscale` 2 gives the correction of its result.
+        The sides are multiples of ``stride``. A network with :attr:`upscale` 2 returns the correction of its result.
         """
 
     def base_image(self, packed: Tensor) -> Tensor:
@@ -184,8 +187,8 @@ class Denoiser(nn.Module, ABC):
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
         """Denoise ``(B, channels, h, w)``; the result has the same shape, or :attr:`upscale`'s, and is not clipped.
 
-        ``variance``, the noise variance of each value, has the shape of ``noisy``. ValueError if a shape or type is
-        wrong, or the network needs ``variance`` and it is missing.
+        ``variance``, the noise variance of each value, has the shape of ``noisy``. ValueError is raised if a shape or
+        type is wrong, or the network needs ``variance`` and it is missing.
         """
         variance = self._require_input(noisy, variance)
 
@@ -257,7 +260,7 @@ class Denoiser(nn.Module, ABC):
         return [signal.clamp_max(NEAR), (white - signal).clamp_max(NEAR)]
 
     def _correction(self, signal: Tensor, *maps: Tensor) -> Tensor:
-        """Compute the residual of a signal and its maps, padded to what the network takes and cropped back."""
+        """Compute the residual of a signal and its maps; pad to what the network takes, and crop back."""
         features = signal
         if maps:
             features = torch.cat([signal, *maps], dim=1)
@@ -267,7 +270,7 @@ class Denoiser(nn.Module, ABC):
         return correction[..., : self.upscale * height, : self.upscale * width]
 
     def _mend(self, noisy: Tensor, levels: Levels, mend: Callable[[Tensor], Tensor]) -> Tensor:
-        """Replace the defects that ``mend`` replaces in the transformed signal; all else keeps its bits."""
+        """Replace the defects that ``mend`` replaces in the transformed signal; all other values keep their bits."""
         domain = DOMAINS[self.domain]
         signal = domain.forward(noisy.float(), *levels)
         mended = mend(signal)
@@ -282,7 +285,7 @@ class Denoiser(nn.Module, ABC):
         return parameter.dtype
 
     def _require_input(self, noisy: Tensor, variance: Tensor | None) -> Tensor | None:
-        """Return the noise map; ValueError if the picture or, where the network reads one, the map is wrong."""
+        """Return the noise map; raise ValueError if the picture or a map that the network reads is wrong."""
         if noisy.ndim != 4 or noisy.shape[1] != self.channels or min(noisy.shape[-2:]) < 2:
             name = type(self).__name__
             raise ValueError(f"{name} takes (B, {self.channels}, h >= 2, w >= 2), got {tuple(noisy.shape)}")
@@ -300,7 +303,7 @@ class Denoiser(nn.Module, ABC):
             raise ValueError(f"{name} is {image.dtype} but the network is {self._dtype}; convert one of them")
 
     def _require_variance(self, noisy: Tensor, variance: Tensor | None) -> Tensor:
-        """Return the noise map; ValueError if it is missing, negative, or of another shape or type."""
+        """Return the noise map; raise ValueError if it is missing, negative, or of another shape or type."""
         if variance is None:
             reason = f"domain={self.domain!r}"
             if self.variance_map:
@@ -311,7 +314,7 @@ class Denoiser(nn.Module, ABC):
         self._require_type(variance, "variance")
 
         is_traced = torch.compiler.is_compiling() or torch.onnx.is_in_onnx_export()
-        is_on_cpu = variance.device.type == "cpu"  # elsewhere reading a value back would stall the device
+        is_on_cpu = variance.device.type == "cpu"  # on other devices, reading a value back would stall
         if is_on_cpu and not is_traced and variance.numel() and float(variance.detach().min()) < 0.0:
             raise ValueError(f"variance must not be negative, got {float(variance.min()):.3g}")
         return variance
@@ -335,7 +338,7 @@ class Denoiser(nn.Module, ABC):
 
     @property
     def core(self) -> Denoiser:
-        """The network whose weights one of another kind starts from: this one, unless it is made of several."""
+        """The network whose weights a network of another kind starts from: this one, unless it is made of several."""
         return self
 
     def start_from(self, model: Denoiser) -> None:
@@ -345,10 +348,10 @@ class Denoiser(nn.Module, ABC):
 
     @torch.no_grad()
     def initialise(self, seed: int, *zeros: nn.Conv2d, gain: float = HE_GAIN) -> None:
-        """Draw all convolutions anew (He et al. 2015), deviation ``gain / sqrt(fan in)``, biases and ``zeros`` zero.
+        """Draw convolutions anew (He et al. 2015), deviation ``gain / sqrt(fan in)``; set biases and ``zeros`` to zero.
 
-        The numbers come from a CPU generator of ``seed``: the same on every device, and the global state is untouched.
-        They are drawn in the order in which the layers were added.
+        The numbers come from a CPU generator of ``seed``, so they are the same on every device, and the global state is
+        untouched. They are drawn in the order in which the layers were added.
         """
         generator = torch.Generator("cpu").manual_seed(seed)
         for module in self.modules():
@@ -363,7 +366,7 @@ class Denoiser(nn.Module, ABC):
 
             fan_in = math.prod(module.weight.shape[1:])
             if isinstance(module, nn.ConvTranspose2d):
-                # Transposed convolutions here have as many taps as strides: each output has one of them.
+                # Transposed convolutions here have as many taps as strides, so each output has one tap.
                 fan_in = module.in_channels
             weight = torch.empty(module.weight.shape, device="cpu")
             nn.init.normal_(weight, 0.0, gain / math.sqrt(fan_in), generator=generator)

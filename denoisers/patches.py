@@ -8,13 +8,13 @@ from torch.nn import functional as F
 
 
 def extract_patches(image: Tensor, side: int) -> Tensor:
-    """Cut all patches of an image ``(C, h, w)``, overlapping, ``(C, side^2, N)``, row by row of their corners."""
+    """Cut all overlapping patches of an image ``(C, h, w)``, by rows of their corners: ``(C, side^2, N)``."""
     patches: Tensor = F.unfold(image[:, None], side)
     return patches
 
 
 def patch_grid(height: int, width: int, side: int, step: int) -> Tensor:
-    """List the indices of patches at every ``step``-th row and column, the last ones always included, ``(R,)``.
+    """List the indices ``(R,)`` of patches at every ``step``-th row and column; the last ones are always included.
 
     They count the corners of :func:`extract_patches` row by row.
     """
@@ -31,7 +31,7 @@ def assemble(sums: Tensor, weights: Tensor, image: Tensor, side: int) -> Tensor:
     Args:
         sums: weighted sums of the estimates of each patch, ``(C, side^2, N)``.
         weights: sums of their weights, ``(C, 1, N)``.
-        image: the picture before, ``(C, h, w)``.
+        image: the original picture, ``(C, h, w)``.
         side: of a patch in pixels.
     """
     size = image.shape[-2:]
@@ -41,7 +41,7 @@ def assemble(sums: Tensor, weights: Tensor, image: Tensor, side: int) -> Tensor:
 
 
 def match_patches(guide: Tensor, corners: Tensor, side: int, reach: int, count: int) -> Tensor:
-    """Find the patches that are most alike, around each of some patches.
+    """Find, for each of some patches, the patches around it that are most like it.
 
     Args:
         guide: the picture by which patches are compared, ``(h, w)``.
@@ -51,7 +51,7 @@ def match_patches(guide: Tensor, corners: Tensor, side: int, reach: int, count: 
         count: number of patches of each group.
 
     Returns:
-        Indices of patches ``(R, count)``, the patch itself first. Where the picture has fewer, it is repeated.
+        Indices of patches ``(R, count)``, the patch itself first; it is repeated if the picture has fewer.
     """
     rows = guide.shape[0] - side + 1
     columns = guide.shape[1] - side + 1

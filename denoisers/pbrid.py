@@ -6,8 +6,8 @@ estimate. One turn is
 .. math:: s \leftarrow s + U([s, s_0 + \mu (x - s_0)])
 
 with a U-Net U and a step :math:`\mu` in (0, 1) that a small head reads from x. There are ten turns. The code is this
-project's own; layers are named as in the file of weights that its authors publish. That file has no licence: it is for
-measuring, it does not ship, and nothing is trained from it.
+project's own; layers are named as in the file of weights that its authors publish. That file has no licence, so it is
+used for measuring only: it does not ship, and nothing is trained from it.
 
 Source: https://github.com/hellopipu/PBRID, the winner of the RAW denoising challenge of Megvii, 2022.
 """
@@ -24,19 +24,19 @@ from torch.nn import functional as F
 from denoisers.layers import pad_to_multiple
 
 STATES = 7
-"""Channels of the state, the first of which is the estimate."""
+"""The state has this many channels, the first of which is the estimate."""
 TURNS = 10
-"""Times that the U-Net runs."""
+"""The U-Net runs this many times."""
 WIDTHS = (10, 14, 14, 16)
-"""Features of the U-Net's four scales."""
+"""The U-Net's four scales have these numbers of features."""
 BLOCKS = 4
-"""Residual blocks of each scale, going down and going up."""
+"""Each scale has this many residual blocks going down, and as many going up."""
 MULTIPLE = 64
 """The sides of a mosaic are padded to multiples of this: the head halves them six times."""
 
 
 class PBRID(nn.Module):
-    """Denoises packed RAW ``(B, 4, h, w)`` blind; 97,207 parameters and 253 GMAC a mosaic megapixel.
+    """Denoises packed RAW ``(B, 4, h, w)`` blind, with 97,207 parameters and 253 GMAC for each megapixel of mosaic.
 
     Example:
         >>> noisy = torch.rand(1, 4, 40, 50)
@@ -56,7 +56,7 @@ class PBRID(nn.Module):
         self.rec_blocks = _UNet()
 
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
-        """Denoise packed RAW ``(B, 4, h, w)``, which is clipped to [0, 1] before; ``variance`` is not used."""
+        """Denoise packed RAW ``(B, 4, h, w)``, which is first clipped to [0, 1]; ``variance`` is not used."""
         height, width = noisy.shape[-2:]
         packed = pad_to_multiple(noisy.clamp(0.0, 1.0), self.stride)
         mosaic = F.pixel_shuffle(packed, 2)

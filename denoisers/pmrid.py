@@ -1,7 +1,7 @@
 """PMRID, a U-Net of separable convolutions for phones, made for the k-sigma domain (Wang et al., ECCV 2020).
 
-Layers are named as in the file of weights that its authors publish. ReLUs and sums work in place: on a CPU fresh memory
-costs more than they do.
+Layers are named as in the file of weights that its authors publish. ReLUs and sums work in place, since on a CPU
+allocating new memory costs more than they do.
 
 Source: Wang et al., "Practical Deep Raw Image Denoising on Mobile Devices", ECCV 2020.
 """
@@ -19,7 +19,7 @@ from denoisers.network import DENOISERS, Denoiser, Shared
 
 PUBLISHED_WIDTH = 16
 BLOCKS = (2, 2, 4, 4)
-"""Bottleneck blocks of the encoder's four stages."""
+"""The encoder's four stages have these numbers of bottleneck blocks."""
 
 
 class Separable(nn.Module):
@@ -38,7 +38,7 @@ class Separable(nn.Module):
         self.pointwise = conv(inputs, outputs, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features ``(B, inputs, h, w)`` to ``(B, outputs, h / stride, w / stride)``."""
+        """Map features ``(B, inputs, h, w)`` to ``(B, outputs, h / stride, w / stride)``."""
         y: Tensor = self.pointwise(self.depthwise(x))
         return y
 
@@ -55,7 +55,7 @@ class EncoderBlock(nn.Module):
             self.proj = Separable(inputs, outputs, 3, stride)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features ``(B, inputs, h, w)`` to ``(B, outputs, h / stride, w / stride)``."""
+        """Map features ``(B, inputs, h, w)`` to ``(B, outputs, h / stride, w / stride)``."""
         y: Tensor = self.conv2(self.conv1(x).relu_())
         return y.add_(self.proj(x)).relu_()
 
@@ -69,7 +69,7 @@ class Residual(nn.Module):
         self.conv1 = Separable(width, width, 3)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features ``(B, C, h, w)`` to features of the same shape."""
+        """Map features ``(B, C, h, w)`` to features of the same shape."""
         y: Tensor = self.conv1(self.conv0(x).relu_())
         return y.add_(x)
 
@@ -86,7 +86,7 @@ class DecoderStage(nn.Module):
         self.proj_conv = Separable(skip, outputs, 3)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
-        """Features ``(B, inputs, h, w)`` and ``skip`` ``(B, skip, 2h, 2w)`` to ``(B, outputs, 2h, 2w)``."""
+        """Map features ``(B, inputs, h, w)`` and ``skip`` ``(B, skip, 2h, 2w)`` to ``(B, outputs, 2h, 2w)``."""
         y: Tensor = self.upsample(self.decode_conv(x))
         return y.add_(self.proj_conv(skip).relu_())
 
@@ -95,9 +95,10 @@ class DecoderStage(nn.Module):
 class PMRID(Denoiser):
     """PMRID's network (Wang et al., ECCV 2020).
 
-    Four encoder stages of 2, 2, 4, 4 bottleneck blocks (depthwise 5 x 5 and pointwise, twice), each at half the size of
-    the one before; four decoder stages of a residual of two separable 3 x 3 convolutions, a transposed convolution
-    2 x 2 and a skip; 1.03 M parameters and 3.7 GMAC a mosaic megapixel at the published width.
+    It has four encoder stages of 2, 2, 4, 4 bottleneck blocks (depthwise 5 x 5 and pointwise, twice), each at half the
+    size of the one before. Each of the four decoder stages has a residual of two separable 3 x 3 convolutions, a
+    transposed convolution 2 x 2 and a skip. At the published width the network has 1.03 M parameters and takes 3.7 GMAC
+    for each megapixel of mosaic.
 
     Args:
         width: features of the first convolution; the encoder has 4, 8, 16 and 32 times as many.

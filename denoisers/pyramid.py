@@ -1,11 +1,11 @@
-"""A denoiser at half the sides of a picture, where wide noise is narrow: binning, interpolation, and what is corrected.
+"""A denoiser at half the sides of a picture, where wide noise is narrow: binning, interpolation, and the correction.
 
-The result of one scale, f, is corrected by what is denoised at half the sides,
+The result of one scale, f, is corrected by what is denoised at half the sides:
 
 ``g_n(y) = f(y) + U k(g_{n-1}(B y) - B f(y))`` and ``g_0 = f``,
 
-B binning by 2 and U interpolating. k smooths, and falls to 0 where :data:`BLIND` of the values are clipped: their mean
-does not tell the light.
+B bins by 2, and U interpolates. k smooths, and falls to 0 where :data:`BLIND` of the values are clipped, since their
+mean does not show how much light there was.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from denoisers.layers import PACKED
 from rawaug import bayer
 
 MOST_HALVINGS = 4
-"""Maximum number of times that the sides are halved."""
+"""The sides are halved at most this many times."""
 BLIND = 0.25
-"""Minimum share of clipped values for ignoring the picture at half the sides."""
+"""The picture at half the sides is ignored where at least this share of the values is clipped."""
 
 
 def halve(picture: Tensor) -> Tensor:
-    """Average a picture ``(B, C, h, w)``, sides even, to half its sides, ``(B, C, h/2, w/2)``.
+    """Average a picture ``(B, C, h, w)`` with even sides to half its sides, ``(B, C, h/2, w/2)``.
 
     Packed RAW, whose sites are those of RGGB, is binned around the places of the new sites.
     """
@@ -34,7 +34,7 @@ def halve(picture: Tensor) -> Tensor:
 
 
 def halved_variance(variance: Tensor) -> Tensor:
-    """Compute the variance ``(B, C, h/2, w/2)`` of noise after :func:`halve` from its variance before."""
+    """Compute the variance ``(B, C, h/2, w/2)`` that noise has after :func:`halve` from its variance before."""
     share = 0.25
     if variance.shape[1] == PACKED:
         share = bayer.bin_mosaic_variance(2)
@@ -60,9 +60,9 @@ def double(picture: Tensor) -> Tensor:
 
 
 def smooth_correction(difference: Tensor, clipped: Tensor) -> Tensor:
-    """Smooth what a picture at half the sides corrects, ``(B, C, h, w)``, and fade it out where values are clipped.
+    """Smooth the correction by a picture at half the sides, ``(B, C, h, w)``, and fade it out where values are clipped.
 
-    ``clipped`` is the share of clipped values, of the same shape. Near its own limit of resolution the half picture
+    ``clipped`` is the share of clipped values, of the same shape. Near its own limit of resolution, the half picture
     knows less than the whole one.
     """
     smooth = F.avg_pool2d(difference, 3, 1, 1, count_include_pad=False)

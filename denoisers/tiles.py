@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 Run = Callable[[Tensor, Tensor | None], Tensor]
-"""``run(noisy, variance) -> denoised``: a network, or anything that is called like one."""
+"""It is called as ``run(noisy, variance) -> denoised``: a network, or anything that is called like one."""
 Each = Callable[[Sequence[Any]], Iterable[Any]]
-"""An iterator over pieces of work, which may show progress, as ``tqdm`` does."""
+"""It iterates over pieces of work and may show progress, as ``tqdm`` does."""
 
 TILE = 1536
-"""Side of a tile in packed pixels, overlap included, where nothing else is said."""
+"""A tile has this side in packed pixels by default, overlap included."""
 
 OVERLAP = 96
-"""The default overlap of tiles, in packed pixels."""
+"""Tiles overlap by this many packed pixels by default."""
 
 
 @torch.no_grad()
@@ -33,11 +33,11 @@ def denoise_tiles(
 ) -> Tensor:
     """Denoise a picture of any size piece by piece, without gradients: ``f(y)[core] = f(y[core + overlap])[core]``.
 
-    The equality is exact (to rounding) where the overlap is at least the network's receptive radius: from 17 pixels for
-    a DnCNN of depth 17 to 169 for the U-Net. Influence falls off with distance: with a trained U-Net of four scales the
+    The equality is exact (to rounding) if the overlap is at least the network's receptive radius: from 17 pixels for a
+    DnCNN of depth 17 to 169 for the U-Net. Influence falls off with distance: with a trained U-Net of four scales, the
     largest difference was 0.3 of the noise's deviation at an overlap of 32, and 2e-6 at 64. Tiles start at multiples of
-    the network's stride, so that pooling grids fall on the same pixels as in the whole picture. Nothing is blended:
-    that would hide an overlap that is too small. Peak memory is the result and one piece.
+    the network's stride, so that pooling grids fall on the same pixels as in the whole picture. Nothing is blended,
+    since that would hide an overlap that is too small. Peak memory is the result and one piece.
 
     Args:
         model: ``model(noisy, variance) -> denoised``; its ``stride``, if it has one, aligns the tiles, and its
@@ -74,7 +74,7 @@ def denoise_tiles(
     columns, tile_width = _tile_starts(width, tile, overlap, stride)
 
     denoised: Tensor | None = None
-    # In reading order: what a tile has too little context for, at its right and lower end, the next tile overwrites.
+    # In reading order, the next tile overwrites what a tile has too little context for at its right and lower end.
     for row, column in each(list(product(rows, columns))):
         window = (..., slice(row, row + tile_height), slice(column, column + tile_width))
         noisy_tile = noisy[window]
@@ -103,7 +103,7 @@ def denoise_tiles(
 
 
 def _tile_starts(size: int, tile: int, overlap: int, stride: int) -> tuple[list[int], int]:
-    """Place tiles along a side, the last up to its end: their starts, and their length, at most ``tile``."""
+    """Place tiles along a side up to its end; return their starts and their length, which is at most ``tile``."""
     step = tile - 2 * overlap
     count = math.ceil((size - 2 * overlap) / step)
     if count > 1:

@@ -4,9 +4,10 @@ A few stages of a diffusion, each with filters and functions of its own:
 
 .. math:: u_t = u_{t-1} - \sum_i \bar k_i * \phi_i(k_i * u_{t-1}) - \lambda (u_{t-1} - f)
 
-f is the noisy plane, and :math:`\bar k` is k turned by 180 degrees. A filter of unit length is a combination of the
-cosines of a square without the constant one, so that light does not matter; a function is a sum of 63 Gaussians, evenly
-spaced, as far apart as they are wide. With 48 filters of 7 x 7 a stage has 48 (48 + 63) + 1 = 5,329 parameters.
+f is the noisy plane, and :math:`\bar k` is k turned by 180 degrees. A filter has unit length and combines the cosines
+of a square without the constant one, so that brightness does not matter. A function is a sum of 63 evenly spaced
+Gaussians, which are as far apart as they are wide. With 48 filters of 7 x 7, a stage has 48 (48 + 63) + 1 = 5,329
+parameters.
 
 Each plane is filtered by itself, with the same weights. Functions are looked up in tables, as in the published code.
 """
@@ -25,14 +26,14 @@ from denoisers.network import DENOISERS, Denoiser, Shared
 from rawaug.registry import require_between
 
 GAUSSIANS = 63
-"""Number of Gaussians of a function."""
+"""A function has this many Gaussians."""
 MARGIN = 5
-"""Widths of a Gaussian beyond the outermost ones after which a function is 0."""
+"""A function is 0 from this many Gaussian widths beyond the outermost Gaussians."""
 KNOTS_A_GAUSSIAN = 16
-"""Knots of the table of a function from one Gaussian to the next; between them it is linear, within 5e-4."""
+"""A function's table has this many knots from one Gaussian to the next; it is linear between them, within 5e-4."""
 KNOTS = KNOTS_A_GAUSSIAN * (GAUSSIANS - 1 + 2 * MARGIN) + 1
 PUBLISHED_REACH = 310.0 / 255.0
-"""The largest response of a filter that a function covers, of pictures with white at 1, as published."""
+"""A function covers responses of a filter up to this published one, on pictures with white at 1."""
 
 
 def cosine_filters(side: int) -> Tensor:
@@ -86,7 +87,7 @@ class Diffusion(nn.Module):
         return torch.lerp(table[index], table[index + 1], share)
 
     def forward(self, plane: Tensor, noisy: Tensor) -> Tensor:
-        """Compute the next plane from a plane and the noisy one, all ``(B, 1, h, w)``; sides are ``side`` or more."""
+        """Compute the next plane from a plane and the noisy one, all ``(B, 1, h, w)``; no side is below ``side``."""
         margin = (self.side // 2,) * 4
         filters = self.filters()
 
@@ -101,13 +102,13 @@ class Diffusion(nn.Module):
 class TNRD(Denoiser):
     """Trainable nonlinear reaction diffusion (Chen and Pock, TPAMI 2017), made for noise of one level.
 
-    In the domain ``anscombe`` every noise has one level; set ``reach`` to what a filter responds there, such as 40
+    In the domain ``anscombe`` every noise has one level; set ``reach`` to the responses of a filter there, such as 40
     deviations.
 
     Args:
-        stages: number of them, 1 to 1000; 5 is published.
-        side: of the filters, 3, 5 or 7; there are ``side**2 - 1``.
-        reach: largest response of a filter that the functions tell from larger ones.
+        stages: number of stages, 1 to 1000; 5 is published.
+        side: side of the filters, 3, 5 or 7; there are ``side**2 - 1`` of them.
+        reach: largest response of a filter that the functions distinguish from larger ones.
         channels, domain, seed: see :class:`denoisers.Denoiser`. There is no noise map.
 
     Example:

@@ -13,19 +13,20 @@ from denoisers.network import DENOISERS, Denoiser, Shared
 from rawaug.registry import require_between
 
 PUBLISHED_WIDTH = 32
-"""Features of the U-Net's first scale in the paper."""
+"""The U-Net's first scale has this many features in the paper."""
 
 
 @DENOISERS.register("UNet")
 class UNet(Denoiser):
     """UPI's U-Net (Brooks et al., "Unprocessing Images for Learned Raw Denoising", CVPR 2019).
 
-    Five scales of three 3 x 3 convolutions with leaky ReLU 0.2; features double at each scale, 32 to 512; max-pooling
-    down, bilinear interpolation up, skips by concatenation. As published, ``deviation=False``.
+    It has five scales of three 3 x 3 convolutions with leaky ReLU 0.2. Features double at each scale, from 32 to 512.
+    Max-pooling leads down, bilinear interpolation leads up, and skips are concatenated. As published, it has
+    ``deviation=False``.
 
     Args:
         width: features of the first scale, 32 as published; the last has ``width * 2**(scales - 1)``.
-        scales: of the pyramid, 1 to 12; sides are padded to multiples of ``2**(scales - 1)``.
+        scales: number of scales, 1 to 12; sides are padded to multiples of ``2**(scales - 1)``.
         channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
     Example:

@@ -6,9 +6,9 @@ the number of patches. It has the singular vectors of Y and the singular values
 
 .. math:: s_i(X) = \frac{s_i - \epsilon + \sqrt{(s_i + \epsilon)^2 - 4 C}}{2}, \qquad C = 2 c \sqrt{n} \sigma^2
 
-or 0 where the root is not real: large ones, which are the picture, shrink less than small ones. Estimates are averaged
-where patches overlap. A tenth of the difference to the noisy picture is then given back, and all is repeated, with the
-noise that is left.
+or 0 if the root is not real. Large values, which are the picture, shrink less than small ones. Estimates are averaged
+where patches overlap. A tenth of the difference to the noisy picture is then given back, and everything is repeated
+with the noise that is left.
 
 The settings are the published ones for noise of up to 20 / 255. The colours are filtered as luminance and differences;
 patches are matched on the luminance.
@@ -25,21 +25,21 @@ from denoisers.classical import FILTERS, Classical, Planes, from_opponent, to_op
 from denoisers.patches import assemble, extract_patches, match_patches, patch_grid
 
 SIDE, STEP, REACH = 6, 2, 12
-"""Side of a patch, distance of the patches that groups are formed for, and how far these reach, in packed pixels."""
+"""These are the side of a patch, the distance of the patches with groups, and a group's reach, in packed pixels."""
 PATCHES = 70
-"""Number of patches of a group in the first rounds."""
+"""A group has this many patches in the first rounds."""
 ROUNDS = 8
-"""Number of rounds."""
+"""There are this many rounds."""
 ROUNDS_A_MATCH = 2
-"""Number of rounds after which groups are formed again, of fewer patches."""
+"""Groups are formed again, with fewer patches, after this many rounds."""
 FEWER = 10
-"""Number of patches by which a group shrinks whenever groups are formed again."""
+"""A group shrinks by this many patches whenever groups are formed again."""
 GIVEN_BACK = 0.1
-"""Share of the difference to the noisy picture that is given back before a round."""
+"""This share of the difference to the noisy picture is given back before a round."""
 NOISE_LEFT = 0.54
-"""Factor of the noise that is estimated to be left after a round."""
+"""This factor of the noise is estimated to be left after a round."""
 WEIGHT = 2.0 * math.sqrt(2.0)
-"""c, the published factor of the weights."""
+"""This is c, the published factor of the weights."""
 EPS = 1e-6
 
 
@@ -47,7 +47,7 @@ def shrink(values: Tensor, noise: Tensor, patches: int) -> Tensor:
     """Shrink the singular values of noisy groups to those of the estimate.
 
     Args:
-        values: those of the noisy groups ``(..., k)``.
+        values: singular values of the noisy groups ``(..., k)``.
         noise: deviation of the noise of each group ``(...)``.
         patches: n, the number of patches of a group.
 

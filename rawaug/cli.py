@@ -25,7 +25,7 @@ from rawaug.progress import hide_progress
 from rawaug.version import __version__
 
 BAD_INPUT = 2
-"""Exit status after an error of the user's."""
+"""This is the exit status after a user's error."""
 
 COMMANDS = {
     "benchmark": "Compare denoisers on the same frozen noise over clean references.",
@@ -41,13 +41,13 @@ COMMANDS = {
     "submit": "Denoise the noisy blocks of a benchmark, in the form that its server takes.",
     "synth": "Write noisy and clean RAW pairs made from sRGB pictures.",
 }
-"""Modules of :mod:`rawaug.commands`, each with a function ``run`` whose docstring opens with this line."""
+"""These are modules of :mod:`rawaug.commands`, each with a function ``run`` whose docstring opens with this line."""
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-"""Numbers of glibc's malloc.h."""
+"""These numbers are from glibc's malloc.h."""
 
 NETWORKS = ("benchmark", "denoise", "evaluate", "run")
-"""Commands that run networks. They take memory in huge pages and keep it, as page faults took a third of their time."""
+"""These commands run networks. They take huge pages and keep them, as page faults took a third of their time."""
 
 app = App(
     name="rawaug",
@@ -114,13 +114,13 @@ def _keep_memory() -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit status.
+    """Run the command line and return the exit status.
 
-    Threads of OpenMP sleep where they wait for each other, unless ``OMP_WAIT_POLICY`` says otherwise. By default they
-    spin, and where other programs want the cores, a thread that spins keeps them from the one that it waits for.
+    Threads of OpenMP sleep while they wait for each other, unless ``OMP_WAIT_POLICY`` says otherwise. By default they
+    would spin, and if other programs want the cores, a spinning thread takes them from the thread that it waits for.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    words.sort(key=lambda word: word != "--quiet")  # comes first, so that run takes it for no key of a recipe
+    words.sort(key=lambda word: word != "--quiet")  # comes first, so that run does not take it for a key of a recipe
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # names of files need not fit the terminal's encoding
             stream.reconfigure(errors="backslashreplace")
@@ -130,7 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words[command : command + 1] and words[command] in NETWORKS:
         _keep_memory()
     if not words or words[0] in ("-h", "--help"):
-        for point in _PLUGINS:  # those alone are imported for the first lines of their docstrings
+        for point in _PLUGINS:  # only these are imported, for the first lines of their docstrings
             with suppress(ImportError, AttributeError):
                 app[point.name]
     if words[command : command + 1] == ["run"] and {"-h", "--help"} & set(words[command + 2 :]):  # a recipe's keys
@@ -157,7 +157,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _command_at(words: Sequence[str]) -> int:
-    """Where the command is, behind the options that come before it."""
+    """Find the place of the command, after the options that come before it."""
     place = 0
     while place < len(words) and words[place].startswith("--"):
         place += 2 if words[place] == "--import" else 1

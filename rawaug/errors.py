@@ -1,4 +1,4 @@
-"""Errors as one line that says what to do: a library that is not installed, or a machine that is short of something.
+"""One-line errors that say what to do: a library is not installed, or the machine is short of something.
 
 Names of files, which may hold any byte but ``/`` and NUL, are made printable for terminals, logs and tables.
 """
@@ -30,9 +30,9 @@ def count_of(number: int, noun: str, plural: str | None = None) -> str:
     """Write a number and its noun.
 
     Args:
-        number: of things.
-        noun: of one of them.
-        plural: of several, where it is not the noun and an s.
+        number: how many there are.
+        noun: the singular.
+        plural: the plural, if it is not the noun with an s.
 
     Example:
         >>> count_of(1, "picture"), count_of(2, "picture"), count_of(0, "pass", "passes")
@@ -89,11 +89,11 @@ _WAYS_OUT = (
     ),
     (r"no space left on device|pytorchstreamwriter", "the disk is full; free some space"),
 )
-"""Patterns of an error's text in lower case, and advice. The first pattern that matches counts."""
+"""These are patterns of an error's text in lower case, with advice. The first pattern that matches counts."""
 
 
 def resource_error(error: BaseException) -> str | None:
-    """Say in one line what the machine is short of and what to do; None for any other error.
+    """Say in one line what the machine is short of and what to do; return None for any other error.
 
     Example:
         >>> resource_error(RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. "))

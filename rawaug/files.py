@@ -1,7 +1,7 @@
-"""Files: written whole or not at all, one run at a time in a folder, hashed; safetensors and JSON checked as read.
+"""Files, written completely or not at all; locks of folders and hashes; safetensors and JSON, checked on reading.
 
 Weights, parameters and states are safetensors (https://huggingface.co/docs/safetensors) with text in their header:
-``format`` is ``rawaug`` and ``kind`` says what the file holds. Numbers in files must be finite.
+``format`` is ``rawaug``, and ``kind`` says what the file holds. Numbers in files must be finite.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 OF_NO_DATASET = (".DS_Store", "Thumbs.db")
-"""Files that macOS and Windows leave in folders."""
+"""macOS and Windows leave these files in folders."""
 
 LOCK = "rawaug.lock"
-"""Name of the lock file in an output folder."""
+"""The lock file in an output folder has this name."""
 
 MOST_BYTES = 2**32
-"""Largest size of an input file; larger ones are refused before they are read."""
+"""An input file has at most this size; larger ones are refused before they are read."""
 
 WEIGHTS = Path(__file__).parent / "weights"
-"""The folder of the shipped ISPs."""
+"""This folder holds the shipped ISPs."""
 
 
 def yaml_value(text: str) -> Any:
@@ -58,21 +58,21 @@ def yaml_value(text: str) -> Any:
     number = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$")
     Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+0123456789"))
     try:
-        return yaml.load(text, Loader)  # of safe values only
+        return yaml.load(text, Loader)  # only safe values
     except yaml.YAMLError as error:
         raise ValueError(f"not YAML: {' '.join(str(error).split())}") from None
 
 
 MOST_YAML_BYTES, MOST_YAML_LEVELS = 2**16, 50
-"""Limits of a YAML file of settings."""
+"""A YAML file of settings has these limits."""
 
 
 def read_yaml(file: str | Path, what: str) -> Any:
-    """Plain values of a YAML file of settings.
+    """Read plain values from a YAML file of settings.
 
     Args:
         file: its path.
-        what: what it should be, for messages, such as ``"camera"``.
+        what: what the file should be, for messages, such as ``"camera"``.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -88,7 +88,7 @@ def read_yaml(file: str | Path, what: str) -> Any:
         text = Path(file).read_text(encoding="utf-8")
         depth = 0
         for event in yaml.parse(text, Loader=yaml.SafeLoader):
-            if isinstance(event, yaml.AliasEvent):  # a few lines of them are billions of values
+            if isinstance(event, yaml.AliasEvent):  # a few lines of aliases can be billions of values
                 raise ValueError("uses aliases (*name); write the values out")
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > MOST_YAML_LEVELS:
@@ -100,13 +100,13 @@ def read_yaml(file: str | Path, what: str) -> Any:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield a path beside ``path``, which it replaces when the block ends without an error; two writers take turns."""
+    """Yield a path next to ``path``, which it replaces if the block ends without an error; writers take turns."""
     from filelock import FileLock
 
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
 
-    key = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]  # the name itself may be as long as a name can be
+    key = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]  # the name itself may already be of maximal length
     partial = path.with_name(f".{key}.partial")
     lock = path.with_name(f".{key}.lock")
     try:
@@ -128,11 +128,11 @@ def replacing(path: str | Path) -> Iterator[Path]:
 def locked(file: Path) -> Iterator[None]:
     """Hold the lock ``file`` in this block.
 
-    Its folder is made if need be, and then removed again if it stays empty.
+    Its folder is created if necessary, and then removed again if it stays empty.
 
     Raises:
         ValueError: if another run holds the lock.
-        OSError: if the folder is removed meanwhile.
+        OSError: if the folder is removed in the meantime.
     """
     from filelock import FileLock, Timeout
 
@@ -150,14 +150,14 @@ def locked(file: Path) -> Iterator[None]:
         if not file.exists():
             raise OSError(f"{folder}: was removed or replaced during this run; run the same command again")
     finally:
-        file.unlink(missing_ok=True)  # while it is locked: whoever waits for this file tries again
+        file.unlink(missing_ok=True)  # while it is locked, so whoever waits for this file tries again
         lock.release()
         if is_new and folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
 
 
 def one_at_a_time(folder: Callable[..., Path | None]) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator: hold the lock of the folder that ``folder(*arguments)`` names; no lock for None."""
+    """Decorate a function to hold the lock of the folder that ``folder(*arguments)`` names; None needs no lock."""
 
     def decorator(function: Callable[P, R]) -> Callable[P, R]:
         @wraps(function)
@@ -172,7 +172,7 @@ def one_at_a_time(folder: Callable[..., Path | None]) -> Callable[[Callable[P, R
 
 
 def to_json(value: Any, indent: int | None = None) -> str:
-    """Write JSON: paths become text, tensors lists, and infinity and NaN, which JSON does not have, null."""
+    """Write JSON: paths become text, tensors become lists, and infinity and NaN, which JSON lacks, become null."""
     return json.dumps(_finite(value), indent=indent, allow_nan=False)
 
 
@@ -214,7 +214,7 @@ def parse_object(text: str) -> dict[str, Any]:
 
 
 def require_writable(path: str | Path, option: str = "", folder: bool = False) -> None:
-    """Refuse, before any work, a file (or ``folder``) that could not be written at the end, or has no name."""
+    """Refuse, before any work, a file (or ``folder``) that could not be written at the end or has no name."""
     if not str(path):
         raise ValueError(f"--{option}: needs the name of a file")
     path = Path(path)
@@ -234,14 +234,14 @@ def require_writable(path: str | Path, option: str = "", folder: bool = False) -
 
 
 def write_json(value: Any, path: str | Path) -> None:
-    """Write a JSON file, whole or not at all."""
+    """Write a JSON file, completely or not at all."""
     text = to_json(value, indent=1)
     with replacing(path) as partial:
         partial.write_text(f"{text}\n", encoding="utf-8")
 
 
 def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path: str | Path) -> None:
-    """Write safetensors, whole or not at all; equal content makes equal files."""
+    """Write safetensors, completely or not at all; equal content makes equal files."""
     from safetensors.torch import save
 
     content = save({name: tensor.contiguous() for name, tensor in tensors.items()}, dict(header))
@@ -261,7 +261,7 @@ def read_tensors(
 
     Args:
         path: the file.
-        advice: the end of messages: what to do.
+        advice: the end of messages, which says what to do.
         infinite: names of tensors that may hold infinity.
 
     Raises:
@@ -276,13 +276,13 @@ def read_tensors(
 
 
 def read_metadata(path: str | Path) -> dict[str, str]:
-    """The metadata of any safetensors file, without its tensors; ValueError if it is damaged."""
+    """Read the metadata of any safetensors file, without its tensors; raise ValueError if it is damaged."""
     header, _ = _read_safetensors(path, "copy or download it again", with_tensors=False)
     return header
 
 
 def read_header(path: str | Path) -> dict[str, str]:
-    """Read the header of a rawaug file, without its tensors; ValueError if it is none."""
+    """Read the header of a rawaug file, without its tensors; raise ValueError if it is not one."""
     advice = "give one written by rawaug fit, rawaug run or denoisers.save, or copy it again"
     header, _ = _read_safetensors(path, advice, with_tensors=False)
     if header.get("format") != "rawaug" or "kind" not in header:
@@ -309,7 +309,7 @@ def find_weights(name: str | Path, *more: Path) -> Path:
 
     Args:
         name: the path or the name.
-        more: folders in which to look besides.
+        more: further folders to look in.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -346,12 +346,12 @@ def sha256(path: str | Path) -> str:
 
 
 def require_file(path: str | Path, what: str = "file") -> None:
-    """Refuse what is not a regular file, for a pipe or a device may never end, and more than :data:`MOST_BYTES`."""
+    """Refuse anything but a regular file (a pipe or a device may never end), and more than :data:`MOST_BYTES`."""
     try:
         status = Path(path).stat()
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such {what}") from None
-    except OSError as error:  # a link to itself, or a folder that may not be entered
+    except OSError as error:  # e.g. a link to itself, or a folder that may not be entered
         raise OSError(f"{path}: cannot be opened ({error.strerror})") from None
     if not stat.S_ISREG(status.st_mode):
         raise OSError(f"{path}: is a pipe, a device or a folder, and must be a regular file")
@@ -381,7 +381,7 @@ def require_same_settings(path: Path, settings: Mapping[str, object], overwrite:
 
 
 def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iterator[Path]:
-    """Yield the files of a folder and its subfolders, in no order; links to folders are not followed.
+    """Yield the files of a folder and its subfolders in no particular order; links to folders are not followed.
 
     Files that macOS and Windows leave there are left out. If there is no such folder, there are no files.
 

@@ -1,4 +1,4 @@
-r"""PSNR and SSIM on RAW, data range 1.
+r"""PSNR and SSIM on RAW, with data range 1.
 
 ``PSNR = -10 log10(mean((a - b)^2))``.
 
@@ -15,10 +15,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 WINDOW = 11
-"""Side of SSIM's window in pixels."""
+"""SSIM's window has this side in pixels."""
 
 PATCH = 256
-"""Side of the mosaic patches over which an ISP's PSNR_r is averaged."""
+"""An ISP's PSNR_r is averaged over mosaic patches of this side."""
 
 
 def _as_floats(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
@@ -35,7 +35,7 @@ def _as_floats(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def psnr(a: Tensor, b: Tensor) -> Tensor:
-    """Compute the PSNR in dB of each picture of a batch, ``(B, ...)`` to ``(B,)``; equal ones have infinity."""
+    """Compute the PSNR in dB of each picture of a batch, ``(B, ...)`` to ``(B,)``; it is infinite for equal ones."""
     a, b = _as_floats(a, b)
     return -10.0 * ((a - b) ** 2).flatten(1).mean(1).log10()
 

@@ -1,4 +1,4 @@
-"""Progress on stderr: a bar in a terminal; elsewhere, as in the log of a job, one plain line every 30 seconds.
+"""Progress on stderr: a bar in a terminal, and elsewhere, as in a job's log, one plain line every 30 seconds.
 
 The environment variable ``RAWAUG_PROGRESS_SECONDS`` sets another interval. Work that takes less time prints no line.
 """
@@ -74,5 +74,5 @@ class _Lines(terminal_tqdm):
 
     def close(self) -> None:
         if not self.disable and self.n > self.last_print_n and self.last_print_t > self.start_t:
-            self.display()  # the end, where there was a line before
+            self.display()  # the end, if there was a line before
         self.disable = True

@@ -1,8 +1,9 @@
-"""Things by name: the networks, filters, noise models, datasets, estimators, losses, ... that one file adds.
+"""Registries of things by name: networks, filters, noise models, datasets, estimators, losses, ..., one file each.
 
-A class or function with ``@KIND.register("name")`` above it, in a module of the kind's package, is found by that name;
-so is one that another installed package offers as an entry point in the group ``rawaug.KIND``. The modules are imported
-when a name is first asked for, an entry point when its own name is: importing this module loads nothing.
+A class or function with ``@KIND.register("name")`` above it, in a module of the kind's package, is found by that name.
+So is one that another installed package offers as an entry point in the group ``rawaug.KIND``. The modules are imported
+when a name is first asked for, and an entry point is imported when its own name is, so importing this module loads
+nothing.
 
 Recipes name a thing as ``{name: r2r, settings: {alpha: 0.5}}``; the settings are the keyword arguments of the class.
 A name that is nearly right is answered with the nearest one.
@@ -31,7 +32,7 @@ class UnknownName(ValueError, KeyError):
 
 
 Spec = str | Mapping[str, Any]
-"""A name, or ``{"name": ..., "settings": {...}}``."""
+"""It is a name, or ``{"name": ..., "settings": {...}}``."""
 
 
 def split_spec(spec: Spec) -> tuple[str, dict[str, Any]]:
@@ -76,7 +77,7 @@ def check_settings(
         label: opens the messages.
         function: a function or class.
         settings: values by name.
-        given: names that the caller passes besides, so that they may be missing here.
+        given: names that the caller passes in addition, so they may be missing here.
 
     Raises:
         ValueError: if one is unknown, missing, or not of the plain type that the signature names.
@@ -126,7 +127,7 @@ def require_between(key: str, value: object, least: float, most: float) -> None:
 
 
 def suggest(name: object, known: Iterable[str]) -> str:
-    """Suggest the known name that is nearest, as ``" (nearest: UNet)"``; nothing if none is near."""
+    """Suggest the nearest known name, as ``" (nearest: UNet)"``; suggest nothing if none is near."""
     by_key = {candidate.casefold(): candidate for candidate in known}
     near = difflib.get_close_matches(str(name).casefold(), by_key, n=1)
     if not near:
@@ -162,7 +163,7 @@ class Registry(Mapping[str, Any]):
         self._unimported = list(packages)
 
     def register(self, name: str) -> Callable[[T], T]:
-        """Decorator: let the class or function be found by ``name``, which no other thing may have."""
+        """Let the decorated class or function be found by ``name``, which no other thing may have."""
 
         def add(thing: T) -> T:
             namesake = self._things.get(name, thing)
@@ -199,14 +200,14 @@ class Registry(Mapping[str, Any]):
         return len(list(iter(self)))
 
     def name_of(self, thing: Any) -> str | None:
-        """Find the name that a thing is registered under; None if it is not."""
+        """Find the name that a thing is registered under; return None if it is not registered."""
         for name in (*self._things, *self):
             if self[name] is thing:
                 return name
         return None
 
     def make(self, spec: Spec, **defaults: Any) -> Any:
-        """Make a thing with the settings of its spec; ``defaults`` fill in what these leave out."""
+        """Make a thing with the settings of its spec; ``defaults`` supply the settings that are left out."""
         name, settings = split_spec(spec)
         thing = self[name]
         arguments = check_settings(f"{self.kind} {name}", thing, settings, defaults)
@@ -239,7 +240,7 @@ class Registry(Mapping[str, Any]):
 
 
 def _path(thing: Any) -> str:
-    """Where a thing is defined, of a ``functools.partial`` its function."""
+    """Find where a thing is defined; a ``functools.partial`` counts as its function."""
     thing = getattr(thing, "func", thing)
     return f"{thing.__module__}.{thing.__qualname__}"
 

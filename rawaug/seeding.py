@@ -25,7 +25,7 @@ def keyed_generator(*keys: int | str, device: torch.device | str = "cpu") -> tor
 
 
 def rank_key() -> tuple[int, ...]:
-    """The rank as a key that separates the draws of distributed processes; empty for rank 0 and for a single one."""
+    """Give the rank as a key that separates the draws of processes; it is empty for rank 0 and a single process."""
     if not torch.distributed.is_available() or not torch.distributed.is_initialized():
         return ()
     rank = torch.distributed.get_rank()

@@ -1,3 +1,3 @@
-"""The version of the package, on the ground floor, where every room may ask for it."""
+"""The version of the package, in a module of its own, which every other one may import."""
 
 __version__ = "0.1.0"

@@ -1,9 +1,9 @@
-r"""Mosaics of any pattern at half their sides, as RGGB: clean references of real frames, and what a pyramid looks at.
+r"""Mosaics of any pattern at half their sides, as RGGB: clean references of real frames, and a pyramid's next level.
 
 .. math:: y'_c(p) = \sum_q w(q - p) \, m_c(q) \, y(q) / \sum_q w(q - p) \, m_c(q)
 
-for the planes m of the colours and a trapezoid w of six pixels about the place p of the new site (normalised
-convolution: Knutsson and Westin, CVPR 1993). Of X-Trans the pixels' mean place lies within 0.03 pixels of p.
+where m are the planes of the colours and w is a trapezoid of six pixels about the place p of the new site (normalised
+convolution: Knutsson and Westin, CVPR 1993). For X-Trans, the mean place of the pixels lies within 0.03 pixels of p.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from rawaug.bayer.patterns import PATTERNS, Pattern, pattern
 
 
 class Halving:
-    """Brings mosaics of one pattern, sides multiples of 4, to half their sides as packed RGGB, and back.
+    """Brings mosaics of one pattern to half their sides as packed RGGB, and back; sides are multiples of 4.
 
-    A new site is the mean of its colour's pixels around its place, weighed as by :func:`rawaug.bayer.bin_mosaic`, only
-    that both greens are one colour.
+    A new site is the mean of its colour's pixels around its place, with the weights of :func:`rawaug.bayer.bin_mosaic`,
+    except that both greens are one colour.
 
     Args:
         planes: ``(B, 3, H, W)``, 1 at the sites of a colour and 0 elsewhere.
@@ -39,7 +39,7 @@ class Halving:
         self.weights = self._sums(self.planes, self.kernels).clamp_min(1e-6)
 
     def __call__(self, mosaic: Tensor) -> Tensor:
-        """Halve a mosaic ``(B, 1, H, W)``: packed ``(B, 4, H/4, W/4)``."""
+        """Halve a mosaic ``(B, 1, H, W)`` to packed ``(B, 4, H/4, W/4)``."""
         return self._sums(mosaic * self.planes, self.kernels) / self.weights
 
     def variance(self, pixels: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ class Halving:
 def to_bayer(mosaic: Tensor, cfa: str) -> Tensor:
     """Convert a mosaic ``(1, H, W)`` of any pattern to RGGB at half the sides, ``(1, h, w)``, h and w even.
 
-    Lines at the end that fill no cell are left out, and in Quad-Bayer a first line that would halve the squares of a
+    Lines at the end that fill no cell are left out. In Quad-Bayer, so is a first line that would halve the squares of a
     colour.
     """
     array = pattern(cfa)
@@ -85,7 +85,7 @@ def to_bayer(mosaic: Tensor, cfa: str) -> Tensor:
 
 
 def _whole_origin(array: Pattern) -> tuple[int, int]:
-    """The first of the origins next to the corner where a pattern begins anew; the corner itself if there is none."""
+    """Find the first origin next to the corner where a pattern begins anew; take the corner itself if there is none."""
     for top, left in product((0, 1), repeat=2):
         if array.shift(top, left).name in PATTERNS:
             return top, left

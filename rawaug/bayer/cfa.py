@@ -1,7 +1,7 @@
 r"""Mosaics: the colour filter array, packing, and geometry that keeps the pattern.
 
-A mosaic keeps one colour a site, ``y[i, j] = x[c(i, j), i, j]``, where ``c`` repeats every two rows and columns in
-Bayer's patterns (US patent 3,971,065, 1976). *Packed* RAW holds the four sites of each 2 x 2 cell as four planes,
+A mosaic keeps one colour for each site, ``y[i, j] = x[c(i, j), i, j]``, where ``c`` repeats every two rows and columns
+in Bayer's patterns (US patent 3,971,065, 1976). *Packed* RAW holds the four sites of each 2 x 2 cell as four planes,
 always in the order R, Gr, Gb, B (Gr is the green of the red row), so that a network need not know the sensor's pattern.
 
 A flip or a quarter turn of a mosaic moves the pattern: a mirrored RGGB is GRBG. :func:`turn` only moves pixels,
@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 _PLANES = 4
-"""Number of planes of packed RAW."""
+"""Packed RAW has this many planes."""
 
 N_VIEWS = 8
-"""The number of flips and quarter turns of a picture: the order of the square's dihedral group."""
+"""A picture has this many flips and quarter turns: it is the order of the square's dihedral group."""
 
 
 class CFA(StrEnum):
@@ -50,7 +50,7 @@ class CFA(StrEnum):
         return (indices[0], indices[1]), (indices[2], indices[3])
 
     def shift(self, rows: int, columns: int) -> CFA:
-        """The pattern of the mosaic that starts ``rows`` lower and ``columns`` further right."""
+        """Give the pattern of the mosaic that starts ``rows`` lower and ``columns`` further right."""
         cell = [self.value[:2], self.value[2:]]
 
         colours = ""
@@ -60,19 +60,19 @@ class CFA(StrEnum):
         return CFA(colours)
 
     def turn(self, view: int) -> CFA:
-        """The pattern after :func:`turn` of a mosaic with even sides."""
+        """Give the pattern after :func:`turn` of a mosaic with even sides."""
         cell = torch.arange(4).reshape(1, 1, 2, 2)
         return CFA("".join(self.value[k] for k in turn(cell, view).flatten().tolist()))
 
     def shift_to(self, other: CFA) -> tuple[int, int]:
-        """(rows, columns) in {0, 1} with ``self.shift(rows, columns) == other``."""
+        """Find (rows, columns) in {0, 1} with ``self.shift(rows, columns) == other``."""
         red_row, red_column = self.sites[0]
         other_row, other_column = other.sites[0]
         return (red_row + other_row) % 2, (red_column + other_column) % 2
 
 
 def noise_variance(raw: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Tensor:
-    """Compute ``shot_var max(raw, 0) + read_var`` of RAW of any shape, white = 1; the levels broadcast."""
+    """Compute ``shot_var max(raw, 0) + read_var`` for RAW of any shape, white = 1; the levels broadcast."""
     return raw.clamp_min(0.0) * shot_var + read_var
 
 
@@ -91,7 +91,7 @@ def require_channels(image: Tensor, channels: int, what: str) -> None:
 
 
 def pack(mosaic: Tensor, cfa: CFA | str) -> Tensor:
-    """Pack a mosaic ``(..., 1, H, W)`` into planes R, Gr, Gb, B ``(..., 4, H/2, W/2)``; ValueError if a side is odd."""
+    """Pack a mosaic ``(..., 1, H, W)`` to R, Gr, Gb, B ``(..., 4, H/2, W/2)``; raise ValueError if a side is odd."""
     require_channels(mosaic, 1, "a mosaic")
     require_even(*mosaic.shape[-2:])
 
@@ -112,26 +112,26 @@ def unpack(packed: Tensor, cfa: CFA | str) -> Tensor:
 
 
 def pack_if_bayer(mosaic: Tensor, cfa: CFA | str) -> Tensor:
-    """:func:`pack` a mosaic ``(..., 1, H, W)`` of one of Bayer's patterns; one of another pattern stays as it is."""
+    """Apply :func:`pack` to a mosaic ``(..., 1, H, W)`` of a Bayer pattern; one of another pattern stays as it is."""
     if cfa in CFA.__members__:
         return pack(mosaic, cfa)
     return mosaic
 
 
 def unpack_if_packed(image: Tensor, cfa: CFA | str) -> Tensor:
-    """:func:`unpack` packed RAW ``(..., 4, H/2, W/2)``; a mosaic or full colour stays as it is."""
+    """Unpack packed RAW ``(..., 4, H/2, W/2)`` by :func:`unpack`; a mosaic or full colour stays as it is."""
     if image.shape[-3] == _PLANES:
         return unpack(image, cfa)
     return image
 
 
 def sites_per_value(image: Tensor) -> int:
-    """How many sites of the mosaic a value stands for along each side of ``(..., C, H, W)``: 2 in packed RAW."""
+    """Count the sites of the mosaic that a value stands for along each side of ``(..., C, H, W)``: 2 in packed RAW."""
     return 2 if image.shape[-3] == _PLANES else 1
 
 
 def pack_rgb(rgb: Tensor, cfa: CFA | str) -> Tensor:
-    """Pack full colour ``(..., 3, H, W)`` into planes ``(..., 4, H/2, W/2)``: each site keeps its own colour alone."""
+    """Pack full colour ``(..., 3, H, W)`` into planes ``(..., 4, H/2, W/2)``: each site keeps only its own colour."""
     require_channels(rgb, 3, "an RGB image")
     require_even(*rgb.shape[-2:])
 
@@ -193,7 +193,7 @@ def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
 
 
 def crop_window(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
-    """Crop ``raw`` ``(..., H, W)`` at ``top``, ``left`` to ``height`` x ``width``; ValueError if that is not inside."""
+    """Crop ``raw`` ``(..., H, W)`` at ``top``, ``left`` to ``height`` x ``width``; raise ValueError outside it."""
     sides = tuple(raw.shape[-2:])
     if min(top, left) < 0 or min(height, width) < 1 or top + height > sides[0] or left + width > sides[1]:
         raise ValueError(f"crop {height} x {width} at ({top}, {left}) extends beyond the mosaic {sides}")
@@ -203,17 +203,18 @@ def crop_window(raw: Tensor, top: int, left: int, height: int, width: int) -> Te
 def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False) -> Tensor:
     """Bin a mosaic: each new site is the mean of its colour around its place.
 
-    The mean is over 2 ``factor`` pixels of the old mosaic either way, ``factor`` sites of a colour, about the centre of
-    the new site; with an even factor a site at the window's end counts by the part of it that is inside. So the sites
-    of the new mosaic are as far apart as a sensor's, and demosaicing finds edges where they are. The pattern stays;
-    independent noise keeps :func:`bin_mosaic_variance` of its variance. Beyond the border the last sites are repeated.
+    The mean is over 2 ``factor`` pixels of the old mosaic either way, which are ``factor`` sites of a colour, about the
+    centre of the new site. With an even factor, a site at the window's end counts by the part of it that is inside. The
+    sites of the new mosaic are therefore as far apart as a sensor's, and demosaicing finds edges where they are. The
+    pattern stays, and independent noise keeps :func:`bin_mosaic_variance` of its variance. Beyond the border the last
+    sites are repeated.
 
     Args:
         raw: ``(..., 1, H, W)``, sides multiples of 2 ``factor``.
         cfa: its pattern, one of Bayer's.
-        factor: by which the sides shrink.
-        together: take the means of a new cell's four sites around its one centre, as a pixel of full colour needs
-            them, so that the colours of its truth are in register.
+        factor: factor by which the sides shrink.
+        together: take the means of a new cell's four sites around the cell's centre. A pixel of full colour needs this,
+            so that the colours of its ground truth are in register.
 
     Returns:
         ``(..., 1, H / factor, W / factor)``.
@@ -228,7 +229,7 @@ def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False)
     height, width = raw.shape[-2:]
     if factor < 1 or height % (2 * factor) or width % (2 * factor):
         raise ValueError(f"a mosaic of {(height, width)} cannot be binned by {factor}; use multiples of 2 factor")
-    CFA(cfa)  # any Bayer pattern: each of its 2 x 2 sites is averaged with its own kind
+    CFA(cfa)  # any Bayer pattern will do: each of its 2 x 2 sites is averaged with its own kind
 
     return unpack(bin_packed(pack(raw, CFA.RGGB), factor, together), CFA.RGGB)
 
@@ -245,13 +246,13 @@ def bin_packed(packed: Tensor, factor: int, together: bool = False) -> Tensor:
 
 
 def bin_mosaic_variance(factor: int, together: bool = False) -> float:
-    """The variance that :func:`bin_mosaic` leaves of independent noise of variance 1: about ``1 / factor^2``."""
+    """Return the variance that :func:`bin_mosaic` leaves of independent noise of variance 1, about ``1 / factor^2``."""
     part = _window_offset(factor, together) % 1
     return ((factor - 1 + part**2 + (1 - part) ** 2) / factor**2) ** 2
 
 
 def _window_offset(factor: int, together: bool) -> float:
-    """How far the windows of a cell's sites lie from its middle, in sites of a colour."""
+    """Compute how far the windows of a cell's sites lie from its middle, in sites of a colour."""
     if together:
         return -0.25
     return (factor - 1) / 4
@@ -260,7 +261,7 @@ def _window_offset(factor: int, together: bool) -> float:
 def _window_means(plane: Tensor, axis: int, factor: int, move: float) -> Tensor:
     """Average windows of ``factor`` sites of one colour, moved by ``move`` of its sites."""
     first = math.floor(move)
-    axis %= plane.ndim  # from here on nothing takes a size as a number, which an exported network would keep
+    axis %= plane.ndim  # from here on, no size is taken as a number, which an exported network would keep
     sites = torch.arange(plane.shape[axis], device=plane.device)
     windows = (*plane.shape[:axis], -1, factor, *plane.shape[axis + 1 :])
 

@@ -5,8 +5,8 @@ r"""Demosaicing: sums over neighbours, and choices between row and column.
 
 along the row or the column. ``adams`` takes the one along which y changes least at this site (J. F. Adams and
 J. E. Hamilton, US patent 5,629,734, 1997), ``ahd`` the one whose picture in full colour is more homogeneous around it
-(K. Hirakawa and T. W. Parks, "Adaptive homogeneity-directed demosaicing algorithm", TIP 2005). RAW developers choose
-like this. In flat areas noise decides, and leaves a maze of short lines, which a sum over neighbours never does.
+(K. Hirakawa and T. W. Parks, "Adaptive homogeneity-directed demosaicing algorithm", TIP 2005). RAW developers choose in
+this way. In flat areas noise decides and leaves a maze of short lines, which a sum over neighbours never does.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ STENCILS: dict[str, tuple[Tensor, Tensor, Tensor]] = {
         torch.tensor([[0, 0, -1.5, 0, 0], [0, 2, 0, 2, 0], [-1.5, 0, 6, 0, -1.5], [0, 2, 0, 2, 0], [0, 0, -1.5, 0, 0]]),
     ),
 }
-"""How a site gets a colour that it lacks from its surroundings, in eighths, by the name of the method.
+"""By these stencils, in eighths and by method, a site gets a colour that it lacks from its surroundings.
 
-The three stencils are for green at red or blue; for a colour at a green whose neighbours along the row have it (turned,
-along the column); and for red at blue or blue at red.
+The three stencils are for green at red or blue; for a colour at a green whose neighbours along the row have it (or,
+turned, along the column); and for red at blue or blue at red.
 """
 
 
@@ -66,7 +66,7 @@ def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:
 
 @lru_cache
 def demosaicing_stencils(cfa: CFA | str, method: str) -> tuple[Tensor, list[list[list[int]]]]:
-    """Make the four stencils ``(4, K, K)``, and say which gives a colour at a site of the cell.
+    """Make the four stencils ``(4, K, K)``, and say which one gives a colour at a site of the cell.
 
     ``kinds[colour][row][column]`` is 0 where the site has the colour itself, else the number of its stencil from 1.
     """
@@ -112,7 +112,7 @@ def _fill_colours(raw: Tensor, other: Tensor, cfa: CFA) -> Tensor:
     for i, j in green_sites:
         green[..., i::2, j::2] = raw[..., i::2, j::2]
 
-    # Red and blue less green, at first at their own sites alone; between two sites is the mean of both.
+    # This is red and blue less green, at first only at their own sites; between two sites it is the mean of both.
     chroma = raw.new_zeros(len(raw), 2, *raw.shape[-2:])
     for k, (i, j) in enumerate((red_site, blue_site)):
         chroma[:, k, i::2, j::2] = (raw - green)[:, 0, i::2, j::2]
@@ -130,7 +130,7 @@ def _fill_colours(raw: Tensor, other: Tensor, cfa: CFA) -> Tensor:
 
 
 def _adams(raw: Tensor, cfa: CFA) -> Tensor:
-    """Demosaic with the green along which the mosaic changes least, or with the mean of both."""
+    """Demosaic with the green of the direction in which the mosaic changes least, or with the mean of both."""
     along_row, change_in_row = _along(raw, -1)
     along_column, change_in_column = _along(raw, -2)
 
@@ -146,7 +146,7 @@ def _ahd(raw: Tensor, cfa: CFA) -> Tensor:
     row_light, row_colour = _steps(along_rows)
     column_light, column_colour = _steps(along_columns)
 
-    # Of the picture along rows the steps along rows, and of the other those along columns, say what is alike here.
+    # Steps along rows in the picture along rows, and along columns in the other, say what is alike here.
     alike_light = torch.minimum(row_light[:, :2].amax(1), column_light[:, 2:].amax(1))[:, None]
     alike_colour = torch.minimum(row_colour[:, :2].amax(1), column_colour[:, 2:].amax(1))[:, None]
 
@@ -177,10 +177,10 @@ def _squared_steps(image: Tensor) -> Tensor:
 
 
 DIRECTIONAL = {"adams": _adams, "ahd": _ahd}
-"""The methods that choose between row and column, by name."""
+"""These methods, by name, choose between row and column."""
 
 METHODS = (*STENCILS, *DIRECTIONAL)
-"""The names of all demosaicings."""
+"""These are the names of all demosaicings."""
 
 
 def require_method(name: str) -> None:

@@ -1,16 +1,16 @@
-r"""Greens that agree: the two greens of Bayer's cell see one light, and a sensor may measure it differently.
+r"""Greens that agree: the two greens of Bayer's cell see the same light, but a sensor may measure it differently.
 
 .. math:: G_r - G_b = q_R(u, v) R + q_G(u, v) G + q_B(u, v) B + e
 
-Gr has its red neighbours along the row and its blue ones along the column, Gb the other way round. Light that leaks
-from them, each pixel's own gain and the black level make the difference, and each q is a quadratic in the place (u, v),
-since leaks grow with the angle of the light. Noise hides the difference; without noise, demosaicing turns it into a
-maze. The model has no term for a difference that the light does not make, so that taking it out scales details by a
-percent or so and blurs none.
+Gr has its red neighbours along the row and its blue ones along the column; for Gb it is the other way round. The
+difference comes from light that leaks from them, from each pixel's own gain and from the black level. Each q is a
+quadratic in the place (u, v), since leaks grow with the angle of the light. Noise hides the difference; without noise,
+demosaicing turns it into a maze. The model has no term for a difference that the light does not make, so taking it out
+scales details by a percent or so and blurs none.
 
-Each block of the frame gives one equation, which counts less the more the block varies: smooth places tell, edges and
-texture do not. The greens disagree where one half of the frame foretells the other: in clearly more of its tiles than
-by chance, the prediction makes the greens agree better, and what is left is noise.
+Each block of the frame gives one equation, which counts less the more the block varies, so smooth places tell the
+difference, and edges and texture do not. The greens disagree if one half of the frame foretells the other: in clearly
+more of its tiles than by chance, the prediction makes the greens agree better, and what is left is noise.
 """
 
 from __future__ import annotations
@@ -25,45 +25,45 @@ from torch.nn import functional as F
 from rawaug.bayer.cfa import CFA, pack, require_channels
 
 BLOCK = 16
-"""Side of a block, in cells."""
+"""A block has this side, in cells."""
 
 _TILES = 8
-"""Number of tiles along each side of the frame; every other tile foretells the rest."""
+"""The frame has this many tiles along each side; every other tile foretells the rest."""
 
 _SURE = 4.0
-"""Significance threshold of the tiles that agree, in standard deviations; chance reaches it 1 in 30,000 times."""
+"""Tiles agree significantly from this many standard deviations, which chance reaches 1 in 30,000 times."""
 
 _CLEAR = 5.0
-"""Significance threshold, in standard errors."""
+"""A difference is significant from this many standard errors."""
 
 _LARGEST = 0.06
-"""The largest relative difference of a sensor's greens; a larger one is a pattern in the scene."""
+"""A sensor's greens differ by at most this share; a larger difference is a pattern in the scene."""
 
 _CLIPPED = 0.98
-"""The signal from which a site counts as clipped."""
+"""A site counts as clipped from this signal."""
 
 _GAIN_SD, _OFFSET_SD = 0.02, 1e-3
-"""Standard deviations of the prior of the coefficients."""
+"""The prior of the coefficients has these standard deviations."""
 
 _LEAST_SD, _LEAST_SCALE = 1e-5, 0.5
-"""Lower limits of the blocks' standard deviation and of the misfit's scale."""
+"""These are the lower limits of the blocks' standard deviation and of the misfit's scale."""
 
 _LARGEST_SCALE = 2.0
-"""Upper limit of the misfit's scale, which is 0.8 for white noise and more for regular texture."""
+"""The misfit's scale is at most this; it is 0.8 for white noise and more for regular texture."""
 
 _ROUNDS = 10
-"""Number of rounds of the robust fit."""
+"""The robust fit has this many rounds."""
 
 _I, _J = torch.tensor([(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0)]).T
-"""The powers of u and v in a quadratic."""
+"""These are the powers of u and v in a quadratic."""
 
 
 @dataclass(frozen=True)
 class GreenDifference:
-    """By how much the greens of a frame differ.
+    """The difference between the greens of a frame.
 
     Attributes:
-        gains: float64 ``(3, 3, 3)``: of R, G and B, the factor of u^i v^j at ``[colour, i, j]``, where u and v go from
+        gains: float64 ``(3, 3, 3)``: the factor of u^i v^j for R, G and B at ``[colour, i, j]``, where u and v go from
             -1 to 1 down and along the frame.
         offset: what is left in the dark, white = 1.
         share: root mean square of Gr - Gb over the frame's blocks, as a part of their green.
@@ -86,7 +86,7 @@ def measure_greens(mosaic: Tensor, cfa: CFA | str) -> GreenDifference | None:
         cfa: its pattern.
 
     Returns:
-        The difference, or None if the frame is smaller than :data:`_TILES` blocks either way, or nearly all is clipped.
+        The difference, or None if the frame is smaller than :data:`_TILES` blocks either way or nearly all clipped.
 
     Example:
         >>> light = torch.linspace(0.3, 0.4, 512).expand(1, 512, 512)
@@ -150,7 +150,7 @@ def balance_greens(mosaic: Tensor, cfa: CFA | str, difference: GreenDifference) 
 
 
 def _neighbours(mosaic: Tensor) -> tuple[Tensor, Tensor]:
-    """Average the next sites in the row, and those in the column, of each site, ``(1, H, W)`` each."""
+    """Average the nearest sites in the row and those in the column of each site, ``(1, H, W)`` each."""
     padded = _pad_by_one(mosaic)
     row = (padded[:, 1:-1, :-2] + padded[:, 1:-1, 2:]) / 2
     column = (padded[:, :-2, 1:-1] + padded[:, 2:, 1:-1]) / 2
@@ -158,14 +158,14 @@ def _neighbours(mosaic: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _diagonals(mosaic: Tensor) -> Tensor:
-    """Average the next sites on the diagonals of each site, ``(1, H, W)``."""
+    """Average the nearest sites on the diagonals of each site, ``(1, H, W)``."""
     padded = _pad_by_one(mosaic)
     row = (padded[..., :-2] + padded[..., 2:]) / 2
     return (row[:, :-2] + row[:, 2:]) / 2
 
 
 def _pad_by_one(mosaic: Tensor) -> Tensor:
-    return F.pad(mosaic, (1, 1, 1, 1), mode="reflect")  # about the border sites: the pattern stays
+    return F.pad(mosaic, (1, 1, 1, 1), mode="reflect")  # about the border sites, so the pattern stays
 
 
 def _powers(x: Tensor) -> Tensor:
@@ -196,7 +196,8 @@ def _blocks(mosaic: Tensor, cfa: CFA | str) -> _Blocks:
     require_channels(mosaic, 1, "a mosaic")
     packed = pack(mosaic, cfa)
     clipped = (packed >= _CLIPPED).any(0, keepdim=True).to(packed)
-    # Each green less the mean of the other kind around it, so that a slope of the light is no difference.
+    # From each green, the mean of the other kind around it is subtracted, so that a slope of the light is no
+    # difference.
     excess = pack(mosaic - _diagonals(mosaic), cfa)[1:3]
 
     # Means are weighted by a tent, as texture that a block cuts off would count as a difference.
@@ -224,7 +225,7 @@ def _blocks(mosaic: Tensor, cfa: CFA | str) -> _Blocks:
 
 
 def _places(count: int, side: int) -> Tensor:
-    """Where the middles of ``count`` blocks lie along a side, from -1 to 1, ``(count,)``."""
+    """Compute where the middles of ``count`` blocks lie along a side, from -1 to 1, ``(count,)``."""
     middles = BLOCK * (2 * torch.arange(count, dtype=torch.float64) + 1)
     return 2 * middles / side - 1
 
@@ -249,7 +250,7 @@ def _fit(terms: Tensor, difference: Tensor, sd: Tensor) -> tuple[Tensor, Tensor,
 
 
 def _halves_agree(blocks: _Blocks, scale: float) -> bool:
-    """Whether each half of the frame, a chessboard of tiles, foretells the other in clearly more tiles than not."""
+    """Tell whether each half of the frame's chessboard of tiles foretells the other in clearly more tiles than not."""
     white = (blocks.tile // _TILES + blocks.tile % _TILES) % 2 == 0
     prediction = torch.zeros_like(blocks.difference)
     for half in (white, ~white):

@@ -1,8 +1,8 @@
-"""Colour filter arrays beside Bayer's.
+"""Colour filter arrays other than Bayer's.
 
-X-Trans (Fujifilm; 6 x 6 sites, as LibRaw reads it from an origin where it begins with G B G G R G) and Quad-Bayer
-(each site of a Bayer cell is 2 x 2 pixels). Their RAW has no packed form: networks read the mosaic with the pattern as
-one-hot planes.
+They are X-Trans (Fujifilm; 6 x 6 sites, as LibRaw reads it from an origin where it begins with G B G G R G) and
+Quad-Bayer (each site of a Bayer cell is 2 x 2 pixels). Their RAW has no packed form, so networks read the mosaic with
+the pattern as one-hot planes.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Pattern:
         return len(self.rows)
 
     def shift(self, rows: int, columns: int) -> Pattern:
-        """The pattern of the mosaic that starts ``rows`` lower and ``columns`` further right; it has a name again.
+        """Give the pattern of the mosaic that starts ``rows`` lower and ``columns`` further right; it has a name again.
 
         Example:
             >>> pattern("QUAD-RGGB").shift(1, 3).name, pattern("RGGB").shift(0, 1).name
@@ -53,13 +53,13 @@ class Pattern:
         return _BY_ROWS[self._rows_from(rows, columns)]
 
     def _rows_from(self, top: int, left: int) -> tuple[str, ...]:
-        """The rows of the cell that begins at another origin."""
+        """Give the rows of the cell that begins at another origin."""
         top, left = top % self.period, left % self.period
         lower_first = self.rows[top:] + self.rows[:top]
         return tuple(row[left:] + row[:left] for row in lower_first)
 
     def channels(self, height: int, width: int) -> Tensor:
-        """The colour of each site as an index into RGB, int64 ``(H, W)``."""
+        """Give the colour of each site as an index into RGB, int64 ``(H, W)``."""
         flat = ["RGB".index(colour) for colour in "".join(self.rows)]
         cell = torch.tensor(flat).reshape(self.period, self.period)
 
@@ -67,11 +67,11 @@ class Pattern:
         return cell.repeat(down, across)[:height, :width]
 
     def planes(self, height: int, width: int) -> Tensor:
-        """Make one plane for each colour, 1 at its sites and 0 elsewhere, float32 ``(3, H, W)``, as networks take."""
+        """Make a plane for each colour, 1 at its sites and 0 elsewhere, float32 ``(3, H, W)``, as networks take it."""
         return (self.channels(height, width) == torch.arange(3)[:, None, None]).float()
 
     def mosaic(self, rgb: Tensor) -> Tensor:
-        """Mosaic full colour ``(..., 3, H, W)``: ``(..., 1, H, W)``."""
+        """Mosaic full colour ``(..., 3, H, W)`` to ``(..., 1, H, W)``."""
         require_channels(rgb, 3, "an RGB image")
         index = self.channels(*rgb.shape[-2:]).to(rgb.device)
         return rgb.gather(-3, index.expand(*rgb.shape[:-3], 1, *index.shape))
@@ -79,8 +79,8 @@ class Pattern:
     def demosaic(self, raw: Tensor) -> Tensor:
         """Demosaic ``(B, 1, H, W)`` to ``(B, 3, H, W)`` for the eye: each site keeps its colour and gets two means.
 
-        The mean is that of the sites of the colour nearby, with the weights of a tent as wide as the cell (normalised
-        convolution: Knutsson and Westin, CVPR 1993); of Bayer's patterns it is bilinear interpolation.
+        A mean is taken over the colour's sites nearby, with the weights of a tent as wide as the cell (normalised
+        convolution: Knutsson and Westin, CVPR 1993); for Bayer's patterns it is bilinear interpolation.
         """
         planes, inverse_weights = _sites(self.name, *raw.shape[-2:])
         planes = planes.to(raw)
@@ -140,7 +140,7 @@ class Pattern:
 
 
 def _tent(image: Tensor, period: int) -> Tensor:
-    """Filter ``(B, C, H, W)`` by a separable tent that reaches half a cell to each side; beyond the edges is 0."""
+    """Filter ``(B, C, H, W)`` by a separable tent that reaches half a cell to each side, with 0 beyond the edges."""
     reach = period // 2
 
     for axis, margins in ((-2, (0, 0, reach, reach)), (-1, (reach, reach))):
@@ -156,7 +156,7 @@ def _tent(image: Tensor, period: int) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _sites(name: str, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Make the planes of a pattern, and one over the sum of the tent's weights on them, each ``(1, 3, H, W)``."""
+    """Make the planes of a pattern and the inverse of the tent's sum of weights on them, each ``(1, 3, H, W)``."""
     array = pattern(name)
     planes = array.planes(height, width)[None]
     return planes, 1.0 / _tent(planes, array.period)
@@ -176,13 +176,13 @@ _XTRANS = Pattern("XTRANS", ("GBGGRG", "RGRBGB", "GBGGRG", "GRGGBG", "BGBRGR", "
 _ALL = (*map(_bayer, CFA), *map(_quad, CFA), _XTRANS)
 
 PATTERNS: dict[str, Pattern] = {array.name: array for array in _ALL}
-"""The patterns by name."""
+"""This maps names to patterns."""
 
 _BY_NAME: dict[str, Pattern] = {}
-"""The patterns by every name, also those from other origins such as ``XTRANS+1+2``; one cell has one pattern."""
+"""This maps every name to its pattern, also from other origins such as ``XTRANS+1+2``; one cell has one pattern."""
 
 _BY_ROWS: dict[tuple[str, ...], Pattern] = {}
-"""The patterns, from all origins, by the rows of their cells."""
+"""This maps the rows of a cell to its pattern, from all origins."""
 
 
 def _add(name: str, rows: tuple[str, ...]) -> None:
@@ -197,7 +197,7 @@ for _array in _ALL:
 
 
 def pattern_name(rows: Sequence[str]) -> str | None:
-    """Name the pattern whose cell reads as ``rows`` from its top left; None if it is unknown.
+    """Name the pattern whose cell reads as ``rows`` from its top left; return None if it is unknown.
 
     Example:
         >>> pattern_name(["GRBGBR", "BGGRGG", "RGGBGG", "GBRGRB", "RGGBGG", "BGGRGG"])
@@ -210,7 +210,7 @@ def pattern_name(rows: Sequence[str]) -> str | None:
 
 
 def canonical_cfa(cfa: str) -> str:
-    """Give the :class:`CFA` of a Bayer pattern, the name of any other; ValueError if there is no such pattern."""
+    """Give the :class:`CFA` of a Bayer pattern, or the name of any other; raise ValueError for an unknown pattern."""
     name = pattern(cfa).name
     if name in CFA.__members__:
         return CFA(name)
@@ -218,7 +218,7 @@ def canonical_cfa(cfa: str) -> str:
 
 
 def plane_indices(cfa: str) -> Tensor:
-    """Say which of R, Gr, Gb, B (0 to 3) each site of a cell is, int64 ``(n, n)``; greens are 1 unless it is Bayer's.
+    """Say which of R, Gr, Gb, B (0 to 3) each site of a cell is, int64 ``(n, n)``; greens are 1 except in Bayer's.
 
     Example:
         >>> plane_indices("GRBG").tolist(), plane_indices("XTRANS").shape
@@ -237,7 +237,8 @@ def plane_indices(cfa: str) -> Tensor:
 def pattern(name: str) -> Pattern:
     """Find a pattern by name: a Bayer one, the same with ``QUAD-`` before it, or ``XTRANS``.
 
-    Those of larger cells may begin at another origin: ``XTRANS+1+2`` begins a row lower and two columns to the right.
+    Patterns with larger cells may begin at another origin: ``XTRANS+1+2`` begins a row lower and two columns further
+    right.
 
     Example:
         >>> pattern("QUAD-RGGB").rows

@@ -14,9 +14,9 @@ from rawaug.bayer.patterns import pattern
 
 
 class _Transform(nn.Module, ABC):
-    """A module whose ``apply(raw, params)`` transforms; with a function alone it is still ``nn.Module.apply``.
+    """A module whose ``apply(raw, params)`` transforms; with only a function, it is still ``nn.Module.apply``.
 
-    Without a generator, as in ``nn.Sequential``, it draws from ``seed``, the number of its worker and that of the call.
+    Without a generator, as in ``nn.Sequential``, it draws from ``seed``, the worker's number and the call's number.
     """
 
     def __init__(self, seed: int) -> None:
@@ -26,7 +26,7 @@ class _Transform(nn.Module, ABC):
     def _own(self, generator: torch.Generator | None) -> torch.Generator:
         if generator is not None:
             return generator
-        from rawaug.seeding import keyed_generator, rank_key  # late: what only turns mosaics, denoisers, needs no seeds
+        from rawaug.seeding import keyed_generator, rank_key  # late: denoisers, which only turn mosaics, need no seeds
 
         self._calls += 1
         worker = get_worker_info()
@@ -45,7 +45,7 @@ class _Transform(nn.Module, ABC):
 class RandomCrop(_Transform):
     """Crops mosaics ``(..., H, W)`` to ``(..., size, size)`` at a random even offset, so that the pattern stays.
 
-    One draw serves the whole tensor, so that noisy and clean mosaics, stacked, are cropped alike.
+    One draw serves the whole tensor, so stacked noisy and clean mosaics are cropped alike.
 
     Args:
         size: even side, or (height, width), in mosaic pixels, at most those of the mosaics.
@@ -69,7 +69,7 @@ class RandomCrop(_Transform):
         self.size = size
 
     def sample(self, height: int, width: int, generator: torch.Generator) -> Tensor:
-        """Draw top and left of a crop of a mosaic of ``height`` x ``width``, ``(2,)``."""
+        """Draw the top and left ``(2,)`` of a crop of a mosaic of ``height`` x ``width``."""
         rows, columns = self.size
         if height < rows or width < columns:
             raise ValueError(f"{height} x {width} is smaller than the crop {rows} x {columns}; choose a smaller crop")
@@ -92,7 +92,7 @@ class RandomTurn(_Transform):
 
     Args:
         cfa: pattern of the mosaics.
-        keep_cfa: crop a line on either side where the pattern would move; if not, it becomes ``cfa.turn(view)``.
+        keep_cfa: crop a line on either side where the pattern would move; otherwise it becomes ``cfa.turn(view)``.
         quarter: draw quarter turns too; without them the sides are not exchanged.
         seed: of its own draws, where no generator is passed.
 

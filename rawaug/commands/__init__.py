@@ -9,11 +9,11 @@ from cyclopts import Parameter
 from rawaug.files import yaml_value
 
 OPTIONS = Parameter(name="*")
-"""The fields of a dataclass as options of their own."""
+"""The fields of a dataclass become options of their own."""
 
 
 def value_of(text: str) -> Any:
-    """Parse a word of the command line as YAML, in which ``demo:`` is a name and no mapping."""
+    """Parse a word of the command line as YAML, in which ``demo:`` is a name and not a mapping."""
     value = yaml_value(text)
     if isinstance(value, dict) and not text.lstrip().startswith("{"):
         return text
@@ -21,4 +21,4 @@ def value_of(text: str) -> Any:
 
 
 YAML = Parameter(converter=lambda _, tokens: value_of(tokens[0].value), n_tokens=1, json_list=False, metavar="VALUE")
-"""One argument of several forms: a name, a list as ``[1e-3, 1e-5]``, or ``{name: ..., settings: {...}}``."""
+"""One argument may be a name, a list as ``[1e-3, 1e-5]``, or ``{name: ..., settings: {...}}``."""

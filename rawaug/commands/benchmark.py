@@ -33,12 +33,12 @@ def run(
         data: clean RAW frames: a folder, a file, or kind:path; of developed pictures cc15:DIR, polyu:DIR, sidd-srgb:DIR
             or pictures:DIR, for which the denoisers are rawaug-srgb, a .safetensors of pictures (FFDNet's weights too)
             or a filter, with @15 behind it if told a level of 15/255.
-        bin: average this many sites of a colour in both directions, to leave less of the frames' own noise.
+        bin: average this many sites of a colour in both directions, to reduce the frames' own noise.
         count: number of frames.
         crop: side of the middle of each frame that is used, in pixels of the mosaic.
         noise: noise in place of the four strengths: a preset, a measured camera, [shot_var, read_var], or a law of
             your own as {name: MeasuredNoise, settings: ...}.
-        iso: ISO values of that camera or law, a column each.
+        iso: ISO values of that camera or law, one column for each.
         seed: seed of the noise.
         device: device for networks: cpu, cuda, ...
         json: write the result as JSON to this file.

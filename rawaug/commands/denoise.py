@@ -46,16 +46,16 @@ def run(
             law, else the levels of the folder's files of the same camera and ISO), profile, estimate, camera (the law
             that the denoiser was trained for), an ISP file (uses its stored noise law), the name of a camera, or
             [shot_var, read_var].
-        strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing; of pictures, a factor on
+        strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing; for pictures, a factor on
             the estimated level of the noise: 2 removes more, 0.5 less.
-        linear: demosaic too, to a linear DNG of full colour; by default with rawaug-joint.
+        linear: also demosaic, to a linear DNG of full colour; by default with rawaug-joint.
         self_ensemble: average eight views of a network, at eight times the cost.
-        greens: auto makes the two greens of a Bayer sensor agree where they clearly differ, since demosaicing makes a
-            maze of the difference; keep leaves them.
+        greens: auto makes the two greens of a Bayer sensor agree if they clearly differ, since demosaicing turns the
+            difference into a maze; keep leaves them as they are.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
-        preview: also write the result, developed by LibRaw, as this .jpg or .png; of a folder, a JPEG of each result
-            to this folder.
-        json: write to this file what was done to each file: noise levels and corrections of RAW, seconds.
+        preview: also write the result, developed by LibRaw, as this .jpg or .png; for a folder, write a JPEG of each
+            result to this folder.
+        json: write what was done to each file to this file: noise levels and corrections of RAW, and seconds.
         overwrite: replace existing results.
     """
     options = Options(denoiser, classical, noise, strength, linear, self_ensemble, greens, device)

@@ -50,17 +50,17 @@ def run(
             pictures cc15:DIR, polyu:DIR, sidd-srgb:DIR or pictures:DIR.
         self_ensemble: also score the average over eight views (denoisers).
         views: also score the average over 4 views, the flips, or 8, with quarter turns.
-        noise: noise added to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
+        noise: noise to add to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
             {name, settings}.
         seed: seed of that noise.
-        bin: K bins the frames K x K by colour site first: clean references of real photographs (denoisers).
+        bin: K bins the frames K x K by colour site first, for clean references of real photographs (denoisers).
         classical: classical filters to score on the same noise: NonLocalMeans, Wavelet, TotalVariation, BM3D.
         as_shot: give an ISP the as-shot gains of each frame.
-        tone: give an ISP with tone curves the one of the pictures, such as linear for LibRaw's rendering.
+        tone: tone curve of the pictures, for an ISP that has several, such as linear for LibRaw's rendering.
         device: device for a denoiser: cpu, cuda, ...
         report: write an HTML page with a denoiser's scores and crops to this file.
         json: write the result as JSON to this file.
-        settings: of pairs:PATH.
+        settings: settings of pairs:PATH.
 
     Returns:
         What ``--json`` writes.
@@ -94,7 +94,7 @@ def run(
 
 
 def is_isp(weights: str) -> bool:
-    """Whether a name or a file stands for an ISP rather than for a denoiser."""
+    """Tell whether a name or a file stands for an ISP rather than for a denoiser."""
     if Path(weights).suffix not in ("", ".safetensors"):
         return False
 
@@ -107,9 +107,9 @@ def is_isp(weights: str) -> bool:
 
 
 def evaluate_isp(evaluation: Evaluation, as_shot: bool = False, tone: str | None = None) -> dict[str, Any]:
-    """PSNR_r of an ISP on the frames of a test set, printed and written; the result, as in the JSON.
+    """Print and write the PSNR_r of an ISP on the frames of a test set; return the result, as in the JSON.
 
-    ``as_shot`` gives the ISP the gains of each frame, and ``tone`` the tone curve of all.
+    ``as_shot`` gives the ISP the gains of each frame; ``tone`` gives it the tone curve of all.
     """
     for_denoisers = (
         evaluation.views > 1

@@ -1,4 +1,4 @@
-"""``rawaug explore``: a page on your own machine that shows what pictures become as RAW of a camera."""
+"""``rawaug explore``: a page on your own machine that shows pictures as RAW of a camera."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def run(pictures: str | None = None, /, *, isp: str = "universal", host: str = "
 
     Args:
         pictures: a picture, or a folder of them; built-in ones by default.
-        isp: ISP to open the page with: a shipped one by its name, a file, or the YAML file of a camera of your own.
+        isp: ISP to open the page with: a shipped one by its name, a file, or the YAML file of your own camera.
         host: address to listen on; by default this machine alone can open the page.
         port: port to listen on.
     """
-    with extra("explore"):  # one line that names all that the page needs, before the pictures ask for theirs
+    with extra("explore"):  # one line names all that the page needs, before the pictures ask for theirs
         import gradio  # noqa: F401
 
     page = build(*choices(pictures), isp=isp)

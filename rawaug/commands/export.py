@@ -1,8 +1,8 @@
 """``rawaug export``: a denoiser as an ONNX file, an ISP as a .cube, for programs without PyTorch.
 
-A denoiser maps ``noisy`` and, where the network reads it, its ``variance`` to ``denoised``: float32 packed RAW, any
-number of pictures of any size. ONNX Runtime runs the file, and it is compared with PyTorch before it is left there. A
-.cube, Adobe's format, maps sRGB to linear camera RGB, up to lens shading and mosaic.
+A denoiser maps ``noisy`` and, if the network reads it, its ``variance`` to ``denoised``: float32 packed RAW, for any
+number of pictures of any size. ONNX Runtime runs the file, and its result is compared with PyTorch's before the file is
+kept. A .cube, Adobe's format, maps sRGB to linear camera RGB, up to lens shading and mosaic.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from rawaug.noise import noise_model
 from rawaug.progress import progress
 
 OPSET = 18
-"""The version of ONNX's operators that graphs are written in."""
+"""Graphs are written in this version of ONNX's operators."""
 
 TOLERANCE = 1e-4
-"""Largest difference between ONNX Runtime and PyTorch, white at 1."""
+"""ONNX Runtime and PyTorch may differ by this much, with white at 1."""
 
 NODES = 33
-"""Number of nodes of a .cube along each axis."""
+"""A .cube has this many nodes along each axis."""
 
 
 def write_onnx(
@@ -72,7 +72,7 @@ def write_onnx(
             output_names=[output],
             dynamic_axes=free_axes,
             opset_version=OPSET,
-            dynamo=False,  # whose graph of a pyramid takes minutes
+            dynamo=False,  # dynamo's graph of a pyramid takes minutes
         )
 
     if metadata:
@@ -101,7 +101,7 @@ def export_cube(isp: DictionaryISP, out: str | Path, white_balance: Sequence[flo
     Args:
         isp: the ISP.
         out: the file.
-        white_balance: as-shot multipliers of the setting; by default those typical of the fit.
+        white_balance: as-shot multipliers of the setting; by default the fit's typical ones.
     """
     path = Path(out)
     if path.suffix != ".cube":
@@ -136,7 +136,7 @@ def run(
     Args:
         weights: a .safetensors file written by rawaug run or rawaug fit, or the name of a shipped denoiser or ISP.
         out: the .onnx file of a denoiser, or the .cube of an ISP.
-        white_balance: as-shot multipliers R, G, B for which an ISP is exported; by default those typical of the fit.
+        white_balance: as-shot multipliers R, G, B for which an ISP is exported; by default the fit's typical ones.
     """
     if read_header(find_weights(weights, FOLDER))["kind"] == "isp":
         export_cube(DictionaryISP.from_pretrained(weights), out, white_balance)

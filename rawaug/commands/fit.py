@@ -37,8 +37,8 @@ def run(
         camera_jpeg: use the camera's JPEG of the same stem as the sRGB image, else LibRaw's rendering.
         held_out: frames to leave out of the fit; their PSNR_r is shown during the fit.
         out: output .safetensors file.
-        noise: measure the camera's noise at each ISO of the files; auto continues without it where the frames do
-            not allow it.
+        noise: measure the camera's noise at each ISO of the files; auto continues without it if the frames do not allow
+            it.
         dark: folder of dark frames to measure the read variance.
         camera: figures of the camera to start from, a YAML file or the name of a published camera.
         mosaics: CFA and levels of pairs:PATH.

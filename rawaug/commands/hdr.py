@@ -1,8 +1,8 @@
 """``rawaug hdr``: sRGB exposures of a scene to RAW, merged or scaled there, and back to one sRGB picture.
 
-RAW files are developed by LibRaw first, each with its own white balance: what :func:`rawaug.fit` learns to reverse, so
-that ``--isp`` is best a camera that was fitted to such files. The formulas are in :mod:`rawaug.isp.exposures`. Source:
-the HDR application of Conde et al., AAAI 2022.
+RAW files are developed by LibRaw first, each with its own white balance. :func:`rawaug.fit` learns to reverse this, so
+``--isp`` is best a camera that was fitted to such files. The formulas are in :mod:`rawaug.isp.exposures`. Source: the
+HDR application of Conde et al., AAAI 2022.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.registry import require_between
 
 MOST_STOPS = 30.0
-"""Largest exposure that can be given, in stops."""
+"""The exposure can be at most this many stops."""
 
 
 def run(
@@ -65,7 +65,7 @@ def hdr(
     exposure: float = 0.0,
     isp: str | Path = "universal",
 ) -> Tensor:
-    """The merged picture ``(3, H, W)`` in [0, 1]; arguments and errors as in :func:`run`."""
+    """Return the merged picture ``(3, H, W)`` in [0, 1]; arguments and errors are as in :func:`run`."""
     if not pictures:
         raise ValueError("hdr: no picture is given")
     _require_one_kind(pictures)
@@ -80,7 +80,7 @@ def hdr(
 
 
 def exposures(pictures: Sequence[str | Path], ev: Sequence[float] | None) -> list[float]:
-    """Stops of each picture: as given, else of EXIF relative to the median; a single picture has 0."""
+    """Return the stops of each picture: as given, else from EXIF relative to the median; a single picture has 0."""
     if ev is not None and len(ev) != len(pictures):
         raise ValueError(f"--ev: one exposure for each picture is needed, got {len(ev)} for {len(pictures)}")
     if ev is not None:
@@ -94,7 +94,7 @@ def exposures(pictures: Sequence[str | Path], ev: Sequence[float] | None) -> lis
 
 
 def _read(paths: Sequence[str | Path]) -> list[Tensor]:
-    """The pictures, of one size."""
+    """Read the pictures, which must have one size."""
     pictures = [isolated(read_shot, path) for path in paths]
     height, width = pictures[0].shape[1:]
     for path, picture in zip(paths, pictures, strict=True):

@@ -1,4 +1,4 @@
-"""``rawaug info``: a readable description of a weights file, and the list of cameras that are known by name."""
+"""``rawaug info``: a readable description of a weights file, and a list of the cameras that are known by name."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rawaug.noise.profiles import SPREAD, load_profiles, profile_ends
 from rawaug.version import __version__
 
 _WITH_LEVELS = 3
-"""Maximum number of cameras that are listed with the levels of their noise."""
+"""At most this many cameras are listed with the levels of their noise."""
 
 
 def run(weights: str, /, *part: str, json: bool = False) -> None:
@@ -30,7 +30,7 @@ def run(weights: str, /, *part: str, json: bool = False) -> None:
         weights: a .safetensors file, the name of a shipped ISP or denoiser, or the YAML file of a camera of your own;
             or the word cameras.
         part: of the names of the cameras to list, such as A7 III.
-        json: print one JSON object, for programs; of an ISP with its tone curve at 256 codes, of cameras with their
+        json: print one JSON object, for programs; an ISP's has its tone curve at 256 codes, and cameras' have their
             matrices.
     """
     if weights == "cameras":
@@ -173,7 +173,7 @@ def _describe_isp(path: Path) -> str:
 
 
 def describe_camera(camera: Camera) -> str:
-    """The figures of a camera of one's own, as the package uses them: a line for each light and each ISO."""
+    """Describe your own camera by the figures that the package uses: a line for each light and each ISO."""
     lines = [f"{camera.name}: camera, {camera.cfa}"]
     grid = f"black {camera.black_level:g}, white {camera.white:g} DN"
     if camera.bits is not None:
@@ -204,7 +204,7 @@ def describe_camera(camera: Camera) -> str:
 
 
 def camera_as_json(camera: Camera) -> dict[str, Any]:
-    """The figures of a camera of one's own: as its file has them, by light, and by ISO as variances."""
+    """Collect the figures of your own camera: as its file has them, by light, and by ISO as variances."""
     lights = {}
     for anchor in camera.anchors():
         lights[anchor.light] = {

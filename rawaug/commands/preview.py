@@ -1,8 +1,8 @@
 """``rawaug preview``: the stages of an ISP on a picture, and augmented RAWs of it.
 
-Linear images are shown through the sRGB curve, RAW bilinearly demosaiced and without white balance: greenish, as a
-sensor sees. The drawn RAWs are clean, and all developed alike, by the ISP's forward pass under the setting that it
-chooses for the picture: what differs between them is camera, light, tone and exposure.
+Linear images are shown through the sRGB curve. RAW is bilinearly demosaiced and shown without white balance: greenish,
+as a sensor sees it. The drawn RAWs are clean and all developed alike, by the ISP's forward pass under the setting that
+it chooses for the picture, so they differ only by camera, light, tone and exposure.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rawaug.plugin.pictures import trim_to_even
 from rawaug.seeding import keyed_generator
 
 _MAXIMUM = 768
-"""Largest side of a previewed picture: larger ones are cropped at the centre."""
+"""A previewed picture has at most this side; larger ones are cropped at the centre."""
 
 
 def run(

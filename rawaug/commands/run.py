@@ -1,4 +1,4 @@
-"""``rawaug run``: a recipe's file with the keys of the command line in it, as the settings of its experiment."""
+"""``rawaug run``: runs the experiment of a recipe's file, with the keys of the command line put into it."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from rawaug.registry import suggest
 from rawaug.tasks.settings import Recipe
 
 SHARED = ("channels", "variance_map", "deviation", "domain")
-"""Settings that all networks share."""
+"""All networks share these settings."""
 
 Options = list[tuple[str, Any]]
-"""The dotted keys of the command line with their values, in their order."""
+"""These are the dotted keys of the command line with their values, in their order."""
 
 
 def run(
@@ -75,7 +75,7 @@ def run(
 
 
 def parse_options(words: Sequence[str], settings: type[Any]) -> Options:
-    """The words of a command line, ``--key value`` or ``--key=value``, as dotted keys and values.
+    """Parse the words of a command line, ``--key value`` or ``--key=value``, into dotted keys and values.
 
     ``--denoiser DnCNN`` is short for ``--denoiser.name DnCNN``; a field of the settings may be spelt with hyphens.
 
@@ -112,7 +112,7 @@ def parse_options(words: Sequence[str], settings: type[Any]) -> Options:
 
 
 def merge_options(content: Mapping[str, Any], options: Options) -> dict[str, Any]:
-    """The content of a recipe's file with the values of the command line in it."""
+    """Put the values of the command line into the content of a recipe's file."""
     merged = deepcopy(dict(content))
     for key, value in options:
         if key.endswith("denoiser.name"):
@@ -128,7 +128,7 @@ def merge_options(content: Mapping[str, Any], options: Options) -> dict[str, Any
 
 
 def set_value(content: dict[str, Any], path: Sequence[str], value: Any) -> None:
-    """Set a value at a path of keys; what is no mapping on the way there becomes one."""
+    """Set a value at a path of keys; whatever is not a mapping on the way there becomes one."""
     for part in path[:-1]:
         if not isinstance(content.get(part), dict):
             content[part] = {}
@@ -138,7 +138,7 @@ def set_value(content: dict[str, Any], path: Sequence[str], value: Any) -> None:
 
 
 def keep_arms(arms: Mapping[str, Any], names: str | Sequence[str]) -> dict[str, Any]:
-    """The arms of a recipe that ``--arms NAME`` or ``--arms '[NAME, NAME]'`` keeps, in the recipe's order.
+    """Keep the arms of a recipe that ``--arms NAME`` or ``--arms '[NAME, NAME]'`` names, in the recipe's order.
 
     Raises:
         ValueError: if a name is none of the recipe's arms.
@@ -153,10 +153,10 @@ def keep_arms(arms: Mapping[str, Any], names: str | Sequence[str]) -> dict[str, 
 
 
 def drop_old_settings(content: dict[str, Any], key: str, name: Any) -> None:
-    """Drop the settings of a network in whose place another is named; what all networks have stays.
+    """Drop the settings of a network that another one replaces; settings that all networks have stay.
 
     Args:
-        content: of the recipe, which is changed.
+        content: the content of the recipe, which is changed.
         key: the dotted key that names the network.
         name: the other network.
     """
@@ -189,7 +189,7 @@ def drop_old_settings(content: dict[str, Any], key: str, name: Any) -> None:
 
 
 def with_values(settings: type[Any], content: Mapping[str, Any], source: object) -> Any:
-    """An instance of the dataclass ``settings`` with the values of ``content``, which its types decide on.
+    """Make an instance of the dataclass ``settings`` with the values of ``content``, which its types validate.
 
     Args:
         settings: a dataclass.
@@ -213,7 +213,7 @@ def with_values(settings: type[Any], content: Mapping[str, Any], source: object)
 
 
 class Key(NamedTuple):
-    """A key of a recipe: its dotted name, what it is where the recipe does not set it, and what it means."""
+    """A key of a recipe: its dotted name, its default, and its meaning."""
 
     name: str
     default: Any
@@ -221,7 +221,7 @@ class Key(NamedTuple):
 
 
 def keys_of(settings: type[Any], above: str = "") -> Iterator[Key]:
-    """The keys of a dataclass and of those in it, as their docstrings explain them."""
+    """Yield the keys of a dataclass and of those in it, as their docstrings explain them."""
     hints = get_type_hints(settings)
     meanings: dict[str, str] = {}
     for base in reversed(settings.__mro__):
@@ -245,7 +245,7 @@ def keys_of(settings: type[Any], above: str = "") -> Iterator[Key]:
 
 
 def print_keys(settings: type[Any], content: Mapping[str, Any]) -> None:
-    """The keys of a recipe by section, each with its value in ``content``."""
+    """Print the keys of a recipe by section, each with its value in ``content``."""
     console = Console(soft_wrap=False)
     sections: dict[str, list[Key]] = {}
     for key in keys_of(settings):
@@ -262,7 +262,7 @@ def print_keys(settings: type[Any], content: Mapping[str, Any]) -> None:
 
 
 def _shown_value(key: Key, content: Mapping[str, Any]) -> str:
-    """The value of a key in a recipe's content, or its default, as JSON."""
+    """Give the value of a key in a recipe's content, or its default, as JSON."""
     if key.name == "arms":
         return "by NAME, below"
 
@@ -274,7 +274,7 @@ def _shown_value(key: Key, content: Mapping[str, Any]) -> str:
 
 
 def _part(hint: Any) -> tuple[type[Any] | None, bool]:
-    """The dataclass that a key's value is, and whether there are several of it, by name."""
+    """Find the dataclass of a key's value, and tell whether there are several of it, by name."""
     for inside in (hint, *get_args(hint)):
         if is_dataclass(inside):
             return inside, getattr(hint, "__origin__", None) is dict  # type: ignore[return-value]
@@ -303,7 +303,7 @@ def _require_keys(settings: Any, content: Any, names: Iterable[str], above: str 
 
 
 def _reason(error: Any, content: Any) -> str:
-    """One error of pydantic in a line; its location goes on into the types of a union, which are no keys."""
+    """Write one error of pydantic as a line; its location goes on into the types of a union, which are no keys."""
     keys = []
     for key in error["loc"]:
         if not isinstance(content, Mapping) or key not in content:

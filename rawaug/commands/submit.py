@@ -1,7 +1,7 @@
 """``rawaug submit``: the noisy blocks of a benchmark whose clean ones are kept, denoised and written as it takes them.
 
-Noise levels are those that the dataset publishes for a frame, else estimated from all of its noisy blocks together.
-Results are cut to [0, 1].
+Noise levels are those that the dataset publishes for a frame; otherwise they are estimated from all of its noisy blocks
+together. Results are cut to [0, 1].
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rawaug.progress import progress
 from rawaug.registry import Spec
 
 _UNUSED = (0.0, 0.0)
-"""The levels for a denoiser that reads none."""
+"""A denoiser that reads no levels gets these."""
 
 
 def run(

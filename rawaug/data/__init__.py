@@ -1,7 +1,7 @@
-"""What is read: pictures, RAW files, published datasets and the built-in demo data.
+"""The data that can be read: pictures, RAW files, published datasets and the built-in demo data.
 
-They come as datasets of sRGB pictures (:func:`open_pictures`) or as RAW-sRGB pairs (:func:`open_pairs`); what has no
-clean version, the benchmarks of SIDD and DND, comes as noisy blocks with a writer for submissions.
+They come as datasets of sRGB pictures (:func:`open_pictures`) or as RAW-sRGB pairs (:func:`open_pairs`). Data without a
+clean version, the benchmarks of SIDD and DND, come as noisy blocks with a writer for submissions.
 """
 
 from __future__ import annotations

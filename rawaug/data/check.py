@@ -1,8 +1,8 @@
 """Identify the dataset in a folder, count its items, sizes, patterns and levels, and list damaged files.
 
-Everything is read once, as training would read it, but in a helper process (:mod:`rawaug.io.isolated`): a file that
-crashes its decoder, or hangs, is named and the rest is read. A folder is recognised by its publisher's file names;
-anything else is a folder of RAW files, of pictures, or both.
+Everything is read once, as training would read it, but in a helper process (:mod:`rawaug.io.isolated`). A file that
+crashes its decoder, or hangs, is named and the rest is read. A folder is recognised by its publisher's file names; any
+other folder counts as one of RAW files, of pictures, or both.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class PartReport:
     unfit: list[str] = field(default_factory=list)
 
     def add_broken(self, error: Exception) -> None:
-        """Note an item that is damaged, or whole but of a kind that is not used; a file of many blocks is one line."""
+        """Note an item that is damaged, or intact but of a kind that is not used; a file of many blocks is one line."""
         lines = self.broken if isinstance(error, OSError) else self.unfit
         line = " ".join(str(error).split())
         if line not in lines:
@@ -85,7 +85,7 @@ class PartReport:
 class DataReport:
     """The report of :func:`check`; ``str()`` is the text that ``rawaug data check`` prints.
 
-    ``left_out`` has a line for each kind of file that nothing here reads.
+    ``left_out`` has a line for each kind of file that no reader here reads.
     """
 
     path: Path
@@ -94,7 +94,7 @@ class DataReport:
 
     @property
     def broken(self) -> list[str]:
-        """The reasons of damaged items."""
+        """Why items are damaged."""
         lines: list[str] = []
         for part in self.parts:
             lines += part.broken
@@ -102,7 +102,7 @@ class DataReport:
 
     @property
     def unfit(self) -> list[str]:
-        """The reasons of items that are whole but not usable, such as a linear DNG among mosaics."""
+        """Why items are intact but not usable, such as a linear DNG among mosaics."""
         lines: list[str] = []
         for part in self.parts:
             lines += part.unfit
@@ -113,7 +113,7 @@ class DataReport:
 
 
 def check(path: str | Path, first: int | None = None, **settings: Any) -> DataReport:
-    """Identify the data in a folder, or a RAW file, or take that of ``kind:PATH``, and read it.
+    """Identify and read the data in a folder or a RAW file, or those of ``kind:PATH``.
 
     At most ``first`` items of each kind are read; ``settings`` are those of :class:`PairFolder`, for ``pairs:PATH``.
     """
@@ -155,7 +155,7 @@ def _left_out(folder: Path) -> list[str]:
 
 
 def _of_kind(kind: str, spec: str) -> list[tuple[str, Callable[[], Any]]]:
-    """How to open ``kind:path``, which may be pairs, pictures, or both."""
+    """List how to open ``kind:path``, which may be pairs, pictures, or both."""
     openers: list[tuple[str, Callable[[], Any]]] = []
     if kind in DATASETS:
         openers.append((f"pairs of {spec}", partial(open_pairs, spec, developed=True)))
@@ -167,7 +167,7 @@ def _of_kind(kind: str, spec: str) -> list[tuple[str, Callable[[], Any]]]:
 
 
 def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """The published datasets recognised by file names, and how to open each."""
+    """Yield the published datasets recognised by file names, and how to open each."""
     files = list(files_below(path))
     names = [file.name for file in files]
 
@@ -197,7 +197,7 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
 
 
 def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """RAW files and pictures of no known dataset; FiveK cannot be told from other DNGs."""
+    """Yield RAW files and pictures of no known dataset; FiveK cannot be told from other DNGs."""
     if path.is_file():
         kind = content_of(path).kind
         if kind in _READERS:
@@ -231,7 +231,7 @@ _READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "raw": ("RAW files", _RawFrames),
     "picture": ("pictures", partial(PictureFolder, allowed_share=1)),
 }
-"""What files of a kind of content are called, and what reads them."""
+"""The name of the files of each kind of content, and their reader."""
 
 
 def _parts(openers: Iterable[tuple[str, Callable[[], Any]]], first: int | None) -> list[PartReport]:
@@ -272,7 +272,7 @@ def _opened(opening: bytes) -> Any:
 
 
 def _facts(opening: bytes, index: int) -> dict[str, str]:
-    """Size, pattern, levels, camera and ISO of an item, which is a picture, pair, RAW frame or noisy block."""
+    """Describe size, pattern, levels, camera and ISO of an item: a picture, pair, RAW frame or noisy block."""
     items = _opened(opening)
     item = getattr(items, "read", items.__getitem__)(index)
     return _facts_of(item)
@@ -280,7 +280,7 @@ def _facts(opening: bytes, index: int) -> dict[str, str]:
 
 @singledispatch
 def _facts_of(picture: Any) -> dict[str, str]:
-    """What a line says of an item, by kinds of fact: of a picture its size."""
+    """Describe an item by kinds of fact; for a picture this is its size."""
     return {"sizes": _size(picture)}
 
 
@@ -316,7 +316,7 @@ def _variances(shot_var: float, read_var: float) -> str:
 
 
 def _origin(item: Pair | RawFrame) -> dict[str, str]:
-    """The camera and the ISO, where they are known."""
+    """The camera and the ISO, if they are known."""
     facts = {}
     if item.camera != "unknown":
         facts["cameras"] = item.camera

@@ -4,12 +4,12 @@ r"""Built-in data: photographs and dead leaves, and shots of both by a camera wh
     srgb  = tone(M diag(g) demosaic(clean / s))
 
 The picture x is the scene, linearised by L (IEC 61966-2-1); B is the blur of lens and optical low-pass filter. A shot
-has an illuminant (gains g), an exposure e and an ISO (noise levels); the camera has a colour matrix M, lens shading s
+has an illuminant (gains g), an exposure e and an ISO (noise levels). The camera has a colour matrix M, lens shading s
 that falls off like cos^4 around a point off centre, a GRBG sensor of 12 bits with a black level (Q), and a film-like
-tone curve. It shares no code with the ISPs that are fitted to it: other noise (Poisson counts), other demosaicing
-(Malvar, He and Cutler), another tone curve.
+tone curve. It shares no code with the ISPs that are fitted to it: its noise (Poisson counts), its demosaicing (Malvar,
+He and Cutler) and its tone curve are different.
 
-The photographs are files of scikit-image's wheel; nothing is downloaded. The splits share no photograph and no source
+The photographs are files from scikit-image's wheel; nothing is downloaded. The splits share no photograph and no source
 of texture. As in practice, there are few RAW pairs and many sRGB pictures.
 """
 
@@ -78,7 +78,7 @@ class DemoCamera:
     cfa: CFA = CFA.GRBG
 
     def sample(self, generator: torch.Generator, iso: int | None = None) -> Shot:
-        """Draw the parameters of a shot; the ISO too, unless it is given."""
+        """Draw the parameters of a shot, including the ISO unless it is given."""
         place, red, blue, exposure, level = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
 
         # interpolate between two illuminants; real light deviates from their line by a few percent
@@ -99,7 +99,7 @@ class DemoCamera:
         )
 
     def apply(self, picture: Tensor, shot: Shot, name: str = "demo") -> Pair:
-        """Take the shot of ``picture``, uint8 ``(3, H, W)`` with even sides of at least 4, as the scene."""
+        """Take the shot with ``picture`` as the scene, uint8 ``(3, H, W)`` with even sides of at least 4."""
         if picture.ndim != 3 or picture.shape[0] != 3 or picture.dtype != torch.uint8 or min(picture.shape[1:]) < 4:
             raise ValueError(f"{name}: a scene must be uint8 (3, H, W), at least 4 x 4, got {tuple(picture.shape)}")
         exposed = self._expose(picture, shot)
@@ -123,11 +123,11 @@ class DemoCamera:
         )
 
     def capture(self, picture: Tensor, generator: torch.Generator, name: str = "demo", iso: int | None = None) -> Pair:
-        """:meth:`sample` and :meth:`apply` in one."""
+        """Call :meth:`sample` and :meth:`apply` in one step."""
         return self.apply(picture, self.sample(generator, iso), name)
 
     def _expose(self, picture: Tensor, shot: Shot) -> Tensor:
-        """The light on the sensor before noise, ``(1, H, W)``, white = 1."""
+        """Compute the light on the sensor before noise, ``(1, H, W)``, white = 1."""
         from kornia.filters import gaussian_blur2d
 
         scene = decode_srgb(picture[None].float() / 255)
@@ -167,7 +167,7 @@ def _digitise(light: Tensor) -> Tensor:
 
 
 def _tone(linear: Tensor) -> Tensor:
-    """Film-like: a shoulder that holds highlights, the sRGB transfer, an S curve; [0, 1] to [0, 1], increasing."""
+    """Apply a film-like curve: a highlight shoulder, the sRGB transfer, an S curve; [0, 1] to [0, 1], increasing."""
     display = encode_srgb(linear * (1 + _SHOULDER) / (linear + _SHOULDER))
     return (1 - _CONTRAST) * display + _CONTRAST * display**2 * (3 - 2 * display)
 
@@ -177,13 +177,13 @@ PHOTOGRAPHS = {
     "validation": ("motorcycle_left.png", "motorcycle_right.png"),
     "test": ("coffee.png", "chelsea.png"),
 }
-"""Files in scikit-image's data folder; the two motorcycles are one scene from two places."""
+"""Files in scikit-image's data folder; the two motorcycles show one scene from two places."""
 
 PICTURES_ONLY = ("brick.png", "grass.png", "gravel.png", "hubble_deep_field.jpg", "ihc.png")
-"""More photographs of the user's sRGB folder, of which the camera has no RAW."""
+"""More photographs in the user's sRGB folder, of which the camera has no RAW."""
 
 PAIRS = {"train": 5, "validation": 4, "test": 9}
-"""Default number of pairs of a split."""
+"""Default number of pairs in each split."""
 
 FRAME = (288, 448)
 """Height and width of every frame."""
@@ -204,7 +204,7 @@ def demo_files() -> list[Path]:
 
 
 def demo_pairs(split: str, count: int | None = None) -> list[Pair]:
-    """Shots by the demo camera, 288 x 448: crops of the split's photographs, and of dead leaves except in training.
+    """Make shots by the demo camera, 288 x 448, of the split's photographs and, except in training, of dead leaves.
 
     Pair k depends on (split, k) alone; scenes and ISO values take turns.
 
@@ -248,9 +248,9 @@ class PicturesInMemory(Dataset[Tensor], Sequence[Tensor]):
 
 
 def demo_pictures(count: int = 32) -> PicturesInMemory:
-    """The sRGB pictures of a user: photographs whole, then dead leaves of 288 x 448 textured from them.
+    """Make the sRGB pictures of a user: whole photographs, then dead leaves of 288 x 448 textured from them.
 
-    The photographs are those of the training pairs and five others, none of validation or test.
+    The photographs are those of the training pairs and five others, and none of validation or test.
     """
     if count < 1:
         raise ValueError(f"demo: count must be at least 1, got {count}")

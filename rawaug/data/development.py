@@ -2,8 +2,8 @@ r"""A plain development of RAW to sRGB, with the colours of DNG's tags.
 
     srgb = encode(M diag(white_balance) demosaic(raw)),    M = (diag(X S 1)^-1 X S)^-1
 
-with X from XYZ to the camera (DNG's ColorMatrix) and S from linear sRGB to XYZ (IEC 61966-2-1): grey stays grey. The
-white balance is the inverse of DNG's AsShotNeutral. There is no tone curve but sRGB's, as in SIDD's pictures
+with X from XYZ to the camera (DNG's ColorMatrix) and S from linear sRGB to XYZ (IEC 61966-2-1), so that grey stays
+grey. The white balance is the inverse of DNG's AsShotNeutral. There is no tone curve but sRGB's, as in SIDD's pictures
 (A. Abdelhamed, S. Lin, M. S. Brown, CVPR 2018).
 
 Pictures of pairs use the demosaicing of Malvar, He and Cutler. Scores and figures use bilinear interpolation, which
@@ -39,7 +39,7 @@ def srgb_from_camera(xyz_to_camera: np.ndarray) -> Tensor:
 
 
 def gains_from_neutral(as_shot_neutral: np.ndarray) -> tuple[float, float, float]:
-    """Multipliers of R, G and B from the tag AsShotNeutral; that of green is 1."""
+    """The multipliers of R, G and B from the tag AsShotNeutral; that of green is 1."""
     red, green, blue = map(float, np.ravel(as_shot_neutral))
     if not (min(red, green, blue) > 0 and max(red, green, blue) < np.inf):
         raise ValueError(f"AsShotNeutral {red:g}, {green:g}, {blue:g} is not positive")
@@ -55,10 +55,10 @@ def render_raw(
     exposure: float = 1.0,
     least: float | None = 0.0,
 ) -> Tensor:
-    """A mosaic ``(1, H, W)`` as a picture, sRGB ``(3, H, W)`` in [0, 1]; no tone curve but sRGB's.
+    """Render a mosaic ``(1, H, W)`` as a picture, sRGB ``(3, H, W)`` in [0, 1]; no tone curve but sRGB's.
 
-    ``exposure`` is a factor on all colours, ``least`` what camera colour is clipped at: None keeps the zero-mean noise
-    of shadows until it is sRGB.
+    ``exposure`` is a factor on all colours. ``least`` is the value at which camera colour is clipped; None keeps the
+    zero-mean noise of shadows until the conversion to sRGB.
 
     Example:
         >>> render_raw(torch.full((1, 8, 8), 0.5), "RGGB", (1, 1, 1), torch.eye(3)).mean().item()  # doctest: +ELLIPSIS
@@ -71,7 +71,7 @@ def render_raw(
 def render_rgb(
     rgb: Tensor, gains: Sequence[float], matrix: Tensor, exposure: float = 1.0, least: float | None = 0.0
 ) -> Tensor:
-    """Linear camera RGB ``(3, H, W)`` as a picture; arguments as in :func:`render_raw`."""
+    """Render linear camera RGB ``(3, H, W)`` as a picture; the arguments are as in :func:`render_raw`."""
     balanced = rgb * exposure * torch.tensor(gains).reshape(3, 1, 1)
     balanced = balanced.clamp(least, 1)
 
@@ -95,13 +95,13 @@ def develop_pair(
 
 
 def develop_packed(packed: Tensor, cfa: CFA, pair: Pair, exposure: float = 1.0) -> Tensor:
-    """Packed RAW ``(1, 4, h, w)`` to sRGB ``(3, H, W)`` in [0, 1] with the colours of ``pair``, for scores."""
+    """Develop packed RAW ``(1, 4, h, w)`` to sRGB ``(3, H, W)`` in [0, 1] with the colours of ``pair``, for scores."""
     raw = bayer.unpack(packed, cfa)[0]
     return render_raw(raw, cfa, pair.white_balance, pair.color_matrix, "bilinear", exposure, least=None)
 
 
 def exposure_of(packed: Tensor, pair: Pair) -> float:
-    """The factor that brings the brightest percent of a clean frame to white."""
+    """Compute the factor that brings the brightest percent of a clean frame to white."""
     green = packed[:, 1:3].flatten()
     stride = max(1, green.numel() // 1_000_000)
     brightest = torch.quantile(green[::stride], 0.99).clamp_min(1e-3)

@@ -1,11 +1,11 @@
-"""The Darmstadt Noise Dataset: noisy boxes whose clean versions are kept, and the files that its server takes.
+"""The Darmstadt Noise Dataset: noisy boxes whose clean versions are not public, and the files that its server takes.
 
 Fifty frames of four cameras are to be denoised in twenty boxes each. ``info.mat`` (version 7.3) holds the struct array
 ``info`` with, for each frame, ``boundingboxes`` (top, left, bottom, right, counted from 1, both ends inside), ``nlf``
 (var(y) = a y + b) and ``camera`` (``pattern`` with R, G, B as 1, 2, 3, ``AsShotNeutral``, ``ColorMatrix2``);
-``images_raw/0001.mat`` holds the frame ``Inoisy`` in [0, 1]. As every matrix of such files the pattern is transposed
-for those who do not exchange its axes: GBRG then looks like GRBG. Source: T. Plötz, S. Roth, "Benchmarking denoising
-algorithms with real photographs", CVPR 2017, and its submission kit.
+``images_raw/0001.mat`` holds the frame ``Inoisy`` in [0, 1]. As with every matrix in such files, the pattern appears
+transposed to a reader that does not exchange its axes: GBRG then looks like GRBG. Source: T. Plötz, S. Roth,
+"Benchmarking denoising algorithms with real photographs", CVPR 2017, and its submission kit.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rawaug.data.pairs import DATASETS, Lazy, Pair
 from rawaug.io import RawFrame
 
 FRAMES, BOXES = 50, 20
-"""Number of frames of the published dataset, and of boxes of a frame."""
+"""Number of frames of the published dataset, and number of boxes in a frame."""
 
 
 class Box(NamedTuple):
@@ -37,7 +37,7 @@ class Box(NamedTuple):
 
 
 class FrameInfo(NamedTuple):
-    """A frame as ``info`` describes it; ``stated`` has the arguments of a :class:`RawFrame` that it states."""
+    """A frame as ``info`` describes it; ``stated`` holds the arguments of a :class:`RawFrame` that it states."""
 
     boxes: list[Box]
     cfa: CFA
@@ -45,7 +45,7 @@ class FrameInfo(NamedTuple):
 
 
 class Dnd(Lazy[RawFrame]):
-    """The boxes, frame by frame: 1,000 of 512 x 512; one frame at a time is in memory.
+    """The boxes, frame by frame: 1,000 boxes of 512 x 512. One frame at a time is in memory.
 
     Results go to :func:`write_dnd_submission`, in the same order.
 
@@ -78,7 +78,7 @@ class Dnd(Lazy[RawFrame]):
         super().__init__(names)
 
     def file(self, number: int) -> Path:
-        """The file of a frame, counted from 0."""
+        """The file of a frame; frames are counted from 0."""
         return self.path / "images_raw" / f"{number + 1:04d}.mat"
 
     def read(self, index: int) -> RawFrame:
@@ -103,7 +103,7 @@ class Dnd(Lazy[RawFrame]):
 
 
 def parse_frame(entry: Any, file: Path, number: int) -> FrameInfo:
-    """A frame of the struct array ``info``; ValueError, which names the file, if it is not as published."""
+    """Parse a frame of the struct array ``info``; ValueError, naming the file, if it is not as published."""
     try:
         boxes = []
         for top, left, bottom, right in np.asarray(entry["boundingboxes"]).reshape(-1, 4).astype(int).tolist():
@@ -123,7 +123,7 @@ def parse_frame(entry: Any, file: Path, number: int) -> FrameInfo:
 
 @DATASETS.register("dnd")
 def no_clean_frames(path: str, split: str) -> Sequence[Pair]:
-    """Nothing: DND has no pairs."""
+    """Refuse to open pairs, which DND does not have."""
     raise ValueError(
         f"dnd:{path}: the clean frames of DND are not public; denoise it with rawaug submit dnd:{path}, and submit "
         "the result"
@@ -155,8 +155,8 @@ def write_dnd_submission(folder: str | Path, denoised: Iterable[Tensor]) -> None
 
 
 def checked_box(mosaic: Tensor, name: str) -> np.ndarray:
-    """The array that is written for a denoised mosaic, float32 ``(H, W)``."""
-    in_range = bool((mosaic >= 0.0).all() and (mosaic <= 1.0).all())  # NaN is not
+    """Make the array to write for a denoised mosaic, float32 ``(H, W)``."""
+    in_range = bool((mosaic >= 0.0).all() and (mosaic <= 1.0).all())  # False for NaN
     if mosaic.ndim != 3 or mosaic.shape[0] != 1 or not in_range:
         raise ValueError(f"{name}: must have values in [0, 1] and shape (1, H, W), got {tuple(mosaic.shape)}")
     return mosaic[0].detach().cpu().float().numpy()

@@ -1,13 +1,13 @@
-r"""Drawn pictures with the statistics of natural images: dead leaves, and shapes as man-made things have them.
+r"""Drawn pictures with the statistics of natural images: dead leaves, and shapes like those of man-made things.
 
     p(r) = C r^-3   for r_min <= r <= r_max,    centres uniform
 
-With this law of sizes pictures look alike at every scale, and have occlusion edges and a 1/f^2 power spectrum as
-photographs do. *Dead leaves* are disks that hide each other, each a window of a photograph or flat in one of its
-colours. Seen from below, the first leaf is on top: disks are laid front to back on what is still bare, until nothing
-is, which draws exactly from the stationary model. *Shapes* are boxes, ellipses, polygons, stripes and lettering:
-photographs of landscapes have few long straight edges and no text, and a denoiser trained on them alone is weakest
-there.
+With this law of sizes, pictures look alike at every scale, and have occlusion edges and a 1/f^2 power spectrum, as
+photographs do. *Dead leaves* are disks that hide each other; each is a window of a photograph, or flat in one of its
+colours. Seen from below, the first leaf is on top, so disks are laid front to back on the pixels that are still bare,
+until none is left. This draws exactly from the stationary model. *Shapes* are boxes, ellipses, polygons, stripes and
+lettering. Photographs of landscapes have few long straight edges and no text, and a denoiser trained on them alone is
+weakest there.
 
 Sources: A. B. Lee, D. Mumford, J. Huang, "Occlusion models for natural images: a statistical study of a scale-invariant
 dead leaves model", IJCV 41, 2001; as training data for restoration: R. Achddou, Y. Gousseau, S. Ladjal, "Synthetic
@@ -39,11 +39,11 @@ _LEAST_RADIUS = 4.0
 
 
 def dead_leaves(height: int, width: int, sources: Sequence[Tensor], generator: torch.Generator) -> Tensor:
-    """One dead-leaves picture, uint8 ``(3, height, width)``, anti-aliased (each pixel the mean of 2 x 2).
+    """Draw a dead-leaves picture, uint8 ``(3, height, width)``, anti-aliased (each pixel the mean of 2 x 2).
 
     Args:
-        height, width: in pixels, at least 16. Radii are 4 pixels to a third of the longer side, or what fits into a
-            source.
+        height, width: in pixels, at least 16. Radii range from 4 pixels to a third of the longer side, or to the
+            largest that fits into a source.
         sources: photographs for colours and textures, uint8 ``(3, h, w)``, sides at least 32, used at half their scale.
         generator: the only source of randomness, on the CPU.
 
@@ -84,7 +84,7 @@ def _fine_picture(
         # the inverse of the distribution function of r^-3 between the two radii
         radius = (smallest**-2 - u[0] * (smallest**-2 - largest**-2)) ** -0.5
 
-        # some centres are outside, as far as the largest disk reaches, so that the border resembles the middle
+        # some centres lie outside, as far as the largest disk reaches, so that the border resembles the middle
         y = u[1] * (height + 2 * largest) - largest
         x = u[2] * (width + 2 * largest) - largest
 
@@ -161,7 +161,7 @@ Rng = np.random.Generator
 
 
 class Shapes(Dataset[Tensor]):
-    """``count`` different pictures, uint8 ``(3, side, side)``, drawn on access, which takes half a second each.
+    """A Dataset of ``count`` different pictures, uint8 ``(3, side, side)``, drawn on access in half a second each.
 
     Picture i depends on (seed, i) alone.
 
@@ -192,7 +192,7 @@ def open_shapes(path: str = "", min_side: int = 2) -> Shapes:
 
 
 def draw_shapes(side: int, rng: Rng) -> Tensor:
-    """One picture, uint8 ``(3, side, side)``: anti-aliased shapes of two to six kinds, shaded, some out of focus."""
+    """Draw a picture, uint8 ``(3, side, side)``: anti-aliased shapes of two to six kinds, shaded, some out of focus."""
     with extra("train"):
         from PIL import Image, ImageFilter
 
@@ -227,7 +227,7 @@ def _shaded(picture: np.ndarray, rng: Rng) -> Tensor:
 
 
 def _colour(rng: Rng) -> Colour:
-    """Draw a colour of any hue, mostly pale; the value is uniform but for rare extremes."""
+    """Draw a colour of any hue, mostly pale; its value is uniform except for rare extremes."""
     hue = rng.random()
     saturation = min(1.0, abs(rng.normal(0.0, 0.35)))
     value = rng.beta(1.2, 1.2)
@@ -241,7 +241,7 @@ def _ellipse(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:
 
 
 def _boxes(picture: Any, centre: np.ndarray, radius: float, rng: Rng, angle: float, stripes: int = 0) -> None:
-    """A box, and as many stripes of another colour across it."""
+    """Draw a box, and as many stripes of another colour across it."""
     half_width, half_height = radius * np.exp(rng.normal(0.0, 0.6, 2))
     cosine, sine = math.cos(angle), math.sin(angle)
 

@@ -1,14 +1,14 @@
-r"""Simulated RAW files of two DSLRs, rendered by LibRaw: the structure of the paper's second table.
+r"""Simulated RAW files of two DSLRs, rendered by LibRaw, with the structure of the paper's second table.
 
     d = round(k Poisson(s e A_T L(x) / k) + N(0, r)) at the sites,   srgb = LibRaw(d)
 
 The scene L(x) and the camera's matrix in its light A_T are those of :mod:`rawaug.data.scenes`. The digital numbers are
-written as a DNG, which LibRaw reads and renders as it does a real one: its demosaicing, its colour, its tone curve, and
-its scaling by the frame's own maximum, as in InvISP's protocol (Xing et al., CVPR 2021). A second kind is that
-rendering as a JPEG of quality 90 gives it back.
+written as a DNG, which LibRaw reads and renders like a real one: with its demosaicing, its colour, its tone curve, and
+its scaling by the frame's own maximum, as in InvISP's protocol (Xing et al., CVPR 2021). A second kind of frames has
+that rendering after a JPEG of quality 90.
 
-Cameras are a Canon EOS 5D and a Nikon D700: their matrices (LibRaw's table), their bits and levels, and noise near that
-of their lowest ISO (darktable's profiles). Light is by day; the camera's white balance errs by a few percent.
+The cameras are a Canon EOS 5D and a Nikon D700, with their matrices (LibRaw's table), bits and levels, and noise near
+that of their lowest ISO (darktable's profiles). Scenes are in daylight; white balance errs by a few percent.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from rawaug.seeding import keyed_generator
 
 _FRAME = (512, 768)
 FRAMES = {"train": 96, "validation": 12, "test": 24}
-"""Frames of each camera in a split."""
+"""Number of frames of each camera in a split."""
 _LIBRAW_THRESHOLD = 0.75
 """LibRaw's own ``adjust_maximum_thr``, which InvISP's published script leaves on."""
 _JPEG_QUALITY = 90
@@ -42,7 +42,7 @@ _MIRED = (182.0, 22.0)
 _BALANCE_ERROR = 0.03
 """Standard deviation of the logarithms of the as-shot red and blue gains."""
 _STOPS = (0.0, 1.5)
-"""Limits of the exposure below the one that takes white to the sensor's white."""
+"""Limits of the exposure, in stops below the one that takes white to the sensor's white."""
 
 
 class Dslr(NamedTuple):
@@ -89,9 +89,9 @@ class DslrFrames(LazyPairs):
         path: a folder of photographs (:func:`rawaug.data.scenes.scene_files`), or empty for the package's own.
         split: ``"train"``, ``"validation"`` or ``"test"``.
         camera: ``"canon"`` or ``"nikon"``.
-        jpeg_quality: of the JPEG that the rendering is stored as; None keeps LibRaw's pixels.
+        jpeg_quality: quality of the JPEG that the rendering is stored as; None keeps LibRaw's pixels.
         adjust_maximum_thr: LibRaw's scaling by the frame's own maximum; 0 turns it off.
-        seed: of all that is drawn.
+        seed: seed of all draws.
 
     Example:
         >>> frames = DslrFrames("", "test", "nikon")
@@ -145,7 +145,7 @@ class DslrFrames(LazyPairs):
 
 
 def take(dslr: Dslr, scene: Tensor, generator: torch.Generator, name: str) -> RawFrame:
-    """Take a RAW frame of a scene, linear sRGB ``(3, H, W)`` in [0, 1] with even sides, by daylight."""
+    """Take a RAW frame of a scene, linear sRGB ``(3, H, W)`` in [0, 1] with even sides, in daylight."""
     exposure = float(torch.rand((), generator=generator, dtype=torch.float64))
     light, red, blue = torch.randn(3, generator=generator, dtype=torch.float64).tolist()
 

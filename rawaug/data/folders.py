@@ -49,10 +49,10 @@ class PictureFolder(Dataset[Tensor]):
     counted in :attr:`left_out`. ``rawaug data check`` finds the files that crash a decoder, and a worker with it.
 
     Args:
-        path: a folder, or one picture; files are taken by their extension, links to folders are not followed.
+        path: a folder, or one picture. Files are chosen by their extension; links to folders are not followed.
         min_side: smaller pictures are skipped; use the side of your crops. A mosaic has sides of at least 2.
         max_pixels: larger pictures are skipped.
-        allowed_share: part of the files that may be skipped; above it, reading raises an error that names them.
+        allowed_share: share of the files that may be skipped; above it, reading raises an error that names them.
 
     Raises:
         FileNotFoundError: if there is no such folder.
@@ -100,7 +100,7 @@ class PictureFolder(Dataset[Tensor]):
         return self.path / os.fsdecode(self._names[index])
 
     def read(self, index: int) -> Tensor:
-        """The picture of one file, not replaced by another; OSError or ValueError if it cannot be used."""
+        """Read the picture of one file, not replaced by another; OSError or ValueError if it cannot be used."""
         picture = read_picture(self.file(index), self.max_pixels)
         if min(picture.shape[1:]) < self.min_side:
             size = f"{picture.shape[1]} x {picture.shape[2]}"
@@ -122,7 +122,7 @@ class PictureFolder(Dataset[Tensor]):
         return indices
 
     def _ask_again(self, index: int) -> str:
-        """The reason why a file cannot be used."""
+        """Read a file again to get the reason why it cannot be used."""
         try:
             self.read(index)
         except (OSError, ValueError) as error:
@@ -130,7 +130,7 @@ class PictureFolder(Dataset[Tensor]):
         return f"{self.file(index)}: was damaged, but is readable now"
 
     def report(self) -> str:
-        """A text about the files that were skipped so far, with the reasons, and the kinds of files not used."""
+        """Describe the files that were skipped so far, with the reasons, and the kinds of files not used."""
         skipped = self.skipped
         pictures = count_of(len(self), "picture")
         head = f"{escape(self.path)}: none of {pictures} skipped so far"
@@ -139,7 +139,7 @@ class PictureFolder(Dataset[Tensor]):
         return "\n".join([head, *map(escape, skipped.values()), *self.left_out])
 
     def _attempt(self, index: int) -> Tensor | None:
-        """The picture; None if the file is damaged, which is then marked."""
+        """Read a picture; return None if the file is damaged, and mark it."""
         try:
             return self.read(index)
         except (OSError, ValueError) as error:
@@ -165,7 +165,7 @@ class PictureFolder(Dataset[Tensor]):
 
 
 def reports(pictures: Any) -> list[str]:
-    """The report of each folder in ``pictures`` that leaves files out, including cached and concatenated ones."""
+    """Get the report of each folder in ``pictures`` that leaves files out, including cached and concatenated ones."""
     if isinstance(pictures, PictureFolder):
         if pictures.skipped or pictures.left_out:
             return [pictures.report()]
@@ -187,7 +187,7 @@ class Cached(Dataset[T]):
 
     Args:
         pictures: the dataset.
-        megabytes: the size of the cache; other items are read and made anew on every access.
+        megabytes: the size of the cache; items that do not fit are read and made anew on every access.
         make: a function from a picture to an item; by default items are the pictures.
     """
 
@@ -259,7 +259,7 @@ class Readable(Sequence[Pair]):
             raise ValueError(f"none of the {count_of(len(self.pairs), 'frame')} can be read; {self.reasons()[0]}")
 
     def attempt(self, index: int, read: Callable[[int], T]) -> T | None:
-        """``read(index)``, or None if this pair cannot be read."""
+        """Return ``read(index)``, or None if this pair cannot be read."""
         if index in self.broken:
             return None
         try:
@@ -269,7 +269,7 @@ class Readable(Sequence[Pair]):
             return None
 
     def reasons(self) -> list[str]:
-        """Why pairs cannot be read, in their order."""
+        """Why pairs cannot be read, in the order of the pairs."""
         return [self.broken[index] for index in sorted(self.broken)]
 
     def kept(self) -> Sequence[Pair]:
@@ -282,7 +282,7 @@ class Readable(Sequence[Pair]):
 
 
 def left_out(pairs: Readable, of: str) -> list[str]:
-    """Lines to print about skipped pairs: how many, then each reason; empty if none was skipped."""
+    """Make lines to print about skipped pairs: their number, then each reason; empty if none was skipped."""
     reasons = pairs.reasons()
     if not reasons:
         return []
@@ -304,17 +304,17 @@ def skip_broken(pairs: Sequence[Pair], of: str) -> Iterator[Pair]:
 class RawFolder(LazyPairs):
     """The RAW files of a folder and its subfolders, sorted by path; or one file; or a list of both.
 
-    A pair's sRGB is the JPEG of the same stem beside the RAW file where there is one of the mosaic's size within 3% (it
-    is turned into the sensor's orientation, both are cut to the smaller size about the centre, and the pair is not
-    ``registered``), else LibRaw's rendering (see :func:`rawaug.io.read_raw_and_develop`), with a warning if there is a
-    JPEG of another size. Its name is the file's stem; where two would have the same, the path.
+    A pair's sRGB is the JPEG of the same stem beside the RAW file, if there is one whose size is the mosaic's within
+    3%. The JPEG is turned into the sensor's orientation, both are cut to the smaller size about the centre, and the
+    pair is not ``registered``. Otherwise it is LibRaw's rendering (see :func:`rawaug.io.read_raw_and_develop`), with a
+    warning if there is a JPEG of another size. A pair's name is the file's stem, or the path if two stems are equal.
 
     Args:
-        path: where the RAW files are.
+        path: path of the RAW files.
         camera_jpeg: False always uses LibRaw's rendering.
         adjust_maximum_thr: LibRaw's scaling by the frame's own maximum, off by default.
-        jpeg_quality: LibRaw's rendering as a JPEG of this quality gives it back; None leaves it as it is.
-        max_pixels: of a JPEG; a larger one is an error of its pair.
+        jpeg_quality: pass LibRaw's rendering through a JPEG of this quality; None leaves it as it is.
+        max_pixels: the limit of a JPEG; a larger one is an error of its pair.
     """
 
     rendering = "LibRaw"
@@ -362,7 +362,7 @@ class RawFolder(LazyPairs):
         return Pair.of_frame(self.names[index], frame, srgb)
 
     def _pair_with_jpeg(self, name: str, file: Path, jpeg: Path) -> Pair | None:
-        """The pair of a RAW file and its JPEG, cut to the smaller size; None, with a warning, if the sizes differ."""
+        """Make the pair of a RAW file and its JPEG, cut to the smaller size; None, with a warning, if sizes differ."""
         frame = read_raw(file)
         srgb = turn_back(read_picture(jpeg, self.max_pixels), frame.upright_view)
 
@@ -384,7 +384,7 @@ class RawFolder(LazyPairs):
 
 
 def _names(files: Sequence[Path]) -> list[str]:
-    """The stems of files, or their paths below the common folder if two stems are equal."""
+    """Name files by their stems, or by their paths below the common folder if two stems are equal."""
     names = [file.stem for file in files]
     if len(set(names)) == len(names):
         return names

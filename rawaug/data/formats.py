@@ -71,7 +71,7 @@ def _read_npz(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
 
 
 def read_npz(file: Path, select: Callable[[list[str]], Iterable[str]]) -> dict[str, np.ndarray]:
-    """The arrays of a file that ``select`` chooses by their names; together they may have :data:`MAX_BYTES`."""
+    """Read the arrays that ``select`` chooses by their names; together they may have :data:`MAX_BYTES`."""
     # opened here, since NumPy does not close the files of damaged archives
     with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
         names = list(select(list(archive.files)))
@@ -88,7 +88,7 @@ def read_npz(file: Path, select: Callable[[list[str]], Iterable[str]]) -> dict[s
 
 
 def _read_npy(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
-    """The array of a file. Its header states its size; NumPy refuses objects, which are pickles."""
+    """Read the array of a file. Its header states its size; NumPy refuses objects, which are pickles."""
     with damage_as_os_error(file, "cannot be read as NPY", _Unclear), file.open("rb") as stream:
         version = np.lib.format.read_magic(stream)
         if version == (1, 0):
@@ -104,7 +104,7 @@ def _read_npy(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
 
 
 def write_npz(file: Path, clean: Tensor, noisy: Tensor, stated: Mapping[str, Any]) -> None:
-    """Write packed RAW ``(4, h, w)`` (or mosaics of other patterns) of a pair, and their metadata (``stated``)."""
+    """Write a pair as packed RAW ``(4, h, w)`` (mosaics for other patterns), with its metadata (``stated``)."""
     arrays: dict[str, Any] = {}
     for key, value in stated.items():
         dtype = None if key == "cfa" else np.float32
@@ -132,7 +132,7 @@ def _read_tiff(file: Path, which: str, alone: bool, max_pixels: int) -> Contents
 
 
 def _parse_description(text: str) -> Mapping[str, Any]:
-    """The metadata in the description of a TIFF; empty if another program wrote it."""
+    """Parse the metadata in the description of a TIFF; empty if another program wrote it."""
     if not text.startswith("{"):
         return {}
     try:
@@ -186,7 +186,7 @@ def read_mosaic(
     Args:
         file: the file.
         which: ``noisy`` or ``clean``, the name of the array.
-        others: metadata that the file does not state.
+        others: metadata to use where the file states none.
         alone: whether the file holds both mosaics of a pair, so that its only array is not enough.
         max_pixels: the limit of a PNG.
 
@@ -218,7 +218,7 @@ def read_mosaic(
 
 
 def _name_of(file: Path, names: Iterable[str], which: str, alone: bool) -> str:
-    """The name of the array that is the mosaic: ``which``, or that of the only array."""
+    """Find the name of the array that is the mosaic: ``which``, or that of the only array."""
     arrays = [name for name in names if name not in KINDS]
     if which in arrays:
         return which
@@ -256,7 +256,7 @@ _SHAPES = "a mosaic (H, W), or packed RAW (4, h, w) or (h, w, 4)"
 
 
 def _packed(file: Path, numbers: Tensor, cfa: CFA) -> Tensor:
-    """Packed RAW ``(4, h, w)`` of a mosaic ``(H, W)`` or ``(1, H, W)``, or of packed RAW with its planes first or last.
+    """Pack a mosaic ``(H, W)`` or ``(1, H, W)``, or packed RAW with planes first or last, as RAW ``(4, h, w)``.
 
     Planes are last if the last axis has 4 elements and the first does not.
     """

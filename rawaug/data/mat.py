@@ -1,6 +1,6 @@
 r"""MATLAB files: version 5, which SciPy reads, and 7.3, HDF5 after 512 bytes of header, which h5py reads.
 
-A 7.3 file stores the axes of a matrix in reverse, since MATLAB stores column by column and HDF5 row by row: without
+A 7.3 file stores the axes of a matrix in reverse, since MATLAB stores column by column and HDF5 row by row. Without
 correction a picture is transposed, and a GRBG mosaic looks like GBRG. All axes here are those of MATLAB. Source:
 MathWorks, "MAT-File Format".
 """
@@ -28,7 +28,7 @@ MAX_BYTES = 2**30
 
 
 def mat_version(path: str | Path) -> str:
-    """``"5"`` or ``"7.3"``, by the header."""
+    """Tell ``"5"`` or ``"7.3"`` by the header."""
     require_file(path, "MATLAB file")
     with Path(path).open("rb") as file:
         header = file.read(512 + len(_HDF5))
@@ -46,7 +46,7 @@ def variables(path: str | Path) -> list[str]:
 
 
 def read_array(path: str | Path, name: str) -> np.ndarray:
-    """The numeric array ``name``, axes and type as in MATLAB."""
+    """Read the numeric array ``name``, with axes and type as in MATLAB."""
     value = isolated(_read, Path(path), name, False)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
         raise ValueError(f"{path}: {name} is not a numeric array but {type(value).__name__}")
@@ -54,9 +54,9 @@ def read_array(path: str | Path, name: str) -> np.ndarray:
 
 
 def read_value(path: str | Path, name: str) -> Any:
-    """The variable ``name`` as plain values.
+    """Read the variable ``name`` as plain values.
 
-    Structs are dicts, struct arrays lists of dicts, cells lists (row by row), characters strings, and numbers arrays
+    Structs become dicts, struct arrays lists of dicts, cells lists (row by row), characters strings, and numbers arrays
     without axes of length 1.
     """
     return isolated(_read, Path(path), name, True)
@@ -125,7 +125,7 @@ def require_size(size: int, name: str) -> None:
 
 
 def _member(group: Any, name: str) -> Any:
-    """A member of a group. Links are refused, since they can point to any file on this machine."""
+    """Get a member of a group. Links are refused, since they can point to any file on this machine."""
     import h5py
 
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
@@ -134,7 +134,7 @@ def _member(group: Any, name: str) -> Any:
 
 
 def _values(node: Any) -> Any:
-    """The values of an HDF5 dataset. External storage and datasets above the size limit are refused."""
+    """Read the values of an HDF5 dataset. External storage and datasets above the size limit are refused."""
     if node.external or node.is_virtual:
         raise ValueError(f"{node.name} is stored in another file")
     require_size(node.size * node.dtype.itemsize, node.name)
@@ -142,7 +142,7 @@ def _values(node: Any) -> Any:
 
 
 def _plain(node: Any, file: Any) -> Any:
-    """The value of an HDF5 node as :func:`read_value` returns it."""
+    """Convert an HDF5 node to the value that :func:`read_value` returns."""
     import h5py
 
     if isinstance(node, h5py.Group):
@@ -164,7 +164,7 @@ def _plain(node: Any, file: Any) -> Any:
 
 
 def _is_struct_array(group: Any) -> bool:
-    """Whether a struct has several elements. Its fields then hold references, but, unlike cells, have no class."""
+    """Whether a struct has several elements. Its fields then hold references but, unlike cells, have no class."""
     import h5py
 
     for field in group.values():
@@ -175,7 +175,7 @@ def _is_struct_array(group: Any) -> bool:
 
 
 def _struct_array(fields: Mapping[str, list[Any]]) -> list[dict[str, Any]]:
-    """The elements of a struct array, given the values of each field."""
+    """Make the elements of a struct array from the values of each field."""
     elements = []
     for values in zip(*fields.values(), strict=True):
         elements.append(dict(zip(fields, values, strict=True)))

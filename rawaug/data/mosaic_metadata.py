@@ -1,4 +1,4 @@
-"""What is known of a mosaic in a file that is no camera RAW: its pattern, levels, colours and noise, parsed by key.
+"""The metadata of a mosaic in a file other than camera RAW: pattern, levels, colours and noise, parsed by key.
 
 The caller must give the CFA and levels that a file does not state, and cannot override those that it states.
 """
@@ -101,7 +101,7 @@ KINDS: dict[str, Callable[[Any], Any]] = {
 
 
 def format_value(value: Any) -> str:
-    """A value as messages show it; levels are parted by slashes."""
+    """Format a value for messages; levels are separated by slashes."""
     if isinstance(value, tuple):
         return "/".join(f"{level:g}" for level in value)
     return str(value)

@@ -20,11 +20,11 @@ _ROUNDS = 5
 _LEAST = 1e-9
 """Minimum of shot_var and read_var."""
 _SITES = 2**20
-"""Approximate number of sites of a larger mosaic that are measured."""
+"""Approximate number of sites that are measured of a larger mosaic."""
 
 
 def measure_noise(clean: np.ndarray, noisy: np.ndarray) -> tuple[float, float]:
-    """(shot_var, read_var) of ``noisy``, both positive; arrays of the same shape, black 0, white 1."""
+    """Measure (shot_var, read_var) of ``noisy``, both positive; the arrays have the same shape, black 0, white 1."""
     signal = np.ravel(clean).astype(np.float64)
     square = (np.ravel(noisy) - signal) ** 2
 
@@ -49,13 +49,13 @@ def measure_noise(clean: np.ndarray, noisy: np.ndarray) -> tuple[float, float]:
 
 
 def measure_levels(clean: Tensor, noisy: Tensor) -> tuple[float, float]:
-    """:func:`measure_noise` of two mosaics ``(1, H, W)``, at about a million of their sites if they are larger."""
+    """Apply :func:`measure_noise` to two mosaics ``(1, H, W)``, or to about a million of their sites if larger."""
     step = max(1, clean.numel() // _SITES) | 1  # an odd step visits all four sites of the cell
     return measure_noise(clean.flatten()[::step].numpy(), noisy.flatten()[::step].numpy())
 
 
 def _line(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    """Slope and offset of the weighted least-squares line through the points, both positive."""
+    """Compute slope and offset of the weighted least-squares line through the points, both positive."""
     mean_x = np.average(x, weights=weight)
     mean_y = np.average(y, weights=weight)
     spread = np.average((x - mean_x) ** 2, weights=weight)

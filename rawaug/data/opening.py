@@ -34,16 +34,17 @@ def open_pairs(
         spec: a RAW file, a folder of RAW files, or ``kind:path`` for a known dataset: ``"pairs:MY_PAIRS"``,
             ``"demo:"``, ``"demo:train"``, ``"sidd:SIDD_Medium_Raw"``, ``"zurich:Zurich-RAW-to-DSLR:test"`` (with the
             split last). A sequence of pairs is taken as it is.
-        split: of a dataset that has splits, unless ``spec`` names one. A folder has none. ``sidd`` has ``train`` (the
-            full frames) and ``test`` (the validation blocks), ``fivek`` and ``zurich`` have ``train`` and ``test``.
-        as_clean: the frames of a bare folder are taken for clean ones, so that ``NAME_noisy.dng`` is refused.
-        max_pixels: of the sRGB pictures, and of mosaics in PNG files; larger ones are an error of their pair. None
-            for :data:`rawaug.io.pictures.MAX_PIXELS`. Pairs given as a sequence keep theirs.
+        split: the split of a dataset that has splits, unless ``spec`` names one. A folder has none. ``sidd`` has
+            ``train`` (the full frames) and ``test`` (the validation blocks), ``fivek`` and ``zurich`` have ``train``
+            and ``test``.
+        as_clean: whether the frames of a bare folder are taken for clean ones, so that ``NAME_noisy.dng`` is refused.
+        max_pixels: the limit of the sRGB pictures, and of mosaics in PNG files; larger ones are an error of their pair.
+            None stands for :data:`rawaug.io.pictures.MAX_PIXELS`. Pairs given as a sequence keep theirs.
         bin: K makes each site the mean of K x K sites of its colour around it: a reference with about 1 / K^2 of its
             own noise.
-        developed: open pairs of developed pictures, too, such as ``cc15:DIR``, in place of an error; they are
+        developed: open pairs of developed pictures, such as ``cc15:DIR``, instead of raising an error; they are
             :class:`rawaug.data.picture_pairs.PicturePair`.
-        settings: of the reader of ``kind``, such as ``cfa="RGGB"`` of ``pairs:``; None leaves it at its default.
+        settings: settings of the reader of ``kind``, such as ``cfa="RGGB"`` of ``pairs:``; None keeps the default.
 
     Raises:
         FileNotFoundError, ValueError: if there is no such kind, split, file, folder or setting, or noisy/clean pairs
@@ -110,7 +111,7 @@ def open_pictures(spec: str | Path | Sequence[str | Path], min_side: int = 2, ma
         spec: the path of a folder or of a picture, ``"demo:"``, ``"shapes:COUNT"``, or several of these, one after
             the other.
         min_side: smaller pictures of a folder are skipped and reported; use the side of your crops.
-        max_pixels: larger ones likewise; None for :data:`rawaug.io.pictures.MAX_PIXELS`.
+        max_pixels: larger pictures likewise; None stands for :data:`rawaug.io.pictures.MAX_PIXELS`.
 
     Raises:
         FileNotFoundError, ValueError: if there is no such kind or folder, or it holds no picture.

@@ -72,7 +72,7 @@ class PairFolder(LazyPairs):
 
     Args:
         path: where the pairs are.
-        noisy: a pattern with a slash is one of paths; files of other names are left out. Without a pattern all readable
+        noisy: a pattern with a slash matches paths; files of other names are left out. Without a pattern all readable
             files must belong to a pair by the naming of ``rawaug synth``.
         clean, cfa, black, white: as in :class:`PairSettings`.
     """

@@ -1,7 +1,8 @@
 """RAW-sRGB pairs, and lazy sequences of pairs.
 
-The resolved paths of its files identify a frame, or its name if it has no files. So a recipe can check that it does not
-score the frames that it trains on, without reading any. Datasets that describe their frames have ``labels``.
+A frame is identified by the resolved paths of its files, or by its name if it has no files. So a recipe can check,
+without reading any frames, that it does not score those that it trains on. Datasets that describe their frames have
+``labels``.
 """
 
 from __future__ import annotations
@@ -41,24 +42,24 @@ class Pair:
     """One shot, RAW and sRGB.
 
     Attributes:
-        name: of the shot, for reports.
+        name: name of the shot, for reports.
         srgb: uint8 ``(3, H, W)``, in the sensor's orientation.
         raw: the clean mosaic, float32 ``(1, H, W)``, black 0, white 1, sides even.
         cfa: the pattern of ``raw`` and ``noisy``.
-        white_balance: as-shot multipliers of R, G, B, green being 1; all 1 where they are not known.
+        white_balance: as-shot multipliers of R, G, B, green being 1; all 1 if they are not known.
         color_matrix: float32 ``(3, 3)``, white-balanced camera colour to linear sRGB, rows summing to 1.
-        noisy: a noisy mosaic of the same scene, like ``raw``, where one was captured.
+        noisy: a noisy mosaic of the same scene, like ``raw``, if one was captured.
         shot_var, read_var: the levels of ``noisy``: its variance is shot_var * raw + read_var.
         camera: make and model.
         iso: None if unknown.
         registered: whether ``srgb`` and ``raw`` agree pixel for pixel. A camera's own JPEG is corrected for its lens:
             compare it at a much lower resolution only.
-        rendered: whether ``srgb`` is a rendering in the camera's colours. False: gains and matrix are unknown, and
+        rendered: whether ``srgb`` is a rendering in the camera's colours. If False, gains and matrix are unknown, and
             ``srgb`` merely displays the RAW, so that no ISP can be fitted to it or scored on it.
-        noisy_srgb: the camera's picture of ``noisy``, like ``srgb``, where there is one.
-        levels_from_clean: whether ``shot_var`` and ``read_var`` were measured against ``raw``, which a denoiser that is
-            tested must not know.
-        own_noise: (shot_var, read_var) of the noise that ``raw`` itself has, where it was measured.
+        noisy_srgb: the camera's picture of ``noisy``, like ``srgb``, if there is one.
+        levels_from_clean: whether ``shot_var`` and ``read_var`` were measured against ``raw``. A denoiser under test
+            must not know such levels.
+        own_noise: (shot_var, read_var) of the noise that ``raw`` itself has, if it was measured.
         color_known: whether ``white_balance`` and ``color_matrix`` are the camera's; without them no ISP can be fitted.
 
     Raises:
@@ -134,7 +135,7 @@ class Pair:
         return self.white_balance != (1.0, 1.0, 1.0)
 
     def with_levels(self) -> Pair:
-        """This pair, with levels measured against ``raw`` if the capture states none."""
+        """Return this pair with levels, measured against ``raw`` if the capture states none."""
         if self.noisy is None or self.shot_var is not None:
             return self
 
@@ -142,7 +143,7 @@ class Pair:
         return replace(self, shot_var=shot_var, read_var=read_var, levels_from_clean=True)
 
     def with_own_noise(self, estimate: Callable[[Tensor, CFA], tuple[float, float] | None]) -> Pair:
-        """This pair, with the noise levels of ``raw`` itself as ``estimate(raw, cfa)``, unless it states them."""
+        """Return this pair with the noise levels of ``raw`` itself, from ``estimate(raw, cfa)`` if it states none."""
         if self.own_noise is not None:
             return self
 
@@ -176,12 +177,12 @@ class Pair:
         return self._transform(crop)
 
     def binned(self, factor: int, together: bool = False) -> Pair:
-        """The frame at 1 / ``factor`` of its sides, whose noise has about 1 / ``factor``^2 of the variance.
+        """Shrink the frame to 1 / ``factor`` of its sides; its noise then has about 1 / ``factor``^2 of the variance.
 
         :func:`rawaug.bayer.bin_mosaic` bins RAW and explains ``together``; pictures are averaged in linear light.
 
         Raises:
-            ValueError: if a side is shorter than two of the new cell's.
+            ValueError: if a side is shorter than two of the new cells.
         """
         if factor == 1 and not together:
             return self
@@ -264,7 +265,7 @@ class Lazy(Sequence[T], ABC, Generic[T]):
 
     @abstractmethod
     def read(self, index: int) -> T:
-        """The item at ``index`` in [0, len)."""
+        """Read the item at ``index`` in [0, len)."""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -296,7 +297,7 @@ class LazyPairs(Lazy[Pair]):
     """What has rendered the sRGB of registered pairs."""
 
     def frame(self, index: int) -> RawFrame:
-        """The captured mosaic of a pair, the noisy one where there is one, without its picture."""
+        """Read the captured mosaic of a pair, the noisy one if there is one, without its picture."""
         pair = self[index]
         mosaic = pair.noisy
         if mosaic is None:
@@ -342,7 +343,7 @@ class _InMemory(LazyPairs):
 
 
 def lazy(pairs: Sequence[Pair]) -> LazyPairs:
-    """The pairs as a sequence with names and files, which are available without reading a pair."""
+    """Return the pairs as a sequence with names and files, which are available without reading a pair."""
     if isinstance(pairs, LazyPairs):
         return pairs
     return _InMemory(pairs)
@@ -353,13 +354,13 @@ def names_of(pairs: Sequence[Pair]) -> list[str]:
 
 
 def stamps(pairs: Sequence[Pair]) -> list[str]:
-    """A fingerprint for each frame; no file is read."""
+    """Compute a fingerprint for each frame; no file is read."""
     frames = lazy(pairs)
     return [frames.stamp(index) for index in range(len(frames))]
 
 
 def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
-    """A frame that both hold, by its path or name; None if they share none."""
+    """Find a frame that both hold, by its path or name; None if they share none."""
     return min(_identities(lazy(first)) & _identities(lazy(second)), default=None)
 
 

@@ -8,16 +8,15 @@ The scene L(x) is a photograph's linear light and A_T the phone's matrix in a li
 (k, r); the phone has a lens shading s and a sensor of ten bits with a black level (Q). Clean RAW stands for the mean of
 a burst: it is not quantised.
 
-The renderer does not know the light. It takes it for one of temperature U and lifts dark frames, both by parts and with
-errors, as the phone's own law says (:class:`Rendering`), in mired and in stops:
+The renderer does not know the light. It takes it to have the temperature U, and lifts dark frames. It does both only
+partly and with errors, as the phone's own law says (:class:`Rendering`), in mired and in stops:
 
     10^6 / U = 10^6 / T0 + a (10^6 / T - 10^6 / T0) + error,    log2 d = b log2(target / mean) + error
 
-so that lamps stay warm and dim rooms dark, and a picture tells something of the gains that made it. Each phone has a
-saturation in its matrix C, and a tone curve t of its own.
+so that lamps stay warm and dim rooms dark, and a picture says something about the gains that made it. Each phone has a
+saturation in its matrix C, and its own tone curve t.
 
-What is as in SIDD, and what is not, stands in docs/datasets.md. None of this shares code with the ISPs that are fitted
-to it.
+docs/datasets.md says what is as in SIDD and what is not. None of this shares code with the ISPs that are fitted to it.
 """
 
 from __future__ import annotations
@@ -46,14 +45,14 @@ WHITE = 1023
 LIGHTS = (3200, 4400, 5500)
 """Colour temperatures in kelvin, SIDD's own."""
 _BRIGHTNESS = {"N": (0.0, 1.0), "L": (1.0, 2.5)}
-"""Normal and low: limits of the exposure in stops below the one that takes white to the sensor's white."""
+"""Limits of normal and low exposures, in stops below the one that takes white to the sensor's white."""
 _TAKEN_FOR_NEUTRAL = 6500.0
 """T0, the temperature in kelvin that a renderer falls back on."""
 SHOTS = ("010", "011")
 """The numbers of an instance's two frames, which differ by their noise."""
 _MOST_LIFT = 16.0
 _SCENE_ENDS = (33, 54, 73, 94, 117, 142, 165, 188, 194, 200)
-"""The last instance of each scene: with SIDD's held-back instances left out, 28 are of scene 001 and 92 of 001 to 005,
+"""The last instance of each scene. With SIDD's held-back instances left out, 28 are of scene 001 and 92 of 001 to 005,
 so that 56 and 184 pairs are whole scenes."""
 
 
@@ -72,13 +71,13 @@ class Rendering(NamedTuple):
     Args:
         adaptation: share a of the way from neutral to the light that white balance goes, in mired.
         balance_error: standard deviation of white balance along the lights, in mired.
-        tint_error: standard deviation of red and blue gains beside it, relative.
-        lift: share b of the way to the target, in stops, that the digital gain goes.
-        target: the mean of balanced RAW that it aims at.
+        tint_error: standard deviation of red and blue gains off that line, relative.
+        lift: share b of the way to the target that the digital gain goes, in stops.
+        target: the mean of balanced RAW that the renderer aims at.
         lift_error: standard deviation of the digital gain, in stops.
         shading_removed: q, the exponent of the shading that is divided out.
         saturation: factor on the distance from grey.
-        brightness, contrast: of the tone curve, see :func:`tone_curve`.
+        brightness, contrast: parameters of the tone curve, see :func:`tone_curve`.
     """
 
     adaptation: float
@@ -94,7 +93,7 @@ class Rendering(NamedTuple):
 
 
 class Phone(NamedTuple):
-    """A phone: code, name and pattern are SIDD's; ``noise`` has (shot_var, read_var) by ISO."""
+    """A phone, with SIDD's code, name and pattern; ``noise`` has (shot_var, read_var) by ISO."""
 
     code: str
     name: str
@@ -108,9 +107,9 @@ class Phone(NamedTuple):
 
 
 class Shot(NamedTuple):
-    """What is drawn for an instance: light in kelvin, exposure in stops, ISO, and the renderer's errors.
+    """The values that are drawn for an instance: light in kelvin, exposure in stops, ISO, and the renderer's errors.
 
-    ``balance_error`` is in mired, ``tint_error`` the logarithms of the red and blue gains', ``lift_error`` in stops.
+    ``balance_error`` is in mired, ``tint_error`` in the logarithms of the red and blue gains, ``lift_error`` in stops.
     """
 
     kelvin: int
@@ -206,14 +205,15 @@ _PHONES = [
 CAMERAS: dict[str, Phone] = {phone.code: phone for phone in _PHONES}
 """The phones by SIDD's code.
 
-Noise: the camera metadata of SIDD as published with Noise Flow (Abdelhamed et al., ICCV 2019). Matrices, XYZ to camera
-for D65 (LibRaw's table): S6 that of the Galaxy S6; the other four are sensors of phones whose matrices are published:
-GP Sony IMX219, IP Galaxy S7, N6 Galaxy S9, G4 OmniVision OV5647. Shading and rendering are invented.
+The noise is from the camera metadata of SIDD as published with Noise Flow (Abdelhamed et al., ICCV 2019). The matrices,
+XYZ to camera for D65, are from LibRaw's table. S6 has that of the Galaxy S6; the other four are sensors of phones whose
+matrices are published: GP Sony IMX219, IP Galaxy S7, N6 Galaxy S9, G4 OmniVision OV5647. Shading and rendering are
+invented.
 """
 
 
 def noise_levels(phone: Phone, iso: int) -> tuple[float, float]:
-    """Look up (shot_var, read_var) at an ISO: interpolated in logarithms, and held beyond the published ones."""
+    """Look up (shot_var, read_var) at an ISO: interpolated in logarithms, and constant beyond the published ISOs."""
     isos = sorted(phone.noise)
     if iso <= isos[0]:
         return phone.noise[isos[0]]
@@ -250,13 +250,13 @@ class _Instance(NamedTuple):
 class PhoneFrames(LazyPairs):
     """The frames of a split, 512 x 512: 320 for training, 40 for validation and 40 for test.
 
-    Two frames of each of the 160 training instances; one of each of SIDD's 40 held-back instances for validation, and
-    one for test, of other photographs, lights and ISO. A frame depends on (seed, split, instance) alone.
+    Training has two frames of each of its 160 instances. Validation has one frame of each of SIDD's 40 held-back
+    instances, and so has test, with other photographs, lights and ISO. Frames depend on (seed, split, instance) alone.
 
     Args:
         path: a folder of photographs (:func:`rawaug.data.scenes.scene_files`), or empty for the package's own.
         split: ``"train"``, ``"validation"`` or ``"test"``.
-        seed: of all that is drawn.
+        seed: seed of all draws.
         size: height and width of the frames, even.
 
     Example:
@@ -326,7 +326,7 @@ class PhoneFrames(LazyPairs):
 
 
 def _training_labels(seed: int) -> list[tuple[int, int, str]]:
-    """The number, scene and phone of the training instances; five that follow each other are five phones."""
+    """List the number, scene and phone of the training instances; five in a row are five different phones."""
     held_back = {int(name[:4]) for name in HELD_BACK}
     numbers = [number for number in range(1, _SCENE_ENDS[-1] + 1) if number not in held_back]
     codes = list(CAMERAS)
@@ -340,7 +340,7 @@ def _training_labels(seed: int) -> list[tuple[int, int, str]]:
 
 
 def _held_back_labels() -> list[tuple[int, int, str]]:
-    """The number, scene and phone of SIDD's held-back instances."""
+    """List the number, scene and phone of SIDD's held-back instances."""
     labels = []
     for name in HELD_BACK:
         label = label_of(name)
@@ -354,7 +354,7 @@ def _scene_of(number: int) -> int:
 
 
 def _draw_shot(phone: Phone, generator: torch.Generator) -> tuple[Shot, str]:
-    """Draw what an instance is taken with, and its brightness, N or L."""
+    """Draw the settings that an instance is taken with, and its brightness, N or L."""
     light, dim, exposure, level = torch.rand(4, generator=generator, dtype=torch.float64).tolist()
     errors = torch.randn(4, generator=generator, dtype=torch.float64).tolist()
 
@@ -379,8 +379,8 @@ def take(phone: Phone, scene: Tensor, shot: Shot, generator: torch.Generator, na
         phone: one of :data:`CAMERAS`.
         scene: linear sRGB of the photograph in [0, 1], float32 ``(3, H, W)``, even sides of at least 4.
         shot: light, exposure, ISO and the renderer's errors.
-        generator: of the noise.
-        name: of the pair.
+        generator: generator of the noise.
+        name: name of the pair.
 
     Returns:
         The pair: ``raw`` without noise, ``noisy``, the renderings of both, the white balance and the matrix that the
@@ -428,7 +428,7 @@ def _expose(phone: Phone, scene: Tensor, shot: Shot) -> Tensor:
 
 
 def balance(phone: Phone, shot: Shot) -> Tensor:
-    """Compute the gains of R, G and B that the renderer takes, ``(3,)``, the least being 1."""
+    """Compute the gains of R, G and B that the renderer uses, ``(3,)``, the least being 1."""
     response = camera_in_light(phone.xyz_to_camera, _taken_for(phone, shot)).sum(dim=1)
     red, blue = shot.tint_error
     gains = torch.tensor([math.exp(red), 1.0, math.exp(blue)], dtype=torch.float64) / response
@@ -436,13 +436,13 @@ def balance(phone: Phone, shot: Shot) -> Tensor:
 
 
 def colour_matrix(phone: Phone, shot: Shot) -> Tensor:
-    """Compute the matrix from balanced camera RGB to linear sRGB, ``(3, 3)``, rows summing to 1, saturation apart."""
+    """Compute the matrix from balanced camera RGB to linear sRGB, ``(3, 3)``; rows sum to 1 before saturation."""
     camera = camera_in_light(phone.xyz_to_camera, _taken_for(phone, shot))
     return torch.linalg.inv(camera / camera.sum(dim=1, keepdim=True))
 
 
 def _taken_for(phone: Phone, shot: Shot) -> float:
-    """The colour temperature that the renderer takes the light for, in kelvin."""
+    """Compute the colour temperature that the renderer assumes for the light, in kelvin."""
     neutral = 1e6 / _TAKEN_FOR_NEUTRAL
     way = phone.rendering.adaptation * (1e6 / shot.kelvin - neutral)
     mired = neutral + way + shot.balance_error
@@ -491,5 +491,5 @@ def _digitise(light: Tensor, black: int) -> Tensor:
 
 @DATASETS.register("phones")
 def open_phones(path: str | Path = "", split: str = "test", seed: int = 0) -> PhoneFrames:
-    """``phones:``, of the package's photographs, or ``phones:DIR`` of a folder's; with a split last if need be."""
+    """Open ``phones:`` with the package's photographs, or ``phones:DIR`` with a folder's; a split may come last."""
     return PhoneFrames(path, split, seed)

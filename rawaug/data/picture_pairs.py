@@ -36,7 +36,7 @@ class PicturePair:
     """A shot and its noise-free version, uint8 sRGB ``(3, H, W)`` each."""
 
     own_noise: ClassVar[None] = None
-    """The noise of developed pictures has no levels."""
+    """It is None, as the noise of developed pictures has no levels."""
 
     name: str
     noisy: Tensor
@@ -49,11 +49,11 @@ class PicturePair:
         return PicturePair(self.name, noisy, clean)
 
     def binned(self, factor: int, together: bool = False) -> PicturePair:
-        """This pair as it is: binning would average its real noise."""
+        """Return this pair unchanged: binning would average its real noise."""
         return self
 
     def with_own_noise(self, estimate: Callable[..., Any]) -> PicturePair:
-        """This pair as it is, see :attr:`own_noise`."""
+        """Return this pair unchanged, see :attr:`own_noise`."""
         return self
 
 
@@ -70,7 +70,7 @@ class PicturePairs(LazyPairs):
         self._files = files
 
     def load(self, index: int) -> tuple[Tensor, Tensor]:
-        """The noisy and the clean picture of a pair, uint8 ``(3, H, W)`` each."""
+        """Load the noisy and the clean picture of a pair, uint8 ``(3, H, W)`` each."""
         noisy, clean = self._files[index]
         return read_picture(noisy), read_picture(clean)
 
@@ -132,9 +132,9 @@ class NamedPictures(PicturePairs):
 
     Args:
         path: the folder.
-        split: of no effect, since there is one.
+        split: has no effect, since there is only one.
         noisy: the pattern of the names of noisy files.
-        clean: that of clean files; None for the one that belongs to ``noisy``.
+        clean: the pattern of clean files; None for the one that belongs to ``noisy``.
     """
 
     def __init__(self, path: str, split: str = "test", noisy: str | None = None, clean: str | None = None) -> None:
@@ -160,7 +160,7 @@ class NamedPictures(PicturePairs):
 @DATASETS.register("cc15")
 @DATASETS.register("polyu")
 class MeanPictures(NamedPictures):
-    """Shots ``*_real.*`` and the means ``*_mean.*`` of many."""
+    """Shots ``*_real.*``, and the means of many shots ``*_mean.*``."""
 
     def __init__(self, path: str, split: str = "test") -> None:
         super().__init__(path, split, "*_real.*", "*_mean.*")
@@ -181,7 +181,7 @@ class SiddPictures(PicturePairs):
 
 
 def _blocks(folder: Path, kind: str) -> Tensor:
-    """The blocks of a file of SIDD's, uint8 ``(1280, 3, 256, 256)``."""
+    """Read the blocks of one of SIDD's files, uint8 ``(1280, 3, 256, 256)``."""
     file = find_file(folder, f"Validation{kind}BlocksSrgb.mat")
     array = read_array(file, file.stem)
     if array.dtype.name != "uint8" or array.ndim != 5 or array.shape[-1] != 3:

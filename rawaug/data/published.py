@@ -49,7 +49,7 @@ def fivek_pairs(
     adjust_maximum_thr: float = 0.0,
     jpeg_quality: int | None = None,
 ) -> RawFolder:
-    """The pairs of a split below a folder, Canon before Nikon, each sorted by number.
+    """Open the pairs of a split below a folder, Canon before Nikon, each sorted by number.
 
     :class:`rawaug.data.RawFolder` explains ``adjust_maximum_thr`` and ``jpeg_quality``.
     """
@@ -119,7 +119,7 @@ class Rawir(LazyPairs):
         super().__init__([str(file.relative_to(folder).with_suffix("")) for file in self.files])
 
     def of_split(self, files: list[Path], split: str) -> list[Path]:
-        """Choose the files of a split; here all, since every split has a folder."""
+        """Choose the files of a split; here all of them, since every split has a folder."""
         return files
 
     def camera_of(self, file: Path) -> str:
@@ -140,7 +140,7 @@ class Rawir(LazyPairs):
 
 
 def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
-    """Packed RAW ``(4, h, w)`` of a file, white at 1.
+    """Read the packed RAW ``(4, h, w)`` of a file, white at 1.
 
     The white level is ``white``, or that of an ``.npz``, or that of the extension of the picture beside the file.
     """
@@ -163,7 +163,7 @@ def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
 
 
 def _picture_beside(file: Path) -> Path:
-    """The picture with the stem of a file, in its folder; FileNotFoundError if there is none."""
+    """Find the picture with the stem of a file, in its folder; FileNotFoundError if there is none."""
     for suffix in WHITE:
         if file.with_suffix(suffix).is_file():
             return file.with_suffix(suffix)
@@ -195,7 +195,7 @@ class Rgb2Raw(Rawir):
 
 
 def _raw_id(file: Path) -> str:
-    """The RAW that a crop belongs to: ``12_3`` is crop 3 of RAW 12."""
+    """The number of the RAW that a crop belongs to: ``12_3`` is crop 3 of RAW 12."""
     return file.stem.rpartition("_")[0] or file.stem
 
 
@@ -247,7 +247,7 @@ class Zurich(LazyPairs):
 
 _NOISY_SHOT = re.compile(r"(Scene_\d+)_ISO\d+(?:_\d+)?", re.IGNORECASE)
 _UNCLIPPED = 0.9
-"""Maximum of the values that the exposures are compared at."""
+"""Maximum of the values at which the exposures are compared."""
 
 
 @DATASETS.register("rawbench")

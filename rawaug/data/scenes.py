@@ -1,6 +1,6 @@
-r"""Photographs as scenes in a light: what stands in front of a simulated camera.
+r"""Photographs as scenes in a light, which stand in front of a simulated camera.
 
-A photograph was balanced for the white of sRGB. The same things in a light of colour temperature T have, in CIE XYZ,
+A photograph was balanced for the white of sRGB. In a light of colour temperature T the same things have, in CIE XYZ,
 
 .. math:: \mathrm{XYZ} = B^{-1} \, \mathrm{diag}\!\left(\frac{B L_T}{B L_{D65}}\right) B \, S \, L(x)
 
@@ -10,8 +10,8 @@ of the light, and B Bradford's cone responses (CIECAM97s). A camera whose matrix
 White points are those of a black body: B. Kang et al., "Design of advanced color temperature control system for HDTV
 applications", J. Korean Physical Society 41, 2002, 1,667 to 25,000 K.
 
-A split has photographs of its own. A folder with subfolders ``train`` and ``test`` gives training the first one, and
-validation and test every other picture of the second; of each five pictures of any other folder, three are for
+Each split has its own photographs. A folder with subfolders ``train`` and ``test`` gives training the first one, and
+validation and test every other picture of the second. In any other folder, three of every five pictures are for
 training, one is for validation and one for test.
 """
 
@@ -92,8 +92,8 @@ def _subfolder_files(folder: Path, split: str) -> list[Path]:
 def draw_window(file: Path, size: tuple[int, int], generator: torch.Generator, max_pixels: int = MAX_PIXELS) -> Tensor:
     """Read a photograph and draw a window of it, as a lens shows it.
 
-    The window takes all of the photograph's shorter side at most, and is scaled down by averaging; only a photograph
-    that is smaller than the window is enlarged.
+    The window spans at most the photograph's shorter side, and is scaled down by averaging. A photograph is enlarged
+    only if it is smaller than the window.
 
     Args:
         file: the photograph.

@@ -11,7 +11,7 @@ from rawaug.errors import count_of
 def select_pairs(
     pairs: Sequence[Pair], available: int, count: int | None, select: str | Sequence[str] = "first"
 ) -> list[int]:
-    """Select ``count`` of the first ``available`` pairs, all if it is None; returns their indices and reads no pair.
+    """Select ``count`` of the first ``available`` pairs, or all for None; return their indices without reading a pair.
 
     ``select`` is a method (``first``, ``scenes`` or ``phones``) or a list of names.
     """
@@ -33,7 +33,7 @@ def select_pairs(
 
 
 def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
-    """Indices of the frames of the first scenes in order of their names, ``count`` frames in all."""
+    """Get the indices of the frames of the first scenes in order of their names, ``count`` frames in all."""
 
     def scene_of(index: int) -> str:
         return labels[index].scene
@@ -53,7 +53,7 @@ def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
 
 
 def one_a_phone(labels: Sequence[FrameLabel], count: int) -> list[int]:
-    """Indices of ``count`` frames that take turns among the phones; those of each phone are evenly spread in ISO."""
+    """Get indices of ``count`` frames, by phones in turn; the frames of each phone are evenly spread in ISO."""
 
     def iso_of(index: int) -> int:
         return labels[index].iso
@@ -83,7 +83,7 @@ def one_a_phone(labels: Sequence[FrameLabel], count: int) -> list[int]:
 
 
 def _indices_of_names(names: Sequence[str], selection: Sequence[str]) -> list[int]:
-    """Indices of the frames in ``selection``, which has names of frames or of scene instances."""
+    """Get the indices of the frames in ``selection``, which has names of frames or of scene instances."""
     indices: list[int] = []
     for name in selection:
         matches = []

@@ -82,7 +82,7 @@ class SiddFrames(LazyPairs):
 
 
 def _shots_below(path: Path, left_out: Sequence[str]) -> list[tuple[str, str, dict[str, Path]]]:
-    """Scene instance, number and files (by kind) of each noisy frame below ``path``, in order."""
+    """List scene instance, number and files (by kind) of each noisy frame below ``path``, in order."""
     shots = []
     for (scene, number), files in sorted(index_files(path).items()):
         if "NOISY_RAW" not in files or scene in left_out:
@@ -95,14 +95,14 @@ def _shots_below(path: Path, left_out: Sequence[str]) -> list[tuple[str, str, di
 
 
 def _turned_back(file: Path, view: int, max_pixels: int) -> Tensor:
-    """The upright picture in ``file``, turned to the orientation of the sensor."""
+    """Read the upright picture in ``file`` and turn it to the orientation of the sensor."""
     picture = read_picture(file, max_pixels)
     return even(turn_back(picture, view)).contiguous()
 
 
 @DATASETS.register("sidd")
 def sidd_pairs(path: str, split: str) -> Sequence[Pair]:
-    """The full frames (``train``) or the validation blocks (``test``)."""
+    """Open the full frames (``train``) or the validation blocks (``test``)."""
     if split == "train":
         return SiddFrames(path)
     if split == "test":
@@ -115,8 +115,7 @@ def sidd_pairs(path: str, split: str) -> Sequence[Pair]:
 
 @DATASETS.register("sidd-cc")
 def sidd_cc_pairs(path: str, split: str) -> Sequence[Pair]:
-    """The full frames of SIDD-CC's own ``train``, in the layout of SIDD Medium, their clean RAW estimated anew.
-
+    """Open the full frames of SIDD-CC's own ``train``, in the layout of SIDD Medium, with clean RAW estimated anew.
     Source: <https://huggingface.co/datasets/MhdMohammadi/SIDD-CC>.
     """
     if split != "train":

@@ -1,7 +1,7 @@
 """The validation blocks of SIDD, 256 x 256 pixels each, and the blocks of SIDD+ (NTIRE 2020).
 
 Blocks have black at 0 and white at 1, and the makers clipped them at black. Pictures of blocks do not say how they were
-turned, so the blocks of a frame are turned to the one of eight views in which their green correlates best with the
+turned. So the blocks of a frame are turned to the one of eight views in which their green correlates best with the
 green of the mosaics. Blocks without pictures and METADATA have gains of 1 and show camera colour (``rendered`` is
 False). They can test a denoiser, but not an ISP.
 """
@@ -112,7 +112,7 @@ class _Blocks(LazyPairs):
 
     @abstractmethod
     def _read_all(self) -> dict[str, Tensor]:
-        """``raw``, ``noisy`` and, if there are pictures, ``srgb`` and ``noisy_srgb``, ``(frames, 32, C, H, W)``."""
+        """Read ``raw``, ``noisy`` and any pictures, ``srgb`` and ``noisy_srgb``, as ``(frames, 32, C, H, W)``."""
 
     @abstractmethod
     def _describe(self, number: int) -> _Frame:
@@ -131,7 +131,7 @@ class _Blocks(LazyPairs):
         return develop_pair(self.names[index], **blocks, **attributes)
 
     def _read_frame(self, number: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """The images of a frame's blocks, turned alike, and the other attributes of a :class:`Pair` that they share."""
+        """Read the images of a frame's blocks, turned alike, and the other attributes of a :class:`Pair` they share."""
         everything = self._all()
         frame = self._describe(number)
 
@@ -159,7 +159,7 @@ class _Blocks(LazyPairs):
 
 
 def block_names(frames: Sequence[str]) -> list[str]:
-    """The names of the blocks of these frames."""
+    """List the names of the blocks of these frames."""
     names = []
     for frame in frames:
         names += [f"{frame}_{block:02d}" for block in range(BLOCKS)]
@@ -222,7 +222,7 @@ class SiddPlusBlocks(_Blocks):
 
 
 def _pictures(path: Path, pattern: str, kinds: tuple[str, str], clean: Tensor) -> dict[str, Tensor]:
-    """The uint8 pictures of the clean and noisy blocks, with the axes of ``clean``, as far as their files exist."""
+    """Read the uint8 pictures of the clean and noisy blocks, with the axes of ``clean``, as far as the files exist."""
     expected = (*clean.shape[:-3], *clean.shape[-2:], 3)
     pictures = {}
     for key, kind in zip(("srgb", "noisy_srgb"), kinds, strict=True):
@@ -239,7 +239,7 @@ def _pictures(path: Path, pattern: str, kinds: tuple[str, str], clean: Tensor) -
 
 
 def _patterns(file: Path) -> list[CFA]:
-    """The patterns in the first column of a CSV file, one for each frame."""
+    """Read the patterns in the first column of a CSV file, one for each frame."""
     require_file(file)
     patterns = []
     try:
@@ -253,7 +253,7 @@ def _patterns(file: Path) -> list[CFA]:
 
 
 def blocks_of_scenes(file: Path) -> Tensor:
-    """The blocks in a file, ``(40, 32, 1, H, W)``."""
+    """Read the blocks in a file, ``(40, 32, 1, H, W)``."""
     blocks = to_raw(read_array(file, file.stem), 4, file)
     if blocks.shape[:2] != (len(HELD_BACK), BLOCKS):
         raise ValueError(f"{file}: holds {tuple(blocks.shape[:2])} blocks, the published file {len(HELD_BACK), BLOCKS}")
@@ -261,7 +261,7 @@ def blocks_of_scenes(file: Path) -> Tensor:
 
 
 def _colours(path: Path) -> dict[str, Colour]:
-    """The colour of each scene instance of the blocks that has a METADATA file below ``path``."""
+    """Read the colour of each scene instance of the blocks that has a METADATA file below ``path``."""
     files = {}
     for (scene, _), files_of_frame in index_files(path).items():
         if scene in HELD_BACK and "METADATA_RAW" in files_of_frame:

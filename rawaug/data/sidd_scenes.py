@@ -1,4 +1,4 @@
-"""SIDD's scene instances: their phones, patterns and files, and what METADATA and the published noise levels say.
+"""SIDD's scene instances: their phones, patterns and files, and the contents of METADATA and published noise levels.
 
 docs/datasets.md shows the files. METADATA files hold the tags of the DNG. The phone determines the pattern (the
 dataset's ``bayer_patterns.csv``); :data:`HELD_BACK` lists the scene instance of each block, which names its phone.
@@ -62,12 +62,12 @@ _FILE = re.compile(r"(?:\d{4}_)?(GT_RAW|NOISY_RAW|METADATA_RAW|GT_SRGB|NOISY_SRG
 
 
 def mosaic_of(file: Path) -> Tensor:
-    """The mosaic ``x`` of a frame, float32 ``(1, H, W)``; an odd side loses its last line."""
+    """Read the mosaic ``x`` of a frame, float32 ``(1, H, W)``; an odd side loses its last line."""
     return even(to_raw(read_array(file, "x"), 2, file))
 
 
 def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
-    """(shot_var, read_var) by scene instance, the mean over a mosaic's sites; empty without the CSV below ``path``."""
+    """Read (shot_var, read_var) by scene instance, the mean over a mosaic's sites; empty if ``path`` has no CSV."""
     file = min(files_below(path, ("noise_level_functions.csv",)), default=None)
     if file is None:
         return {}
@@ -89,13 +89,15 @@ def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
 
 
 def _mean_over_sites(row: dict[str, str], parameter: str) -> float:
-    """The mean of a noise parameter over the sites R, G, G, B."""
+    """Average a noise parameter over the sites R, G, G, B."""
     return sum(float(row[f"{parameter}_{colour}"]) for colour in "rggb") / 4
 
 
 def index_files(path: Path) -> dict[tuple[str, str], dict[str, Path]]:
-    """Files below ``path`` by (scene instance, number), and by kind: GT_RAW, NOISY_RAW, METADATA_RAW, GT_SRGB,
-    NOISY_SRGB."""
+    """Index the files below ``path`` by (scene instance, number) and kind.
+
+    The kinds are GT_RAW, NOISY_RAW, METADATA_RAW, GT_SRGB and NOISY_SRGB.
+    """
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder of SIDD")
 
@@ -118,7 +120,7 @@ class Colour(NamedTuple):
 
 
 def colour_of(file: Path) -> Colour:
-    """The colour that a METADATA file states."""
+    """Read the colour that a METADATA file states."""
     tags: dict[str, Any] = read_value(file, "metadata")
     try:
         gains = gains_from_neutral(tags["AsShotNeutral"])
@@ -130,14 +132,14 @@ def colour_of(file: Path) -> Colour:
 
 
 def even(image: Tensor) -> Tensor:
-    """The image without the last line of an odd side."""
+    """Drop the last line of an odd side of an image."""
     height = image.shape[-2] // 2 * 2
     width = image.shape[-1] // 2 * 2
     return image[..., :height, :width]
 
 
 def find_file(path: Path, pattern: str) -> Path:
-    """The one file of this name below ``path``, or ``path`` itself."""
+    """Find the one file of this name below ``path``, or return ``path`` itself."""
     if path.is_file() and path.match(pattern):
         return path
 
@@ -151,5 +153,5 @@ def find_file(path: Path, pattern: str) -> Path:
 
 
 def matching_files(folder: Path, pattern: str) -> list[Path]:
-    """The files below a folder whose names match a pattern, sorted."""
+    """List the files below a folder whose names match a pattern, sorted."""
     return sorted(file for file in files_below(folder) if fnmatchcase(file.name, pattern))

@@ -1,1 +1,1 @@
-"""What makes clean RAW of noisy RAW: denoisers by any name, the levels that they are told, frames and files."""
+"""Turn noisy RAW into clean RAW: denoisers by any name, the noise levels that they are given, frames and files."""

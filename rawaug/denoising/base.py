@@ -1,11 +1,11 @@
-r"""The face that denoisers of every kind of image have, and what they are given.
+r"""The interface of denoisers for every kind of image, and their input.
 
     result = y + s (f(y) - y)
 
-A denoiser is made by ``of``, of a name, a file, a filter or a network; it says which kind of image it takes, and is
-called with a noisy one. :class:`rawaug.RawDenoiser` takes RAW, :class:`rawaug.denoising.pictures.PictureDenoiser`
-developed pictures. What is the same for both is here: where and how precisely a network computes, and the check of its
-result.
+A denoiser is made by ``of`` from a name, a file, a filter or a network. It says which kind of image it takes, and is
+called with a noisy one. :class:`rawaug.RawDenoiser` takes RAW, and :class:`rawaug.denoising.pictures.PictureDenoiser`
+takes developed pictures. This module holds what both share: where and how precisely a network computes, and the check
+of its result.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from rawaug.progress import progress
 from rawaug.registry import suggest
 
 Levels = tuple[float, float]
-"""The levels of noise: (shot_var, read_var)."""
+"""These are the levels of noise: (shot_var, read_var)."""
 CPU = torch.device("cpu")
 IMAGES: dict[Image, str] = {"raw": "RAW", "srgb": "developed pictures"}
-"""The kinds of image, as messages call them."""
+"""Messages call the kinds of image by these names."""
 
 
 class Noisy(NamedTuple):
-    """The input of a denoiser: an image, and what may be known of its noise.
+    """The input of a denoiser: an image, and whatever is known of its noise.
 
     Attributes:
-        image: packed RAW ``(1, 4, h, w)``, white at 1, not clipped at black; of other patterns than Bayer's the mosaic
-            ``(1, 1, H, W)``; or developed sRGB ``(1, 3, H, W)``.
-        variance: of the noise of each value, shape of ``image``; None if it is not known.
+        image: packed RAW ``(1, 4, h, w)``, white at 1, not clipped at black; for patterns other than Bayer's, the
+            mosaic ``(1, 1, H, W)``; or developed sRGB ``(1, 3, H, W)``.
+        variance: variance of the noise of each value, with the shape of ``image``; None if it is not known.
         levels: (shot_var, read_var) if the variance is ``shot_var max(image, 0) + read_var``.
         cfa: the pattern of packed RAW or of the mosaic.
     """
@@ -54,7 +54,7 @@ class Noisy(NamedTuple):
 
     @classmethod
     def of(cls, image: Tensor, levels: Levels, cfa: CFA | str) -> Noisy:
-        """Packed RAW ``(1, 4, h, w)``, or a mosaic ``(1, 1, H, W)``, with the variance of these levels."""
+        """Make one of packed RAW ``(1, 4, h, w)`` or a mosaic ``(1, 1, H, W)``, with the variance of these levels."""
         return cls(image, noise_variance(image, *levels), levels, bayer.canonical_cfa(cfa))
 
 
@@ -67,7 +67,7 @@ class ImageDenoiser(ABC):
 
     Attributes:
         name: in tables.
-        network: the network that computes, if it is one of PyTorch's.
+        network: the network that computes, if it is a PyTorch network.
         info: what its file says of its training.
         reads_levels: whether noise levels make a difference.
         views: number of turns of the image that are averaged, at that many times the work.
@@ -75,17 +75,17 @@ class ImageDenoiser(ABC):
         device: where it runs.
         mixed: whether it computes in bfloat16.
         checked: whether a result that is not finite is an error; a training that diverged is scored as it is.
-        settings: what its results depend on, as JSON.
+        settings: everything that its results depend on, as JSON.
     """
 
     takes: ClassVar[Image]
-    """The kind of image that it takes."""
+    """It takes this kind of image."""
 
     default: ClassVar[str]
-    """The shipped denoiser where none is named."""
+    """This is the shipped denoiser if none is named."""
 
     files: ClassVar[str]
-    """The files of networks that can be named, for messages."""
+    """Messages say that these files of networks can be named."""
 
     name: str
     network: nn.Module | None = field(default=None, repr=False)
@@ -106,11 +106,11 @@ class ImageDenoiser(ABC):
         precision: Literal["full", "auto"] = "full",
         **changes: Any,
     ) -> D:
-        """The denoiser that a name, a file or an object stands for. Nothing is imported by name.
+        """Make the denoiser that a name, a file or an object stands for. Nothing is imported by name.
 
         Args:
             spec: see the class.
-            device: auto, cpu, cuda, ...; where a network of PyTorch's runs. Everything else runs on the CPU.
+            device: auto, cpu, cuda, ...: where a PyTorch network runs. Everything else runs on the CPU.
             precision: ``"auto"`` computes in bfloat16 where that is fast and costs the network less than 0.05 dB.
             changes: attributes in place of those of the denoiser, such as ``name``, ``views``, ``strength``.
 
@@ -132,11 +132,11 @@ class ImageDenoiser(ABC):
     @classmethod
     @abstractmethod
     def _resolve(cls: type[D], spec: Any, name: str | None) -> D:
-        """The denoiser of an object or of a name, on the CPU; ``name`` is what it will be called, if that is given."""
+        """Find the denoiser of an object or a name, on the CPU; it will be called ``name``, if that is given."""
 
     @classmethod
     def shipped(cls) -> list[str]:
-        """Names of the shipped networks that take this kind of image."""
+        """List the names of the shipped networks that take this kind of image."""
         names = []
         for name in list_shipped():
             if image_of_header(read_header(find_denoiser(name))) == cls.takes:
@@ -145,14 +145,14 @@ class ImageDenoiser(ABC):
 
     @abstractmethod
     def __call__(self, noisy: Noisy) -> Tensor:
-        """The image denoised, on the CPU."""
+        """Denoise the image; the result is on the CPU."""
 
     def _precision(self) -> torch.autocast:
-        """The precision in which a network computes, as a context."""
+        """Return the precision in which a network computes, as a context."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed)
 
     def _require_sound(self, denoised: Tensor, noisy: Tensor, expected: Sequence[int]) -> Tensor:
-        """The result for a noisy image, if it has the expected shape and is finite."""
+        """Return the result for a noisy image if it has the expected shape and is finite; else raise an error."""
         if tuple(denoised.shape) != tuple(expected) or (self.checked and not denoised.isfinite().all()):
             shapes = f"{tuple(denoised.shape)} for {tuple(noisy.shape)}"
             raise ValueError(f"{self.name}: the result is not finite, or of another shape: {shapes}")
@@ -160,7 +160,7 @@ class ImageDenoiser(ABC):
 
 
 def read_named(spec: str | Path, kind: type[ImageDenoiser]) -> NetworkFile:
-    """The network of a ``.safetensors`` file or of a shipped name, for denoisers of this kind.
+    """Read the network of a ``.safetensors`` file or of a shipped name, for denoisers of this kind.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -181,7 +181,7 @@ def read_named(spec: str | Path, kind: type[ImageDenoiser]) -> NetworkFile:
 
 
 def progress_by(unit: str) -> Callable[[Sequence[Any]], Iterable[Any]]:
-    """A function that iterates over the parts of a frame, such as its tiles, with progress if there are several."""
+    """Make a function that iterates over the parts of a frame, such as tiles, with progress if there are several."""
 
     def iterate(parts: Sequence[Any]) -> Iterable[Any]:
         if len(parts) == 1:

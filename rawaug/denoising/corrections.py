@@ -1,6 +1,6 @@
-"""Errors of a sensor that a frame tells of itself, taken out before it is denoised.
+"""Sensor errors that show in a frame itself and are taken out before it is denoised.
 
-Smooth places tell by how much the two greens of a Bayer sensor differ (:mod:`rawaug.bayer.greens`).
+Smooth places show by how much the two greens of a Bayer sensor differ (:mod:`rawaug.bayer.greens`).
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from rawaug.bayer import CFA, GreenDifference
 from rawaug.io.raw import RawFrame
 
 Correction = Literal["auto", "keep"]
-"""When to correct an error: always, never, or if it is significant."""
+"""This says when to correct an error: always, never, or if it is significant."""
 
 
 @dataclass(frozen=True)
 class Corrected:
-    """What was corrected in a frame.
+    """The corrections that were made to a frame.
 
     Attributes:
         greens: by how much its greens differ; None if that cannot be measured.
@@ -36,7 +36,7 @@ class Corrected:
 
 @dataclass(frozen=True)
 class Corrections:
-    """Which errors are taken out where they are significant, and which are kept.
+    """The errors that are taken out if they are significant, and those that are kept.
 
     Args:
         greens: the difference of a Bayer frame's two greens.

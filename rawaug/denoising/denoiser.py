@@ -3,8 +3,8 @@ r"""Denoisers of RAW, whatever they are made of.
     d = f(y, v),    v = shot_var max(y, 0) + read_var,    result = y + s (d - y)
 
 :class:`RawDenoiser` holds what is the same for a network, an ONNX file, a filter and a function f: tiles, the CFA that
-f was trained for, the self-ensemble, device and precision, the strength s. A mosaic of another pattern than f's is
-continued by a mirrored line on the sides where the patterns differ, and the result is cropped.
+f was trained for, the self-ensemble, device and precision, and the strength s. A mosaic with a pattern other than f's
+is extended by a mirrored line on the sides where the patterns differ, and the result is cropped.
 """
 
 from __future__ import annotations
@@ -39,35 +39,35 @@ from rawaug.noise import anscombe
 from rawaug.registry import Spec, spec_label, split_spec
 
 Model = Callable[[Tensor, Tensor | None], Tensor]
-"""``model(noisy, variance) -> denoised``, each ``(B, 4, h, w)``; it may have a ``stride`` and an ``upscale``."""
+"""It is ``model(noisy, variance) -> denoised``, each ``(B, 4, h, w)``, perhaps with a ``stride`` and an ``upscale``."""
 FILTER_TILES = (512, 32)
-"""Side and overlap of a filter's tiles, in packed pixels; the filters have a reach of 8 pixels, and BM3D of 20."""
+"""A filter's tiles have this side and overlap, in packed pixels; the filters reach 8 pixels, and BM3D reaches 20."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RawDenoiser(ImageDenoiser):
     """Anything that denoises RAW; made by :meth:`of`, and changed by :func:`dataclasses.replace`.
 
-    :meth:`of` takes the name of a shipped denoiser; a ``.safetensors`` of rawaug, or of PMRID, BF-DnCNN or PBRID as
-    published; an ``.onnx``; a classical filter by its name, or ``{"name": ..., "settings": {...}}``; a network
-    ``model(noisy, variance)`` or ``model(noisy)`` of packed RAW ``(B, 4, h, w)``; or a function of the same arguments,
-    which gets whole frames.
+    :meth:`of` takes the name of a shipped denoiser; a ``.safetensors`` file of rawaug, or a published one of PMRID,
+    BF-DnCNN or PBRID; an ``.onnx`` file; a classical filter by its name, or ``{"name": ..., "settings": {...}}``; a
+    network ``model(noisy, variance)`` or ``model(noisy)`` of packed RAW ``(B, 4, h, w)``; or a function of the same
+    arguments, which gets whole frames.
 
     Attributes:
         name: in tables.
         model: ``model(levels)`` is the function f that denoises a piece of packed RAW; levels may be None.
-        network: the network that computes, if it is one of PyTorch's.
+        network: the network that computes, if it is a PyTorch network.
         cfa: the pattern that it was trained for; None if it works on any of Bayer's.
         info: what its file says of its training.
         reads_levels: whether noise levels make a difference.
-        tiles: side and overlap of the pieces, in packed pixels, None being the default of
-            :func:`denoisers.denoise_tiles`; None alone denoises a frame in one piece.
-        views: 1, or 4 or 8 of a self-ensemble, at that many times the work.
+        tiles: side and overlap of the pieces, in packed pixels, where None is the default of
+            :func:`denoisers.denoise_tiles`; a single None denoises a frame in one piece.
+        views: number of views of a self-ensemble, 4 or 8, at that many times the work; 1 for none.
         strength: s in [0, 1]; ``(1 - s)^2`` of the noise's variance is left.
         device: where it runs.
         mixed: whether it computes in bfloat16.
         checked: whether a result that is not finite is an error; a training that diverged is scored as it is.
-        settings: what its results depend on, as JSON.
+        settings: everything that its results depend on, as JSON.
 
     Example:
         >>> denoiser = RawDenoiser.of("NonLocalMeans")
@@ -79,7 +79,7 @@ class RawDenoiser(ImageDenoiser):
     default: ClassVar[str] = DEFAULT
     files: ClassVar[str] = "a .safetensors or an .onnx"
     demosaics: ClassVar[bool] = False
-    """Whether the result is linear camera RGB in place of a mosaic."""
+    """This says whether the result is linear camera RGB instead of a mosaic."""
 
     model: Callable[[Levels | None], Model] = field(repr=False)
     cfa: CFA | None = None
@@ -102,11 +102,11 @@ class RawDenoiser(ImageDenoiser):
         return _of_file(spec)
 
     def takes_pattern(self, cfa: str) -> bool:
-        """Whether it denoises mosaics of a pattern: any of Bayer's; a :class:`MosaicDenoiser` takes others, too."""
+        """Tell whether it takes mosaics of a pattern: any of Bayer's; a :class:`MosaicDenoiser` also takes others."""
         return cfa in CFA.__members__
 
     def require_mosaic(self) -> RawDenoiser:
-        """This denoiser; ValueError if it gives full colour, which cannot be compared with a mosaic."""
+        """Return this denoiser; raise ValueError if it gives full colour, which cannot be compared with a mosaic."""
         return self
 
     def require_linear(self, linear: bool) -> None:
@@ -122,10 +122,10 @@ class RawDenoiser(ImageDenoiser):
 
     @torch.inference_mode()
     def __call__(self, noisy: Noisy) -> Tensor:
-        """Packed RAW ``(1, 4, h, w)`` denoised, on the CPU; a :class:`JointDenoiser` gives full colour.
+        """Denoise packed RAW ``(1, 4, h, w)`` to a result on the CPU; a :class:`JointDenoiser` gives full colour.
 
-        A mosaic ``(1, 1, H, W)`` of another pattern than Bayer's remains one. ValueError if this denoiser takes none,
-        the result has another shape, or is not finite where ``checked``.
+        A mosaic ``(1, 1, H, W)`` of a pattern other than Bayer's remains one. ValueError is raised if this denoiser
+        takes none, or if the result has another shape or, with ``checked``, is not finite.
         """
         if noisy.image.shape[1] == 1:
             denoised = self._of_mosaic(noisy)
@@ -149,7 +149,7 @@ class RawDenoiser(ImageDenoiser):
         return _crop(denoised, own, cfa)
 
     def _result_shape(self, packed: Tensor) -> tuple[int, ...]:
-        """The shape of the result for packed RAW."""
+        """Return the shape of the result for packed RAW."""
         return tuple(packed.shape)
 
     def _of_mosaic(self, noisy: Noisy) -> Tensor:
@@ -157,7 +157,7 @@ class RawDenoiser(ImageDenoiser):
         raise ValueError(f"{self.name}: is for Bayer mosaics, not {noisy.cfa}; {advice}")
 
     def _run(self, run: Model, image: Tensor, variance: Tensor | None, expected: Sequence[int]) -> Tensor:
-        """``run`` on the device and in the precision of this denoiser, its result checked."""
+        """Call ``run`` on the device and in the precision of this denoiser, and check its result."""
         if variance is not None:
             variance = variance.to(self.device)
         with self._precision():
@@ -165,7 +165,7 @@ class RawDenoiser(ImageDenoiser):
         return self._require_sound(denoised, image, expected)
 
     def _whole(self, model: Model, cfa: CFA) -> Model:
-        """The model in tiles, within the self-ensemble."""
+        """Wrap the model in tiles, and those in the self-ensemble."""
         run = model
         if self.tiles is not None:
             tile, overlap = self.tiles
@@ -175,7 +175,7 @@ class RawDenoiser(ImageDenoiser):
         return run
 
     def frame(self, frame: RawFrame, levels: Levels | None) -> Tensor:
-        """The mosaic ``(1, H, W)`` of a camera's frame denoised, at most 1; a :class:`JointDenoiser` gives full colour.
+        """Denoise the mosaic ``(1, H, W)`` of a frame, to at most 1; a :class:`JointDenoiser` gives full colour.
 
         ``levels`` may be None where :attr:`reads_levels` is False.
         """
@@ -190,18 +190,18 @@ class RawDenoiser(ImageDenoiser):
 
 @dataclass(frozen=True, kw_only=True)
 class MosaicDenoiser(RawDenoiser):
-    """A denoiser of mosaics of every pattern, X-Trans and Quad-Bayer too.
+    """A denoiser for mosaics of every pattern, including X-Trans and Quad-Bayer.
 
     Attributes:
         of_any: the network, which takes a mosaic with the planes of its colours. Packed RAW goes through ``network``.
 
-    The other attributes are those of :class:`RawDenoiser`, by whose ``of`` it is made.
+    The other attributes are those of :class:`RawDenoiser`, whose ``of`` makes it.
     """
 
     of_any: MosaicDRUNet = field(repr=False)
 
     def takes_pattern(self, cfa: str) -> bool:
-        """Whether it denoises mosaics of a pattern: of every one."""
+        """Tell whether it denoises mosaics of a pattern: it takes every pattern."""
         return True
 
     def _of_mosaic(self, noisy: Noisy) -> Tensor:
@@ -217,9 +217,9 @@ class MosaicDenoiser(RawDenoiser):
 
 @dataclass(frozen=True, kw_only=True)
 class JointDenoiser(RawDenoiser):
-    """A denoiser that demosaics, too: packed RAW ``(1, 4, h, w)`` to linear camera RGB ``(1, 3, 2h, 2w)``.
+    """A denoiser that also demosaics, from packed RAW ``(1, 4, h, w)`` to linear camera RGB ``(1, 3, 2h, 2w)``.
 
-    The attributes are those of :class:`RawDenoiser`, by whose ``of`` it is made.
+    The attributes are those of :class:`RawDenoiser`, whose ``of`` makes it.
     """
 
     demosaics: ClassVar[bool] = True
@@ -230,7 +230,7 @@ class JointDenoiser(RawDenoiser):
             raise ValueError("--strength does not support --linear: the noisy frame has no full colour to mix in")
 
     def require_mosaic(self) -> RawDenoiser:
-        """ValueError: its results cannot be compared with a mosaic."""
+        """Raise ValueError, since its results cannot be compared with a mosaic."""
         raise ValueError(f"{self.name}: demosaics, too; rawaug run demosaic --denoiser.start {self.name} scores it")
 
     def require_linear(self, linear: bool) -> None:
@@ -239,11 +239,11 @@ class JointDenoiser(RawDenoiser):
             raise ValueError(f"--denoiser {self.name}: demosaics too, to a linear DNG; add --linear")
 
     def require_preview(self, preview: Path) -> None:
-        """ValueError: LibRaw has nothing to demosaic."""
+        """Raise ValueError, since LibRaw has nothing to demosaic."""
         raise ValueError(f"--preview {preview}: --linear does not support it; open the linear DNG in a RAW developer")
 
     def require_grey(self, name: str) -> None:
-        """ValueError: a monochrome frame has no colours to find."""
+        """Raise ValueError, since a monochrome frame has no colours to find."""
         raise ValueError(f"{name}: is monochrome; there is nothing to demosaic, omit --linear")
 
     def _result_shape(self, packed: Tensor) -> tuple[int, ...]:
@@ -252,7 +252,7 @@ class JointDenoiser(RawDenoiser):
 
 
 def _continue(packed: Tensor, cfa: CFA, own: CFA) -> Tensor:
-    """The mosaic in the pattern ``own``, with a mirrored line on the sides where the patterns differ."""
+    """Extend a mosaic to the pattern ``own``, by a mirrored line on the sides where the patterns differ."""
     if own == cfa:
         return packed
     rows, columns = cfa.shift_to(own)
@@ -261,7 +261,7 @@ def _continue(packed: Tensor, cfa: CFA, own: CFA) -> Tensor:
 
 
 def _crop(image: Tensor, own: CFA, cfa: CFA) -> Tensor:
-    """A result without the lines that :func:`_continue` added, packed by ``cfa`` again."""
+    """Crop the lines that :func:`_continue` added from a result, and pack it by ``cfa`` again."""
     if own == cfa:
         return image
     if image.shape[1] != PACKED:
@@ -275,7 +275,7 @@ def _crop(image: Tensor, own: CFA, cfa: CFA) -> Tensor:
 
 
 def shipped_of_mosaics() -> list[str]:
-    """Names of the shipped networks that denoise the mosaic and leave demosaicing to others."""
+    """List the names of the shipped networks that denoise the mosaic and leave demosaicing to others."""
     names = []
     for name in RawDenoiser.shipped():
         model = read_header(find_denoiser(name))["model"]
@@ -293,14 +293,14 @@ def require_classical(specs: Sequence[Spec]) -> None:
 
 
 def denoiser_file(spec: str | Path) -> Path | None:
-    """The file of a network that a name or a path stands for; None for a filter or a function."""
+    """Find the file of a network that a name or a path stands for; return None for a filter or a function."""
     if Path(spec).suffix in (".safetensors", ".onnx") or str(spec) in list_shipped():
         return find_denoiser(spec)
     return None
 
 
 def _of_file(spec: str | Path) -> RawDenoiser:
-    """The network of a file, or of a shipped denoiser by its name."""
+    """Make the denoiser of a file, or of a shipped network by its name."""
     path = Path(spec)
     if path.suffix == ".onnx":
         network = OnnxNetwork(path)
@@ -315,7 +315,7 @@ def _of_file(spec: str | Path) -> RawDenoiser:
 
 
 def _of_network(name: str, network: nn.Module, info: Mapping[str, Any], cfa: CFA | None) -> RawDenoiser:
-    """A network; one that does not say so takes a variance if its ``forward`` has two arguments."""
+    """Make the denoiser of a network; unless it says so, it takes a variance if its ``forward`` has two arguments."""
     if isinstance(network, MosaicDRUNet):
         packed = _of_network(name, BayerAdapter(network), info, cfa)
         return MosaicDenoiser(of_any=network, **vars(packed))
@@ -339,7 +339,7 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any], cfa: CFA
 
 
 class _Foreign(nn.Module):
-    """A network that states no stride, and takes noisy RAW alone unless it ``reads`` the variance."""
+    """A network that states no stride, and takes only noisy RAW unless it ``reads`` the variance."""
 
     def __init__(self, network: nn.Module, reads: bool) -> None:
         super().__init__()
@@ -360,7 +360,7 @@ def _of_filter(spec: Spec) -> RawDenoiser:
     stabilised = Stabilised(denoiser, anscombe)
 
     def model(levels: Levels | None) -> Model:
-        """Noise of an unknown law is taken for white, at the mean level of its map."""
+        """Take noise of an unknown law for white noise, at the mean level of its map."""
         if levels is None:
             return denoiser
         shot_var, read_var = levels
@@ -386,7 +386,7 @@ def _of_function(function: Callable[..., Any], name: str | None) -> RawDenoiser:
 
 
 def _takes_two(function: Callable[..., Any]) -> bool:
-    """Whether a function must be given the variance besides noisy RAW."""
+    """Tell whether a function must also be given the variance, besides noisy RAW."""
     count = 0
     for parameter in inspect.signature(function).parameters.values():
         is_positional = parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)

@@ -1,7 +1,7 @@
-"""Files and folders, denoised: what is the same for RAW and pictures.
+"""Denoising of files and folders, as far as it is the same for RAW and pictures.
 
-A folder's results stand under the same names in another folder, and those that are there already are left. A file that
-cannot be read, or whose decoder crashes or hangs, is named and counted, and the others go on.
+A folder's results have the same names in another folder, and results that are already there are left. A file that
+cannot be read, or whose decoder crashes or hangs, is named and counted, and the other files are still processed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rawaug.files import one_at_a_time, require_file, require_same_settings, req
 from rawaug.progress import progress
 
 SETTINGS = "denoise.json"
-"""The file in a folder of results that says how they were made."""
+"""This file in a folder of results says how they were made."""
 
 
 @dataclass
@@ -52,7 +52,7 @@ def denoise_file(
 
     Args:
         source: the file.
-        out: the result; its folder is made.
+        out: the result; its folder is created.
         kind: how files of this kind are denoised.
         preview: a .jpg or .png of the result of a RAW file as LibRaw develops it.
         overwrite: replace ``out`` and ``preview`` if they exist.
@@ -62,8 +62,8 @@ def denoise_file(
 
     Raises:
         FileNotFoundError, OSError: if a file is missing or cannot be read or written.
-        ValueError: if the source cannot be denoised, or ``out`` has another extension, is the source itself, or is
-            there already.
+        ValueError: if the source cannot be denoised, or ``out`` has another extension, is the source itself, or already
+            exists.
     """
     source, out = Path(source), Path(out)
     require_file(source, f"{kind.what} file")
@@ -152,7 +152,7 @@ def denoise_folder(
 
 
 def _targets(source: Path, out: Path, kind: Files[T], files: list[Path]) -> dict[Path, Path]:
-    """The result of each file."""
+    """Name the result of each file."""
     if out.resolve().is_relative_to(source.resolve()):
         raise ValueError(f"{out}: is inside the source folder {source}; choose an output folder outside it")
 
@@ -168,7 +168,7 @@ def _targets(source: Path, out: Path, kind: Files[T], files: list[Path]) -> dict
 def _preview_targets(
     out: Path, kind: Files[T], targets: dict[Path, Path], previews: str | Path | None
 ) -> dict[Path, Path]:
-    """The preview of each file, in the subfolders of ``previews``; none without such a folder."""
+    """Name the preview of each file, in the subfolders of ``previews``; there are none without such a folder."""
     if previews is None:
         return {}
 
@@ -182,7 +182,7 @@ def _preview_targets(
 
 
 def _raise_if_unwritable(error: Exception, *files: Path | None) -> None:
-    """Raise an error of writing, such as to a full disk, which is no fault of the source."""
+    """Raise a write error, such as one of a full disk, which is no fault of the source."""
     if not isinstance(error, OSError):
         return
 

@@ -1,7 +1,7 @@
-"""Networks of others: ONNX files, and published networks with their authors' weights.
+"""Other people's networks: ONNX files, and published networks with their authors' weights.
 
-``rawaug export`` writes ONNX that states the CFA and the stride; any will do that takes noisy packed RAW
-``(1, 4, h, w)``, and its variance or not. What anybody's file does wrong is one line that names it.
+``rawaug export`` writes ONNX that states the CFA and the stride. Any other ONNX file will do that takes noisy packed
+RAW ``(1, 4, h, w)``, with or without its variance. If a file does something wrong, the error is one line that names it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rawaug.files import parse_object, read_tensors
 from rawaug.noise import anscombe
 
 STRIDE = 32
-"""The default stride of a network."""
+"""This is the default stride of a network."""
 
 
 class OnnxNetwork(nn.Module):
@@ -50,7 +50,7 @@ class OnnxNetwork(nn.Module):
         self.upscale = 2 if metadata.get("upscale") == "2" else 1
 
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
-        """RAW ``(B, 4, h, w)`` denoised, on the CPU; ValueError with ONNX Runtime's reason if it fails."""
+        """Denoise RAW ``(B, 4, h, w)`` on the CPU; raise ValueError with ONNX Runtime's reason if it fails."""
         results = []
         try:
             for index in range(len(noisy)):
@@ -71,7 +71,7 @@ class OnnxNetwork(nn.Module):
 
 
 def session_of(path: Path) -> Any:
-    """ONNX Runtime with a network, on the CPU, on as many threads as PyTorch has.
+    """Open a network in ONNX Runtime, on the CPU, with as many threads as PyTorch has.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -92,7 +92,7 @@ def session_of(path: Path) -> Any:
 
 
 def feeds(names: Sequence[str], images: Sequence[Tensor]) -> dict[str, Any]:
-    """The inputs of a session by name: of ``images``, each ``(1, 4, h, w)``, as many as it has ``names``."""
+    """Give a session its inputs by name: as many of the ``images``, each ``(1, 4, h, w)``, as it has ``names``."""
     inputs = {}
     for name, image in zip(names, images, strict=False):
         inputs[name] = image.numpy()
@@ -100,7 +100,7 @@ def feeds(names: Sequence[str], images: Sequence[Tensor]) -> dict[str, Any]:
 
 
 AGAIN = "download or convert it again"
-"""What to do about a damaged file of weights."""
+"""This is the advice about a damaged file of weights."""
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -110,7 +110,7 @@ def load_published(model: Network, path: str | Path) -> Network:
 
     Args:
         model: PMRID, PBRID, or FFDNet for colour, whose normalisations are folded into its convolutions.
-        path: of the file.
+        path: path of the file.
 
     Raises:
         ValueError: if the file is damaged or holds other weights.
@@ -129,12 +129,12 @@ class BiasFreeDnCNN(nn.Module):
 
     .. math:: u = (z - z(0)) / (z(1) - z(0)), \qquad u' = u - f(u), \qquad y' = z^{-1}(u' (z(1) - z(0)) + z(0))
 
-    with twenty 3 x 3 convolutions f without biases, normalisations folded in, and the exact unbiased inverse. Source:
-    S. Mohan, Z. Kadkhodaie, E. P. Simoncelli, C. Fernandez-Granda, "Robust and interpretable blind image denoising via
-    bias-free convolutional neural networks", ICLR 2020.
+    f are twenty 3 x 3 convolutions without biases, into which normalisations are folded, and the inverse is the exact
+    unbiased one. Source: S. Mohan, Z. Kadkhodaie, E. P. Simoncelli, C. Fernandez-Granda, "Robust and interpretable
+    blind image denoising via bias-free convolutional neural networks", ICLR 2020.
 
     Args:
-        weights: of the convolutions, ``(n, m, 3, 3)``, by names whose order is theirs.
+        weights: weights of the convolutions, ``(n, m, 3, 3)``, by names in the order of the convolutions.
     """
 
     reads_variance = True
@@ -144,7 +144,7 @@ class BiasFreeDnCNN(nn.Module):
         self.layers = nn.ParameterList([weights[name] for name in sorted(weights)])
 
     def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
-        """Packed RAW ``(B, 4, h, w)`` denoised; ``variance`` is a map ``shot_var max(noisy, 0) + read_var``."""
+        """Denoise packed RAW ``(B, 4, h, w)``; ``variance`` is a map ``shot_var max(noisy, 0) + read_var``."""
         shot_var, read_var = fit_levels(noisy, variance)
         levels = shot_var.flatten(), read_var.flatten()
         black = anscombe.forward(noisy.new_full((1, 1, 1, 1), 0.0), *levels)

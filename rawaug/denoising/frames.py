@@ -1,12 +1,12 @@
-r"""Frames of cameras, denoised in memory.
+r"""Denoising of cameras' frames in memory.
 
     x = f(y, shot_var max(y, 0) + read_var)
 
-on the mosaic as the sensor gave it, before any gain map. The result has the source's levels, colour, lens corrections,
-orientation and EXIF; it differs by noise and by errors of the sensor (:mod:`rawaug.denoising.corrections`). Its noise
-profile is gone with the noise, so that a RAW developer does not smooth once more. With a strength s below 1 the result
-is y + s (x - y): (1 - s)^2 of the noise's variance is left, and the noise profile says so. A network that demosaics as
-well gives camera RGB.
+This is done on the mosaic as the sensor gave it, before any gain map. The result has the source's levels, colour, lens
+corrections, orientation and EXIF; it differs by noise and by errors of the sensor
+(:mod:`rawaug.denoising.corrections`). Its noise profile is removed along with the noise, so that a RAW developer does
+not smooth once more. With a strength s below 1 the result is y + s (x - y): (1 - s)^2 of the noise's variance is left,
+and the noise profile says so. A network that also demosaics gives camera RGB.
 
 A monochrome frame is denoised as the mosaic of a grey scene, which it is.
 """
@@ -33,7 +33,7 @@ from rawaug.io.dng import LINEAR_WHITE, cell_of_planes
 from rawaug.io.raw import MONOCHROME
 
 OTHER_PATTERNS = "rawaug-xtrans"
-"""The denoiser of X-Trans and Quad-Bayer frames where none is named."""
+"""X-Trans and Quad-Bayer frames are denoised by this if no denoiser is named."""
 DNG_ADVICE = "the output is a DNG; give a name ending in .dng"
 
 
@@ -42,10 +42,10 @@ class DenoisedFrame:
     """A denoised frame, and what was done to it.
 
     Attributes:
-        frame: with the denoised mosaic, and what is left of the noise.
+        frame: the frame with the denoised mosaic, and the noise that is left.
         rgb: linear camera RGB ``(3, H, W)``, if the denoiser demosaics.
-        levels: (shot_var, read_var) that the denoiser was told; None if it needs none.
-        noise_source: where they come from.
+        levels: (shot_var, read_var) that the denoiser was given; None if it needs none.
+        noise_source: where the levels come from.
         below_zero: the share of sites whose result was below the digital number 0.
         corrected: errors of the sensor that were taken out.
     """
@@ -93,7 +93,7 @@ class FrameDenoiser:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the results depend on, as JSON."""
+        """Everything that the results depend on, as JSON."""
         settings = dict(self.usual.settings)
         if settings:
             settings["self_ensemble"] = self.usual.views > 1
@@ -110,7 +110,7 @@ class FrameDenoiser:
         return RawDenoiser.of(OTHER_PATTERNS, **self._options)
 
     def denoiser_of(self, frame: RawFrame) -> RawDenoiser:
-        """The denoiser of a frame."""
+        """Find the denoiser of a frame."""
         if self._by_pattern and frame.cfa not in (*CFA.__members__, MONOCHROME):
             return self._of_other_patterns
         return self.usual
@@ -146,7 +146,7 @@ class FrameDenoiser:
 
 
 def _as_mosaic(frame: RawFrame, denoiser: RawDenoiser) -> RawFrame:
-    """The frame as a denoiser takes it: a monochrome one is the mosaic of a grey scene."""
+    """Make of a frame what a denoiser takes: a monochrome one is the mosaic of a grey scene."""
     if frame.cfa != MONOCHROME:
         return frame
     denoiser.require_grey(frame.name)
@@ -154,7 +154,7 @@ def _as_mosaic(frame: RawFrame, denoiser: RawDenoiser) -> RawFrame:
 
 
 def _rest(levels: Levels | None, strength: float) -> Levels | None:
-    """The levels of the noise that a strength leaves."""
+    """Compute the levels of the noise that a strength leaves."""
     rest = (1 - strength) ** 2
     if levels is None or rest == 0:
         return None
@@ -162,7 +162,7 @@ def _rest(levels: Levels | None, strength: float) -> Levels | None:
 
 
 def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
-    """Clip, in place, what a digital number cannot hold; its share of the sites."""
+    """Clip, in place, what a digital number cannot hold; return the share of clipped sites."""
     cell = cell_of_planes(frame.cfa)
     size = len(cell)
 
@@ -179,7 +179,7 @@ def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
 
 
 def require_output(path: Path, overwrite: bool, extensions: Sequence[str], advice: str) -> None:
-    """Raise an error, before any work, if a file is there already, has another extension, or cannot be written."""
+    """Raise an error, before any work, if a file already exists, has another extension, or cannot be written."""
     if path.exists() and not overwrite:
         raise ValueError(f"{path}: exists; give another name, or --overwrite to replace it")
     if path.suffix.lower() not in extensions:
@@ -199,11 +199,11 @@ def denoise(
     device: str = "auto",
     overwrite: bool = False,
 ) -> RawFrame:
-    """Denoise a RAW frame: what ``rawaug denoise`` does, in memory.
+    """Denoise a RAW frame in memory, as ``rawaug denoise`` does.
 
     Args:
         source: a RAW file of any kind that :func:`rawaug.io.read_raw` reads, monochrome ones too, or a frame.
-        out: a DNG to write as well; None for none.
+        out: a DNG to write as well; None writes none.
         denoiser: whatever :meth:`rawaug.RawDenoiser.of` takes: a shipped name, a file, a network, a function, ...; by
             default the shipped one for the frame's pattern.
         noise: where the noise levels come from, see :data:`rawaug.denoising.levels.Noise`.
@@ -219,8 +219,8 @@ def denoise(
 
     Raises:
         FileNotFoundError, OSError: if a file is missing or cannot be read or written.
-        ValueError: if the source has no mosaic, its noise is unknown, there is no such denoiser, or it demosaics too:
-            its colours come from :meth:`rawaug.RawDenoiser.frame`.
+        ValueError: if the source has no mosaic, its noise is unknown, there is no such denoiser, or the denoiser also
+            demosaics; :meth:`rawaug.RawDenoiser.frame` gives its colours.
 
     Example:
         >>> frame = rawaug.denoise("in.dng", "out.dng", denoiser="rawaug-base")  # doctest: +SKIP

@@ -1,6 +1,7 @@
-r"""The noise levels (shot_var, read_var) that a denoiser is told of a frame.
+r"""The noise levels (shot_var, read_var) of a frame that a denoiser is given.
 
-They come from the NoiseProfile tag, an estimate, or a camera's law at the frame's ISO; or the user gives them.
+They come from the NoiseProfile tag, from an estimate, or from a camera's law at the frame's ISO, or the user gives
+them.
 """
 
 from __future__ import annotations
@@ -25,18 +26,18 @@ from rawaug.noise.profiles import ProfileLevels
 from rawaug.seeding import keyed_generator
 
 Shots = Mapping[tuple[str, float | None], tuple[float, float]]
-"""Levels by camera and ISO."""
+"""These are levels by camera and ISO."""
 Noise = str | Sequence[float] | MeasuredLevels | Shots
-"""``"auto"``, ``"profile"`` (the tag), ``"estimate"``, a measured camera's name or law (at the file's ISO), two
+"""It is ``"auto"``, ``"profile"`` (the tag), ``"estimate"``, a measured camera's name or law (at the file's ISO), two
 variances, or the levels of other files."""
 
 LOOSE = 0.9
-"""Minimum R^2 for a reliable estimate."""
+"""A reliable estimate has at least this R^2."""
 DISAGREE = 1.75
-"""Ratio of the variances at the mean signal, by the tag and by the estimate, from which ``auto`` takes the estimate.
+"""``auto`` takes the estimate if its variance at the mean signal differs from the tag's by this ratio or more.
 
-On frames whose noise is known the estimate is right within 1.24; a denoiser that is told half the variance leaves most
-of the noise."""
+On frames whose noise is known, the estimate is right within 1.24; a denoiser that is given half the variance leaves
+most of the noise."""
 _BY_HAND = "--noise '[shot_var, read_var]'"
 
 
@@ -45,13 +46,13 @@ class UnknownNoise(ValueError):
 
 
 def find_levels(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str]:
-    """(shot_var, read_var) of a frame, and a word on where they come from.
+    """Find (shot_var, read_var) of a frame, and a word on where they come from.
 
     ``auto`` takes the tag if the frame's own noise agrees with it, else the estimate, else the camera's published law.
 
     Raises:
         UnknownNoise: if the levels are not known.
-        ValueError: if ``noise`` names no camera, or another one than the frame's.
+        ValueError: if ``noise`` names no camera, or one other than the frame's.
     """
     if isinstance(noise, MeasuredLevels):
         return *_of_law(noise, frame), "camera"
@@ -93,7 +94,7 @@ def _profile(frame: RawFrame) -> tuple[float, float, str]:
 
 
 def _estimate(frame: RawFrame) -> tuple[float, float, str]:
-    """The estimate, read_var at least half of the camera's published one, since flat areas say little about it."""
+    """Estimate the levels; read_var is at least half of the published one, since flat areas say little about it."""
     try:
         estimate = estimate_noise(frame.mosaic, frame.cfa)
     except ValueError as error:
@@ -128,7 +129,7 @@ def _published_levels(frame: RawFrame, name: str) -> tuple[float, float]:
 
 
 def _check_profile(frame: RawFrame, profile: tuple[float, float]) -> tuple[float, float, str]:
-    """The tag, unless the frame's own noise is :data:`DISAGREE` times as strong or as weak."""
+    """Return the tag's levels, unless the frame's own noise is :data:`DISAGREE` times as strong or as weak."""
     try:
         estimate = estimate_noise(frame.mosaic, frame.cfa)
     except ValueError:  # too little of the frame is flat to tell
@@ -161,7 +162,7 @@ def _of_other_files(levels: Shots, frame: RawFrame) -> tuple[float, float, str]:
 
 
 def load_noise(noise: Noise, denoiser: ImageDenoiser) -> Noise:
-    """``"camera"`` as the law in the denoiser's file, an ISP's file as the law in it; anything else as it is.
+    """Turn ``"camera"`` or an ISP's file into the law that the denoiser's or the ISP's file holds; keep all else.
 
     Raises:
         ValueError: if the file holds no camera's noise law.
@@ -182,7 +183,7 @@ def load_noise(noise: Noise, denoiser: ImageDenoiser) -> Noise:
 
 
 def as_json(noise: Noise) -> Any:
-    """The setting as JSON has it."""
+    """Convert the setting to what JSON can hold."""
     if isinstance(noise, MeasuredLevels):
         return noise.spec()
     if isinstance(noise, str):

@@ -1,8 +1,8 @@
 """Kinds of files that are denoised: RAW to DNG, and pictures to pictures.
 
 A kind says which files of a folder are its own, what their results are called, and how one file is read, denoised and
-written. :mod:`rawaug.denoising.files` does the rest, and is the same for all; :func:`kind_of` says of which kind a file
-or a folder is.
+written. :mod:`rawaug.denoising.files` does the rest, which is the same for all kinds; :func:`kind_of` tells the kind of
+a file or a folder.
 """
 
 from __future__ import annotations
@@ -40,24 +40,24 @@ from rawaug.io.stored import PICTURE_FORMATS, StoredPicture, read_stored, write_
 from rawaug.registry import Spec
 
 _LINEAR = (".exr",)
-"""Extensions of pictures of linear light."""
+"""Pictures of linear light have these extensions."""
 _SUBSTITUTE = ".png"
-"""The format of the results of pictures whose own format is read but not written; it loses nothing."""
+"""Pictures whose own format is read but not written have results in this format, which loses nothing."""
 PREVIEWS = (".jpg", ".jpeg", ".png")
-"""Extensions of the previews of RAW files."""
+"""Previews of RAW files have these extensions."""
 
 
 @dataclass(frozen=True)
 class Denoised:
-    """What was done to a RAW file.
+    """The record of what was done to a RAW file.
 
     Attributes:
         source, out: the files.
-        shot_var, read_var: the noise levels that the denoiser was told.
-        noise_source: where they come from.
+        shot_var, read_var: the noise levels that the denoiser was given.
+        noise_source: where the levels come from.
         below_zero: the share of sites whose result was below the digital number 0.
-        seconds: for reading, denoising and writing.
-        camera, iso: of the source.
+        seconds: the time for reading, denoising and writing.
+        camera, iso: the source's camera and ISO.
         corrected: errors of the sensor that were taken out.
     """
 
@@ -82,7 +82,7 @@ class Denoised:
 
 @dataclass(frozen=True)
 class DenoisedPicture:
-    """What was done to a picture; ``deviation`` is that of the noise that was removed, in units of 1/255."""
+    """The record of what was done to a picture; ``deviation`` is the removed noise's, in units of 1/255."""
 
     source: Path
     out: Path
@@ -95,7 +95,7 @@ class DenoisedPicture:
 
 @dataclass(frozen=True)
 class Options:
-    """How files are to be denoised, whatever their kind.
+    """The settings by which files of any kind are denoised.
 
     Attributes:
         denoiser: a name or a file; None for the shipped denoiser of the kind of files.
@@ -128,12 +128,12 @@ class Options:
 
     @property
     def spec(self) -> Any:
-        """What denoises: the filter or the denoiser; None for the shipped one."""
+        """The filter or the denoiser that is used; None for the shipped one."""
         return self.denoiser if self.classical is None else self.classical
 
     @property
     def changes(self) -> dict[str, Any]:
-        """The attributes of a denoiser that they set."""
+        """The attributes of a denoiser that the options set."""
         changes: dict[str, Any] = {"strength": self.strength}
         if self.self_ensemble:
             changes["views"] = 8
@@ -148,33 +148,33 @@ class Files(ABC, Generic[T]):
     """One kind of files."""
 
     what: ClassVar[str]
-    """What a file of this kind is called."""
+    """A file of this kind is called this."""
 
     formats: ClassVar[tuple[str, ...]]
-    """Extensions of the results."""
+    """Results have these extensions."""
 
     format_advice: ClassVar[str]
-    """What is said of other extensions."""
+    """This is said of other extensions."""
 
     others: ClassVar[str]
-    """What is said of files of a folder that are of no kind."""
+    """This is said of files in a folder that are of no kind."""
 
     @classmethod
     @abstractmethod
     def of(cls: type[K], source: str | Path, options: Options) -> K:
-        """The files of this kind, denoised as the options say; ValueError if one does not apply to ``source``."""
+        """Make this kind with the options; raise ValueError if one of them does not apply to ``source``."""
 
     @property
     def settings(self) -> dict[str, Any] | None:
-        """What the results depend on, as JSON; None if a folder's results may be of several settings."""
+        """Return what the results depend on, as JSON; None if a folder's results may be of several settings."""
         return None
 
     @abstractmethod
     def extensions(self) -> tuple[str, ...]:
-        """Extensions of the files of a folder that are of this kind."""
+        """Return the extensions of the files of a folder that are of this kind."""
 
     def listing(self, folder: Path) -> Listing:
-        """The files of a folder that are of this kind; ValueError if there is none."""
+        """List the files of a folder that are of this kind; raise ValueError if there is none."""
         extensions = self.extensions()
         listing = list_files(folder, extensions, self.others)
         self._advise(listing)
@@ -185,15 +185,15 @@ class Files(ABC, Generic[T]):
 
     @abstractmethod
     def _advise(self, listing: Listing) -> None:
-        """Say what to do with files that are left out, where this kind knows better."""
+        """Say what to do with files that are left out, if this kind knows better."""
 
     def remarks(self, files: Sequence[Path]) -> list[str]:
-        """Lines on the results of these files of a folder."""
+        """Write lines on the results of these files of a folder."""
         return []
 
     @abstractmethod
     def target(self, file: Path) -> Path:
-        """The name of the result of a file, both below their folders."""
+        """Name the result of a file; both paths are relative to their folders."""
 
     @abstractmethod
     def require_preview(self, preview: Path) -> None:
@@ -204,17 +204,17 @@ class Files(ABC, Generic[T]):
         """Read, denoise and write a file, in a helper process if a file from a stranger is to be isolated.
 
         Raises:
-            UnknownNoise: if other files may tell the noise levels of this one.
+            UnknownNoise: if other files may show the noise levels of this one.
             OSError, ValueError: if it cannot be read, denoised or written.
         """
 
     def informed_by(self, results: Sequence[T]) -> Files[T] | None:
-        """This kind with what the results tell of files whose noise is unknown; None if they tell nothing."""
+        """Return this kind with what the results tell about files of unknown noise, or None if they tell nothing."""
         return None
 
 
 class RawFiles(Files[Denoised]):
-    """RAW files, denoised to DNGs.
+    """RAW files, which are denoised to DNGs.
 
     Args:
         denoiser: a :class:`FrameDenoiser`, or whatever it takes in its first place.
@@ -313,7 +313,7 @@ class RawFiles(Files[Denoised]):
 
 
 class PictureFiles(Files[DenoisedPicture]):
-    """Developed pictures, denoised to pictures with their EXIF, ICC profile and orientation."""
+    """Developed pictures, which are denoised to pictures with their EXIF, ICC profile and orientation."""
 
     what = "picture"
     formats = PICTURE_FORMATS
@@ -341,7 +341,7 @@ class PictureFiles(Files[DenoisedPicture]):
             listing.left_out["picture"].advice = "linear light; save it as a developed picture"
 
     def target(self, file: Path) -> Path:
-        """The name of the file; of a format that is read but not written, with ``.png`` behind it."""
+        """Keep the name of the file, with ``.png`` appended if its format is read but not written."""
         if file.suffix.lower() in PICTURE_FORMATS:
             return file
         return file.with_name(file.name + _SUBSTITUTE)
@@ -375,11 +375,11 @@ class PictureFiles(Files[DenoisedPicture]):
 
 
 KINDS: dict[str, type[Files[Any]]] = {"raw": RawFiles, "picture": PictureFiles}
-"""The kinds by what the content of a file is."""
+"""This maps the content of a file to its kind."""
 
 
 def kind_of(source: str | Path) -> type[Files[Any]]:
-    """The kind of a file by its content; of a folder, pictures if it has some and no RAW file.
+    """Find the kind of a file by its content; a folder is of pictures if it has some and no RAW file.
 
     Raises:
         FileNotFoundError: if there is no such file.

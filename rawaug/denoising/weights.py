@@ -1,4 +1,4 @@
-"""Files of weights: those that ``rawaug run`` writes, and published ones, which their tensors tell apart."""
+"""Files of weights: those that ``rawaug run`` writes, and published ones, which are told apart by their tensors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rawaug.denoising.foreign import AGAIN, BiasFreeDnCNN, load_published
 from rawaug.files import parse_object, read_tensors
 
 Image = Literal["raw", "srgb"]
-"""The kind of image that a denoiser takes: packed RAW, or developed pictures."""
+"""A denoiser takes this kind of image: packed RAW, or developed pictures."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Published:
     Attributes:
         name: in tables.
         tensor: the name of a tensor that no other network's file has.
-        build: makes the network of the path of its file and the tensors in it.
+        build: makes the network from the path of its file and the tensors in it.
         image: the kind of image that it takes.
         cfa: the pattern that it was trained for; None if it works on any of Bayer's.
     """
@@ -54,16 +54,16 @@ PUBLISHED = (
     Published("PBRID, published weights", "rec_blocks.m_head.weight", partial(_with_weights, PBRID)),
     Published("FFDNet, published weights", "conv00.weight", partial(_with_weights, denoisers.FFDNet), image="srgb"),
 )
-"""The published weights that can be read."""
+"""These published weights can be read."""
 
 
 class NetworkFile(NamedTuple):
-    """A network that was read of a file.
+    """A network that was read from a file.
 
     Attributes:
         path: the file.
-        name: in tables: of the file, or of the arm whose weights it has.
-        network: in eval mode, on the CPU.
+        name: its name in tables: that of the file, or of the arm whose weights it has.
+        network: the network, in eval mode, on the CPU.
         info: what the file says of its training.
         image: the kind of image that it takes.
         cfa: the pattern that it was trained for; None if it works on any of Bayer's.
@@ -78,7 +78,7 @@ class NetworkFile(NamedTuple):
 
 
 def read_network(path: Path) -> NetworkFile:
-    """The network of a ``.safetensors`` file, of whichever kind.
+    """Read the network of a ``.safetensors`` file of any kind.
 
     Raises:
         ValueError: if the file is damaged, or holds weights of no known denoiser.
@@ -99,7 +99,7 @@ def read_network(path: Path) -> NetworkFile:
 
 
 def image_of_header(header: Mapping[str, str]) -> Image:
-    """The kind of image that the network of a file of rawaug takes, by the file's metadata."""
+    """Find the kind of image that the network of a rawaug file takes, by the file's metadata."""
     return _image_of(parse_object(header["config"]).get("channels", PACKED))
 
 

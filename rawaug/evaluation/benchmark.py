@@ -2,10 +2,10 @@ r"""Denoisers side by side: the same frozen noise on the same clean references, 
 
 .. math:: \operatorname{var}(y) = \mathrm{shot\_var}\, y + \mathrm{read\_var}
 
-Each denoiser is told the levels as they are, and once more as they are estimated from the noisy frame, which is what a
-photographer has. A third table has sensors as they are: hot pixels, banding, black levels and colours that are a
-little off, rounding to 12 bits. A reference is the middle of a frame, binned by colour site if it has noise of its own.
-The hash of all noisy inputs says whether the figures of two people can be compared.
+Each denoiser is given the true levels, and in a second table the levels as estimated from the noisy frame, which is
+what a photographer has. A third table simulates real sensors: hot pixels, banding, black levels and colours that are
+slightly off, rounding to 12 bits. A reference is the middle of a frame, binned by colour site if it has noise of its
+own. The hash of all noisy inputs says whether the figures of two people can be compared.
 """
 
 from __future__ import annotations
@@ -57,16 +57,16 @@ _SENSOR: dict[str, Any] = {
 """The faults that sensors add to shot and read noise, at the strengths of :data:`_OF_SENSORS` or at the caller's."""
 
 _OF_SENSORS = ("phone", "strong")
-"""The strengths at which sensors as they are are simulated."""
+"""The strengths at which real sensors are simulated."""
 
 _CONDITIONS = TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensors as they are"
-"""What the denoisers are told, and what the sensor does: a table each."""
+"""What the denoisers are told, or how the sensor behaves; each has a table."""
 
 
 def strengths_of(
     noise: str | Sequence[float] | Sequence[str] | None = None, isos: Sequence[float] | None = None
 ) -> dict[str, NoiseLevels]:
-    """Noise levels by the name of their column: :data:`STRENGTHS`, or those of ``noise``, at each of ``isos``.
+    """Noise levels by the name of their column: :data:`STRENGTHS`, or those of ``noise`` at each of ``isos``.
 
     Raises:
         ValueError: if the noise is unknown, or there are ISO values but no camera.
@@ -87,14 +87,14 @@ def strengths_of(
 def trials(
     frames: Iterable[Pair], crop: int, seed: int = 0, strengths: Mapping[str, NoiseLevels] | None = None
 ) -> list[Trial]:
-    """The middles of all frames under every condition and strength; the same bits for the same frames and seed.
+    """Make the middles of all frames under every condition and strength; same frames and seed give the same bits.
 
-    Noise is put on whole frames, from which the levels are estimated; if that fails, the condition has no trial.
+    Noise is added to whole frames, from which the levels are estimated; if that fails, the condition has no trial.
 
     Args:
         frames: clean references.
         crop: side of the middles in pixels of the mosaic.
-        seed: of the noise.
+        seed: seed of the noise.
         strengths: noise levels by name, see :func:`strengths_of`.
     """
     strengths = strengths or strengths_of()
@@ -120,15 +120,15 @@ def trials(
 
 
 def noisy_frame(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real: bool = False) -> Noisy:
-    """A whole frame with noise of a strength, ``(1, 4, h, w)``.
+    """Make a whole frame with noise of a strength, ``(1, 4, h, w)``.
 
     Args:
         frame: the clean reference.
-        strength: a name; that of none of :data:`STRENGTHS` stands for the caller's levels, whose noise is the same as
-            in ``rawaug evaluate``.
+        strength: a name; one that is not in :data:`STRENGTHS` stands for the caller's levels, whose noise is the same
+            as in ``rawaug evaluate``.
         levels: the noise levels.
-        seed: of the noise.
-        real: whether what sensors add, :data:`_SENSOR`, is added.
+        seed: seed of the noise.
+        real: whether to add the faults of sensors, :data:`_SENSOR`.
     """
     noise: NoiseModel = ShotReadNoise(levels)
     if real:
@@ -145,7 +145,7 @@ def noisy_frame(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real
 
 
 def _middle(noisy: Noisy, frame: Pair, crop: int, condition: str, strength: str) -> Trial:
-    """The middle of a noisy frame beside that of the clean one, ``crop`` pixels of the mosaic."""
+    """Cut the middle out of a noisy frame and its clean one, ``crop`` pixels of the mosaic."""
     assert noisy.variance is not None
     side = crop // 2
     image = centre(noisy.image, side, side, step=1)
@@ -169,10 +169,10 @@ def hash_of(trials: Iterable[Trial]) -> str:
 
 
 def benchmark(denoisers: Sequence[RawDenoiser], cases: Sequence[Trial]) -> dict[str, Any]:
-    """Scores of every denoiser, by its name, on these :func:`trials`, beside those of the noisy input.
+    """Score every denoiser, by its name, on these :func:`trials`, along with the noisy input.
 
     Returns:
-        ``frames``, ``hash``, and ``rows`` by name: ``gmac`` and ``seconds`` a mosaic megapixel, and ``scores`` by
+        ``frames``, ``hash``, and ``rows`` by name: ``gmac`` and ``seconds`` per mosaic megapixel, and ``scores`` by
         condition and strength, means of :data:`rawaug.evaluation.scores.METRICS`.
     """
     strengths = _strengths_in(cases)
@@ -192,12 +192,12 @@ def benchmark(denoisers: Sequence[RawDenoiser], cases: Sequence[Trial]) -> dict[
 
 
 def _strengths_in(cases: Iterable[Trial]) -> list[str]:
-    """The strengths of these trials, in their order."""
+    """List the strengths of these trials, in their order."""
     return list(dict.fromkeys(trial.strength for trial in cases))
 
 
 def _by_condition(rows: Sequence[Row], strengths: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Mean scores of one denoiser by condition and strength; sensors have some of the strengths alone."""
+    """Average the scores of one denoiser by condition and strength; real sensors have only some of the strengths."""
     scores: dict[str, dict[str, Any]] = {}
     for condition in _CONDITIONS:
         of_condition = group_rows(rows, "condition").get(condition, [])
@@ -219,7 +219,7 @@ def _by_condition(rows: Sequence[Row], strengths: Sequence[str]) -> dict[str, di
 
 
 def noise_note(cases: Sequence[Trial], strengths: Iterable[str], seed: int) -> str:
-    """A sentence that says what the noise of these :func:`trials` is, by strength and levels, and that it is drawn."""
+    """Describe the noise of these :func:`trials` in a sentence, by strength and levels, and say that it is drawn."""
     parts = []
     for name in strengths:
         levels = []
@@ -240,7 +240,7 @@ def noise_note(cases: Sequence[Trial], strengths: Iterable[str], seed: int) -> s
 
 
 def _gmac(denoiser: RawDenoiser, trial: Trial) -> float | None:
-    """Multiplications that PyTorch computes, in 10^9 a megapixel of the mosaic; None if there are none."""
+    """Count the multiplications that PyTorch computes, in 10^9 a megapixel of the mosaic; None if there are none."""
     with FlopCounterMode(display=False) as counter:
         denoiser(trial.input)
 
@@ -248,7 +248,7 @@ def _gmac(denoiser: RawDenoiser, trial: Trial) -> float | None:
 
 
 def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str, list[str]]]]:
-    """Title, columns and cells by denoiser of each condition's table; heads say how many frames could be estimated."""
+    """Yield title, columns and cells by denoiser of each condition's table; heads say how many could be estimated."""
     count = len(result["frames"])
     frames = count_of(count, "frame")
 
@@ -285,7 +285,7 @@ def _format_cost(value: float | None) -> str:
 
 
 def costs_of(result: Mapping[str, Any]) -> dict[str, tuple[float | None, float, float]]:
-    """By denoiser its GMAC a megapixel and its PSNR of RAW and sRGB, at the strength that is shown."""
+    """Get GMAC per megapixel and PSNR of RAW and sRGB, at the strength that is shown, by denoiser."""
     strength = display_strength(result["rows"]["noisy input"]["scores"][TOLD])
     costs = {}
     for name, row in result["rows"].items():
@@ -307,7 +307,7 @@ def display_strength(strengths: Collection[str]) -> str:
 
 
 def crops(denoisers: Sequence[RawDenoiser], cases: Iterable[Trial], most: int) -> Iterator[Panels]:
-    """Pictures for the page: the first ``most`` frames with noise of :func:`display_strength`, by every denoiser."""
+    """Make pictures for the page: the first ``most`` frames with noise of :func:`display_strength`, by denoiser."""
     cases = list(cases)
     strength = display_strength(_strengths_in(cases))
     count = 0

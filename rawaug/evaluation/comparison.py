@@ -1,4 +1,4 @@
-"""``rawaug benchmark`` from start to end: denoisers by name, tables, JSON and, of RAW, the page."""
+"""``rawaug benchmark`` from start to end: denoisers by name, tables, JSON and, for RAW, the page."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from rawaug.evaluation.trials import Measured, Trial, own_noise_note
 from rawaug.files import write_json
 
 _ALWAYS = "NonLocalMeans"
-"""The filter that is in every table, as the shipped denoisers of mosaics are."""
+"""The filter that is in every table, as are the shipped denoisers of mosaics."""
 
 _ON_PAGE = 4
 """Largest number of frames on the page."""
@@ -40,20 +40,20 @@ _ON_PAGE = 4
 
 @dataclass(frozen=True)
 class Comparison:
-    """What ``rawaug benchmark`` is asked to compare.
+    """The settings of a comparison by ``rawaug benchmark``.
 
     Attributes:
         denoisers: names or files.
         data: clean frames, or real pairs of pictures, by a path or ``kind:path``.
-        bin: the frames are binned by this factor.
+        bin: the factor by which the frames are binned.
         count: number of frames.
         crop: side of the middles that are used, in pixels of the mosaic.
-        noise: in place of the four strengths; None for these.
+        noise: noise instead of the four strengths; None for these.
         iso: ISO values of the camera that ``noise`` names.
-        seed: of the noise.
-        device: where networks run.
-        json: the file that gets the result; None for none.
-        report: the page that gets tables and crops; None for none.
+        seed: seed of the noise.
+        device: device on which networks run.
+        json: file to write the result to; None for none.
+        report: page to write tables and crops to; None for none.
     """
 
     denoisers: Sequence[str]
@@ -70,7 +70,7 @@ class Comparison:
 
 
 def compare_raw(comparison: Comparison) -> None:
-    """Compare denoisers of RAW on the same frozen noise; tables are printed, and written as JSON and as a page."""
+    """Compare denoisers of RAW on the same frozen noise; print the tables, and write them as JSON and as a page."""
     strengths = strengths_of(comparison.noise, comparison.iso)
     denoisers = _open_denoisers(comparison)
 
@@ -103,7 +103,7 @@ def compare_raw(comparison: Comparison) -> None:
 
 
 def compare_pictures(comparison: Comparison) -> None:
-    """Compare denoisers of pictures; the table is printed, and written as JSON."""
+    """Compare denoisers of pictures; print the table, and write it as JSON."""
     denoisers = [PictureDenoiser.of(spec, comparison.device) for spec in comparison.denoisers]
     result = picture_scores(denoisers, open_picture_pairs(comparison.data))
     print_pictures(comparison.data, result)
@@ -112,7 +112,7 @@ def compare_pictures(comparison: Comparison) -> None:
 
 
 def _open_denoisers(comparison: Comparison) -> list[RawDenoiser]:
-    """The denoisers of the table; one whose name is taken goes by its spec."""
+    """Open the denoisers of the table; one whose name is taken goes by its spec."""
     by_name: dict[str, RawDenoiser] = {}
     for spec in dict.fromkeys((_ALWAYS, *shipped_of_mosaics(), *comparison.denoisers)):
         denoiser = denoiser_of(spec, comparison.device).require_mosaic()
@@ -124,7 +124,7 @@ def _open_denoisers(comparison: Comparison) -> list[RawDenoiser]:
 
 
 def _notes_of(result: dict[str, Any]) -> list[str]:
-    """Lines below the tables."""
+    """Make the lines below the tables."""
     summaries = {}
     for name, row in result["rows"].items():
         if name == "noisy input":
@@ -147,7 +147,7 @@ def _page_of(
     cases: Sequence[Trial],
     notes: Sequence[str],
 ) -> Page:
-    """The page: tables, quality over cost, and crops of some frames by every denoiser."""
+    """Make the page: tables, quality over cost, and crops of some frames by every denoiser."""
     page = Page(f"Denoisers on {comparison.data}", result["noise"])
     page.add(texts=notes)
     for title, head, cells in tables(result):

@@ -1,4 +1,4 @@
-"""One denoiser on a test set, beside classical filters: what ``rawaug evaluate`` measures of RAW and of pictures."""
+"""The scores of one denoiser on a test set, beside classical filters: ``rawaug evaluate`` on RAW and on pictures."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ from rawaug.registry import Spec
 from rawaug.version import __version__
 
 PRESET = "cycleisp_sidd"
-"""The noise of frames without a capture where the denoiser does not say which it was trained with."""
+"""The noise of frames without a capture if the denoiser does not say which noise it was trained with."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What ``rawaug evaluate`` is asked to measure.
+    """The settings of an evaluation by ``rawaug evaluate``.
 
     Attributes:
         denoiser: a name or a file, see :meth:`rawaug.RawDenoiser.of`.
         data: the test set, by a path or ``kind:path``.
         views: 1, or 4 or 8 to score the self-ensemble, too.
-        noise: is added to frames without a capture; None for that of the denoiser's training.
-        seed: of that noise.
-        bin: the frames are binned by this factor.
+        noise: noise to add to frames without a capture; None for that of the denoiser's training.
+        seed: seed of that noise.
+        bin: the factor by which the frames are binned.
         classical: filters to score on the same noise.
-        device: where a network runs.
-        json: the file that gets the result; None for none.
-        report: the page that gets scores and crops; None for none.
-        settings: of ``pairs:PATH``.
+        device: device on which a network runs.
+        json: file to write the result to; None for none.
+        report: page to write scores and crops to; None for none.
+        settings: settings of ``pairs:PATH``.
     """
 
     denoiser: str
@@ -63,7 +63,7 @@ class Evaluation:
     settings: PairSettings = field(default_factory=PairSettings)
 
     def facts(self, kind: str, file: Path | None = None) -> dict[str, Any]:
-        """What the result says besides scores: the kind of weights, denoiser or isp, the hash of their file, ..."""
+        """State the facts of the result besides scores: the kind of weights, denoiser or isp, their file's hash, ..."""
         facts: dict[str, Any] = {"kind": kind, "data": self.data}
         if file is not None:
             facts["weights_sha256"] = sha256(file)
@@ -74,13 +74,13 @@ class Evaluation:
         return facts
 
     def write(self, result: Mapping[str, Any]) -> None:
-        """Write the result as JSON, if there is a file for it."""
+        """Write the result as JSON, if a file is set for it."""
         if self.json is not None:
             write_json(result, self.json)
 
 
 def evaluate_raw(evaluation: Evaluation) -> dict[str, Any]:
-    """Score a denoiser of RAW, print its tables and write its files; the result, as in the JSON.
+    """Score a denoiser of RAW, print its tables and write its files; return the result, as in the JSON.
 
     The plain scores are printed and written first, then those of the self-ensemble and of filters, which take longer.
     """
@@ -92,7 +92,7 @@ def evaluate_raw(evaluation: Evaluation) -> dict[str, Any]:
     pairs = open_pairs(evaluation.data, split="test", **vars(evaluation.settings))
     frames = Readable(Kept(Binned(Measured(pairs), evaluation.bin)))
     for _ in frames:
-        pass  # finds those that cannot be read
+        pass  # finds the pairs that cannot be read
     trials = make_trials(frames.kept(), lambda pair: trial_of(pair, model, denoiser.cfa, evaluation.seed))
 
     facts = evaluation.facts("denoiser", denoiser_file(evaluation.denoiser))
@@ -138,9 +138,9 @@ def evaluate_raw(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def evaluate_pictures(evaluation: Evaluation) -> dict[str, Any]:
-    """Score a denoiser of pictures, beside classical filters; the result, as in the JSON.
+    """Score a denoiser of pictures, beside classical filters; return the result, as in the JSON.
 
-    ``plain`` holds the result with the default number of views, where more are asked for.
+    ``plain`` holds the result with the default number of views, if more are requested.
     """
     if evaluation.noise is not None or evaluation.bin != 1 or evaluation.report:
         raise ValueError(f"{evaluation.data}: has developed pictures; --noise, --bin and --report are for RAW")
@@ -173,7 +173,7 @@ def evaluate_pictures(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def denoiser_of(spec: str, device: str = "cpu") -> RawDenoiser:
-    """What a word of the command line names, the only place where ``package.module:function`` is imported."""
+    """Open the denoiser that the command line names; only here is ``package.module:function`` imported."""
     module, colon, function = spec.partition(":")
     if not colon or Path(spec).suffix in (".onnx", ".safetensors"):
         return RawDenoiser.of(spec, device)
@@ -190,14 +190,14 @@ def denoiser_of(spec: str, device: str = "cpu") -> RawDenoiser:
 
 
 def _finite_rows(denoisers: Sequence[Any], trials: Iterable[Trial], label: str) -> Iterator[Row]:
-    """The scores; ValueError at the first that is NaN, which damaged weights are at their first frame."""
+    """Yield the scores; ValueError at the first NaN, which damaged weights give at their first frame."""
     for row in score(denoisers, trials, label):
         require_finite(row.frame, row.psnr)
         yield row
 
 
 def require_finite(frame: str, value: float) -> float:
-    """The score of a frame, unless it is NaN, which it is where weights are damaged."""
+    """Return the score of a frame; ValueError if it is NaN, which means that the weights are damaged."""
     if math.isnan(value):
         raise ValueError(f"{frame}: the result is not finite; the weights are damaged")
 
@@ -212,7 +212,7 @@ def _page(
     trials: Sequence[Trial],
     noise: NoiseSpec,
 ) -> Page:
-    """The scores, and some frames noisy, denoised by each filter and by the denoiser, and clean."""
+    """Make the page: the scores, and some frames noisy, denoised by each filter and by the denoiser, and clean."""
     runs = {"plain": result.get("plain", result)}
     if "plain" in result:
         runs["self_ensemble"] = result

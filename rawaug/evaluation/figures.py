@@ -28,7 +28,7 @@ WINDOW = 64
 """Side of an enlarged window, in packed pixels."""
 
 PANEL = 256
-"""Largest side of a panel, in mosaic pixels: larger frames are shown as a crop of the centre."""
+"""Largest side of a panel, in mosaic pixels; larger frames are shown as a crop of the centre."""
 
 _CROP = 192
 """Side of a crop at 100 %, in pixels."""
@@ -40,7 +40,7 @@ CURVES = {"loss": "loss", "psnr": "validation PSNR (dB)", "psnr_srgb": "validati
 """Columns of a log that are plotted, with the titles of their plots."""
 
 LINE_STYLES = ("-", "--", "-.", ":")
-"""Line styles of the arms of a training, so that a curve under another one is still seen."""
+"""Line styles of the arms of a training, so that a curve below another one can still be seen."""
 
 Log = Sequence[Mapping[str, str]]
 """The rows of a training's ``log.csv``."""
@@ -48,12 +48,12 @@ Log = Sequence[Mapping[str, str]]
 
 @dataclass
 class Panels:
-    """One trial in pictures.
+    """The pictures of one trial.
 
     Attributes:
-        trial: of which these are.
+        trial: the trial.
         images: ``(1, 4, h, w)`` or ``(1, 3, H, W)``, like the trial's noisy or clean one, by title; the clean one last.
-        captions: by title.
+        captions: captions by title.
     """
 
     trial: Trial
@@ -61,7 +61,7 @@ class Panels:
     captions: dict[str, str] = field(default_factory=dict)
 
     def show(self, image: Tensor) -> Tensor:
-        """An image, or a part of one, ``(1, C, H, W)``, as sRGB ``(3, H, W)`` in [0, 1]."""
+        """Develop an image, or a part of one, ``(1, C, H, W)``, to sRGB ``(3, H, W)`` in [0, 1]."""
         if self.trial.develop is None:
             return image[0].clamp(0.0, 1.0)
 
@@ -69,10 +69,10 @@ class Panels:
 
 
 def panels_of(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOISY) -> Panels:
-    """The trial noisy, denoised by each, and clean, in pictures.
+    """Make the pictures of a trial: noisy, denoised by each denoiser, and clean.
 
-    Captions say the PSNR, that of the clean image its own noise: the PSNR of a perfect denoiser. ``noisy`` shows the
-    noisy input.
+    Captions state the PSNR. That of the clean image states its own noise, as the PSNR of a perfect denoiser. ``noisy``
+    gives the picture of the noisy input.
     """
     panels = Panels(trial)
     clean = trial.compared(trial.clean)
@@ -95,7 +95,7 @@ def panels_of(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOI
 
 
 def find_detail(image: Tensor, side: int = WINDOW) -> tuple[int, int]:
-    """Top and left of the window of ``side`` in which green is steepest, of ``(1, 4, h, w)`` or ``(1, 3, H, W)``."""
+    """Find top and left of the window of ``side`` with the steepest green, in ``(1, 4, h, w)`` or ``(1, 3, H, W)``."""
     green = image[:, 1:-1].mean(1, keepdim=True).clamp_min(0.0).sqrt()
     down = (green[..., 1:, :-1] - green[..., :-1, :-1]).abs()
     right = (green[..., :-1, 1:] - green[..., :-1, :-1]).abs()
@@ -108,13 +108,13 @@ def find_detail(image: Tensor, side: int = WINDOW) -> tuple[int, int]:
 
 
 def detail_window(image: Tensor, side: int = WINDOW) -> tuple[Any, slice, slice]:
-    """The index of the window of :func:`find_detail` in an image."""
+    """Make the index of the window of :func:`find_detail` in an image."""
     y, x = find_detail(image, side)
     return ..., slice(y, y + side), slice(x, x + side)
 
 
 def crops_at_100(rows: Sequence[Panels]) -> Tensor:
-    """A row of crops of each trial, every image's where the clean one has most detail; sRGB ``(3, h, w)``."""
+    """Make a row of crops of each trial, all where its clean image has most detail; sRGB ``(3, h, w)``."""
     strips = []
     for row in rows:
         window = detail_window(row.trial.clean, _CROP)
@@ -125,7 +125,7 @@ def crops_at_100(rows: Sequence[Panels]) -> Tensor:
 
 
 def new_figure(width: float, height: float) -> Any:
-    """An empty figure of matplotlib's, its sides in inches; no display is needed."""
+    """Make an empty matplotlib figure, with its sides in inches; no display is needed."""
     with extra("train"):
         from matplotlib.figure import Figure
 
@@ -133,7 +133,7 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def save_picture(rows: Sequence[Panels], path: Path) -> Path:
-    """Write the panels of each row as a picture, at most :data:`_ACROSS` side by side; the path."""
+    """Write the panels of each row as a picture, at most :data:`_ACROSS` side by side; return the path."""
     counts = [len(row.images) for row in rows]
     columns = min(_ACROSS, max(counts))
     heights = [math.ceil(count / columns) for count in counts]
@@ -162,15 +162,15 @@ def save_picture(rows: Sequence[Panels], path: Path) -> Path:
 
 
 def read_log(path: Path) -> Log:
-    """The rows of a training's ``log.csv``."""
+    """Read the rows of a training's ``log.csv``."""
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
 
 def plot_curves(logs: Mapping[str, Sequence[Path]]) -> dict[str, bytes]:
-    """Loss and validation PSNR over the steps as PNG files by title, from the ``log.csv`` of every seed of every arm.
+    """Plot loss and validation PSNR over the steps, from the ``log.csv`` of every seed and arm, as PNG files by title.
 
-    The loss is the mean since the row before. A curve of one point is a dot. What no log has is left out.
+    The loss is the mean since the previous row. A curve of one point is a dot. Values that no log has are left out.
     """
     rows: dict[tuple[str, int], Log] = {}
     styles = {}
@@ -191,7 +191,7 @@ def plot_curves(logs: Mapping[str, Sequence[Path]]) -> dict[str, bytes]:
 def _plot_curve(
     key: str, title: str, logs: Mapping[tuple[str, int], Log], styles: Mapping[str, Mapping[str, Any]]
 ) -> bytes:
-    """A curve for each log, the arm in the legend; empty if no log has the key."""
+    """Plot a curve for each log, with the arms in the legend; empty if no log has the key."""
     figure = new_figure(5.2, 3.6)
     axis = figure.subplots()
 
@@ -228,7 +228,7 @@ def _plot_curve(
 
 
 def plot_costs(rows: Mapping[str, tuple[float | None, float, float]]) -> bytes:
-    """A PNG file with the PSNR of RAW and sRGB over GMAC a megapixel; a filter, which has none, is a dashed line.
+    """Plot the PSNR of RAW and sRGB over GMAC per megapixel as PNG; a filter without GMAC is a dashed line.
 
     ``rows`` has GMAC and the two PSNR by the name of a denoiser.
     """

@@ -45,9 +45,9 @@ class Figure(NamedTuple):
 
     Attributes:
         png: the file.
-        alt: what stands in its place where it cannot be shown.
+        alt: text to show if the picture cannot be shown.
         style: a class of the template: window, curve, or none for a whole frame.
-        caption: below it.
+        caption: text below the picture.
     """
 
     png: bytes
@@ -60,7 +60,7 @@ class Page:
     """A page, to which parts are added from top to bottom; frames are encoded as they come and not kept.
 
     Args:
-        title: of the page.
+        title: title of the page.
         lead: the sentence below the title.
     """
 
@@ -73,10 +73,10 @@ class Page:
         """Add a part.
 
         Args:
-            heading: of a chapter; without one the part belongs to the chapter before.
-            content: what stands below it, as far as there is any: ``name``, a smaller heading; ``texts``, paragraphs;
+            heading: heading of a chapter; without one the part belongs to the previous chapter.
+            content: the content below it, as far as there is any: ``name``, a smaller heading; ``texts``, paragraphs;
                 ``terms``, explanations by term; ``head`` and ``rows`` of a table, the names of columns and the cells by
-                name, with the set ``best`` of (row, column) in bold; ``figures``, :class:`Figure` beside each other.
+                name, with the set ``best`` of (row, column) in bold; ``figures``, :class:`Figure` side by side.
         """
         self.parts.append({"heading": heading, "best": (), **content})
 
@@ -89,14 +89,14 @@ class Page:
         facts: Mapping[str, Any] | None = None,
         arms: Mapping[str, str] | None = None,
     ) -> Page:
-        """A page with scores, which opens with the verdict.
+        """Make a page with scores, which opens with the verdict.
 
         Args:
-            title: of the page.
-            results: by arm, one entry a seed.
+            title: title of the page.
+            results: by arm, one entry per seed.
             others: summaries of other denoisers, by name.
-            facts: what else is stated, by term; ``Noise`` as a recipe has it.
-            arms: what the methods are, by name.
+            facts: further facts to state, by term; ``Noise`` in the form of a recipe.
+            arms: descriptions of the methods, by name.
         """
         page = cls(title, verdict(results, others).sentence)
         page.add_facts({**(facts or {}), "Own noise": own_noise_note(first_runs(results, others))}, results)
@@ -106,7 +106,7 @@ class Page:
         return page
 
     def add_facts(self, facts: Mapping[str, Any], results: Runs) -> None:
-        """Add the command and other facts by term, those that are not empty; ``Noise`` as a recipe has it."""
+        """Add the command and other facts by term, unless they are empty; ``Noise`` is in the form of a recipe."""
         terms = {"Command": command_line(), **facts}
         noise = terms.pop("Noise", None)
         if noise:
@@ -122,9 +122,9 @@ class Page:
         """Add the tables of scores: plain, self-ensemble, quarters, and every image.
 
         Args:
-            results: by arm, one entry a seed.
+            results: by arm, one entry per seed.
             others: summaries of other denoisers, by name.
-            of: what these scores are of, for the headings, such as a pattern.
+            of: the subject of these scores, for the headings, such as a pattern.
         """
         end = ""
         if of:
@@ -138,7 +138,7 @@ class Page:
                 continue
             head = ["", *table.columns]
             self.add(heading + end, texts=notes, head=head, rows=table.rows, best=table.best)
-            notes = []  # said once, with the first table
+            notes = []  # stated once, with the first table
 
         self.add(f"Every image{end}", **_every_image(first_runs(results, others)))
 
@@ -152,7 +152,7 @@ class Page:
 
         Args:
             row: the images of the frame.
-            crop: the side in pixels of the middle to which larger frames were cut; None if none was.
+            crop: the side in pixels to which larger frames were cut around the middle; None if none was.
         """
         clean = row.trial.clean
         pixels = bayer.sites_per_value(clean)
@@ -181,7 +181,7 @@ class Page:
         self.add(heading, name=name, figures=figures)
 
     def write(self, path: Path, settings: Mapping[str, Any]) -> Path:
-        """Write the page, which ends with the settings of the run, and its tables beside it; the path of the page."""
+        """Write the page, ending with the run's settings, and its tables beside it; return the path of the page."""
         import yaml
         from jinja2 import Environment, PackageLoader
 
@@ -199,7 +199,7 @@ class Page:
 
 
 def name_part(height: int, width: int, crop: int | None) -> str:
-    """How much of a frame is shown, with its size in pixels.
+    """Say how much of a frame is shown, with its size in pixels.
 
     Example:
         >>> name_part(512, 512, crop=512)
@@ -215,7 +215,7 @@ def name_part(height: int, width: int, crop: int | None) -> str:
 
 
 def command_line() -> str:
-    """The command that runs, as it was typed; empty in another program."""
+    """The running command as it was typed; empty in another program."""
     if Path(sys.argv[0]).stem not in ("rawaug", "__main__"):
         return ""
 
@@ -223,7 +223,7 @@ def command_line() -> str:
 
 
 def _levels_range(summary: Mapping[str, Any]) -> str:
-    """The lowest and highest noise levels of the images of a summary, in words; empty if none is known."""
+    """Describe the lowest and highest noise levels of a summary's images; empty if none is known."""
     ranges = []
     for key in ("shot_var", "read_var"):
         values = []
@@ -238,13 +238,13 @@ def _levels_range(summary: Mapping[str, Any]) -> str:
 
 
 def select_for_page(trials: Sequence[Trial]) -> Iterator[Trial]:
-    """At most :data:`ON_PAGE` of the trials, evenly spaced."""
+    """Choose at most :data:`ON_PAGE` of the trials, evenly spaced."""
     for k in evenly_spaced(len(trials), ON_PAGE):
         yield trials[k]
 
 
 def _every_image(summaries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """PSNR / SSIM of every image by every method, on the mosaic."""
+    """Make the table of PSNR / SSIM of every image by every method, on the mosaic."""
     rows: dict[str, list[str]] = {}
     for summary in summaries.values():
         for image in summary["images"]:

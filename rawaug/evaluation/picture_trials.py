@@ -1,10 +1,10 @@
-r"""Real pairs of developed pictures as trials, as they are published and with the truth registered to the shot.
+r"""Real pairs of developed pictures as trials, both as published and with the truth registered to the shot.
 
 .. math:: c'_k = a_k\, c_k(p - t) + b_k
 
-The mean of many shots lies up to half a pixel from the one that is scored, and differs from it by codes in brightness,
-which no denoiser can know. t is found by phase correlation, a and b of each colour by least squares, all of them
-between the noisy picture and the clean one, so that they do not depend on the denoiser. A border is left out.
+The mean of many shots lies up to half a pixel from the shot that is scored, and differs from it by codes in brightness,
+which no denoiser can know. Phase correlation gives t; least squares give a and b of each colour. All are found between
+the noisy picture and the clean one, so that they do not depend on the denoiser. A border is left out.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _BORDER = 4
 
 
 def picture_trials(pairs: Sequence[Any], registered: bool = False) -> Sequence[Trial]:
-    """A trial in the domain ``srgb`` of every pair."""
+    """Make a trial in the domain ``srgb`` from every pair."""
 
     def make(pair: PicturePair) -> Trial:
         noisy, clean = pair.noisy[None] / 255.0, pair.clean[None] / 255.0
@@ -43,7 +43,7 @@ def picture_trials(pairs: Sequence[Any], registered: bool = False) -> Sequence[T
 
 
 def register(noisy: Tensor, clean: Tensor) -> Tensor:
-    """The clean picture ``(3, H, W)`` moved onto the noisy one, with its gain and offset in each colour."""
+    """Move the clean picture ``(3, H, W)`` onto the noisy one, and match its gain and offset in each colour."""
     with extra("raw"):
         from skimage.registration import phase_cross_correlation
     from scipy.ndimage import shift
@@ -64,7 +64,7 @@ def register(noisy: Tensor, clean: Tensor) -> Tensor:
 
 
 def picture_scores(denoisers: Sequence[Denoiser], pairs: Sequence[Any]) -> dict[str, Any]:
-    """Every denoiser on pairs of pictures: ``rows`` by its name and by condition, as of ``rawaug evaluate --json``."""
+    """Score every denoiser on pairs of pictures: ``rows`` by name and condition, as in ``rawaug evaluate --json``."""
     rows: dict[str, dict[str, Any]] = {}
     for condition in (PUBLISHED, REGISTERED):
         trials = picture_trials(pairs, registered=condition == REGISTERED)
@@ -76,7 +76,7 @@ def picture_scores(denoisers: Sequence[Denoiser], pairs: Sequence[Any]) -> dict[
 
 
 def print_pictures(data: str, result: Mapping[str, Any]) -> None:
-    """The table of :func:`picture_scores`."""
+    """Print the table of :func:`picture_scores`."""
     rows = []
     for name, by_condition in result["rows"].items():
         cells = [name]

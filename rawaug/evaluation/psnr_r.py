@@ -1,4 +1,4 @@
-"""PSNR_r of an ISP: how well it reconstructs RAW frames from their sRGB."""
+"""PSNR_r of an ISP, which measures how well it reconstructs RAW frames from their sRGB."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def psnr_r(
     patches: int | None = None,
     tone: staged.Tone | None = None,
 ) -> float:
-    """Measure PSNR_r of one frame; of an unregistered pair that of block averages.
+    """Measure PSNR_r of one frame; for an unregistered pair, that of block averages.
 
     Args:
-        isp: reconstructs the RAW.
+        isp: the ISP that reconstructs the RAW.
         pair: the frame.
         white_balance: whether the ISP is given the frame's as-shot gains.
-        patches: how many patches of a registered frame are scored, all by default.
+        patches: number of patches to score in a registered frame, all by default.
         tone: the tone curve that the ISP is given, as in :meth:`DictionaryISP.reverse`.
 
     Raises:
-        ValueError: if the picture is not in the camera's colours, as SIDD's blocks without their sRGB files.
+        ValueError: if the picture is not in the camera's colours, like SIDD's blocks without their sRGB files.
     """
     pair.require_rendered()
     as_shot = None
@@ -63,13 +63,13 @@ def psnr_r(
 
 
 def block_psnr(estimate: Tensor, raw: Tensor, clipped: Tensor) -> float:
-    """PSNR between block averages ``(3, h, w)``, blocks with a clipped reading ``(h, w)`` left out."""
+    """Compute the PSNR between block averages ``(3, h, w)``, without blocks that have a clipped reading ``(h, w)``."""
     error = (estimate.clamp(0.0, 1.0) - raw) ** 2
     return -10.0 * error[:, ~clipped].mean().log10().item()
 
 
 def windows_of(pair: Pair, count: int | None) -> list[tuple[int, int]]:
-    """Corners of ``count`` random patches of the frame, keyed by its name; all of :func:`patch_psnr`'s if None."""
+    """Choose corners of ``count`` random patches of a frame, keyed by its name; None for all of :func:`patch_psnr`."""
     height, width = pair.raw.shape[-2:]
     rows = range(0, max(height - PATCH, 0) + 1, PATCH)
     columns = range(0, max(width - PATCH, 0) + 1, PATCH)
@@ -83,7 +83,7 @@ def windows_of(pair: Pair, count: int | None) -> list[tuple[int, int]]:
 
 @torch.no_grad()
 def windows_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair, count: int | None) -> float:
-    """Mean PSNR over windows; ``make`` maps an sRGB patch ``(1, 3, h, w)`` and its place in the frame to RAW."""
+    """Average the PSNR over windows; ``make`` maps an sRGB patch ``(1, 3, h, w)`` and its place in the frame to RAW."""
     height, width = pair.raw.shape[-2:]
     values = []
     for corner in windows_of(pair, count):

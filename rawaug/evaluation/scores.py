@@ -1,8 +1,8 @@
 """PSNR and SSIM of denoisers on trials: a row for each denoiser on each trial, and their means as JSON.
 
-Scores are those of the whole mosaic, and once more of sRGB, after one fixed development of result and clean frame:
+Scores are those of the whole mosaic, and also those of sRGB after one fixed development of result and clean frame:
 bilinear demosaic, the frame's white balance and colour matrix, one exposure taken from the clean frame, the sRGB curve
-of IEC 61966-2-1. What is developed already is compared as it is.
+of IEC 61966-2-1. Images that are already developed are compared as they are.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _QUARTER_OF = 4
 """Minimum number of images for reporting quartiles."""
 
 _SHOWN_FAULTS = 5
-"""Maximum number of scores without a number that an error names."""
+"""Maximum number of infinite or NaN scores that an error names."""
 
 
 class Denoiser(Protocol):
-    """A denoiser that can be scored: :class:`rawaug.RawDenoiser`, and whatever gives developed pictures in [0, 1].
+    """A denoiser that can be scored: :class:`rawaug.RawDenoiser`, and anything that gives developed pictures in [0, 1].
 
     Attributes:
         name: its name in tables.
@@ -69,13 +69,13 @@ class Row(NamedTuple):
 
     Attributes:
         denoiser: its name, with the way that follows it if there is one.
-        frame: of the trial, as ``condition``, ``strength`` and ``domain`` are.
+        frame: frame of the trial; ``condition``, ``strength`` and ``domain`` are the trial's as well.
         psnr: in dB in the trial's domain.
         ssim: in the trial's domain.
-        psnr_srgb: in dB after development; None for what is developed already.
-        ssim_srgb: after development; None for what is developed already.
+        psnr_srgb: in dB after development; None for images that are already developed.
+        ssim_srgb: after development; None for images that are already developed.
         own_noise: the reference's own noise as a share of the squared error, if it is known.
-        levels: (shot_var, read_var) that the denoiser was told, if any.
+        levels: (shot_var, read_var) that the denoiser was given, if any.
         levels_from_clean: whether these were measured against the clean frame.
         seconds: time that the denoiser took for each megapixel of its input.
     """
@@ -96,12 +96,12 @@ class Row(NamedTuple):
 
 
 def score(denoisers: Sequence[Denoiser], trials: Iterable[Trial], label: str = "") -> Iterator[Row]:
-    """Every denoiser on every trial, one trial in memory at a time.
+    """Score every denoiser on every trial, with one trial in memory at a time.
 
     Args:
-        denoisers: what is compared, see :meth:`rawaug.RawDenoiser.of`; :data:`NOISY` is the input itself.
+        denoisers: the denoisers to compare, see :meth:`rawaug.RawDenoiser.of`; :data:`NOISY` is the input itself.
         trials: see :func:`rawaug.evaluation.trials.trial_of`.
-        label: of the progress.
+        label: label of the progress bar.
 
     Example:
         >>> from rawaug import RawDenoiser
@@ -122,7 +122,7 @@ def score(denoisers: Sequence[Denoiser], trials: Iterable[Trial], label: str = "
 
 
 def _score_one(denoiser: Denoiser, trial: Trial) -> Iterator[Row]:
-    """The rows of one denoiser on one trial: several where several ways lead to the trial's domain."""
+    """Make the rows of one denoiser on one trial: several if several ways lead to the trial's domain."""
     noisy = trial.input_for(denoiser)
 
     start = time.perf_counter()
@@ -151,9 +151,9 @@ def _score_one(denoiser: Denoiser, trial: Trial) -> Iterator[Row]:
 
 
 def to_domain(name: str, denoised: Tensor, trial: Trial) -> Iterator[tuple[str, Tensor]]:
-    """A denoiser's result in the trial's domain, by name.
+    """Convert a denoiser's result to the trial's domain, and yield it by name.
 
-    RAW ``(1, 4, h, w)`` goes all of the trial's ways there, whose names, if any, follow that of the denoiser.
+    RAW ``(1, 4, h, w)`` is converted in all of the trial's ways, whose names, if any, follow that of the denoiser.
     """
     if denoised.shape[1] == trial.clean.shape[1]:
         yield name, denoised
@@ -164,7 +164,7 @@ def to_domain(name: str, denoised: Tensor, trial: Trial) -> Iterator[tuple[str, 
 
 
 def compare(image: Tensor, trial: Trial) -> tuple[float, float, float | None, float | None]:
-    """PSNR in dB and SSIM of an image against the clean one of the same shape, and both again after development.
+    """Compute PSNR in dB and SSIM of an image against the clean one of its shape, and both again after development.
 
     ``image`` has the form of the trial's domain: ``(1, 4, h, w)`` or ``(1, 3, H, W)``.
     """
@@ -181,7 +181,7 @@ def compare(image: Tensor, trial: Trial) -> tuple[float, float, float | None, fl
 
 
 def group_rows(rows: Iterable[Row], key: str = "denoiser") -> dict[str, list[Row]]:
-    """Rows by their denoiser, or by another of their attributes, in their order."""
+    """Group rows by their denoiser, or by another of their attributes, in their order."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(getattr(row, key), []).append(row)
@@ -190,17 +190,17 @@ def group_rows(rows: Iterable[Row], key: str = "denoiser") -> dict[str, list[Row
 
 
 def summary(rows: Iterable[Row], noisy: Iterable[Row] = ()) -> dict[str, Any]:
-    """The scores of one denoiser as JSON.
+    """Summarise the scores of one denoiser as JSON.
 
     Args:
-        rows: one a trial.
+        rows: one row per trial.
         noisy: the rows of the input on the same trials, in the same order.
 
     Returns:
-        ``images``, the scores of each; the mean of each of :data:`METRICS`, and of its worst and best 25%; the same of
+        ``images``, the scores of each; the mean of each of :data:`METRICS`, and of its worst and best 25%; the same for
         the noisy input; ``own_noise``; ``levels_from_clean``, the number of images whose noise levels were
         measured against the clean frame; and ``no_numbers``, which names scores that are infinite or NaN, such as the
-        PSNR of two equal frames. What does not apply is left out.
+        PSNR of two equal frames. Entries that do not apply are left out.
     """
     rows, noisy = list(rows), list(noisy)
     images = list(map(_image, rows))
@@ -224,7 +224,7 @@ def summary(rows: Iterable[Row], noisy: Iterable[Row] = ()) -> dict[str, Any]:
 
 
 def _add_means(result: dict[str, Any], key: str, rows: Sequence[Row], metric: str) -> list[str]:
-    """Add a metric of the rows to each image and its means to the result, as ``key``; the faults are returned."""
+    """Add a metric of the rows to each image and its means to the result, as ``key``; return the faults."""
     values = []
     faults = []
     for image, row in zip(result["images"], rows, strict=False):
@@ -246,7 +246,7 @@ def _add_means(result: dict[str, Any], key: str, rows: Sequence[Row], metric: st
 
 
 def _image(row: Row) -> dict[str, Any]:
-    """What the JSON says of an image besides its scores."""
+    """Describe an image for the JSON, besides its scores."""
     image: dict[str, Any] = {"name": row.frame}
     if row.levels is not None:
         image["shot_var"], image["read_var"] = row.levels
@@ -257,7 +257,7 @@ def _image(row: Row) -> dict[str, Any]:
 
 
 def _own_noise(rows: Sequence[Row], images: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """The references' own noise as a share of the squared error: of each image, in place, and of all together."""
+    """Compute the references' own noise as a share of the squared error: of each image, in place, and overall."""
     errors = []
     own = []
     for row, image in zip(rows, images, strict=True):
@@ -275,7 +275,7 @@ def _own_noise(rows: Sequence[Row], images: Sequence[dict[str, Any]]) -> dict[st
 
 
 def require_numbers(summaries: Iterable[Mapping[str, Any]]) -> None:
-    """Raise ValueError if summaries left out scores; called once all else is printed and written."""
+    """Raise ValueError if summaries left out scores; this is called after everything else is printed and written."""
     faults: list[str] = []
     for one in summaries:
         faults += [*one.get("broken", ()), *one.get("no_numbers", ())]

@@ -1,4 +1,4 @@
-r"""The tables of a page as files of their own: CSV for a spreadsheet or a script, LaTeX for a paper.
+r"""The tables of a page as separate files: CSV for a spreadsheet or a script, LaTeX for a paper.
 
 ``report.html`` has ``report_scores.csv`` and ``report_scores.tex`` beside it, and so on for each of its tables. The
 LaTeX needs no package; the best figures are bold.
@@ -34,8 +34,8 @@ def write_tables(page: Path, parts: Iterable[Mapping[str, Any]]) -> list[Path]:
     """Write each table of a page as CSV and as LaTeX beside it.
 
     Args:
-        page: the path of the page, after which the files are named.
-        parts: the parts of the page, see :meth:`rawaug.evaluation.page.Page.add`. Those without ``rows`` are no tables.
+        page: the path of the page, which gives the files their names.
+        parts: the parts of the page, see :meth:`rawaug.evaluation.page.Page.add`. Parts without ``rows`` are no tables.
 
     Returns:
         The paths of the files.
@@ -67,12 +67,12 @@ def _write_csv(path: Path, head: Sequence[str], rows: Mapping[str, Sequence[str]
 
 
 def latex_table(head: Sequence[str], rows: Mapping[str, Sequence[str]], best: Collection[tuple[str, int]] = ()) -> str:
-    r"""A table as a ``tabular`` of LaTeX.
+    r"""Format a table as a LaTeX ``tabular``.
 
     Args:
         head: the names of the columns.
         rows: the cells by the name of a row.
-        best: (row, column) of the cells in bold, columns being counted from 0 behind the name.
+        best: (row, column) of the cells in bold; columns are counted from 0 after the name.
 
     Example:
         >>> print(latex_table(["", "PSNR"], {"my_arm": ["40.1 ± 0.2"]}, {("my_arm", 0)}))

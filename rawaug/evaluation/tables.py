@@ -1,7 +1,7 @@
-"""Tables of scores: what their columns are, their cells, and how they are printed.
+"""Tables of scores: their columns, their cells, and how they are printed.
 
-A run has one entry a seed in the list of each arm: summaries by kind, ``plain`` and ``self_ensemble``, see
-:func:`rawaug.evaluation.scores.summary`. Several seeds make a mean and a standard deviation.
+A run has a list for each arm, with one entry per seed: summaries by kind, ``plain`` and ``self_ensemble``, see
+:func:`rawaug.evaluation.scores.summary`. Several seeds give a mean and a standard deviation.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ FIGURES = {
 """Headings by figure: of the mosaic, of its development, and the references' own share of the squared error."""
 
 WITHOUT_BEST = {"own_noise"}
-"""Figures of which the highest is not the best, so that none of their cells is marked."""
+"""Figures whose highest value is not the best, so that none of their cells is marked."""
 
 Runs = Mapping[str, Sequence[Mapping[str, Any]]]
-"""For each arm a list with one entry a seed: summaries by kind, ``plain`` and ``self_ensemble``."""
+"""A list for each arm with one entry per seed: summaries by kind, ``plain`` and ``self_ensemble``."""
 
 Columns = Mapping[str, tuple[str, str]]
-"""For each heading of a table the kind of summary, and the figure in it, that the column shows."""
+"""The kind of summary, and the figure in it, that the column under each heading of a table shows."""
 
 
 def _columns(kind: str) -> Columns:
@@ -60,9 +60,9 @@ _PRINTED: Columns = {
 
 
 class Table(NamedTuple):
-    """A table: its columns, cells by row, empty where a figure does not apply, and the best cells of columns.
+    """A table: its columns, cells by row, which are empty if a figure does not apply, and the best cells of columns.
 
-    A column has no best cell where its highest score comes of keeping the references' own noise.
+    A column has no best cell if its highest score comes from keeping the references' own noise.
     """
 
     columns: list[str]
@@ -71,7 +71,7 @@ class Table(NamedTuple):
 
 
 def table_of(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, columns: Columns) -> Table:
-    """The noisy input, other denoisers and the arms, without columns and rows that have no figure."""
+    """Make a table of the noisy input, other denoisers and the arms, without columns and rows that have no figure."""
     methods: dict[str, Sequence[Mapping[str, Any]]] = {"noisy input": [{"plain": _of_input(results)}]}
     for name, scores in (others or {}).items():
         methods[name] = [{"plain": scores}]
@@ -114,7 +114,7 @@ def _of_input(results: Runs) -> dict[str, Any]:
 
 
 def _best_rows(key: str, values: Mapping[str, Sequence[float]]) -> list[str]:
-    """The rows with the highest mean, as it is shown, in a column of several; none where less is better."""
+    """Find the rows with the highest mean, as shown, in a column of several; none if less is better."""
     means = {}
     for name, column in values.items():
         if column:
@@ -128,7 +128,7 @@ def _best_rows(key: str, values: Mapping[str, Sequence[float]]) -> list[str]:
 
 
 def _keeping_noise(methods: Runs) -> set[str]:
-    """The methods that score more than a perfect denoiser would, since they keep the references' own noise."""
+    """Find the methods that score more than a perfect denoiser would, since they keep the references' own noise."""
     names = set()
     for name, runs in methods.items():
         for run in runs:
@@ -139,7 +139,7 @@ def _keeping_noise(methods: Runs) -> set[str]:
 
 
 def first_runs(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
-    """The summary of every method by name; of an arm that of its first seed."""
+    """Get the summary of every method by name; for an arm, that of its first seed."""
     summaries = dict(others)
     for arm, runs in results.items():
         summaries[arm] = runs[0]["plain"]
@@ -172,7 +172,7 @@ def _digits(key: str) -> int:
 
 
 def mean_and_spread(values: Sequence[float], digits: int) -> str:
-    """``mean``, or ``mean ± standard deviation`` of several values."""
+    """Format ``mean``, or ``mean ± standard deviation`` of several values."""
     mean = f"{statistics.fmean(values):.{digits}f}"
     if len(values) < 2:
         return mean
@@ -181,7 +181,7 @@ def mean_and_spread(values: Sequence[float], digits: int) -> str:
 
 
 def _format_figure(key: str, value: float | None) -> str:
-    """The figure of a metric as tables have it; empty if there is none."""
+    """Format the figure of a metric for tables; empty if there is none."""
     if value is None:
         return ""
     if key == "own_noise":
@@ -191,7 +191,7 @@ def _format_figure(key: str, value: float | None) -> str:
 
 
 def join_figures(scores: Mapping[str, Any], first: str, second: str) -> str:
-    """Two figures in a cell; a dash stands for what is no number."""
+    """Format two figures for a cell; a dash stands for a missing number."""
     figure = _format_figure(first, scores.get(first)) or "-"
     other = _format_figure(second, scores.get(second)) or "-"
     return f"{figure} / {other}"
@@ -213,7 +213,7 @@ def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str
 
     for rows in sections:
         for row in rows:
-            table.add_row(*(Text(escape(cell)) for cell in row))  # Text: brackets are no markup
+            table.add_row(*(Text(escape(cell)) for cell in row))  # Text, since brackets are not markup here
         table.add_section()
 
     console = Console()
@@ -228,9 +228,9 @@ def print_cells(title: str, head: Sequence[str], cells: Mapping[str, Sequence[st
 
 
 def print_table(results: Runs, title: str, others: Mapping[str, Mapping[str, Any]] | None = None) -> None:
-    """Print PSNR and SSIM of every method: in RAW plain and by self-ensemble, and developed.
+    """Print PSNR and SSIM of every method: in RAW, plain and by self-ensemble, and developed.
 
-    ``results`` has one entry a seed in an arm's list, ``others`` a summary by name.
+    ``results`` has one entry per seed in an arm's list, ``others`` a summary by name.
     """
     table = table_of(results, others, _PRINTED)
     print_cells(title, ["arm", *table.columns], table.rows)
@@ -282,7 +282,7 @@ def _figures(scores: Mapping[str, Any], keys: Sequence[str], end: str = "") -> l
 
 
 def levels_note(summary: Mapping[str, Any]) -> str:
-    """A line on scores whose noise levels came from the clean frames; empty if there are none."""
+    """Make a note on scores whose noise levels came from the clean frames; empty if there are none."""
     flagged = summary.get("levels_from_clean")
     if not flagged:
         return ""

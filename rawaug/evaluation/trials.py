@@ -1,11 +1,11 @@
-r"""Trials: a frame with its frozen noise, read and drawn once, and all that a score of it needs.
+r"""Trials: a frame with its frozen noise, read and drawn once, and everything that scoring it requires.
 
-A test case is what was captured, or noise that is keyed by (seed, name) on a clean frame. A denoiser is given
-:attr:`Trial.input` alone; the clean image, and all that follows from it, stays with the trial.
+A test case is a captured noisy frame, or a clean frame with noise that is keyed by (seed, name). A denoiser is given
+:attr:`Trial.input` alone; the clean image, and everything derived from it, stays with the trial.
 
-A "clean" reference is a photograph, ``r = x + m``, with noise m of its own. An error against it is ``|d - x|^2 +
-|m|^2`` as far as m is independent of the denoised d, so that even a perfect denoiser has the variance of m left. Binned
-K x K by colour site (:func:`rawaug.bayer.bin_mosaic`) references have about 1 / K^2 of it.
+A "clean" reference is a photograph, ``r = x + m``, with its own noise m. An error against it is ``|d - x|^2 + |m|^2``
+as far as m is independent of the denoised d, so that even a perfect denoiser is left with the variance of m. References
+binned K x K by colour site (:func:`rawaug.bayer.bin_mosaic`) have about 1 / K^2 of it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ TEST_NOISE = "test noise"
 """The part of the key of test frames' noise that is the same for all of them."""
 
 _CACHE_MB = 1024
-"""Megabytes of trials that stay in memory; others are made again for each pass."""
+"""How many megabytes of trials stay in memory; others are made again for each pass."""
 
 _Case = TypeVar("_Case")
 
@@ -48,16 +48,16 @@ class Trial:
     Attributes:
         noisy: the input: packed RAW ``(1, 4, h, w)``, or sRGB ``(1, 3, H, W)`` in the domain ``srgb``.
         clean: the truth, in the form of ``domain``.
-        variance: of the noise of each value, at the noisy signal, shape of ``noisy``; None if it is not known.
+        variance: variance of the noise of each value at the noisy signal, in the shape of ``noisy``; None if unknown.
         frame: name of the frame.
         domain: the form in which results are compared with the truth.
-        condition: what the denoiser is told, or what the sensor does; rows carry it.
+        condition: what the denoiser is told, or how the sensor behaves; rows carry it.
         strength: the name of the noise's strength; rows carry it.
-        levels: (shot_var, read_var) that the denoiser is told, if the noise has any.
+        levels: (shot_var, read_var) that the denoiser is given, if the noise has any.
         cfa: the pattern of packed RAW, or of a mosaic ``(1, 1, H, W)`` in its place.
-        develop: makes sRGB ``(3, H, W)`` of an image like ``noisy`` or ``clean``, the same way for both; None for what
-            is developed already.
-        inputs: inputs of denoisers of other kinds of image, by what they take: for developed pictures, the RAW that
+        develop: makes sRGB ``(3, H, W)`` of an image like ``noisy`` or ``clean``, the same way for both; None for
+            images that are already developed.
+        inputs: inputs for denoisers of other kinds of image, by the kind: for developed pictures, the RAW that
             they were developed from.
         ways: functions from denoised RAW to ``domain``, by name; a denoiser that gives RAW is scored once for each.
         own: the mean variance of the noise that the reference itself has, if it is known.
@@ -81,26 +81,26 @@ class Trial:
 
     @property
     def input(self) -> Noisy:
-        """The input of a denoiser of this kind of image."""
+        """The input for a denoiser of this kind of image."""
         return Noisy(self.noisy, self.variance, self.levels, self.cfa)
 
     def input_for(self, denoiser: Any) -> Noisy:
-        """The input of this denoiser: a denoiser of RAW gets the RAW that a picture was developed from."""
+        """The input for this denoiser: a denoiser of RAW gets the RAW that a picture was developed from."""
         return self.inputs.get(denoiser.takes, self.input)
 
     def compared(self, image: Tensor) -> Tensor:
-        """An image in the form of ``domain`` as scores compare it: packed RAW as the mosaic, others as they are."""
+        """Convert an image in the form of ``domain`` for scores: packed RAW to the mosaic, others stay as they are."""
         return bayer.unpack_if_packed(image, self.cfa)
 
 
 def trial_of(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: int = 0, **about: Any) -> Trial:
-    """A frame as a test case in the domain ``raw``: its own captured noise, or noise keyed by (seed, name).
+    """Make a test case of a frame in the domain ``raw``, with its captured noise or noise keyed by (seed, name).
 
     Args:
-        pair: the frame; levels of a capture that states none are measured against its clean version.
-        noise: drawn for frames without a noisy capture.
-        cfa: the pattern to pack by, if another than the frame's.
-        seed: of the drawn noise.
+        pair: the frame; if its capture states no levels, they are measured against its clean version.
+        noise: the noise to draw for frames without a noisy capture.
+        cfa: the pattern to pack by, if it is not the frame's.
+        seed: seed of the drawn noise.
         about: other attributes, such as ``condition``.
     """
     pair = pair.with_levels()
@@ -116,13 +116,13 @@ def trial_of(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: 
 
 
 def freeze_noise(clean: Tensor, noise: NoiseModel, seed: int, *key: str) -> tuple[Tensor, Tensor, Levels | None]:
-    """Noise on a clean frame, the same for the same seed and key.
+    """Add noise to a clean frame, the same for the same seed and key.
 
     Args:
         clean: packed RAW ``(1, 4, h, w)``.
-        noise: what is drawn.
-        seed: of the test.
-        key: what the noise is for, and the name of the frame.
+        noise: the noise to draw.
+        seed: seed of the test.
+        key: the purpose of the noise, and the name of the frame.
 
     Returns:
         Noisy RAW and the variance of its noise, both ``(1, 4, h, w)``, and (shot_var, read_var) if the noise has any.
@@ -139,13 +139,13 @@ def freeze_noise(clean: Tensor, noise: NoiseModel, seed: int, *key: str) -> tupl
 def raw_trial(
     pair: Pair, noisy: Tensor, clean: Tensor, variance: Tensor, levels: Levels | None, cfa: CFA, **about: Any
 ) -> Trial:
-    """Packed RAW of a frame as a trial that is developed with the frame's colours.
+    """Make a trial, developed with the frame's colours, of packed RAW of the frame.
 
     Args:
         pair: the frame.
         noisy: ``(1, 4, h, w)``.
         clean: ``(1, 4, h, w)``.
-        variance: of the noise, ``(1, 4, h, w)``.
+        variance: variance of the noise, ``(1, 4, h, w)``.
         levels: (shot_var, read_var) of the noise, if it has any.
         cfa: the pattern by which all three are packed.
         about: other attributes of the trial.
@@ -159,13 +159,13 @@ def raw_trial(
 
 
 def make_trials(cases: Sequence[_Case], make: Callable[[_Case], Trial]) -> Sequence[Trial]:
-    """``make(case)`` of every case, made at its first use and kept in memory, up to a gigabyte."""
+    """Make the trial ``make(case)`` of every case at its first use, and keep up to a gigabyte of them in memory."""
     trials: Any = Cached(cases, _CACHE_MB, make)
     return trials
 
 
 def evenly_spaced(length: int, most: int) -> list[int]:
-    """At most ``most`` of the indices of a sequence of this length, evenly spaced from the first.
+    """Choose at most ``most`` indices of a sequence of this length, evenly spaced from the first.
 
     Example:
         >>> evenly_spaced(10, 4)
@@ -201,7 +201,7 @@ class Measured(SomePairs):
         self.measured = set(evenly_spaced(len(pairs), most))
 
     def read(self, index: int) -> Pair:
-        """The reference at ``index``, with its own noise if it is one of those that are measured."""
+        """Read the reference at ``index``, with its own noise if it is one of those that are measured."""
         pair = super().read(index)
         if index not in self.measured:
             return pair
@@ -210,7 +210,7 @@ class Measured(SomePairs):
 
 
 def own_noise_note(summaries: Mapping[str, Mapping[str, Any]]) -> str:
-    """A line on scores of which the references' own noise is a large part; empty if there are none."""
+    """Make a note on scores of which the references' own noise is a large part; empty if there are none."""
     shares = {}
     for name, scores in summaries.items():
         share = scores.get("own_noise", 0.0)
@@ -229,7 +229,7 @@ def own_noise_note(summaries: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def added_noise_note(trials: Iterable[Trial]) -> str:
-    """A line that warns of noise hardly stronger than that of the references; empty if it is much stronger."""
+    """Make a warning of noise hardly stronger than that of the references; empty if it is much stronger."""
     own_variances = []
     test_variances = []
     for trial in trials:
@@ -252,15 +252,15 @@ def added_noise_note(trials: Iterable[Trial]) -> str:
 
 
 def training_noise_note(pairs: Sequence[Pair], noise: NoiseModel, arms: Sequence[str]) -> str:
-    """A line that warns of clean training frames with much noise of their own, which a network learns to keep.
+    """Make a warning of clean training frames with much noise of their own, which a network learns to keep.
 
     Args:
-        pairs: the training frames. Those with a noisy capture are left out, since its noise is another one.
-        noise: what is added to the others.
+        pairs: the training frames. Frames with a noisy capture are left out, since their noise is different.
+        noise: the noise that is added to the others.
         arms: the names of the arms that train on them.
 
     Returns:
-        The line; empty if there are no such frames or arms, or their noise is weak or cannot be measured.
+        The warning; empty if there are no such frames or arms, or their noise is weak or cannot be measured.
     """
     if not arms:
         return ""

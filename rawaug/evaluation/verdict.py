@@ -1,14 +1,14 @@
 r"""The verdict of a comparison: which method to use, or why the test cannot say.
 
-A photograph that serves as the clean reference, :math:`r = x + m`, has noise m of its own, of variance n. The test adds
+A photograph that serves as the clean reference, :math:`r = x + m`, has its own noise m, of variance n. The test adds
 noise w of variance v. A perfect denoiser returns x and scores n; a method that keeps some of m scores better than that,
 down to
 
 .. math:: \min_h \operatorname{E} (h (m + w) - m)^2 = \frac{n v}{n + v},
 
-so that up to :math:`n - n v / (n + v) = n^2 / (n + v)` of any difference between two methods may be kept noise. Where
-the best method scores more than a perfect denoiser, or leads by less than that, the test decides nothing. Nor does it
-where one method leads in RAW and the other after development.
+so that up to :math:`n - n v / (n + v) = n^2 / (n + v)` of any difference between two methods may be kept noise. If the
+best method scores more than a perfect denoiser, or leads by less than that, the test decides nothing. Nor does it if
+one method leads in RAW and the other after development.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _MATTERS = 0.05
 """Minimum gain in dB for preferring a trained arm to a method without training."""
 
 _INPUT = "the noisy input"
-"""The name of the noisy input where no other method was scored."""
+"""The name of the noisy input, which is used if no other method was scored."""
 
 CLEANER_TEST = "bin the references (bin 4), or add the noise of a higher ISO"
 """Advice for making a test less sensitive to the noise of its references."""
@@ -38,7 +38,7 @@ class Verdict(NamedTuple):
 
     Attributes:
         use: the name of the recommended method; empty if nothing is recommended.
-        sentence: the recommendation or the reason why there is none; empty if nothing has a PSNR.
+        sentence: the recommendation or the reason why there is none; empty if no method has a PSNR.
     """
 
     use: str
@@ -46,10 +46,10 @@ class Verdict(NamedTuple):
 
 
 def verdict(results: Mapping[str, Sequence[Mapping[str, Summary]]], others: Mapping[str, Summary]) -> Verdict:
-    """Compare the arm of the highest mean PSNR with the best of the other methods.
+    """Compare the arm with the highest mean PSNR with the best of the other methods.
 
     Args:
-        results: by arm, one entry a seed, with the summary ``plain``.
+        results: by arm, one entry per seed, with the summary ``plain``.
         others: summaries of methods that were not trained, by name. Without any, the arm is compared with the noisy
             input.
 
@@ -104,7 +104,7 @@ def _mean(runs: Sequence[Summary], key: str) -> float:
 
 
 def _best_rival(others: Mapping[str, Summary]) -> tuple[str, Summary]:
-    """The name and scores of the method of the highest PSNR; an empty name if none has one."""
+    """Find the name and scores of the method with the highest PSNR; an empty name if none has one."""
     rival = ""
     for name, summary in others.items():
         if "psnr" in summary and (not rival or summary["psnr"] > others[rival]["psnr"]):
@@ -125,7 +125,7 @@ def _of_input(summary: Summary) -> dict[str, Any]:
 
 
 def _gain_srgb(runs: Sequence[Summary], rival: Summary) -> float | None:
-    """The mean gain over the rival after development; None where something was not developed."""
+    """Compute the mean gain over the rival after development; None if something was not developed."""
     if not all("psnr_srgb" in scores for scores in (*runs, rival)):
         return None
 
@@ -133,7 +133,7 @@ def _gain_srgb(runs: Sequence[Summary], rival: Summary) -> float | None:
 
 
 def _how_sure(runs: Sequence[Summary], rival: Summary, gain: float) -> str:
-    """A clause that compares the gain with the spread of the seeds, or counts frames if there is one seed."""
+    """Compare the gain with the spread of the seeds in a clause, or count frames if there is one seed."""
     if len(runs) > 1:
         spread = stdev(run["psnr"] for run in runs)
         relation = "more than"
@@ -151,7 +151,7 @@ def _how_sure(runs: Sequence[Summary], rival: Summary, gain: float) -> str:
 
 
 def _arms_as_good(arm: str, runs_by_arm: Mapping[str, Sequence[Summary]]) -> list[str]:
-    """The other arms whose mean is lower than that of ``arm`` by no more than the larger deviation of the seeds."""
+    """List the other arms whose mean is below that of ``arm`` by no more than the larger deviation of the seeds."""
     scores = {}
     for name, runs in runs_by_arm.items():
         if len(runs) > 1:
@@ -170,7 +170,7 @@ def _arms_as_good(arm: str, runs_by_arm: Mapping[str, Sequence[Summary]]) -> lis
 
 
 def _disagreement(arm: str, rival: str, gain: float, gain_srgb: float | None) -> str:
-    """Why RAW and developed scores decide nothing together; empty where they agree."""
+    """Explain why RAW and developed scores together decide nothing; empty if they agree."""
     if gain_srgb is None:
         return ""
 
@@ -186,7 +186,7 @@ def _disagreement(arm: str, rival: str, gain: float, gain_srgb: float | None) ->
 
 
 def _kept_noise(arm: str, runs: Sequence[Summary], rival: str, other: Summary) -> str:
-    """Why the references' own noise leaves the comparison open; empty where it does not."""
+    """Explain why the references' own noise leaves the comparison open; empty if it does not."""
     best = max(runs, key=lambda run: run["psnr"])
     name, scores = arm, best
     if other["psnr"] > best["psnr"]:
@@ -215,7 +215,7 @@ def _kept_noise(arm: str, runs: Sequence[Summary], rival: str, other: Summary) -
 
 
 def _noise_of_references(summary: Summary) -> tuple[float | None, float | None]:
-    """The mean variance of the references' own noise and that of the noise added to them; None if not known."""
+    """Get the mean variance of the references' own noise and of the noise added to them; None if not known."""
     own_variances = []
     test_variances = []
     for image in summary["images"]:
@@ -229,7 +229,7 @@ def _noise_of_references(summary: Summary) -> tuple[float | None, float | None]:
 
 
 def _squared_error(psnr: float) -> float:
-    """The mean squared error at a PSNR in dB."""
+    """Compute the mean squared error at a PSNR in dB."""
     return float(10.0 ** (-psnr / 10.0))
 
 

@@ -1,7 +1,7 @@
-"""The folder of a run, ``OUT/NAME``, which holds one run alone.
+"""The folder of a run, ``OUT/NAME``, which holds only that run.
 
-``run.json`` in it has the run's settings. The same settings resume it; others are refused, but for those that change
-no result.
+Its file ``run.json`` has the run's settings. The same settings resume the run; others are refused, except for those
+that change no result.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from rawaug.files import LOCK, require_writable, write_json
 from rawaug.training.config import SAME_WEIGHTS
 
 STAMP = "run.json"
-"""The file with the settings of a run."""
+"""This file has the settings of a run."""
 
 _FREE = frozenset({"name", "out", "device", "devices", "seeds", "self_ensemble", "views"})
-"""Keys that may change when a run is resumed, as they do not change its results."""
+"""These keys may change when a run is resumed, as they do not change its results."""
 
 _FREE_ANYWHERE = SAME_WEIGHTS | {"memory_mb"}
-"""Keys in parts of the recipe that may change when a run is resumed."""
+"""These keys in parts of the recipe may change when a run is resumed."""
 
 _SHOWN = 3
-"""Maximum number of changed keys that an error names."""
+"""An error names at most this many changed keys."""
 
 
 def run_folder(settings: Any) -> Path:
-    """``OUT/NAME`` of a recipe; ValueError if the name leads out of OUT."""
+    """Return ``OUT/NAME`` of a recipe; raise ValueError if the name leads out of OUT."""
     out, name = Path(settings.out), Path(settings.name)
     if name.is_absolute() or ".." in name.parts or not name.parts:
         raise ValueError(
@@ -40,7 +40,7 @@ def run_folder(settings: Any) -> Path:
 
 
 def require_free(settings: Any, overwrite: bool = False) -> Path:
-    """The folder of a run; ValueError unless it can be written, and is empty, this run's, or to be replaced."""
+    """Return a run's folder; raise ValueError unless it is writable, and empty, this run's or to be replaced."""
     folder = run_folder(settings)
     require_writable(folder, folder=True)
     if overwrite or not _holds_results(folder):
@@ -73,7 +73,7 @@ def require_free(settings: Any, overwrite: bool = False) -> Path:
 
 
 def _holds_results(folder: Path) -> bool:
-    """Whether a folder has more than a run has as it begins, or left when it was killed there."""
+    """Tell whether a folder has more in it than a run has when it begins, or leaves if it is killed then."""
     if not folder.is_dir():
         return False
 
@@ -81,14 +81,14 @@ def _holds_results(folder: Path) -> bool:
 
 
 def claim(settings: Any, overwrite: bool = False) -> Path:
-    """The folder of a run with the run's settings in it; ValueError if it is another run's."""
+    """Return the folder of a run, with its settings written there; raise ValueError if it is another run's."""
     folder = require_free(settings, overwrite)
     write_json(asdict(settings), folder / STAMP)
     return folder
 
 
 def _flatten(value: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys, as on the command line, and their values; an empty mapping counts as none."""
+    """Yield dotted keys, as on the command line, and their values; an empty mapping counts as none."""
     for key, inner in value.items():
         if not isinstance(inner, Mapping):
             yield f"{above}{key}", inner

@@ -1,4 +1,4 @@
-"""The data of a run: opened and divided, but not yet read, so that everything that is missing is found at once."""
+"""The data of a run. It is opened and divided, but not yet read, so that everything missing is found at once."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.noisy_frames import noise_of
 
 _MOST_HELD_OUT = 16
-"""Maximum number of frames that are held out for validation; it is a fifth of them, and at least one."""
+"""At most this many frames are held out for validation: a fifth of them, and at least one."""
 
 _GIVEN = "given pairs"
-"""The value of ``data.pairs``, ``data.validation`` or ``data.test`` in the results of pairs given from Python."""
+"""``data.pairs``, ``data.validation`` and ``data.test`` have this value in the results of pairs given from Python."""
 
 _MARGIN = 6
-"""Pixels by which a frame is larger than the crops of it, which are turned and shifted to a pattern."""
+"""A frame is larger than its crops by this many pixels, as they are turned and shifted to a pattern."""
 
 _NAMED = 6
 
@@ -35,9 +35,9 @@ class Inputs:
     """The data of a run.
 
     Attributes:
-        pairs: what the ISP is fitted to, and real training frames.
-        validation: what chooses the weights.
-        test: what the result is scored on.
+        pairs: the frames that the ISP is fitted to and that are real training frames.
+        validation: the frames that choose the weights.
+        test: the frames that the result is scored on.
         pictures: sRGB pictures to make RAW of.
         available: the number of frames that ``pairs``, ``validation`` and ``test`` were taken from.
         held_out: whether ``validation`` is a part of ``pairs``.
@@ -51,7 +51,7 @@ class Inputs:
     held_out: bool
 
     def lines(self, recipe: Recipe) -> list[str]:
-        """The number and the names of the frames of each part of the run, a line each, for the user to check."""
+        """List the number and the names of the frames of each part of the run, a line each, for the user to check."""
         data = recipe.data
         of_pairs, of_validation, of_test = self.available
 
@@ -79,9 +79,9 @@ class Inputs:
         ]
 
     def read(self) -> tuple[Inputs, list[str]]:
-        """The data without the frames that cannot be read, and lines that name these.
+        """Leave out the frames that cannot be read; return the data without them, and lines that name them.
 
-        All frames are read once: a damaged one is better found now than after the training.
+        All frames are read once, since it is better to find a damaged one now than after the training.
         """
         pairs, validation, test = Readable(self.pairs), Readable(self.validation), Readable(self.test)
         readable_pairs = list(pairs)
@@ -95,13 +95,13 @@ class Inputs:
 
 
 def _listing(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
-    """Tell which frames of a dataset are used, as in ``"2 of 8 of demo:train: a, b"``.
+    """Say which frames of a dataset are used, as in ``"2 of 8 of demo:train: a, b"``.
 
     Args:
-        frames: what is used.
+        frames: the frames that are used.
         available: the number of frames that they are taken from.
-        source: its name.
-        most: the number of frames that are named.
+        source: name of the dataset.
+        most: largest number of frames that are named.
     """
     names = names_of(frames)
     text = ", ".join(names[:most])
@@ -115,7 +115,7 @@ def _listing(frames: Sequence[Pair], available: int, source: Any, most: int = _N
 
 
 def open_inputs(recipe: Recipe, frames: Mapping[str, Sequence[Pair]], task: Task | None = None) -> Inputs:
-    """Open and divide the data that a recipe names, or that ``frames`` has in their place; no frame is read.
+    """Open and divide the data that a recipe names, or those in ``frames`` instead; no frame is read.
 
     Raises:
         FileNotFoundError: if there are no such data.
@@ -153,7 +153,7 @@ def open_inputs(recipe: Recipe, frames: Mapping[str, Sequence[Pair]], task: Task
 
 
 def _number_held_out(available: int) -> int:
-    """The number of frames that are held out of those available; none of a single one."""
+    """Compute how many of the available frames are held out; of a single one, none is."""
     if available < 2:
         return 0
 
@@ -168,7 +168,7 @@ def _require_unseen(test: Sequence[Any], frames: Sequence[Any], part: str) -> No
 
 
 def _open_pictures(data: DataConfig, pairs: Sequence[Pair], crop: int) -> Any:
-    """The pictures to make RAW of, those of the pairs or others, cached as far as the recipe says."""
+    """Open the pictures to make RAW of, from the pairs or elsewhere, cached as far as the recipe says."""
     pictures: Any = PairPictures(pairs)
     if data.pictures != OWN_PICTURES:
         pictures = open_pictures(data.pictures, crop + _MARGIN, data.max_pixels)
@@ -183,13 +183,13 @@ def _open_pictures(data: DataConfig, pairs: Sequence[Pair], crop: int) -> Any:
 
 
 def use_all_pairs(recipe: Recipe, content: Mapping[str, Any], keys: Collection[str]) -> Recipe:
-    """The recipe with all of the pairs that replace its own, a part of which is held out to validate on.
+    """Let the recipe use all of the pairs that replace its own; some of them are held out for validation.
 
-    What its file says of ``data.count`` and ``data.validation`` is about its own pairs; a validation of null stays.
+    ``data.count`` and ``data.validation`` in its file are about its own pairs; a validation of null stays.
 
     Args:
-        recipe: with the user's values.
-        content: what its file says.
+        recipe: the recipe with the user's values.
+        content: the content of its file.
         keys: the dotted keys that the user has set.
     """
     data = recipe.data
@@ -206,16 +206,16 @@ def use_all_pairs(recipe: Recipe, content: Mapping[str, Any], keys: Collection[s
 
 
 def _dataset(spec: str | None) -> str | None:
-    """The dataset that a spec names; each folder counts as a dataset."""
+    """Find the dataset that a spec names; each folder counts as a dataset."""
     kind, colon, _ = (spec or "").partition(":")
-    if colon and len(kind) > 1 and kind != "pairs":  # one letter is a drive of Windows
+    if colon and len(kind) > 1 and kind != "pairs":  # one letter is a Windows drive
         return kind
 
     return spec
 
 
 def name_given_pairs(recipe: Recipe, frames: Mapping[str, Sequence[Pair]]) -> Recipe:
-    """The recipe with :data:`_GIVEN` as the name of data that are given; if pairs alone are, some are held out."""
+    """Name given data :data:`_GIVEN` in the recipe; if only pairs are given, some of them are held out."""
     names: dict[str, Any] = dict.fromkeys(frames, _GIVEN)
     if "pairs" in frames and "validation" not in frames and recipe.data.validation is not None:
         names["validation"] = HELD_OUT
@@ -227,7 +227,7 @@ def name_given_pairs(recipe: Recipe, frames: Mapping[str, Sequence[Pair]]) -> Re
 
 
 def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[Pair]) -> None:
-    """Raise ValueError unless the frames, as they were read, have what the fit and the arms need of them."""
+    """Raise ValueError unless the frames, as they were read, have what the fit and the arms need."""
     real = {name: arm for name, arm in recipe.arms.items() if arm.augmented < 1.0}
 
     for pair in pairs:

@@ -12,18 +12,18 @@ from rawaug.registry import Registry, suggest
 from rawaug.tasks.base import TASKS
 
 EXPERIMENTS = Registry("experiment", "rawaug.experiments", "rawaug.paper")
-"""The experiments that are no tasks, by the name in a recipe's key ``experiment``.
+"""This maps the name in a recipe's key ``experiment`` to an experiment, except for tasks.
 
-They are functions ``run(settings, overwrite)``. ``settings`` is a dataclass of the recipe's keys, whose method
+Experiments are functions ``run(settings, overwrite)``. ``settings`` is a dataclass of the recipe's keys, whose method
 ``shortest()`` gives the settings of a dry run.
 """
 
 _DEFAULT_KIND = "raw"
-"""The kind of a recipe without the key ``experiment``."""
+"""A recipe without the key ``experiment`` is of this kind."""
 
 
 def read_recipe(file: str | Path) -> dict[str, Any]:
-    """The keys and values of a YAML file; ValueError if it is no recipe, or has aliases or too many bytes."""
+    """Read a YAML file's keys and values; raise ValueError if it is no recipe, has aliases or is too large."""
     content = read_yaml(file, "recipe") or {}
     if not isinstance(content, dict):
         raise ValueError(f"{file}: not a recipe: it must hold keys and values")
@@ -32,7 +32,7 @@ def read_recipe(file: str | Path) -> dict[str, Any]:
 
 
 def kind_of(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
-    """The kind of experiment that a recipe is for; ValueError, which names the file, if there is no such kind."""
+    """Find the kind of experiment that a recipe is for; raise ValueError, with the file's name, if it is unknown."""
     kind = content.get("experiment", _DEFAULT_KIND)
     if kind not in kinds():
         raise ValueError(f"{file}: unknown experiment {kind!r:.80}; use one of {', '.join(kinds())}")
@@ -41,12 +41,12 @@ def kind_of(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
 
 
 def kinds() -> list[str]:
-    """The kinds of experiment: the tasks and the comparisons of methods, each named after its file."""
+    """List the kinds of experiment: the tasks and the comparisons of methods, each named after its file."""
     return [*TASKS, *EXPERIMENTS]
 
 
 def settings_of(kind: str) -> type[Any]:
-    """The dataclass with the keys of a kind of experiment: a task's, or the type of a function's first argument."""
+    """Find the dataclass with a kind's keys: a task's, or the type of a function's first argument."""
     if kind in TASKS:
         settings: type[Any] = TASKS[kind].settings
         return settings
@@ -55,9 +55,9 @@ def settings_of(kind: str) -> type[Any]:
 
 
 def shipped_recipes() -> dict[str, Path]:
-    """The recipes that travel with the package, by name."""
+    """List the recipes that are shipped with the package, by name."""
     folder = Path(str(resources.files("rawaug"))) / "recipes"
-    if not folder.is_dir():  # a clone, in which they lie beside the package
+    if not folder.is_dir():  # this is a clone, where they lie next to the package
         folder = Path(__file__).parents[2] / "recipes"
 
     recipes = {}
@@ -69,9 +69,9 @@ def shipped_recipes() -> dict[str, Path]:
 
 
 def recipe_list() -> str:
-    """The names of the shipped recipes and the first lines of their files, a line each."""
+    """List the names of the shipped recipes and the first lines of their files, a line each."""
     recipes = shipped_recipes()
-    names = sorted(recipes, key=lambda name: ("/" in name, name))  # those at the top first
+    names = sorted(recipes, key=lambda name: ("/" in name, name))  # those at the top come first
     width = max(map(len, names)) + 2
 
     lines = []
@@ -84,7 +84,7 @@ def recipe_list() -> str:
 
 
 def find_recipe(name: str) -> Path:
-    """The path of a recipe: a file, or one that travels with the package, by its name with or without ``.yaml``.
+    """Find a recipe: a file, or a shipped one by its name with or without ``.yaml``.
 
     Raises:
         FileNotFoundError: if there is no such recipe.

@@ -30,15 +30,15 @@ from rawaug.tasks.settings import Recipe
 
 
 class Report:
-    """The scores of a run as they come.
+    """The scores of a run, collected as they come.
 
     Args:
         experiment: the run.
 
     Attributes:
-        networks: by arm, of the last seed.
-        tables: by table and arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``.
-        noise_note: a line on training frames with much noise of their own; empty if there are none.
+        networks: the networks of the last seed, by arm.
+        tables: by table and arm, one entry for each seed: the summaries ``plain`` and ``self_ensemble``.
+        noise_note: a line on training frames that have much noise themselves; empty if there are none.
     """
 
     def __init__(self, experiment: Experiment) -> None:
@@ -48,14 +48,14 @@ class Report:
         self.noise_note = ""
 
     def add(self, arm: str, network: Denoiser, scores: Mapping[str, Summaries]) -> None:
-        """Add the scores of an arm with one more seed."""
+        """Add the scores of an arm for one more seed."""
         self.networks[arm] = network
         for group, summaries in scores.items():
             self.tables.setdefault(group, {}).setdefault(arm, []).append(summaries)
 
     @property
     def results(self) -> Results:
-        """The scores as ``results.json`` has them; of a process that writes nothing, arms without entries."""
+        """Return the scores as in ``results.json``; in a process that writes nothing, arms have no entries."""
         if not self.tables:
             return {arm: [] for arm in self.experiment.recipe.arms}
 
@@ -71,7 +71,7 @@ def write_report(report: Report, camera: Camera) -> None:
         camera: the ISP, noise and trials of the last seed.
 
     Raises:
-        ValueError: if a score is no number; everything else is written before.
+        ValueError: if a score is not a number; everything else has been written by then.
     """
     experiment = report.experiment
     recipe, task, folder = experiment.recipe, experiment.task, experiment.folder
@@ -110,7 +110,7 @@ def write_report(report: Report, camera: Camera) -> None:
 
 
 def say(*lines: str) -> None:
-    """Print what is not empty, in the process that writes."""
+    """Print the lines that are not empty, in the process that writes."""
     text = "\n".join(filter(None, lines))
     if text and is_leader():
         print(text)
@@ -120,7 +120,7 @@ def say(*lines: str) -> None:
 
 
 def _write_results(report: Report, others: Mapping[str, Mapping[str, Any]]) -> Path:
-    """Write ``results.json``; the path."""
+    """Write ``results.json`` and return its path."""
     experiment = report.experiment
     tables = {}
     for group, results in report.tables.items():
@@ -137,7 +137,7 @@ def _write_results(report: Report, others: Mapping[str, Mapping[str, Any]]) -> P
 
 
 def _choose_methods(report: Report, camera: Camera) -> dict[str, list[Any]]:
-    """The denoisers that arms are compared with, by table."""
+    """Choose the denoisers that arms are compared with, by table."""
     experiment = report.experiment
     arm = next(iter(experiment.recipe.arms))
     methods = {}
@@ -149,7 +149,7 @@ def _choose_methods(report: Report, camera: Camera) -> dict[str, list[Any]]:
 
 
 def _all_first_runs(report: Report, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
-    """The summary of every method by name and table, of an arm that of its first seed."""
+    """Collect the summary of every method by name and table; an arm has that of its first seed."""
     runs = {}
     for group, results in report.tables.items():
         for name, scores in first_runs(results, others[group]).items():
@@ -159,12 +159,12 @@ def _all_first_runs(report: Report, others: Mapping[str, Mapping[str, Any]]) -> 
 
 
 def _with_group(name: str, group: str) -> str:
-    """The name of a row, with that of its table where there are several."""
+    """Name a row, with its table if there are several."""
     return ", ".join(filter(None, [name, group]))
 
 
 def _require_all_numbers(report: Report, others: Mapping[str, Mapping[str, Any]]) -> None:
-    """Raise ValueError if a score of any table is no number."""
+    """Raise ValueError if a score of any table is not a number."""
     summaries: list[Mapping[str, Any]] = []
     for group, results in report.tables.items():
         for runs in results.values():
@@ -179,7 +179,7 @@ def _require_all_numbers(report: Report, others: Mapping[str, Mapping[str, Any]]
 
 
 def _title_of(experiment: Experiment) -> str:
-    """The title of tables and page: what was tested on what."""
+    """Write the title of the tables and the page, which says what was tested on what."""
     recipe, task = experiment.recipe, experiment.task
     settings = f"real pairs: {len(experiment.inputs.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
     title = f"{recipe.name} tested on {recipe.data.test} ({settings})"
@@ -187,7 +187,7 @@ def _title_of(experiment: Experiment) -> str:
 
 
 def _lead_of(verdicts: Mapping[str, Verdict]) -> str:
-    """The verdict of every table in a sentence each."""
+    """Write the verdict of each table as a sentence."""
     sentences = []
     for group, one in verdicts.items():
         sentences.append(": ".join(filter(None, [group, one.sentence])))
@@ -196,7 +196,7 @@ def _lead_of(verdicts: Mapping[str, Verdict]) -> str:
 
 
 def _facts_of(report: Report, others: Mapping[str, Mapping[str, Any]], command: str) -> dict[str, Any]:
-    """What the page states besides the scores, by term; ``command`` is the line that ends a run."""
+    """Collect what the page states besides the scores, by term; ``command`` is the line that ends a run."""
     task = report.experiment.task
     return {
         "Noise": task.test_noise(),
@@ -207,7 +207,7 @@ def _facts_of(report: Report, others: Mapping[str, Mapping[str, Any]], command: 
 
 
 def _methods_of(recipe: Recipe, methods: Mapping[str, Sequence[Any]]) -> dict[str, str]:
-    """A line on each row of the tables, by its name; ``methods`` are the denoisers beside the arms, by table."""
+    """Write a line on each row of the tables, by name; ``methods`` are the denoisers besides arms, by table."""
     names: set[str] = set()
     for of_group in methods.values():
         for one in of_group:
@@ -227,7 +227,7 @@ def _methods_of(recipe: Recipe, methods: Mapping[str, Sequence[Any]]) -> dict[st
 
 
 def _explain(recipe: Recipe, label: str) -> str:
-    """What an arm is trained on, in a line."""
+    """Say in a line what an arm is trained on."""
     arm, network = recipe.arms[label], recipe.network_of(label)
     start = f"{network.name} from random weights"
     if network.start is not None:
@@ -248,7 +248,7 @@ def _explain(recipe: Recipe, label: str) -> str:
 
 
 def curves(experiment: Experiment) -> dict[str, bytes]:
-    """PNG files of the arms' loss and validation PSNR, by title."""
+    """Plot the arms' loss and validation PSNR as PNG files, by title."""
     logs = {}
     for arm in experiment.recipe.arms:
         logs[arm] = [experiment.arm_folder(arm, seed) / "log.csv" for seed in experiment.seeds]
@@ -257,7 +257,7 @@ def curves(experiment: Experiment) -> dict[str, bytes]:
 
 
 def _notes_on_losses(recipe: Recipe) -> list[str]:
-    """A note where the losses of arms are in different units."""
+    """Write a note if the losses of arms are in different units."""
     weighings = {recipe.loop_of(arm).weigh for arm in recipe.arms}
     if len(weighings) == 1:
         return []
@@ -266,7 +266,7 @@ def _notes_on_losses(recipe: Recipe) -> list[str]:
 
 
 def _shown_methods(report: Report, camera: Camera, methods: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
-    """The denoisers whose pictures are shown, by table: the first filter, trained denoisers, and the arms."""
+    """Choose the denoisers whose pictures are shown, by table: first filter, trained denoisers, arms."""
     experiment = report.experiment
     hidden = {spec_label(spec) for spec in experiment.classical[1:]}
 
@@ -284,7 +284,7 @@ def _shown_methods(report: Report, camera: Camera, methods: Mapping[str, Sequenc
 def usage(
     experiment: Experiment, tables: Mapping[str, Mapping[str, Sequence[Summaries]]], verdicts: Mapping[str, Verdict]
 ) -> list[str]:
-    """The files of weights, and the commands that use what the verdicts name; of an arm the best seed's."""
+    """List the files of weights and the commands for what the verdicts name; an arm has its best seed's."""
     lines = []
     for arm in experiment.recipe.arms:
         for seed in experiment.seeds:
@@ -299,7 +299,7 @@ def usage(
 
 
 def _command(experiment: Experiment, results: Mapping[str, Sequence[Summaries]], one: Verdict) -> str:
-    """The command that uses what a verdict recommends."""
+    """Write the command that uses what a verdict recommends."""
     if not one.use:
         return "to use: nothing is recommended, as the verdict says"
 

@@ -1,7 +1,7 @@
-"""A recipe, stage by stage: fit the ISP, train every arm, score it, report.
+"""The stages of a recipe in turn: fit the ISP, train every arm, score it, report.
 
-Each stage leaves a file in ``OUT/NAME``; a stage whose file was made with the same settings is skipped, so that
-a stopped run resumes.
+Each stage leaves a file in ``OUT/NAME``. A stage whose file was made with the same settings is skipped, so that a
+stopped run resumes.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ def run(
     validation: Sequence[Pair] | None = None,
     test: Sequence[Pair] | None = None,
 ) -> Results:
-    """Run a recipe; the results as in ``results.json``.
+    """Run a recipe and return its results, as in ``results.json``.
 
     Of several processes (``devices``) the first one writes; the others return no scores.
 
     Args:
-        recipe: what is run.
+        recipe: the recipe to run.
         overwrite: whether a run of this name with other settings is replaced; what does not depend on them is kept.
-        pairs: frames in place of those that ``data.pairs`` names. Without ``validation`` a part of them is held out.
+        pairs: frames in place of those that ``data.pairs`` names. Without ``validation``, a part of them is held out.
         validation: frames in place of those that ``data.validation`` names.
         test: frames in place of those that ``data.test`` names.
 
     Returns:
-        By arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``. Of a task with several tables, by
+        By arm, one entry for each seed: the summaries ``plain`` and ``self_ensemble``. If a task has several tables, by
         pattern or level, each of these has such results.
     """
     frames = {}
@@ -95,7 +95,7 @@ def run(
 
 
 def prepare(recipe: Recipe, overwrite: bool, frames: dict[str, Sequence[Pair]]) -> Experiment:
-    """An experiment with everything that could be missing or wrong opened or tried, before anything is fitted."""
+    """Prepare an experiment: open or try everything that could be missing or wrong, before anything is fitted."""
     recipe = name_given_pairs(recipe, frames)
     folder = require_free(recipe, overwrite)
     require_trainable(recipe.device, recipe.devices, recipe.train.precision, recipe.train.logger)
@@ -129,7 +129,7 @@ def prepare(recipe: Recipe, overwrite: bool, frames: dict[str, Sequence[Pair]]) 
 
 
 def _hide_clean_frames(recipe: Recipe, inputs: Inputs) -> Inputs:
-    """The inputs in memory; if no arm sees clean frames, nothing but the test knows one from here on."""
+    """Keep the inputs in memory; if no arm sees clean frames, only the test knows any from here on."""
     pairs = list(inputs.pairs)
     validation = inputs.validation
     if recipe.self_supervised:
@@ -144,7 +144,7 @@ def _hide_clean_frames(recipe: Recipe, inputs: Inputs) -> Inputs:
 
 
 def warn_of_noise(camera: Camera) -> str:
-    """Print notes on the frames' own noise; the one on training frames is returned, empty if there is none."""
+    """Print notes on the frames' own noise; return the one on training frames, which is empty if there is none."""
     if not is_leader():
         return ""
 
@@ -165,7 +165,7 @@ def warn_of_noise(camera: Camera) -> str:
 
 
 def find_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
-    """The classical denoisers of a recipe; BM3D is left out if its wheel is missing, which is printed if ``shown``.
+    """Find a recipe's classical denoisers, without BM3D if its wheel is missing; if ``shown``, that is printed.
 
     Raises:
         ValueError: if another filter's library is missing, or a filter or setting is unknown.
@@ -196,8 +196,8 @@ def dry_run(kind: str, settings: Any, overwrite: bool = False) -> None:
     """Print what data a training would use, and try the run in its shortest form in a temporary folder.
 
     Args:
-        kind: of the experiment.
-        settings: its recipe.
+        kind: kind of the experiment.
+        settings: the experiment's recipe.
         overwrite: as for the run itself.
     """
     folder = require_free(settings, overwrite)

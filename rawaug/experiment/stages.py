@@ -1,6 +1,6 @@
-"""The stages of a run: fit the ISP, train an arm, score it; and what they need to know.
+"""The stages of a run, which fit the ISP, train an arm and score it; and what they need to know.
 
-A stage writes a file and the hash of what the file depends on, and is skipped where the file has this hash already.
+A stage writes a file with the hash of everything that it depends on; it is skipped if the file already has this hash.
 """
 
 from __future__ import annotations
@@ -36,29 +36,29 @@ from rawaug.training.loop import train
 from rawaug.training.state import Start
 
 _PLAIN, _ENSEMBLE = "plain", "self_ensemble"
-"""The kinds of scores of a denoiser, in the order of tables."""
+"""A denoiser has these kinds of scores, in the order of tables."""
 
 Summaries = dict[str, dict[str, Any]]
-"""By :data:`_PLAIN` and :data:`_ENSEMBLE`, a summary of scores."""
+"""It maps :data:`_PLAIN` and :data:`_ENSEMBLE` to a summary of scores."""
 
 Results = dict[str, Any]
-"""By arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``; of several tables, by table first."""
+"""It has, by arm, summaries ``plain`` and ``self_ensemble`` for each seed; several tables come first."""
 
 
 @dataclass
 class Experiment:
-    """A recipe with everything that it names, opened.
+    """A recipe with everything that it names already opened.
 
     Attributes:
-        recipe: what is run.
-        task: what is special about its kind of image.
-        folder: of the run.
+        recipe: the recipe that is run.
+        task: everything that is special about its kind of image.
+        folder: folder of the run.
         inputs: the frames and pictures.
         unreadable: lines that name frames which cannot be read.
         classical: the filters to compare with.
         methods: the denoisers to compare with, see :meth:`rawaug.tasks.base.Task.open_methods`.
-        estimators: by arm.
-        starts: by arm, the weights that it continues from.
+        estimators: estimator of each arm.
+        starts: the weights that each arm continues from.
     """
 
     recipe: Recipe
@@ -77,7 +77,7 @@ class Experiment:
         return range(self.recipe.seed, self.recipe.seed + self.recipe.seeds)
 
     def arm_folder(self, arm: str, seed: int) -> Path:
-        """The folder of an arm's weights, log and scores."""
+        """Return the folder of an arm's weights, log and scores."""
         return self.folder / f"seed{seed}" / arm
 
 
@@ -86,11 +86,11 @@ class Camera:
     """The ISP and the noise of a seed, and the frames and trials that have this noise.
 
     Attributes:
-        experiment: whose frames these are.
+        experiment: the experiment that the frames belong to.
         isp: fitted with this seed, or the recipe's own.
-        noise: is added to clean RAW.
+        noise: the noise that is added to clean RAW.
         pairs: the real training frames, as the task's arms take them.
-        validation: the validation frames, likewise.
+        validation: the validation frames, in the same form.
         trials: the test frames with their noise.
     """
 
@@ -105,7 +105,7 @@ class Camera:
 
     @classmethod
     def of(cls, experiment: Experiment, isp: DictionaryISP) -> Camera:
-        """The recipe's noise, which an ISP may have measured, and the frames and trials that have it."""
+        """Make the recipe's noise, which an ISP may have measured, and the frames and trials that have it."""
         task, inputs = experiment.task, experiment.inputs
         noise = noise_for(isp, experiment.recipe.noise)
         pairs = task.training_frames(inputs.pairs, isp)
@@ -113,22 +113,22 @@ class Camera:
         return cls(experiment, isp, noise, pairs, validation, task.test_trials(inputs.test, isp, noise))
 
     def with_isp(self, isp: DictionaryISP) -> Camera:
-        """The camera with the ISP of another seed; frames and trials stay, unless the ISP has measured their noise."""
+        """Take the ISP of another seed; frames and trials stay, unless the ISP has measured their noise."""
         if self.experiment.recipe.noise == "camera":
             return Camera.of(self.experiment, isp)
 
         return replace(self, isp=isp, _watched={})
 
     def pattern(self, arm: str) -> CFA:
-        """The CFA that an arm is trained for."""
+        """Return the CFA that an arm is trained for."""
         return self.experiment.task.pattern(self.experiment.starts[arm], self.isp)
 
     def isp_of(self, arm: str) -> DictionaryISP:
-        """The ISP in the CFA that an arm is trained for."""
+        """Return the ISP in the CFA that an arm is trained for."""
         return change_cfa(self.isp, self.pattern(arm))
 
     def validation_trials(self, arm: str) -> Sequence[Trial]:
-        """The frozen samples by which the weights of an arm are chosen."""
+        """Make the frozen samples by which the weights of an arm are chosen."""
         cfa = self.pattern(arm)
         if cfa not in self._watched:
             task, pictures = self.experiment.task, self.experiment.inputs.pictures
@@ -137,7 +137,7 @@ class Camera:
         return self._watched[cfa]
 
     def noisy_rows(self, group: str) -> list[Row]:
-        """The scores of the input itself in a table."""
+        """Score the input itself in a table."""
         if not self._noisy:
             rows = score([self.experiment.task.input], self.trials)
             self._noisy.update(_group_by_table(self.experiment.task, rows))
@@ -146,7 +146,7 @@ class Camera:
 
 
 def is_leader() -> bool:
-    """Whether this is the one of several training processes that writes and evaluates."""
+    """Tell whether this is the training process, among several, that writes and evaluates."""
     with extra("train"):
         from lightning_fabric.utilities.rank_zero import rank_zero_only
 
@@ -154,7 +154,7 @@ def is_leader() -> bool:
 
 
 def change_cfa(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
-    """The ISP of the same camera behind a CFA: itself, or a copy if it had another."""
+    """Put the ISP of a camera behind a CFA: return itself, or a copy if it had another CFA."""
     if isp.cfa == cfa:
         return isp
 
@@ -167,7 +167,7 @@ def change_cfa(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
 
 
 def fit_isp(experiment: Experiment, seed: int) -> DictionaryISP:
-    """The ISP of the few pairs, or the recipe's own."""
+    """Fit the ISP to the few pairs, or take the recipe's own."""
     recipe, pairs = experiment.recipe, experiment.inputs.pairs
     if recipe.camera is not None:
         weights = find_weights(recipe.camera)
@@ -201,7 +201,7 @@ def fit_isp(experiment: Experiment, seed: int) -> DictionaryISP:
 
 
 def train_arm(experiment: Experiment, camera: Camera, arm: str, seed: int) -> Denoiser:
-    """The network of an arm, trained, or loaded if it has been trained with the same settings."""
+    """Train the network of an arm, or load it if it has been trained with the same settings."""
     recipe, inputs = experiment.recipe, experiment.inputs
     folder = experiment.arm_folder(arm, seed)
     path = folder / "denoiser.safetensors"
@@ -237,7 +237,7 @@ def train_arm(experiment: Experiment, camera: Camera, arm: str, seed: int) -> De
 
 
 def _info_of_arm(experiment: Experiment, camera: Camera, arm: str, seed: int, key: str) -> dict[str, Any]:
-    """What the file of an arm's weights says of its training."""
+    """Collect what the file of an arm's weights says about its training."""
     recipe, inputs, start = experiment.recipe, experiment.inputs, experiment.starts[arm]
     noise: Any = recipe.noise
     if noise == "camera":
@@ -284,7 +284,7 @@ def _arm_key(experiment: Experiment, camera: Camera, arm: str, seed: int) -> str
 
 
 def score_arm(experiment: Experiment, camera: Camera, arm: str, seed: int, network: Denoiser) -> dict[str, Summaries]:
-    """The arm's summaries by table; those in its file are kept."""
+    """Compute the arm's summaries by table; those in its file are kept."""
     recipe, task = experiment.recipe, experiment.task
     path = experiment.arm_folder(arm, seed) / "evaluation.json"
     key = _scores_key(experiment, sha256(path.with_name("denoiser.safetensors")))
@@ -318,12 +318,12 @@ def score_arm(experiment: Experiment, camera: Camera, arm: str, seed: int, netwo
 
 
 def _all_have(tables: Mapping[str, Summaries], kind: str) -> bool:
-    """Whether there are tables and each has summaries of this kind."""
+    """Tell whether there are tables and each has summaries of this kind."""
     return bool(tables) and all(kind in table for table in tables.values())
 
 
 def _read_scores(path: Path, key: str) -> dict[str, Summaries]:
-    """The summaries by table in a file of this key; none if there is no such file."""
+    """Read the summaries by table from a file of this key; there are none without such a file."""
     if not path.is_file():
         return {}
 
@@ -339,7 +339,7 @@ def _read_scores(path: Path, key: str) -> dict[str, Summaries]:
 
 
 def _score_tables(camera: Camera, denoiser: Any, label: str) -> dict[str, dict[str, Any]]:
-    """The summaries of a denoiser by table; those whose images it does not take are left out."""
+    """Compute the summaries of a denoiser by table; tables whose images it does not take are left out."""
     task = camera.experiment.task
     trials = (trial for trial in camera.trials if task.can_denoise(denoiser, trial))
     rows = _group_by_table(task, score([denoiser], trials, label))
@@ -352,7 +352,7 @@ def _score_tables(camera: Camera, denoiser: Any, label: str) -> dict[str, dict[s
 
 
 def _group_by_table(task: Task, rows: Any) -> dict[str, list[Row]]:
-    """Rows by the table that they belong to."""
+    """Group rows by the table that they belong to."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(task.group(row), []).append(row)
@@ -363,7 +363,7 @@ def _group_by_table(task: Task, rows: Any) -> dict[str, list[Row]]:
 def _scores_key(experiment: Experiment, digest: str) -> str:
     """Hash what the scores of an arm depend on besides the noise and the arm's own settings.
 
-    ``digest`` is that of its weights.
+    ``digest`` is the digest of its weights.
     """
     recipe = experiment.recipe
     frames = recipe.data.test, recipe.data.test_crop, recipe.data.bin, stamps(experiment.inputs.test)
@@ -371,7 +371,7 @@ def _scores_key(experiment: Experiment, digest: str) -> str:
 
 
 def score_methods(camera: Camera, methods: Mapping[str, Sequence[Any]]) -> dict[str, dict[str, Any]]:
-    """The summaries of the denoisers that arms are compared with, by table and name; one trial in memory at a time."""
+    """Score the denoisers that arms are compared with, by table and name, with one trial in memory at a time."""
     task = camera.experiment.task
     rows: dict[str, list[Row]] = {group: [] for group in methods}
     for trial in progress(camera.trials, label="other denoisers", unit="image"):
@@ -389,7 +389,7 @@ def score_methods(camera: Camera, methods: Mapping[str, Sequence[Any]]) -> dict[
 
 
 def without_tables(by_table: Mapping[str, Any]) -> Any:
-    """What a file has of several tables: all of them by name, or the only one, which has none."""
+    """Choose what a file holds: all tables by name, or only the table itself if there is one without a name."""
     if set(by_table) == {""}:
         return by_table[""]
 

@@ -1,1 +1,1 @@
-"""A page on your own machine that shows what pictures become as RAW of a camera."""
+"""A page on your own machine that shows pictures as RAW of a camera."""

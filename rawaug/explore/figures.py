@@ -21,7 +21,7 @@ from rawaug.plugin.params import RawPair
 
 
 class Example(NamedTuple):
-    """A picture, uint8 ``(3, H, W)``, its augmentation, and one pair of it, without B."""
+    """A picture, uint8 ``(3, H, W)``, with its augmentation and one pair made from it, without B."""
 
     srgb: Tensor
     augment: RawAugment
@@ -29,23 +29,23 @@ class Example(NamedTuple):
 
 
 COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue"}
-"""The colours of the plots by channel."""
+"""Plots draw the channels in these colours."""
 
 _ATOMS = 60
-"""Maximum number of colour atoms in a plot."""
+"""A plot has at most this many colour atoms."""
 
 _BINS = 24
-"""Number of bins of the signal."""
+"""The signal has this many bins."""
 
 _MOST = 2**16
-"""Maximum number of values of a colour; of more, evenly spaced ones are used."""
+"""At most this many values of a colour are used; of more, evenly spaced ones are taken."""
 
 _FEWEST = 50
-"""Minimum number of values in a bin of the signal for estimating a variance."""
+"""A variance is estimated from at least this many values in a bin of the signal."""
 
 
 def histograms(example: Example) -> np.ndarray:
-    """Plot how often RAW has each value, by colour: clean as a line, noisy as an area; uint8 ``(H, W, 3)``."""
+    """Plot how often RAW has each value, by colour, clean as a line and noisy as an area; uint8 ``(H, W, 3)``."""
     figure, axis = _figure()
     clean = _by_colour(example, example.pair.clean)
     noisy = _by_colour(example, example.pair.noisy)
@@ -114,7 +114,7 @@ def noise(example: Example) -> np.ndarray:
     ramp = torch.logspace(-4, 0, 100)
     law = augment.noise.variance(ramp.expand(1, 4, 1, -1), params).mean(dim=(0, 1, 2))
 
-    layout = CFA.RGGB  # of other patterns too, as noise models take four planes
+    layout = CFA.RGGB  # also for other patterns, as noise models take four planes
     if augment.pattern is None:
         layout = CFA(augment.cfa)
     mosaic = bayer.pack(augment.mosaic(pair.clean)[None], layout)
@@ -168,7 +168,7 @@ def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[
 
 
 def _by_colour(example: Example, raw: Tensor) -> list[Tensor]:
-    """The values of the red, green and blue sites, ``(N,)`` each; of many, evenly spaced ones."""
+    """Take the values of the red, green and blue sites, ``(N,)`` each; if there are many, evenly spaced ones."""
     mosaic = raw
     if len(raw) != 1:
         mosaic = example.augment.mosaic(raw)
@@ -197,7 +197,7 @@ def _figure() -> tuple[Any, Any]:
 
 
 def _plain_numbers(axis: Any, *scales: Any) -> None:
-    """Label powers of ten as 0.01, without ticks between: typeset labels take longer than the rest of the figure."""
+    """Label powers of ten as 0.01, without ticks between; typeset labels would take longer than all the rest."""
     axis.minorticks_off()
     for scale in scales:
         scale.set_major_formatter("{x:g}")
@@ -210,7 +210,7 @@ def _pixels(figure: Any) -> np.ndarray:
 
 @torch.no_grad()
 def grey_curve(isp: DictionaryISP, setting: ISPParams) -> Tensor:
-    """Linear values ``(256,)`` of the 256 greys of sRGB under a setting without B."""
+    """Compute the linear values ``(256,)`` of the 256 greys of sRGB under a setting without B."""
     if isp.tone is None:
         return isp.tone_curve().mean(dim=1)
     return isp.tone.combine(setting.tone_weights[None])[0, ::STEPS]

@@ -1,6 +1,6 @@
-"""The page: controls on one side, a tab for each view on the other; every change redraws the open tab alone.
+"""The page: controls on one side, a tab for each view on the other; every change redraws only the open tab.
 
-Nothing is loaded from elsewhere and nothing is sent: pictures are data in the page, fonts are the system's.
+Nothing is loaded from elsewhere and nothing is sent: pictures are data in the page, and fonts are the system's.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ ANY, OWN = "any", "the ISP's"
 KELVINS = (2000, 2500, 2856, 3200, 4000, 5000, 5500, 6500, 7500, 10000)
 DENOISE = "Denoise"
 FIRST_SEED = 2
-"""The seed on the page at first; it gives the first built-in picture ordinary noise, 0 nearly the strongest."""
+"""The page starts with this seed, which gives the first built-in picture ordinary noise; 0 nearly the strongest."""
 
 
 def parse_look(values: Mapping[str, Any]) -> Look:
-    """Read the values of the controls, by their names; ValueError if no picture is chosen."""
+    """Read the values of the controls, by their names; raise ValueError if no picture is chosen."""
     picture = values["picture"]
     if not picture:
         raise ValueError("choose a picture")
@@ -95,11 +95,11 @@ def show(tab: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Draw the open tab.
 
     Args:
-        tab: its name.
-        values: those of the controls, by their names.
+        tab: name of the tab.
+        values: values of the controls, by their names.
 
     Returns:
-        What changes on the page: ``message``, ``python``, ``command``, and the content of the tab by its name.
+        Everything that changes on the page: ``message``, ``python``, ``command``, and the tab's content by its name.
     """
     try:
         look = views.with_tab(tab, parse_look(values))
@@ -125,7 +125,7 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None, isp: str
     Args:
         pictures: files to choose from, besides uploaded ones.
         names: their names on the page; those of the files by default.
-        isp: the ISP that is chosen at first, by its name or path.
+        isp: the ISP that is selected at first, by its name or path.
     """
     views.load_isp(isp)  # raises here rather than on the page
     os.environ["GRADIO_ANALYTICS_ENABLED"] = "False"
@@ -163,7 +163,7 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]], isp: str) -> dict[str
     noise = str(AugmentConfig(isp).noise)
 
     controls: dict[str, Any] = {}
-    whole = {"num_choices_shown": None}  # in a list that is shown in part, a retyped choice gives way to the first one
+    whole = {"num_choices_shown": None}  # in a list shown in part, a retyped choice gives way to the first one
     with gr.Group():
         controls["picture"] = gr.Dropdown(choices, value=choices[0][1] if choices else None, label="Picture", **whole)
         upload = gr.UploadButton("Open your own", size="sm", elem_id="upload")
@@ -235,7 +235,7 @@ def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, An
 
 
 def _update_choices(gr: Any, isp: str, tone: str, noise: str) -> list[Any]:
-    """Offer cameras, lights and tones of published cameras alone, and an ISP's own noise with this ISP alone."""
+    """Offer cameras, lights and tones only of published cameras, and an ISP's own noise only with this ISP."""
     published = bool(views.load_isp(isp).config.cameras)
     tones = [ANY, *views.tone_names(isp)]
     noises = views.noise_choices(isp)
@@ -273,7 +273,7 @@ def make_server(page: Any) -> Any:
 
 
 def open_socket(host: str, port: int) -> socket.socket:
-    """Open a socket for :func:`make_server`; port 0 takes any that is free. OSError if the port cannot be used."""
+    """Open a socket for :func:`make_server`; port 0 takes any free one. Raise OSError if the port is unusable."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family)
@@ -282,6 +282,6 @@ def open_socket(host: str, port: int) -> socket.socket:
 
 
 def socket_url(open_: socket.socket) -> str:
-    """The address that a browser opens."""
+    """Return the address that a browser opens."""
     host, port = open_.getsockname()[:2]
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

@@ -1,8 +1,9 @@
 """The views of the page: functions that make titled pictures of a :class:`Look`, in :data:`VIEWS` by the tab's name.
 
-Noisy and clean are shown pixel by pixel; of a large picture the central part is shown. RAW is demosaiced bilinearly and
-developed by the ISP's forward pass with the setting of the draw. The eight draws are all developed with the setting of
-the first, so that cameras, lights and exposures can be seen to differ. Python and a command make the pair again.
+Noisy and clean are shown pixel by pixel; for a large picture, the central part is shown. RAW is demosaiced bilinearly
+and developed by the ISP's forward pass with the setting of the draw. The eight draws are all developed with the setting
+of the first, so that differences in camera, light and exposure can be seen. The Python code and the command that are
+shown make the pair again.
 """
 
 from __future__ import annotations
@@ -43,27 +44,27 @@ from rawaug.plugin.pictures import trim_to_even
 from rawaug.plugin.targets import Srgb
 
 DRAWS = 8
-"""Number of draws side by side."""
+"""This many draws are shown side by side."""
 
 HEIGHT, WIDTH = 512, 768
-"""Largest height and width of the part of a picture that is shown pixel by pixel."""
+"""The part of a picture that is shown pixel by pixel has at most this height and width."""
 
 _WHOLE_CELLS = 12
-"""Parts begin at multiples of it, where the cells of all patterns do."""
+"""Parts begin at multiples of this, where the cells of all patterns begin."""
 
 _THUMBNAIL = 384
-"""Longer side of the pictures between the stages."""
+"""The longer side of the pictures between the stages has this length."""
 
 _ZOOM = (24, 36)
-"""Height and width of the part of the mosaic that is magnified."""
+"""The part of the mosaic that is magnified has this height and width."""
 
 _SCALE = 8
-"""Magnification of that part."""
+"""That part is magnified this many times."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """The settings of the page: a picture's file, the settings of its pair, and the seed, as of ``rawaug synth``."""
+    """The settings of the page: a picture's file, the settings of its pair, and the seed, as in ``rawaug synth``."""
 
     picture: str
     config: AugmentConfig = field(default_factory=AugmentConfig)
@@ -85,7 +86,7 @@ def _make_example(look: Look, changed: int) -> Example:
 
 @lru_cache(maxsize=2)
 def _read_even(picture: str, changed: int) -> Tensor:
-    """Read a picture, sides even; ``changed`` stands for the state of the file."""
+    """Read a picture with even sides; ``changed`` stands for the state of the file."""
     return trim_to_even(read_picture(picture))
 
 
@@ -118,7 +119,7 @@ def noise_choices(isp: str) -> list[str]:
 
 
 def iso_range(noise: str) -> tuple[float, float] | None:
-    """Get the lowest and the highest ISO of a camera's noise; None if the noise does not depend on the ISO."""
+    """Get the lowest and the highest ISO of a camera's noise; return None if the noise does not depend on ISO."""
     if noise == "camera":
         return None
 
@@ -132,7 +133,7 @@ def iso_range(noise: str) -> tuple[float, float] | None:
 def drop_inapplicable(config: AugmentConfig) -> AugmentConfig:
     """Leave out the settings that do not apply to their ISP and noise.
 
-    A fitted ISP has no light, tone and camera to choose, and noise that is not a measured camera's has no ISO.
+    A fitted ISP has no light, tone or camera to choose, and noise that is not a measured camera's has no ISO.
     """
     if not load_isp(config.isp).config.cameras:
         config = replace(config, camera=None, draw=replace(config.draw, light=None, tone=None))
@@ -255,16 +256,16 @@ def stages(look: Look) -> list[Panel]:
 def stage_pictures(
     augment: RawAugment, srgb: Tensor, setting: ISPParams | None, place: Tensor | None = None
 ) -> dict[str, Tensor]:
-    """Show what the stages of an ISP make of a picture.
+    """Show what each stage of an ISP makes of a picture.
 
     Args:
-        augment: its ISP and pattern are used.
+        augment: the augmentation whose ISP and pattern are used.
         srgb: the picture, uint8 ``(3, H, W)``.
         setting: the camera setting, with B = 1; the ISP chooses it by default.
         place: coordinates of the pixels in the full frame, ``(1, 2, H, W)``; those of a full frame by default.
 
     Returns:
-        By title pictures ``(3, H, W)`` in [0, 1], linear ones through the sRGB curve.
+        Pictures ``(3, H, W)`` in [0, 1] by title; linear ones are shown through the sRGB curve.
     """
     result = augment.isp.reverse(srgb[None], setting, coordinates=place, intermediates=True)
     stage_of = {f"x{stage.makes}": stage.name for stage in augment.isp.ordered_stages}
@@ -393,10 +394,10 @@ VIEWS: dict[str, Callable[[Look], list[Panel]]] = {
     "sRGB": srgb,
     "Burst": burst,
 }
-"""The tabs, but for the one that compares the noisy picture with the denoised one."""
+"""These are the tabs, except for the one that compares the noisy picture with the denoised one."""
 
 FORMS: dict[str, dict[str, Any]] = {"sRGB": {"target": Srgb(finish=True)}, "Burst": {"burst": 4}}
-"""The target and the burst of the tabs that need their own."""
+"""These tabs need a target or a burst of their own."""
 
 
 def with_tab(tab: str, look: Look) -> Look:
@@ -406,12 +407,12 @@ def with_tab(tab: str, look: Look) -> Look:
 
 @lru_cache(maxsize=2)
 def _shipped(kind: type[ImageDenoiser]) -> ImageDenoiser:
-    """The shipped denoiser of a kind of image."""
+    """Return the shipped denoiser of a kind of image."""
     return kind.of(kind.default)
 
 
 def _half(example: Example) -> Tensor:
-    """Noisy RAW in three colours at half the size, ``(3, H/2, W/2)``: one pixel for each cell of a Bayer pattern."""
+    """Halve noisy RAW to three colours, ``(3, H/2, W/2)``, one pixel for each cell of a Bayer pattern."""
     noisy = example.pair.noisy
     if example.augment.pattern is None:
         return torch.stack([noisy[0], (noisy[1] + noisy[2]) / 2, noisy[3]])
@@ -419,7 +420,7 @@ def _half(example: Example) -> Tensor:
 
 
 def _setting(example: Example) -> str:
-    """The white balance of the draw, and the mean of its RAW, in words."""
+    """Describe the white balance of the draw and the mean of its RAW in words."""
     gains = example.pair.params.isp.gains
     red, green, blue = (gains / gains[1]).tolist()
     return f"white balance {red:.2f}, {green:.0f}, {blue:.2f}; mean {example.pair.clean.mean().item():.3f}"
@@ -452,7 +453,7 @@ def _as_batch(setting: ISPParams) -> ISPParams:
 
 
 def _centre(image: Tensor, size: tuple[int, int] = (HEIGHT, WIDTH)) -> tuple[int, int, int, int]:
-    """Top, left, height and width of the central part of at most this size, in pixels of the mosaic."""
+    """Compute top, left, height and width of the central part of at most this size, in pixels of the mosaic."""
     scale = bayer.sites_per_value(image)
     full_height, full_width = scale * image.shape[-2], scale * image.shape[-1]
     height, width = min(full_height, size[0]), min(full_width, size[1])

@@ -1,4 +1,4 @@
-"""Files at the edges: pictures through OpenImageIO, RAW in through LibRaw, DNG out through tifffile.
+"""Input and output: pictures through OpenImageIO, RAW in through LibRaw, DNG out through tifffile.
 
 None of them is loaded before a file is opened.
 """

@@ -25,7 +25,7 @@ from rawaug.io.raw import read_preview
 from rawaug.io.tiff import ACTIVE_AREA, all_pages, is_dng, main_mosaic, opened_tiff
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 7, 10, 12
-"""The numbers of TIFF's types."""
+"""These are the numbers of TIFF's types."""
 
 SUB_DIRECTORIES = {"ExifTag": EXIF, "GPSTag": GPS}
 MAKER_NOTE, _MAKER_NOTE_SAFETY = 37500, 50741
@@ -43,18 +43,18 @@ _DROPPED = frozenset((*_LAYOUT, *_OF_PREVIEWS, *_LEVELS, *_DIGESTS, *_REPLACED))
 _CROP = (50718, 50719, 50720, 51125)
 
 _PREVIEW_TAGS = frozenset((*_LAYOUT, *_OF_PREVIEWS, 34675)) - {320, 330}
-"""Tags of a preview's directory that are copied: its layout, the program that made it, its colour profile."""
+"""These tags of a preview's directory are copied: its layout, the program that made it, its colour profile."""
 _SEGMENTS = ((273, 279), (324, 325), (513, 514))
-"""Tags with the places and the lengths of strips, of tiles, and of a JPEG."""
+"""These tags have the places and the lengths of strips, of tiles, and of a JPEG."""
 _PREVIEW_PHOTOMETRICS = (1, 2, 6)
-"""Photometric interpretations of previews: grey, RGB, YCbCr."""
+"""Previews have these photometric interpretations: grey, RGB, YCbCr."""
 _GREY, _YCBCR = 1, 6
 _SUBFILE_TYPE, _REDUCED = 254, 1
 _MOST_PREVIEW_BYTES = 2**26
-"""Maximum size of all previews of a file together."""
+"""All previews of a file together have at most this size."""
 
 Tags = dict[int, tuple[int, int, Any]]
-"""Type, count and value by code, as tifffile writes them; tifffile counts the characters of text itself."""
+"""It maps codes to type, count and value, as tifffile writes them; tifffile counts characters of text itself."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def _read_tiff(pages: list[Any], file: BinaryIO, size: tuple[int, int], source_i
 
 
 def _tags_of(page: Any, source_is_dng: bool) -> Tags:
-    """The tags of a page that another file may have."""
+    """Select the tags of a page that another file may have."""
     tags: Tags = {}
     for tag in page.tags:
         is_copied = tag.code in _OF_ANY_TIFF
@@ -164,7 +164,7 @@ def _take_pointers(tiff: TiffFile, exif: list[Tag], is_note_safe: bool) -> list[
 
 
 def _value(tag: Any) -> Any:
-    """The value of a tag as tifffile writes it: ASCII text as a string, other text as its bytes in UTF-8."""
+    """Give the value of a tag as tifffile writes it: ASCII text as a string, other text as its bytes in UTF-8."""
     if tag.dtype == ASCII and isinstance(tag.value, str) and not tag.value.isascii():
         return tag.value.encode() + b"\0"
     return tag.value
@@ -183,7 +183,7 @@ def _read_directory(tiff: TiffFile, place: int) -> list[Tag]:
 
 
 def _previews(pages: list[Any], tiff: TiffFile) -> list[Preview]:
-    """The reduced pictures of a DNG, sorted by size."""
+    """Read the reduced pictures of a DNG, sorted by size."""
 
     def area(page: Any) -> int:
         return int(page.imagelength * page.imagewidth)
@@ -205,7 +205,7 @@ def _previews(pages: list[Any], tiff: TiffFile) -> list[Preview]:
 
 
 def _preview(page: Any, tiff: TiffFile) -> Preview | None:
-    """A page with its data; None if its data are missing or incomplete."""
+    """Read a page with its data; return None if its data are missing or incomplete."""
     for codes in _SEGMENTS:
         if codes[0] not in page.tags or codes[1] not in page.tags:
             continue
@@ -222,7 +222,7 @@ def _preview(page: Any, tiff: TiffFile) -> Preview | None:
 
 
 def _read_segments(page: Any, tiff: TiffFile, codes: tuple[int, int]) -> list[bytes] | None:
-    """The strips or tiles of a page; None if the file does not hold them all."""
+    """Read the strips or tiles of a page; return None if the file does not hold them all."""
     places = np.ravel(page.tags.valueof(codes[0]))
     lengths = np.ravel(page.tags.valueof(codes[1]))
     segments = []
@@ -234,10 +234,10 @@ def _read_segments(page: Any, tiff: TiffFile, codes: tuple[int, int]) -> list[by
 
 
 def _decoded_preview(path: Path, order: str) -> list[Preview]:
-    """The preview that LibRaw extracts from a file, a JPEG or a bitmap; empty if there is none."""
+    """Let LibRaw extract the preview of a file, a JPEG or a bitmap; return an empty list if there is none."""
     try:
         preview = read_preview(path)
-    except (OSError, ValueError):  # not a RAW file, such as a TIFF that lends its EXIF
+    except (OSError, ValueError):  # not a RAW file, such as a TIFF that supplies EXIF
         return []
     if preview is None:
         return []
@@ -263,14 +263,14 @@ def _decoded_preview(path: Path, order: str) -> list[Preview]:
 
 
 def _bitmap_preview(bitmap: np.ndarray, order: str) -> Preview:
-    """A preview of uncompressed RGB, ``(H, W, 3)``."""
+    """Make a preview of uncompressed RGB, ``(H, W, 3)``."""
     height, width = bitmap.shape[:2]
     data = np.ascontiguousarray(bitmap, np.uint8).tobytes()
     return _one_strip(_layout(height, width, compression=1, photometric=2), data, order)
 
 
 def _layout(height: int, width: int, compression: int, photometric: int) -> dict[int, tuple[int, ...]]:
-    """The numbers of the tags that describe a picture of 8 bits in one strip, by their codes."""
+    """Give the numbers of the tags that describe a picture of 8 bits in one strip, by their codes."""
     channels = 1 if photometric == _GREY else 3
     return {
         _SUBFILE_TYPE: (_REDUCED,),

@@ -1,8 +1,8 @@
-"""CRW files, Canon's RAW of 1998 to 2004: what the camera says of the exposure, which LibRaw does not give.
+"""CRW files, Canon's RAW of 1998 to 2004: the camera's record of the exposure, which LibRaw does not give.
 
 A CRW is a heap of records in heaps. A heap ends with the place of its directory, whose entries of ten bytes are a tag,
-a size and a place. ShotInfo (tag 0x102a) has the exposure in steps of 1/32, thirds rounded: the f-number is
-``2^(v / 2)`` and the exposure time ``2^-v``. Source: P. Harvey, "The Canon RAW (CRW) File Format".
+a size and a place. ShotInfo (tag 0x102a) has the exposure in steps of 1/32, with thirds rounded: the f-number is ``2^(v
+/ 2)``, and the exposure time is ``2^-v``. Source: P. Harvey, "The Canon RAW (CRW) File Format".
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from typing import BinaryIO, NamedTuple
 _SIGNATURE = b"HEAPCCDR"
 _SHOT_INFO = 0x102A
 _HEAPS = (0x300A, 0x300B)
-"""The heap of the picture's properties, and that of the exposure in it."""
+"""These are the heap of the picture's properties, and the heap of the exposure in it."""
 _F_NUMBER, _SECONDS = 21, 22
 _MOST_ENTRIES, _DEEPEST = 1000, 4
 
 
 class ShotInfo(NamedTuple):
-    """The exposure that the camera made; None where it does not say."""
+    """The exposure that the camera made; a value is None if the camera does not say."""
 
     seconds: float | None
     f_number: float | None
 
 
 def read_shot_info(path: Path) -> ShotInfo | None:
-    """The exposure in a CRW file; None if it is another kind of file, or does not say."""
+    """Read the exposure in a CRW file; return None for another kind of file, or if it does not say."""
     with path.open("rb") as file:
         header = file.read(14)
         if header[6:] != _SIGNATURE or header[:2] not in (b"II", b"MM"):
@@ -38,7 +38,7 @@ def read_shot_info(path: Path) -> ShotInfo | None:
         (start,) = struct.unpack_from(order + "I", header, 2)
         try:
             values = _find_shot_info(file, order, start, path.stat().st_size, 0)
-        except struct.error:  # a damaged heap; what matters is the mosaic
+        except struct.error:  # a damaged heap; only the mosaic matters
             return None
 
     if values is None or len(values) <= _SECONDS:
@@ -53,7 +53,7 @@ def read_shot_info(path: Path) -> ShotInfo | None:
 
 
 def _find_shot_info(file: BinaryIO, order: str, start: int, end: int, depth: int) -> tuple[int, ...] | None:
-    """The numbers of ShotInfo in the heap from ``start`` to ``end``; None if it is not there."""
+    """Find the numbers of ShotInfo in the heap from ``start`` to ``end``; return None if it is not there."""
     file.seek(max(0, end - 4))
     (place,) = struct.unpack(order + "I", file.read(4))
     file.seek(start + place)
@@ -73,7 +73,7 @@ def _find_shot_info(file: BinaryIO, order: str, start: int, end: int, depth: int
 
 
 def _stops(value: int) -> float:
-    """Canon's steps of 1/32 as stops; 12 and 20 stand for thirds."""
+    """Convert Canon's steps of 1/32 to stops; 12 and 20 stand for thirds."""
     whole, part = divmod(abs(value), 32)
     part_of_stop = {12: 32 / 3, 20: 64 / 3}.get(part, float(part)) / 32
     return math.copysign(whole + part_of_stop, value)

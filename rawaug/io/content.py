@@ -1,8 +1,8 @@
-"""What a file is, asked of its first bytes: camera RAW, a picture, or neither.
+"""The content of a file by its first bytes: camera RAW, a picture, or neither.
 
-Names lie: iPhones write HEIC that is renamed to .jpg, DNG, NEF and CR2 are TIFF files whose first picture is a
-thumbnail, and downloads have no extension at all. Every command asks :func:`content_of`. Where the bytes tell nothing
-(RAW without a header, an empty file), the extension decides, so that the reader can say what is wrong.
+Names can be misleading: iPhones write HEIC that is renamed to .jpg; DNG, NEF and CR2 are TIFF files whose first picture
+is a thumbnail; and downloads may have no extension at all. Every command asks :func:`content_of`. If the bytes say
+nothing (RAW without a header, an empty file), the extension decides, so that the reader can say what is wrong.
 
 A TIFF is RAW if it has a DNG's version, or a directory whose pixels are a mosaic (photometric interpretation 32803) or
 linear RAW (34892). Source: TIFF 6.0; DNG 1.7.1; ISO/IEC 14496-12 (brands of HEIF); the signatures of each format.
@@ -26,17 +26,17 @@ RAW_EXTENSIONS = (
     *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
 )
 PICTURE_EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
-"""Extensions of the pictures that are read without an extra."""
+"""Pictures with these extensions are read without an extra."""
 HEIF_EXTENSIONS, AVIF_EXTENSIONS = (".heic", ".heif", ".hif"), (".avif",)
 ALL_PICTURE_EXTENSIONS = (*PICTURE_EXTENSIONS, *HEIF_EXTENSIONS, *AVIF_EXTENSIONS)
 _UNKNOWN_RAW = (".x3f", ".cap", ".eip", ".braw", ".r3d", ".ari", ".gpr")
-"""Extensions of RAW files that cannot be read; they are counted as RAW."""
+"""RAW files with these extensions cannot be read; they are counted as RAW."""
 
 Kind = Literal["raw", "picture", "other"]
 
 
 class Content(NamedTuple):
-    """What a file is, and the name of its format, such as ``"JPEG"`` or ``"DNG"``."""
+    """The content of a file, and the name of its format, such as ``"JPEG"`` or ``"DNG"``."""
 
     kind: Kind
     format: str
@@ -79,11 +79,11 @@ _MOST_DIRECTORIES = 32
 
 
 def content_of(path: str | Path) -> Content:
-    """What a file is, by its first bytes, or by its extension where they tell nothing.
+    """Identify a file by its first bytes, or by its extension if they say nothing.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        OSError: if it is no regular file, or cannot be read.
+        OSError: if it is not a regular file, or cannot be read.
 
     Example:
         >>> content_of("IMG_0001.jpg").format  # doctest: +SKIP
@@ -96,7 +96,7 @@ def content_of(path: str | Path) -> Content:
 
 
 def content_of_opened(file: BinaryIO, path: Path) -> Content:
-    """:func:`content_of` a file that is open at its beginning."""
+    """Identify a file that is open at its beginning, as :func:`content_of` does."""
     content = _by_bytes(file)
     if content.kind == "other" or content.format == "TIFF":
         return _by_extension(path.suffix.lower(), content)
@@ -104,7 +104,7 @@ def content_of_opened(file: BinaryIO, path: Path) -> Content:
 
 
 def is_raw(path: str | Path) -> bool:
-    """Whether a file is camera RAW: see :func:`content_of`."""
+    """Tell whether a file is camera RAW; see :func:`content_of`."""
     return content_of(path).kind == "raw"
 
 
@@ -124,7 +124,7 @@ def _by_bytes(file: BinaryIO) -> Content:
 
 
 def _by_extension(extension: str, content: Content) -> Content:
-    """What the extension says of a file whose bytes do not: those of a TIFF can be either."""
+    """Identify a file by its extension if its bytes do not say; those of a TIFF can be either."""
     if extension in (*RAW_EXTENSIONS, *_UNKNOWN_RAW):
         return Content("raw", extension[1:].upper())
     if extension in ALL_PICTURE_EXTENSIONS and content.kind == "other":
@@ -133,7 +133,7 @@ def _by_extension(extension: str, content: Content) -> Content:
 
 
 def _of_boxes(head: bytes) -> Content:
-    """The brands of a file of boxes: its own comes first, then those that it is compatible with."""
+    """Identify a file of boxes by its brands: its own comes first, then those that it is compatible with."""
     size = int.from_bytes(head[:4], "big")
     brands = [head[8:12]] + [head[place : place + 4] for place in range(16, min(size, len(head)), 4)]
     if b"crx " in brands:
@@ -149,7 +149,7 @@ def _of_boxes(head: bytes) -> Content:
 
 
 def _of_tiff(file: BinaryIO) -> Content:
-    """RAW or a picture; a picture where the directories are damaged, which its reader will say."""
+    """Tell RAW from a picture; with damaged directories it is a picture, and its reader will report them."""
     try:
         tiff = TiffFile(file)
         for directory in _directories(tiff):
@@ -164,7 +164,7 @@ def _of_tiff(file: BinaryIO) -> Content:
 
 
 def _directories(tiff: TiffFile) -> Iterator[Directory]:
-    """The first directories of a file and those that they point at, each once."""
+    """Yield the first directories of a file and those that they point at, each once."""
     waiting = [tiff.first]
     places: set[int] = set()
     while waiting and len(places) < _MOST_DIRECTORIES:
@@ -184,7 +184,7 @@ def _directories(tiff: TiffFile) -> Iterator[Directory]:
 
 @dataclass
 class LeftOut:
-    """Files of one kind that a command does not read: how many of each extension, and what to do with them."""
+    """Files of one kind that a command does not read: their number by extension, and what to do with them."""
 
     what: str
     advice: str
@@ -207,7 +207,7 @@ class LeftOut:
 
 
 _MAX_EXTENSIONS = 6
-"""Maximum number of extensions that a line lists."""
+"""A line lists at most this many extensions."""
 
 
 @dataclass
@@ -218,7 +218,7 @@ class Listing:
     left_out: dict[str, LeftOut] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
-        """A line for each kind that is left out."""
+        """Write a line for each kind that is left out."""
         return [str(kind) for kind in self.left_out.values()]
 
     def leave_out(self, what: str, advice: str, extension: str) -> None:
@@ -228,7 +228,7 @@ class Listing:
 
 
 def picture_extensions() -> tuple[str, ...]:
-    """Extensions of the pictures that can be read here: HEIC and AVIF where their decoders are installed."""
+    """List the extensions of the pictures that can be read here; HEIC and AVIF need their decoders."""
     extensions: tuple[str, ...] = PICTURE_EXTENSIONS
     if reads_heic():
         extensions += HEIF_EXTENSIONS
@@ -238,19 +238,19 @@ def picture_extensions() -> tuple[str, ...]:
 
 
 def reads_heic() -> bool:
-    """Whether the decoder of HEIC is installed."""
+    """Tell whether the decoder of HEIC is installed."""
     return find_spec("pillow_heif") is not None
 
 
 def reads_avif() -> bool:
-    """Whether Pillow is there, and of a version that reads AVIF."""
+    """Tell whether Pillow is installed in a version that reads AVIF."""
     return find_spec("PIL") is not None and find_spec("PIL.AvifImagePlugin") is not None
 
 
 def list_pictures(path: str | Path) -> Listing:
-    """The pictures of a folder and its subfolders by their extensions, and by kinds how many other files there are.
+    """List the pictures of a folder and its subfolders by their extensions, and count other files by kind.
 
-    No file is opened, so that a folder of a million files is listed in seconds. A path of a file is that file.
+    No file is opened, so a folder of a million files is listed in seconds. The path of a file stands for that file.
 
     Raises:
         FileNotFoundError: if there is no such file or folder.
@@ -271,7 +271,7 @@ def list_pictures(path: str | Path) -> Listing:
 
 
 def list_files(folder: Path, taken: Sequence[str], other: str) -> Listing:
-    """The files of a folder whose extensions are ``taken``, and the number of others by kind, ``other`` last."""
+    """List the files of a folder whose extensions are ``taken``, and count others by kind, ``other`` last."""
     advice = _advice_by_extension(other)
     listing = Listing()
     for file in files_below(folder):
@@ -289,7 +289,7 @@ def list_files(folder: Path, taken: Sequence[str], other: str) -> Listing:
 
 
 def _advice_by_extension(other: str) -> dict[str, tuple[str, str]]:
-    """What files of an extension are called, and what to do with them."""
+    """Say what files of an extension are called and what to do with them."""
     advice: dict[str, tuple[str, str]] = {}
     for extension in PICTURE_EXTENSIONS:
         advice[extension] = ("picture", "call the command on a folder of them alone")

@@ -1,10 +1,10 @@
-"""Whether the mosaic of a DNG is whole, where its decoder notices nothing.
+"""A check that the mosaic of a DNG is whole, for damage that its decoder does not notice.
 
 A hole in the middle of a file (a download that stopped, a failing card) decodes to numbers of some kind. Two things
-tell it. The first is the MD5 of the mosaic, as Adobe's programs and this project write it (tags RawImageDigest and
-NewRawImageDigest). The second is lossless JPEG itself: its code words have many lengths, so that the data of a damaged
-stream end before its pixels do, or after them. To see which, the last bytes of a stream are changed, others are put
-behind them, and it is decoded again: in a sound stream the last samples change, and no others do.
+reveal it. The first is the MD5 of the mosaic, as Adobe's programs and this project write it (tags RawImageDigest and
+NewRawImageDigest). The second is lossless JPEG itself: its code words have many lengths, so the data of a damaged
+stream end before its pixels do, or after them. To check this, the last bytes of a stream are changed, others are
+appended, and it is decoded again: in a sound stream the last samples change, and no others do.
 
 Source: DNG specification 1.4, chapter 4; ITU-T T.81, annex H.
 """
@@ -20,22 +20,22 @@ from rawaug.errors import extra
 from rawaug.io.tiff import LOSSLESS_JPEG, StoredMosaic
 
 _TILE = 256
-"""Side of the tiles of NewRawImageDigest."""
+"""The tiles of NewRawImageDigest have this side."""
 _END = b"\xff\xd9"
-"""The marker at the end of a JPEG stream."""
+"""This marker ends a JPEG stream."""
 _CHANGED_BYTES = (2, 16)
-"""How many bytes are changed at the end of the data, more of them if the last two are padding."""
+"""This many bytes are changed at the end of the data, the larger number if the last two are padding."""
 _MORE = b"\x5a\x33" * 32
-"""What is put behind the data, for a decoder that reads on."""
+"""This is appended to the data, for a decoder that reads on."""
 
 
 def find_fault(path: Path, stored: StoredMosaic, numbers: np.ndarray | None) -> str:
-    """What is wrong with the mosaic of a DNG; empty if nothing is.
+    """Say what is wrong with the mosaic of a DNG; the text is empty if nothing is.
 
     Args:
         path: the file.
-        stored: how it stores the mosaic.
-        numbers: all digital numbers ``(H, W)`` as decoded, margins included; None if they are not at hand.
+        stored: how the file stores the mosaic.
+        numbers: all digital numbers ``(H, W)`` as decoded, margins included; None if they are not available.
     """
     if numbers is not None and stored.plain and numbers.shape == stored.size:
         if stored.tiled_digest is not None:
@@ -53,7 +53,7 @@ def find_fault(path: Path, stored: StoredMosaic, numbers: np.ndarray | None) -> 
 
 
 def tiled_digest(numbers: np.ndarray) -> bytes:
-    """NewRawImageDigest of digital numbers ``(H, W)``: the MD5 of the MD5s of tiles of 256 x 256."""
+    """Compute NewRawImageDigest of digital numbers ``(H, W)``, the MD5 of the MD5s of tiles of 256 x 256."""
     height, width = numbers.shape
     digests = md5(usedforsecurity=False)
     for top in range(0, height, _TILE):
@@ -89,7 +89,7 @@ def _find_fault_in_streams(path: Path, stored: StoredMosaic) -> str:
 
 
 def _decode(stream: bytes) -> np.ndarray | None:
-    """The samples of a lossless JPEG; None if no decoder takes it."""
+    """Decode the samples of a lossless JPEG; return None if no decoder takes it."""
     with extra("raw"):
         import imagecodecs
 
@@ -116,7 +116,7 @@ def _ends_with_its_data(stream: bytes, decoded: np.ndarray) -> bool:
 
 
 def _first_change(stream: bytes, end: int, count: int, decoded: np.ndarray) -> int | None:
-    """The first sample that changes with the last ``count`` bytes before ``end``; None if none does."""
+    """Find the first sample that changes with the last ``count`` bytes before ``end``; return None if none does."""
     with extra("raw"):
         import imagecodecs
 

@@ -1,12 +1,12 @@
-"""Pictures of any format as the numbers that their files hold, by the decoder that reads that format right.
+"""Decoding of pictures to the numbers that their files hold, by the decoder that reads each format correctly.
 
-OpenImageIO reads most. Four kinds go to other libraries. BMP, of which it mixes up run lengths and bit fields, goes to
-Pillow; so does a JPEG with a gain map ("Ultra HDR", as Android phones write it), which it renders in linear light, for
-the picture that every viewer shows. HEIC and AVIF, which it does not know, go to libheif and Pillow. TIFF in lossless
-JPEG of 16 bits, which it decodes to black, goes to tifffile.
+OpenImageIO reads most formats. Four kinds go to other libraries. BMP goes to Pillow, since OpenImageIO mixes up its run
+lengths and bit fields. So does a JPEG with a gain map ("Ultra HDR", as Android phones write it), which OpenImageIO
+renders in linear light; Pillow gives the picture that every viewer shows. HEIC and AVIF, which it does not know, go to
+libheif and Pillow. TIFF in lossless JPEG of 16 bits, which it decodes to black, goes to tifffile.
 
-What a header says besides is read here too, byte for byte: OpenImageIO takes the orientation from XMP where EXIF says
-otherwise, and does not see an EXIF chunk behind the pixels of a PNG.
+Everything else in a header is read here too, byte for byte, since OpenImageIO takes the orientation from XMP even if
+EXIF says otherwise, and does not see an EXIF chunk after the pixels of a PNG.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.profiles import profile_of_code_points
 
 MAX_PIXELS = 2**26
-"""The default maximum number of pixels of a picture: 8192 x 8192."""
+"""A picture has at most this many pixels by default: 8192 x 8192."""
 
 MAX_CHANNELS = 4
 
 _LINEAR_FORMATS = ("OpenEXR", "Radiance")
 _WITH_ASSOCIATED_ALPHA = ("TIFF", "OpenEXR")
-"""Formats whose colours may be multiplied by alpha already."""
+"""In these formats, colours may already be multiplied by alpha."""
 _UPRIGHT = ("JPEG XL", "HEIC", "JPEG 2000")
-"""Formats that their decoders turn upright, whatever EXIF says."""
+"""Decoders of these formats turn pictures upright, whatever EXIF says."""
 _FLOATS = ("half", "float", "double")
 _BITS = 258
 _JPEG_IN_TIFF = 7
@@ -46,8 +46,8 @@ class Decoded(NamedTuple):
 
     Args:
         colours: ``(H, W, 1)`` or ``(H, W, 3)`` of uint8, uint16 or float32, as stored: neither turned nor converted.
-        alpha: ``(H, W, 1)`` of the same type, where there is transparency.
-        associated: whether ``colours`` are multiplied by alpha already.
+        alpha: ``(H, W, 1)`` of the same type, if there is transparency.
+        associated: whether ``colours`` are already multiplied by alpha.
         format: of the content, such as ``"JPEG"``.
         linear: whether the numbers are linear light, as those of OpenEXR are.
         profile: the ICC profile.
@@ -66,12 +66,12 @@ class Decoded(NamedTuple):
 
 
 def decode(path: Path, max_pixels: int = MAX_PIXELS, coarse: bool = False) -> Decoded:
-    """The numbers of a picture file.
+    """Decode the numbers of a picture file.
 
     Args:
         path: the file.
         max_pixels: larger pictures are refused before anything is decoded.
-        coarse: 16 bits may be given back as 8, by rounding, where no profile and no alpha have to be applied first.
+        coarse: 16 bits may be returned as 8, by rounding, if no profile or alpha has to be applied first.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -106,7 +106,7 @@ def require_utf8(path: Path) -> None:
     """Raise OSError if the name is not UTF-8, which the libraries need."""
     try:
         str(path).encode()
-    except UnicodeEncodeError:  # Python represents bytes that are not UTF-8 by letters that have no code in it
+    except UnicodeEncodeError:  # Python represents bytes that are not UTF-8 by characters that UTF-8 cannot encode
         raise OSError(f"{os.fsencode(path)!r}: cannot be opened because its name is not UTF-8; rename it") from None
 
 
@@ -125,7 +125,7 @@ def require_size(path: Path, height: int, width: int, channels: int, max_pixels:
 
 
 def open_image(path: Path, may_have_alpha: bool = True) -> Any:
-    """OpenImageIO's reader of a file, which leaves colours as they are under their alpha."""
+    """Open OpenImageIO's reader of a file, which does not multiply colours by their alpha."""
     oiio = load_oiio()
     if may_have_alpha:
         config = oiio.ImageSpec()
@@ -139,7 +139,7 @@ def open_image(path: Path, may_have_alpha: bool = True) -> Any:
 
 
 def load_oiio() -> Any:
-    """OpenImageIO, which is not imported before a picture is read or written."""
+    """Import OpenImageIO, which is not done before a picture is read or written."""
     with extra("raw"):
         import OpenImageIO
 
@@ -147,10 +147,10 @@ def load_oiio() -> Any:
 
 
 def reason(source: Any) -> str:
-    """The first line of OpenImageIO's message, if there is one."""
+    """Return the first line of OpenImageIO's message, if there is one."""
     try:
         lines = source.geterror().strip().splitlines()
-    except UnicodeDecodeError:  # it quotes the damaged file
+    except UnicodeDecodeError:  # the message quotes the damaged file
         return "its header is damaged"
     if not lines:
         return ""
@@ -174,9 +174,9 @@ def _decode_with_oiio(path: Path, name: str, max_pixels: int, coarse: bool, head
 
     try:
         pixels = source.read_image(kind)
-    except UnicodeDecodeError as error:  # OpenImageIO's binding, of texts in the header
+    except UnicodeDecodeError as error:  # from OpenImageIO's binding, for texts in the header
         raise OSError(f"{path}: cannot be read as a picture (its header is damaged: {error}); copy it again") from error
-    fault = reason(source)  # also set where a decoder padded a truncated file
+    fault = reason(source)  # also set if a decoder padded a truncated file
     moves = name != "JPEG" and _moves(source, spec)
     source.close()
     if moves:
@@ -206,21 +206,21 @@ def _decode_with_oiio(path: Path, name: str, max_pixels: int, coarse: bool, head
 
 
 def _split_alpha(pixels: np.ndarray, has_alpha: bool) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colours ``(H, W, C)`` and alpha ``(H, W, 1)`` of pixels whose last channel may be alpha."""
+    """Split pixels whose last channel may be alpha into colours ``(H, W, C)`` and alpha ``(H, W, 1)``."""
     if not has_alpha:
         return pixels, None
     return pixels[..., :-1], pixels[..., -1:]
 
 
 def _moves(source: Any, spec: Any) -> bool:
-    """Whether there are several frames; a GIF is marked so only if they have a duration."""
+    """Tell whether there are several frames; a GIF is only marked as such if they have a duration."""
     if spec.get_int_attribute("oiio:Movie"):
         return True
     return source.format_name() == "gif" and bool(source.seek_subimage(1, 0))
 
 
 def _number_type(name: str, path: Path) -> str:
-    """The type that numbers are read in: their own, or the next that holds them."""
+    """Choose the type that numbers are read in: their own, or the next one that holds them."""
     if name in _FLOATS:
         return "float"
     if name not in ("uint8", "uint16"):
@@ -229,7 +229,7 @@ def _number_type(name: str, path: Path) -> str:
 
 
 def _require_grey_or_rgb(spec: Any, path: Path) -> bool:
-    """Whether there is alpha; ValueError if a conversion to RGB would need a profile or a choice of channels."""
+    """Tell whether there is alpha; raise ValueError if RGB would need a profile or a choice of channels."""
     stored = spec.get_string_attribute("tiff:ColorSpace") or spec.get_string_attribute("jpeg:ColorSpace")
     if stored and any(name in stored for name in ("CMYK", "YCCK", "LAB", "separated")):
         raise ValueError(f"{path}: is {stored}; convert it to sRGB first")
@@ -249,7 +249,7 @@ def _require_grey_or_rgb(spec: Any, path: Path) -> bool:
 
 
 def _decode_with_pillow(path: Path, name: str, max_pixels: int, headers: Headers) -> Decoded:
-    """The first picture of a BMP or JPEG, 8 bits."""
+    """Decode the first picture of a BMP or JPEG with 8 bits."""
     with extra("raw"):
         from PIL import Image
 
@@ -264,7 +264,7 @@ def _pillow_damage(path: Path) -> Any:
 
 
 class _Refused(ValueError):
-    """A file that is whole, but not taken."""
+    """A file that is whole but not accepted."""
 
 
 def _of_pillow(image: Any, path: Path, name: str, headers: Headers, orientation: int | None = None) -> Decoded:
@@ -295,7 +295,7 @@ def _of_pillow(image: Any, path: Path, name: str, headers: Headers, orientation:
 
 
 def _decode_heif(path: Path, name: str, max_pixels: int, headers: Headers) -> Decoded:
-    """HEIC by libheif, AVIF by Pillow; colours that are named by numbers alone get a profile."""
+    """Decode HEIC by libheif and AVIF by Pillow; colours that only numbers name get a profile."""
     if name == "HEIC":
         if not reads_heic():
             raise ValueError(f"{path}: is HEIC, and pillow_heif is not installed; {how_to_install('heif')}")
@@ -325,7 +325,7 @@ def _decode_avif(path: Path, max_pixels: int, headers: Headers) -> Decoded:
 
 
 def _decode_heic(path: Path, max_pixels: int) -> Decoded:
-    """HEIC of 8, 10 or 12 bits. libheif turns it upright; 10 and 12 bits come as 16."""
+    """Decode HEIC of 8, 10 or 12 bits. libheif turns it upright; 10 and 12 bits come as 16."""
     with extra("heif"):
         import pillow_heif
 
@@ -359,7 +359,7 @@ def _without_prefix(exif: bytes | None) -> bytes | None:
 
 
 def _is_jpeg_of_many_bits(path: Path) -> bool:
-    """Whether a TIFF holds lossless JPEG of more than 8 bits."""
+    """Tell whether a TIFF holds lossless JPEG of more than 8 bits."""
     with path.open("rb") as file:
         try:
             tiff = TiffFile(file)

@@ -1,9 +1,8 @@
-"""TIFF directories, as they stand in TIFF files, in RAW files and in EXIF: tags read and written byte for byte.
+"""TIFF directories, as in TIFF files, RAW files and EXIF, with tags that are read and written byte for byte.
 
-A directory is a list of entries: a code, a type, the number of values, and the values or where they stand. An EXIF
-block is a small TIFF without pixels: its first directory points at those of the exposure, of GPS, and at a thumbnail's.
-Nothing is converted here, so that what is copied stays what it was, makers' notes included. Source: TIFF 6.0;
-Exif 2.32.
+A directory is a list of entries: a code, a type, the number of values, and the values or their place. An EXIF block is
+a small TIFF without pixels, whose first directory points at those of the exposure, of GPS and of a thumbnail. Nothing
+is converted here, so copied data stay as they were, makers' notes included. Source: TIFF 6.0; Exif 2.32.
 """
 
 from __future__ import annotations
@@ -16,13 +15,13 @@ ORIENTATION, COMPRESSION, PHOTOMETRIC, SUB_DIRECTORIES = 274, 259, 262, 330
 EXIF, GPS, INTEROPERABILITY = 34665, 34853, 40965
 THUMBNAIL, THUMBNAIL_BYTES = 513, 514
 POINTERS = (EXIF, GPS, INTEROPERABILITY)
-"""Tags whose value is the place of another directory."""
+"""The value of these tags is the place of another directory."""
 
 MOST_ENTRIES, MOST_BYTES, MOST_NUMBERS = 4096, 2**26, 2**20
-"""Limits of a directory and of its values; larger ones count as damaged."""
+"""These are the limits of a directory and of its values; larger ones count as damaged."""
 
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
-"""Bytes of a value, by type."""
+"""A value has this many bytes, by type."""
 
 
 class DamagedTags(ValueError):
@@ -49,7 +48,7 @@ class Tag(NamedTuple):
 
 
 class Directory(NamedTuple):
-    """The tags of a directory by their codes, and where the next one begins, 0 for none."""
+    """The tags of a directory by their codes, and the place of the next one, or 0."""
 
     entries: dict[int, Entry]
     following: int
@@ -62,7 +61,7 @@ class TiffFile:
         file: the bytes, which begin with those of a TIFF's header.
 
     Raises:
-        DamagedTags: if this is no TIFF.
+        DamagedTags: if this is not a TIFF.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -84,7 +83,7 @@ class TiffFile:
             (self.first,) = struct.unpack_from(self.order + "I", head, 4)
 
     def directory(self, place: int) -> Directory:
-        """The directory that begins at ``place``."""
+        """Read the directory that begins at ``place``."""
         counter, pointer = ("Q", "Q") if self.big else ("H", "I")
         head = struct.calcsize(self.order + counter)
         (count,) = struct.unpack(self.order + counter, self.read(place, head))
@@ -111,13 +110,13 @@ class TiffFile:
         return Directory(entries, self._following(place + head + count * step, pointer))
 
     def tag(self, entry: Entry) -> Tag:
-        """A tag with its values."""
+        """Read a tag with its values."""
         if entry.size > MOST_BYTES:
             raise DamagedTags(f"tag {entry.code} of {entry.size} bytes")
         return Tag(entry.code, entry.dtype, entry.values, self.read(entry.place, entry.size))
 
     def tags(self, entries: Iterable[Entry]) -> list[Tag]:
-        """Tags with their values. Their total size is limited, since values may overlap in a hostile file."""
+        """Read tags with their values. Their total size is limited, since values may overlap in a hostile file."""
         tags = []
         size = 0
         for entry in entries:
@@ -128,7 +127,7 @@ class TiffFile:
         return tags
 
     def numbers(self, entry: Entry | None) -> tuple[int, ...]:
-        """The whole numbers of a tag; none where it is missing or holds others."""
+        """Read the whole numbers of a tag; there are none if it is missing or holds something else."""
         letters = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}
         if entry is None or entry.dtype not in letters:
             return ()
@@ -137,14 +136,14 @@ class TiffFile:
         return struct.unpack(f"{self.order}{entry.values}{letters[entry.dtype]}", self.tag(entry).data)
 
     def number(self, directory: Directory, code: int, default: int = 0) -> int:
-        """The first whole number of a tag."""
+        """Read the first whole number of a tag."""
         numbers = self.numbers(directory.entries.get(code))
         if not numbers:
             return default
         return numbers[0]
 
     def rational(self, entry: Entry | None) -> float:
-        """The first number of a tag of fractions; 0 where it is missing, holds others, or divides by zero."""
+        """Read the first number of a tag of fractions; return 0 if it is missing, holds others, or divides by zero."""
         if entry is None or entry.dtype not in (5, 10):
             return 0.0
         letter = "I" if entry.dtype == 5 else "i"
@@ -154,14 +153,14 @@ class TiffFile:
         return float(numerator / denominator)
 
     def _following(self, place: int, pointer: str) -> int:
-        """Where the next directory begins. Some programs leave this out behind the last one."""
+        """Read where the next directory begins. Some programs leave this out after the last one."""
         size = struct.calcsize(self.order + pointer)
         if place + size > self.end:
             return 0
         return int(struct.unpack(self.order + pointer, self.read(place, size))[0])
 
     def read(self, place: int, size: int) -> bytes:
-        """Bytes of the file; DamagedTags if it has fewer."""
+        """Read bytes of the file; raise DamagedTags if it has fewer."""
         if place + size > self.end:
             raise DamagedTags(f"{size} bytes at {place} of {self.end}")
         self._file.seek(place)
@@ -169,7 +168,7 @@ class TiffFile:
 
 
 def pack_directory(order: str, tags: Iterable[Tag], place: int, following: int = 0) -> bytes:
-    """A directory that stands at ``place``, with the values that do not fit into it behind it."""
+    """Pack a directory for ``place``, followed by the values that do not fit into it."""
     ordered = sorted(tags, key=lambda tag: tag.code)
     beyond = place + 2 + 12 * len(ordered) + 4
 
@@ -185,5 +184,5 @@ def pack_directory(order: str, tags: Iterable[Tag], place: int, following: int =
 
 
 def pointer_tag(order: str, code: int, place: int) -> Tag:
-    """The tag that says where a directory stands."""
+    """Make the tag that says where a directory is."""
     return Tag(code, 4, 1, struct.pack(order + "I", place))

@@ -1,16 +1,16 @@
-r"""Mosaics and linear RGB out, as DNG: ``d = round(y (white - black) + black)``, 16 bits a site or sample.
+r"""Writing of mosaics and linear RGB as DNG: ``d = round(y (white - black) + black)``, 16 bits a site or sample.
 
 ``AsShotNeutral`` is the colour of grey to the camera, ``1 / white_balance``. ``ColorMatrix1`` takes XYZ to the camera
 under D65, ``X = diag(1 / daylight) M^-1 S^-1``, from the frame's ``color_matrix`` M (white-balanced camera to linear
 sRGB) and S, which takes linear sRGB to XYZ: the inverse of what :func:`rawaug.io.read_raw` does.
 
 A rewritten DNG keeps camera, colour, lens corrections, EXIF, GPS, XMP and previews of its source
-(:mod:`rawaug.io.carried`). The mosaic stands in the first directory, the previews in its sub-directories.
+(:mod:`rawaug.io.carried`). The mosaic is in the first directory, and the previews are in its sub-directories.
 
-Pixels are compressed as lossless JPEG, the difference to the left neighbour of the same colour in Huffman's code, to
-about half (14 bits) or a third (10 bits) of their size. (LibRaw reads no integers compressed by deflate.) Their MD5 is
-written as well, so that a damaged file can be told.
-Source: DNG specification 1.4, chapters 3 to 6; TIFF 6.0, section 2; ITU-T T.81, annex H.
+Pixels are compressed as lossless JPEG, which stores the difference to the left neighbour of the same colour in
+Huffman's code, to about half (14 bits) or a third (10 bits) of their size. (LibRaw reads no integers compressed by
+deflate.) Their MD5 is also written, so that a damaged file can be recognised. Source: DNG specification 1.4, chapters 3
+to 6; TIFF 6.0, section 2; ITU-T T.81, annex H.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ from rawaug.io.tiff import (
 from rawaug.version import __version__
 
 LINEAR_WHITE = 65535
-"""Digital number of white in a linear DNG, whose black is 0."""
+"""White has this digital number in a linear DNG, whose black is 0."""
 
 _BEYOND_16_BITS = 65535.5
 _LARGEST = 2.0**31 - 2
@@ -70,7 +70,7 @@ _LARGEST_ISO = 65535
 _D65 = 21
 _GREY = 1
 _EXIF_ORIENTATIONS = {0: 1, 1: 2, 3: 3, 2: 4, 4: 5, 6: 6, 7: 7, 5: 8}
-"""EXIF orientations by LibRaw's flip."""
+"""This maps LibRaw's flip to an EXIF orientation."""
 
 _SUBFILE_TYPE, _ORIENTATION, _PHOTOMETRIC, _SUB_IFDS = 254, 274, 262, 330
 _UNIQUE_CAMERA_MODEL = 50708
@@ -78,10 +78,10 @@ _CROP_ORIGIN, _CROP_SIZE = 50719, 50720
 _COLOR_MATRIX, _AS_SHOT_NEUTRAL, _ILLUMINANT = 50721, 50728, 50778
 _NOISE_PROFILE, _NEW_RAW_DIGEST = 51041, 51111
 _OF_MOSAICS = (50710, 50733, 50734, 50737, 50738, 51008, OPCODE_LIST_2)
-"""Green split, Bayer's sharpness, antialias strength, and opcodes of what is before demosaicing."""
+"""These are green split, Bayer's sharpness, antialias strength, and opcodes for before demosaicing."""
 
 _PADDING = 2
-"""Sites around the default crop, which Adobe's programs want for demosaicing."""
+"""Adobe's programs want this many sites around the default crop for demosaicing."""
 
 
 def write_dng(
@@ -91,14 +91,15 @@ def write_dng(
     baseline_exposure: float = 0.0,
     rgb: Tensor | None = None,
 ) -> None:
-    """Write a frame as a DNG, whole or not at all; the inverse of :func:`rawaug.io.read_raw`.
+    """Write a frame as a DNG, completely or not at all; this is the inverse of :func:`rawaug.io.read_raw`.
 
     Args:
         path: the file, in a folder that exists.
-        frame: its mosaic is rounded to digital numbers by its own levels; orientation, colour, noise profile, exposure
-            and gain maps are written as tags; ``iso`` and ``exposure`` too, unless the source has EXIF.
-        source: the RAW file that the frame was read from: its other metadata (a DNG's profiles, opcodes and crop;
-            EXIF, GPS and XMP of any TIFF) and its previews are kept.
+        frame: the frame. Its mosaic is rounded to digital numbers by its own levels; orientation, colour, noise
+            profile, exposure and gain maps are written as tags, and so are ``iso`` and ``exposure`` unless the source
+            has EXIF.
+        source: the RAW file that the frame was read from. Its other metadata (a DNG's profiles, opcodes and crop; EXIF,
+            GPS and XMP of any TIFF) and its previews are kept.
         baseline_exposure: stops by which a RAW developer should brighten; a DNG source's own value takes precedence.
         rgb: linear camera RGB ``(3, H, W)`` to write in place of the mosaic, as a linear DNG.
 
@@ -166,7 +167,7 @@ def _write_pixels(
         columns = np.ascontiguousarray(numbers)
         planes = "contig"
     else:
-        # even and odd columns of a mosaic are components: their colours differ
+        # even and odd columns of a mosaic are components, as their colours differ
         columns = numbers.reshape(height, width // 2, 2)
         planes = None
 
@@ -202,7 +203,7 @@ def _require_colour(frame: RawFrame, path: Path) -> None:
 
 
 def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
-    """The mosaic as uint16 ``(H, W)``."""
+    """Convert the mosaic to uint16 ``(H, W)``."""
     height, width = frame.mosaic.shape[-2:]
     if frame.mosaic.shape[0] != 1 or frame.mosaic.ndim != 3 or height % 2 or width % 2:
         raise ValueError(f"{path}: the mosaic must be (1, H, W) with even sides, got {tuple(frame.mosaic.shape)}")
@@ -226,14 +227,14 @@ def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
 
 
 def cell_of_planes(cfa: str) -> Tensor:
-    """Indices into a frame's ``black`` of the sites of a pattern's cell, ``(n, n)``."""
+    """Give, for the sites of a pattern's cell, the indices ``(n, n)`` into a frame's ``black``."""
     if cfa == MONOCHROME:
         return torch.zeros(1, 1, dtype=torch.long)
     return plane_indices(cfa)
 
 
 def linear_numbers(frame: RawFrame, rgb: Tensor, path: Path) -> np.ndarray:
-    """Linear RGB as uint16 ``(H, W, 3)``, black at 0 and white at 65535, clipped at both."""
+    """Convert linear RGB to uint16 ``(H, W, 3)``, with black at 0 and white at 65535, clipped at both."""
     size = frame.mosaic.shape[-2:]
     if rgb.shape != (3, *size):
         raise ValueError(f"{path}: full colour of this frame is (3, {size[0]}, {size[1]}), got {tuple(rgb.shape)}")
@@ -248,13 +249,13 @@ def _camera(frame: RawFrame) -> Tags:
     names = {271: make, 272: model or make, _UNIQUE_CAMERA_MODEL: frame.camera}
     tags: Tags = {}
     for code, name in names.items():
-        # tifffile takes text of 7 bits; DNG has UTF-8 in its place
+        # tifffile takes text of 7 bits, whereas DNG allows UTF-8
         tags[code] = (ASCII, 0, name if name.isascii() else name.encode())
     return tags
 
 
 def _converted(frame: RawFrame, baseline_exposure: float) -> Tags:
-    """The tags, besides those of colour, that a frame gets whose source is not a DNG."""
+    """Make the tags, besides those of colour, for a frame whose source is not a DNG."""
     needed = 3 if frame.gain_maps else 1
     tags: Tags = {
         DNG_VERSION: (BYTE, 4, bytes((1, 4, 0, 0))),
@@ -269,7 +270,7 @@ def _converted(frame: RawFrame, baseline_exposure: float) -> Tags:
 
 
 def _colour(frame: RawFrame) -> Tags:
-    """The matrix and the white balance of a frame whose source is not a DNG."""
+    """Make the matrix and the white balance for a frame whose source is not a DNG."""
     return {
         _COLOR_MATRIX: (SRATIONAL, 9, _rationals(xyz_to_camera(frame).ravel())),
         _AS_SHOT_NEUTRAL: (RATIONAL, 3, _rationals([1 / gain for gain in frame.white_balance])),
@@ -278,7 +279,7 @@ def _colour(frame: RawFrame) -> Tags:
 
 
 def _no_colour(frame: RawFrame) -> Tags:
-    """A monochrome picture has neither."""
+    """Give a monochrome picture neither matrix nor white balance."""
     return {}
 
 
@@ -293,7 +294,7 @@ def _of_mosaic(frame: RawFrame) -> Tags:
     known = pattern(frame.cfa)
     size = known.period
     kinds = plane_indices(frame.cfa).flatten().tolist()
-    # LibRaw states one level of X-Trans, if it is one
+    # LibRaw states one level of X-Trans if there is only one
     repeats = size if size == 2 or len(set(frame.black)) > 1 else 1
     levels = [frame.black[kind] for kind in kinds[: repeats**2]]
     return {
@@ -306,7 +307,7 @@ def _of_mosaic(frame: RawFrame) -> Tags:
 
 
 def _of_one_plane(frame: RawFrame) -> Tags:
-    """The levels of a monochrome picture."""
+    """Make the levels of a monochrome picture."""
     return _levels(frame, 1, [frame.black[0]])
 
 
@@ -322,7 +323,7 @@ def _levels(frame: RawFrame, repeats: int, black: Sequence[float]) -> Tags:
 
 
 def _of_full_colour(frame: RawFrame) -> Tags:
-    """Levels by colour; shading maps of the mosaic's sites become maps of the planes."""
+    """Make the levels by colour; shading maps of the mosaic's sites become maps of the planes."""
     maps = []
     for gain_map in frame.gain_maps:
         if gain_map.on_mosaic:
@@ -343,8 +344,8 @@ class _Layout:
     Attributes:
         photometric: what the pixels mean, in TIFF's numbers.
         tags: the levels and the pattern of a frame.
-        colour: its colours.
-        inapplicable: tags of a source that say nothing of such pixels.
+        colour: the tags of its colours.
+        inapplicable: tags of a source that do not apply to such pixels.
     """
 
     photometric: int
@@ -357,17 +358,17 @@ _MOSAIC = _Layout(CFA_PHOTOMETRIC, _of_mosaic)
 _ONE_PLANE = _Layout(_GREY, _of_one_plane, _no_colour, _OF_MOSAICS)
 _FULL_COLOUR = _Layout(LINEAR_PHOTOMETRIC, _of_full_colour, inapplicable=_OF_MOSAICS)
 _LAYOUTS = {MONOCHROME: _ONE_PLANE}
-"""Layouts of frames that are no mosaics, by their patterns."""
+"""Frames that are not mosaics have these layouts, by their patterns."""
 
 
 def xyz_to_camera(frame: RawFrame) -> np.ndarray:
-    """The DNG's ColorMatrix for D65, ``(3, 3)``."""
+    """Compute the DNG's ColorMatrix for D65, ``(3, 3)``."""
     balanced = np.linalg.inv(frame.color_matrix.double().numpy()) @ np.linalg.inv(XYZ_FROM_SRGB)
     return np.asarray(balanced / np.array(frame.daylight)[:, None])
 
 
 def _exif(frame: RawFrame, byte_order: str) -> list[Tag]:
-    """ISO and exposure as an EXIF directory, with the version of EXIF that it follows; empty where nothing is known."""
+    """Make an EXIF directory of ISO, exposure and the version of EXIF; it is empty if nothing is known."""
     shot = frame.exposure
     entries = []
     for code, value in ((33434, shot.seconds), (33437, shot.f_number), (37386, shot.focal_length)):
@@ -388,7 +389,7 @@ def _exif(frame: RawFrame, byte_order: str) -> list[Tag]:
 
 
 def _rationals(values: Iterable[float], denominator: int = 10**6) -> tuple[int, ...]:
-    """Numerators and denominators of 32 bits; large values get smaller denominators."""
+    """Convert to numerators and denominators of 32 bits; large values get smaller denominators."""
     numbers = []
     for value in values:
         if not abs(value) <= _LARGEST:
@@ -402,7 +403,7 @@ def _rationals(values: Iterable[float], denominator: int = 10**6) -> tuple[int, 
 
 
 def _append_directories(path: Path, directories: dict[str, list[Tag]], carried: Carried) -> None:
-    """Write sub-directories and previews behind the pixels, and have the first directory point at them."""
+    """Write sub-directories and previews after the pixels, and let the first directory point at them."""
     with path.open("r+b") as file:
         order = "<" if file.read(2) == b"II" else ">"
         for name, entries in directories.items():
@@ -417,7 +418,7 @@ def _append_directories(path: Path, directories: dict[str, list[Tag]], carried: 
             _point(file, order, _SUB_IFDS, places)
 
         first = _entry(file, order, _PHOTOMETRIC)
-        if _unpack(file, order + "H", first + _VALUE) == (_GREY,):  # tifffile writes linear RAW of three planes alone
+        if _unpack(file, order + "H", first + _VALUE) == (_GREY,):  # tifffile writes linear RAW only of three planes
             file.seek(first + _VALUE)
             file.write(struct.pack(order + "H", LINEAR_PHOTOMETRIC))
 
@@ -462,11 +463,11 @@ def _point(file: BinaryIO, order: str, code: int, places: Sequence[int]) -> None
 
 
 _VALUE = 8
-"""Offset within an entry of its value, or of the pointer to it."""
+"""An entry has its value, or the pointer to it, at this offset."""
 
 
 def _entry(file: BinaryIO, order: str, code: int) -> int:
-    """Where the entry of tag ``code`` stands in the first directory."""
+    """Find the place of the entry of tag ``code`` in the first directory."""
     (first,) = _unpack(file, order + "I", 4)
     (count,) = _unpack(file, order + "H", first)
     for place in range(first + 2, first + 2 + 12 * count, 12):

@@ -3,7 +3,7 @@ r"""Lens shading in DNG: the GainMap opcodes of its OpcodeList2 and OpcodeList3.
     corrected(i, j) = gain((i + 1/2) / H, (j + 1/2) / W) y(i, j)
 
 where ``gain`` interpolates a coarse grid bilinearly and holds its border values outside. Several maps multiply. A map
-of OpcodeList2 is made for the mosaic and reaches one site of the cell by its pitch of 2; a map of OpcodeList3 is made
+of OpcodeList2 is made for the mosaic and selects one site of the cell by its pitch of 2; a map of OpcodeList3 is made
 for the demosaiced picture, whose planes are R, G, B. Source: DNG specification 1.4, chapter 7, "GainMap"; opcode lists
 are big-endian in every file.
 """
@@ -34,10 +34,12 @@ class GainMap:
     Attributes:
         area: top, left, bottom, right in pixels of the visible frame.
         pitch: step in rows and columns within ``area``.
-        planes: first colour plane, and how many.
-        origin, spacing: of the grid, (vertical, horizontal), in parts of the frame's height and width.
+        planes: the first colour plane, and the number of planes.
+        origin, spacing: origin and spacing of the grid, (vertical, horizontal), in parts of the frame's height and
+            width.
         gains: float32 ``(P, V, H)``; further planes than P take the last one.
-        on_mosaic: of OpcodeList2, whose only plane is the mosaic; else of OpcodeList3, planes R, G, B.
+        on_mosaic: whether the map is of OpcodeList2, whose only plane is the mosaic; otherwise it is of OpcodeList3,
+            whose planes are R, G, B.
     """
 
     area: tuple[int, int, int, int]
@@ -50,7 +52,7 @@ class GainMap:
 
 
 def parse_gain_maps(opcodes: bytes, on_mosaic: bool) -> tuple[GainMap, ...]:
-    """The gain maps of an opcode list; its other opcodes are skipped.
+    """Parse the gain maps of an opcode list; its other opcodes are skipped.
 
     Raises:
         ValueError: if the list is truncated, or a map is incomplete or has spacings or gains that are not positive.
@@ -96,7 +98,7 @@ def _parse(body: bytes, on_mosaic: bool) -> GainMap:
 
 
 def opcode_list(maps: Iterable[GainMap]) -> bytes:
-    """The inverse of :func:`parse_gain_maps`, of maps for one list."""
+    """Pack the maps for one list; this is the inverse of :func:`parse_gain_maps`."""
     opcodes = []
     for gain_map in maps:
         planes, points_v, points_h = gain_map.gains.shape
@@ -108,7 +110,7 @@ def opcode_list(maps: Iterable[GainMap]) -> bytes:
 
 
 def of_planes(gain_map: GainMap, cfa: CFA | str) -> list[GainMap]:
-    """A map of a mosaic's sites as maps of the planes R, G, B of the demosaiced picture."""
+    """Turn a map of a mosaic's sites into maps of the planes R, G, B of the demosaiced picture."""
     if gain_map.pitch != (2, 2):
         return [replace(gain_map, planes=(0, 3))]
 

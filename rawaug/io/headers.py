@@ -1,9 +1,9 @@
-"""What the header of a picture file says beside its pixels: EXIF and XMP as bytes, and whether it is an animation.
+"""Metadata in the header of a picture file: EXIF and XMP as bytes, and whether it is an animation.
 
-Each container is walked by its own lengths, without decoding: the segments of JPEG, the chunks of PNG (some programs
-write EXIF behind the pixels) and of WebP, the directories of TIFF, the boxes of HEIF and JPEG XL. Damage ends the walk,
-and the decoder says what is wrong. Source: ITU-T T.81; PNG 3; RIFF container of WebP; TIFF 6.0; ISO/IEC 14496-12 and
-18181-1.
+Each container is walked through by its own lengths, without decoding: the segments of JPEG, the chunks of PNG (some
+programs write EXIF after the pixels) and of WebP, the directories of TIFF, and the boxes of HEIF and JPEG XL. Damage
+ends the walk, and the decoder says what is wrong. Source: ITU-T T.81; PNG 3; RIFF container of WebP; TIFF 6.0; ISO/IEC
+14496-12 and 18181-1.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class Headers(NamedTuple):
     Args:
         exif: a block that begins with a TIFF's header.
         xmp: a packet of XMP.
-        stated: the orientation of a TIFF, whose tags are no block.
+        stated: the orientation of a TIFF, whose tags are not a block.
         animated: whether the file says that it has several frames.
-        code_points: primaries and transfer function by the numbers of ITU-T H.273, of HEIF.
+        code_points: primaries and transfer function of HEIF by the numbers of ITU-T H.273.
     """
 
     exif: bytes | None = None
@@ -50,7 +50,7 @@ class Headers(NamedTuple):
 
     @property
     def orientation(self) -> int | None:
-        """The orientation that EXIF states, else the one of XMP; None where neither does, or it is none of 1 to 8."""
+        """The orientation that EXIF states, else that of XMP; None if neither does, or it is none of 1 to 8."""
         orientation = self.stated or orientation_of_exif(self.exif)
         if orientation is not None or self.xmp is None:
             return orientation
@@ -62,13 +62,13 @@ class Headers(NamedTuple):
 
 
 def read_headers(path: Path, name: str) -> Headers:
-    """The metadata of a file of the format ``name``; what is damaged or unknown is left out."""
+    """Read the metadata of a file of the format ``name``; damaged or unknown parts are left out."""
     with path.open("rb") as file:
         return headers_of_opened(file, name)
 
 
 def headers_of_opened(file: BinaryIO, name: str) -> Headers:
-    """:func:`read_headers` of a file that is open."""
+    """Read the metadata of an open file, as :func:`read_headers` does."""
     reader = _READERS.get(name)
     if reader is None:
         return Headers()
@@ -80,7 +80,7 @@ def headers_of_opened(file: BinaryIO, name: str) -> Headers:
 
 
 def orientation_of_exif(exif: bytes | None) -> int | None:
-    """The orientation of an EXIF block, 1 to 8; None if it states none."""
+    """Read the orientation of an EXIF block, 1 to 8; return None if it states none."""
     if not exif:
         return None
     try:
@@ -98,14 +98,14 @@ def orientation_of_exif(exif: bytes | None) -> int | None:
 
 
 class Segment(NamedTuple):
-    """A part of a JPEG's header: its marker, and what stands behind marker and length."""
+    """A part of a JPEG's header: its marker, and the data after marker and length."""
 
     marker: int
     data: bytes
 
 
 def jpeg_segments(file: BinaryIO) -> Iterator[Segment]:
-    """The segments of a JPEG before its first scan."""
+    """Yield the segments of a JPEG before its first scan."""
     file.seek(2)
     while True:
         head = file.read(4)
@@ -145,7 +145,7 @@ class Chunk(NamedTuple):
 
 
 def png_chunks(file: BinaryIO) -> Iterator[Chunk]:
-    """The chunks of a PNG in their order."""
+    """Yield the chunks of a PNG in their order."""
     place = len(PNG_SIGNATURE)
     end = file.seek(0, 2)
     for _ in range(_MOST_CHUNKS):
@@ -161,9 +161,9 @@ def png_chunks(file: BinaryIO) -> Iterator[Chunk]:
 
 
 def png_fault(path: Path) -> str | None:
-    """What is wrong with the chunks of a PNG that hold its pixels; None if they are whole.
+    """Say what is wrong with the chunks of a PNG that hold its pixels; return None if they are whole.
 
-    libpng would write this to the standard error stream, beside the line that names the file.
+    libpng would write this to the standard error stream, in addition to the line that names the file.
     """
     name = b""
     with path.open("rb") as file:
@@ -177,7 +177,7 @@ def png_fault(path: Path) -> str | None:
 
 
 def _checksum(file: BinaryIO, chunk: Chunk) -> bytes:
-    """The checksum of a chunk as it should be; the file is then at the one that it has."""
+    """Compute the checksum that a chunk should have; the file is then positioned at the one that it has."""
     file.seek(chunk.place)
     left, checksum = chunk.length, zlib.crc32(chunk.name)
     while left:
@@ -188,7 +188,7 @@ def _checksum(file: BinaryIO, chunk: Chunk) -> bytes:
 
 
 def chunk_data(file: BinaryIO, chunk: Chunk) -> bytes:
-    """What a chunk holds."""
+    """Read the data of a chunk."""
     if chunk.length > _MOST_BYTES:
         raise ValueError(f"chunk {chunk.name!r} of {chunk.length} bytes")
     file.seek(chunk.place)
@@ -211,7 +211,7 @@ def _of_png(file: BinaryIO) -> Headers:
 
 
 def xmp_of_text(data: bytes) -> bytes | None:
-    """The packet of an iTXt chunk; None if it holds another text."""
+    """Find the packet in an iTXt chunk; return None if it holds another text."""
     keyword, _, rest = data.partition(b"\0")
     if keyword != XMP_KEYWORD or len(rest) < 2:
         return None
@@ -220,7 +220,7 @@ def xmp_of_text(data: bytes) -> bytes | None:
 
 
 def inflate(data: bytes) -> bytes:
-    """Data of zlib, up to a limit."""
+    """Decompress data of zlib, up to a limit."""
     inflater = zlib.decompressobj()
     plain = inflater.decompress(data, _MOST_BYTES)
     if inflater.unconsumed_tail:
@@ -229,7 +229,7 @@ def inflate(data: bytes) -> bytes:
 
 
 def _raw_profile(name: bytes, data: bytes) -> bytes | None:
-    """EXIF as ImageMagick wrote it before PNG had a chunk for it: a text of hexadecimal numbers."""
+    """Read EXIF as ImageMagick wrote it before PNG had a chunk for it, as a text of hexadecimal numbers."""
     keyword, _, text = data.partition(b"\0")
     if keyword not in (b"Raw profile type exif", b"Raw profile type APP1"):
         return None
@@ -244,7 +244,7 @@ def _raw_profile(name: bytes, data: bytes) -> bytes | None:
 
 
 def webp_chunks(file: BinaryIO) -> Iterator[Chunk]:
-    """The chunks of a WebP in their order."""
+    """Yield the chunks of a WebP in their order."""
     place = 12
     end = file.seek(0, 2)
     for _ in range(_MOST_CHUNKS):
@@ -284,7 +284,7 @@ def _of_tiff(file: BinaryIO) -> Headers:
 
 
 class Box(NamedTuple):
-    """A box: its name, and where its contents begin and end."""
+    """A box, with its name and the places where its contents begin and end."""
 
     name: bytes
     start: int
@@ -292,7 +292,7 @@ class Box(NamedTuple):
 
 
 def boxes(file: BinaryIO, start: int, end: int) -> Iterator[Box]:
-    """The boxes between two places of a file."""
+    """Yield the boxes between two places of a file."""
     place = start
     for _ in range(_MOST_CHUNKS):
         file.seek(place)
@@ -312,7 +312,7 @@ def boxes(file: BinaryIO, start: int, end: int) -> Iterator[Box]:
 
 
 def _of_heif(file: BinaryIO) -> Headers:
-    """The code points of the first colour box; its decoder gives EXIF."""
+    """Read the code points of the first colour box; the decoder gives EXIF."""
     start, end = 0, file.seek(0, 2)
     for name, skipped in ((b"meta", 4), (b"iprp", 0), (b"ipco", 0)):
         inside = [box for box in boxes(file, start, end) if box.name == name]
@@ -330,7 +330,7 @@ def _of_heif(file: BinaryIO) -> Headers:
 
 
 def _of_jpeg_xl(file: BinaryIO) -> Headers:
-    """EXIF and XMP of a file of boxes, and whether the codestream is an animation."""
+    """Read EXIF and XMP of a file of boxes, and whether the codestream is an animation."""
     file.seek(0)
     if file.read(2) == b"\xff\x0a":
         file.seek(0)
@@ -386,7 +386,7 @@ def _is_animated_codestream(data: bytes) -> bool:
 
 
 def _pass_size(bits: _Bits) -> None:
-    """Pass over height and width; the latter is left out where a ratio gives it."""
+    """Pass over height and width; the latter is left out if a ratio gives it."""
     small = bits.take(1)
     for what in ("height", "width"):
         if small:

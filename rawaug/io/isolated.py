@@ -52,7 +52,7 @@ def isolated(read: Callable[..., T], *arguments: Any, name: object = None) -> T:
 
 
 def _exit_code(error: BrokenProcessPool) -> str:
-    """The exit code in loky's message, in brackets after a space; empty if the message has none."""
+    """Find the exit code in loky's message, in brackets after a space; the text is empty if it has none."""
     match = re.search(r"exit codes? .*\{(.*)\}", str(error))
     if match is None:
         return ""
@@ -72,7 +72,7 @@ def damage_as_os_error(path: Path, what: str, *passed: type[Exception]) -> Itera
 
 
 def time_limit() -> float:
-    """Maximum number of seconds for reading a file; 0 means that files are read in this process."""
+    """Read the maximum number of seconds for reading a file; 0 means that files are read in this process."""
     text = os.environ.get(LIMIT, str(SECONDS))
     try:
         seconds = float(text)
@@ -86,10 +86,10 @@ def time_limit() -> float:
 
 @cache
 def _helper() -> Any:
-    """loky starts it without importing the user's script again, unlike multiprocessing's forkserver."""
+    """Start the helper by loky, which does not import the user's script again, unlike multiprocessing's forkserver."""
     from loky import ProcessPoolExecutor
 
-    # the helper has no helper of its own, and the parent reports a crash, so that no traceback is printed
+    # the helper has no helper itself, and the parent reports a crash, so no traceback is printed
     env = {LIMIT: "0", "PYTHONFAULTHANDLER": "", "OPENBLAS_NUM_THREADS": "1"}
 
     # only the parent handles Ctrl-C

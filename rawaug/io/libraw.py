@@ -1,8 +1,8 @@
-"""RAW files opened and unpacked by LibRaw, whose complaints become one line that names the file.
+"""RAW files, opened and unpacked by LibRaw, whose complaints become one line that names the file.
 
-LibRaw writes what it finds damaged to the standard error stream and goes on. What it did not decode is then memory that
-it never wrote to, which may hold the pixels of the file before. So that stream is caught while LibRaw unpacks. Memory
-is filled with :data:`FILL` first, where the C library can do so (glibc), which tells the sites that were left out.
+LibRaw reports damage on the standard error stream and goes on. What it did not decode is then memory that it never
+wrote to, which may hold the pixels of the previous file. That stream is therefore caught while LibRaw unpacks. Memory
+is first filled with :data:`FILL`, if the C library can do so (glibc), which reveals the sites that were left out.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ from rawaug.io.pictures import require_utf8
 from rawaug.io.tiff import TiffTags, read_tiff_tags
 
 MAX_PIXELS = 200_000_000
-"""Maximum number of sites of a mosaic; the largest sensors have 150 million."""
+"""A mosaic has at most this many sites; the largest sensors have 150 million."""
 
 FILL = 0xFEFE
-"""The number that every site of a mosaic holds before it is decoded."""
+"""Every site of a mosaic holds this number before it is decoded."""
 
 SMALLEST_GAP = 64
-"""Minimum number of sites without a value for a gap; fewer may be defects of the sensor."""
+"""A gap has at least this many sites without a value; fewer may be defects of the sensor."""
 
 KNOWN_PATTERNS = "Bayer, X-Trans and Quad-Bayer RAW is supported"
 
 _DEVELOPED = (b"\xff\xd8\xff", b"\x89PNG", b"RIFF", b"GIF8", b"\x00\x00\x00\x0cJXL", b"\xff\x0a")
-"""First bytes of files that cannot hold RAW: JPEG, PNG, WebP, GIF, JPEG XL."""
+"""Files that begin with these bytes cannot hold RAW: JPEG, PNG, WebP, GIF, JPEG XL."""
 
 _UNREAD_COMPRESSIONS = {52546: "JPEG XL (DNG 1.7)", 34892: "lossy JPEG", 8: "deflate", 32946: "deflate"}
-"""Compressions that LibRaw may fail to decode, by TIFF's number."""
+"""LibRaw may fail to decode these compressions, by TIFF's number."""
 
 _COMPLAINT = re.compile(r": (Unexpected end of file|data corrupted at -?\d+)$")
 _M_PERTURB = -6
-"""glibc's parameter of ``mallopt``: new memory is filled with the complement of this byte."""
+"""With this parameter of glibc's ``mallopt``, new memory is filled with the complement of a byte."""
 
 
 @contextmanager
 def opened_raw(path: Path, unpack: bool = True) -> Iterator[tuple[Any, TiffTags]]:
-    """The file, its mosaic decoded if it is to be unpacked, and its TIFF tags.
+    """Open a file, decode its mosaic if it is to be unpacked, and read its TIFF tags.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -62,7 +62,7 @@ def opened_raw(path: Path, unpack: bool = True) -> Iterator[tuple[Any, TiffTags]
 
     require_file(path, "RAW file")
     require_utf8(path)
-    # rawpy warns of forks, which rendering on one thread makes safe
+    # rawpy warns about forks, which rendering on one thread makes safe
     warnings.filterwarnings("ignore", "rawpy is being used in a process created by", RuntimeWarning)
 
     try:
@@ -76,7 +76,7 @@ def opened_raw(path: Path, unpack: bool = True) -> Iterator[tuple[Any, TiffTags]
             yield raw, tags
     except rawpy.LibRawError as error:
         raise _explained(path, error) from error
-    except NotImplementedError as error:  # rawpy's, of a mosaic without a repeating cell
+    except NotImplementedError as error:  # from rawpy, for a mosaic without a repeating cell
         raise ValueError(f"{path}: has no mosaic of a known pattern ({error}); {KNOWN_PATTERNS}") from error
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         raise OSError(f"{path}: its white balance or colour matrix is damaged ({error}); copy it again") from error
@@ -94,7 +94,7 @@ def _require_size(path: Path, raw: Any, tags: TiffTags) -> None:
 
 
 def _unpack(path: Path, raw: Any, tags: TiffTags) -> None:
-    """Decode the mosaic; OSError if a part of it is not there."""
+    """Decode the mosaic; raise OSError if a part of it is missing."""
     with caught_stderr() as lines, _filled_memory() as filled:
         raw.unpack()
     if lines:
@@ -114,7 +114,7 @@ def _unpack(path: Path, raw: Any, tags: TiffTags) -> None:
 
 
 def is_stack(raw: Any) -> bool:
-    """Whether a file has all colours at every pixel."""
+    """Tell whether a file has all colours at every pixel."""
     with extra("raw"):
         import rawpy
 
@@ -122,7 +122,7 @@ def is_stack(raw: Any) -> bool:
 
 
 def _explained(path: Path, error: Any) -> Exception:
-    """LibRaw's error as one that says what the file is, where its content tells."""
+    """Turn LibRaw's error into one that says what the file is, if its content shows that."""
     with extra("raw"):
         import rawpy
 
@@ -190,7 +190,7 @@ def caught_stderr() -> Iterator[list[str]]:
 
 @contextmanager
 def _filled_memory() -> Iterator[bool]:
-    """Have the C library fill new memory with :data:`FILL`; False where it cannot."""
+    """Let the C library fill new memory with :data:`FILL`; yield False if it cannot."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):

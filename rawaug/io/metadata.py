@@ -1,11 +1,11 @@
 """EXIF, XMP and ICC profiles, carried from one picture file to another byte for byte.
 
-Between two files of one format everything is copied as it stands: the segments of a JPEG, with what follows its picture
-(gain maps, short films), the chunks of a PNG before and behind its pixels, the tags of a TIFF. To another format go
-EXIF, XMP and the ICC profile. What describes the coding of the pixels is the new file's own. Three things are mended
-because new pixels make them untrue: a thumbnail in EXIF is rendered again in the bytes that it has; an orientation
-becomes 1 where the decoder has turned the picture (HEIC, JPEG XL); and the list of pictures in a JPEG of several (MPF)
-gets their new places. Source: Exif 2.32; CIPA DC-007 (MPF); PNG 3; TIFF 6.0.
+Between two files of one format, everything is copied as it is: the segments of a JPEG and what follows its picture
+(gain maps, short films), the chunks of a PNG before and after its pixels, the tags of a TIFF. To another format, EXIF,
+XMP and the ICC profile are copied. Data that describe the coding of the pixels are the new file's own. Three things are
+corrected because new pixels make them untrue: a thumbnail in EXIF is rendered again into the bytes that it has; an
+orientation becomes 1 if the decoder has turned the picture (HEIC, JPEG XL); and the list of pictures in a JPEG of
+several (MPF) gets their new places. Source: Exif 2.32; CIPA DC-007 (MPF); PNG 3; TIFF 6.0.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _APP0, _APP1, _APP2, _APP14, _APP15, _COMMENT = 0xE0, 0xE1, 0xE2, 0xEE, 0xEF, 0x
 _MOST_IN_SEGMENT = 65533
 _MP_ENTRIES = 45058
 _LARGEST_THUMBNAIL = 2**20
-"""Pixels of a thumbnail; a larger one is left as it is."""
+"""A thumbnail is rendered up to this many pixels; a larger one is left as it is."""
 
 _LAYOUT = frozenset(
     (
@@ -67,25 +67,25 @@ _LAYOUT = frozenset(
         *(*range(320, 331), *range(332, 348), *range(512, 522), *range(529, 533), 559, 37724),
     )
 )
-"""Tags of a TIFF that describe how its pixels are stored; 37724 holds Photoshop's layers, which are other pixels."""
+"""These tags of a TIFF describe how its pixels are stored; 37724 holds Photoshop's layers, which are other pixels."""
 _NOT_IN_EXIF = (XMP_TAG, IPTC_TAG, PHOTOSHOP_TAG, ICC_TAG)
-"""Tags of a TIFF that other files have in parts of their own."""
+"""Other files have these tags of a TIFF in separate parts."""
 
 _OF_PNG_CODING = (
     *(b"IHDR", b"PLTE", b"IDAT", b"IEND", b"tRNS", b"hIST", b"sPLT", b"bKGD", b"sBIT"),
     *(b"acTL", b"fcTL", b"fdAT"),
 )
 _KEPT_OF_PNG = (b"iCCP", b"sRGB", b"gAMA", b"cHRM", b"cICP", b"mDCV", b"cLLI", b"mDCv", b"cLLi", b"tIME")
-"""Chunks that may not be copied to other pixels unless they are known, which these are."""
+"""These chunks may only be copied to other pixels because they are known."""
 
 
 class Metadata(NamedTuple):
-    """What a file says beside its pixels.
+    """The metadata of a file, besides its pixels.
 
     Args:
         source: the file.
         format: of its content, such as ``"JPEG"``.
-        exif: a block that begins with a TIFF's header; of a TIFF, one that is made of its tags.
+        exif: a block that begins with a TIFF's header; for a TIFF, one that is made of its tags.
         xmp: a packet of XMP.
         profile: the ICC profile.
     """
@@ -98,11 +98,11 @@ class Metadata(NamedTuple):
 
 
 Thumbnail = Callable[[int, int], np.ndarray]
-"""A function that renders the new picture, as it is stored, in a height and a width: uint8 ``(h, w, 3)``."""
+"""It renders the new picture, as it is stored, at a height and a width: uint8 ``(h, w, 3)``."""
 
 
 def read_exif(path: Path, name: str) -> bytes | None:
-    """The EXIF block of a file of the format ``name``; of a TIFF, one that is made of its tags."""
+    """Read the EXIF block of a file of the format ``name``; for a TIFF, make one of its tags."""
     if name != "TIFF":
         return read_headers(path, name).exif
     try:
@@ -115,7 +115,7 @@ def read_exif(path: Path, name: str) -> bytes | None:
 
 
 def _exif_of_tiff(path: Path) -> bytes:
-    """The tags of a TIFF's first directory that are no part of its coding, and those of EXIF and GPS, as a block."""
+    """Make a block of EXIF, GPS and the tags of a TIFF's first directory that are no part of its coding."""
     with path.open("rb") as file:
         tiff = TiffFile(file)
         first = tiff.directory(tiff.first)
@@ -124,7 +124,7 @@ def _exif_of_tiff(path: Path) -> bytes:
 
 
 def _without_layout(entries: Iterable[Entry]) -> list[Entry]:
-    """Tags that neither describe how pixels are stored nor point at other directories."""
+    """Select tags that neither describe how pixels are stored nor point at other directories."""
     return _without(POINTERS, _without(_LAYOUT, entries))
 
 
@@ -133,7 +133,7 @@ def _without(codes: Container[int], entries: Iterable[Entry]) -> list[Entry]:
 
 
 def _pack_block(tiff: TiffFile, tags: list[Tag], first: Directory) -> bytes:
-    """A block of ``tags`` and of the directories that ``first`` points at."""
+    """Pack a block of ``tags`` and of the directories that ``first`` points at."""
     codes = [code for code in (EXIF, GPS) if code in first.entries]
     placeholders = [pointer_tag(tiff.order, code, 0) for code in codes]
     size = len(pack_directory(tiff.order, tags + placeholders, 8))
@@ -149,13 +149,13 @@ def _pack_block(tiff: TiffFile, tags: list[Tag], first: Directory) -> bytes:
 
 
 def _tiff_head(order: str) -> bytes:
-    """The first eight bytes of a TIFF whose first directory follows."""
+    """Make the first eight bytes of a TIFF whose first directory follows."""
     signature = b"II*\0" if order == "<" else b"MM\0*"
     return signature + struct.pack(order + "I", 8)
 
 
 def _pack_pointed(tiff: TiffFile, source: int, place: int) -> bytes:
-    """The directory at ``source`` of a file for ``place`` of a block, with that of interoperability behind it."""
+    """Pack the directory at ``source`` of a file for ``place`` of a block, followed by the interoperability one."""
     directory = tiff.directory(source)
     tags = tiff.tags(_without(POINTERS, directory.entries.values()))
     if INTEROPERABILITY not in directory.entries:
@@ -169,9 +169,9 @@ def _pack_pointed(tiff: TiffFile, source: int, place: int) -> bytes:
 
 
 def mend_exif(exif: bytes, thumbnail: Thumbnail | None, upright: bool) -> bytes:
-    """A block with its thumbnail rendered again, and the orientation 1 if the picture has been turned ``upright``.
+    """Render a block's thumbnail again, and set its orientation to 1 if the picture was turned ``upright``.
 
-    Every other byte stays where it is. A block that is damaged is left as it is.
+    Every other byte stays where it is. A damaged block is left as it is.
     """
     block = bytearray(exif)
     try:
@@ -189,7 +189,7 @@ def mend_exif(exif: bytes, thumbnail: Thumbnail | None, upright: bool) -> bytes:
 
 
 def _mend_thumbnail(block: bytearray, tiff: TiffFile, second: Directory, render: Thumbnail) -> None:
-    """Put a new JPEG of the same sides where the old one stands, at the best quality that fits."""
+    """Put a new JPEG of the same sides in place of the old one, at the best quality that fits."""
     from PIL import Image
 
     start, size = tiff.number(second, THUMBNAIL), tiff.number(second, THUMBNAIL_BYTES)
@@ -215,7 +215,7 @@ def _mend_thumbnail(block: bytearray, tiff: TiffFile, second: Directory, render:
 
 
 def _small_jpeg(pixels: np.ndarray, size: int) -> bytes | None:
-    """A JPEG of the best quality that takes at most ``size`` bytes; None if none does."""
+    """Encode a JPEG at the best quality that takes at most ``size`` bytes; return None if none does."""
     from PIL import Image
 
     picture = Image.fromarray(pixels)
@@ -231,7 +231,7 @@ def _small_jpeg(pixels: np.ndarray, size: int) -> bytes | None:
 
 
 def dress_jpeg(plain: bytes, metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -> bytes:
-    """A JPEG as an encoder writes it, with the metadata of the source in place of the encoder's."""
+    """Give a JPEG, as an encoder writes it, the metadata of the source in place of the encoder's."""
     coding = _without_application_segments(plain)
     if metadata.format != "JPEG":
         return b"\xff\xd8" + _new_segments(metadata, thumbnail, upright) + coding
@@ -253,7 +253,7 @@ def dress_jpeg(plain: bytes, metadata: Metadata, thumbnail: Thumbnail | None, up
 
 
 def _is_kept(segment: Segment) -> bool:
-    """Whether a segment is metadata: not a table, nor what the encoder says of its colours."""
+    """Tell whether a segment is metadata, and neither a table nor the encoder's data on its colours."""
     if segment.marker == _COMMENT:
         return True
     if segment.marker == _APP14 and segment.data.startswith(b"Adobe"):
@@ -275,7 +275,7 @@ def _pack_segment(segment: Segment) -> bytes:
 
 
 def _new_segments(metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -> bytes:
-    """EXIF, XMP and the profile of another kind of file; a warning of what is too long for a segment."""
+    """Pack EXIF, XMP and the profile of another kind of file; warn if one is too long for a segment."""
     packed = b""
     if metadata.exif is not None:
         exif = EXIF_PREFIX + mend_exif(metadata.exif, thumbnail, upright)
@@ -288,7 +288,7 @@ def _new_segments(metadata: Metadata, thumbnail: Thumbnail | None, upright: bool
 
 
 def _pack_if_short(what: str, data: bytes, source: Path) -> bytes:
-    """A segment of metadata; nothing, and a warning, if it does not fit into one."""
+    """Pack a segment of metadata; return nothing, with a warning, if it does not fit into one."""
     if len(data) > _MOST_IN_SEGMENT:
         warnings.warn(f"{source}: its {what} of {len(data)} bytes is left out of a JPEG", stacklevel=2)
         return b""
@@ -296,7 +296,7 @@ def _pack_if_short(what: str, data: bytes, source: Path) -> bytes:
 
 
 def _profile_segments(profile: bytes) -> bytes:
-    """An ICC profile in as many segments as it needs, each with its number and their count."""
+    """Pack an ICC profile into as many segments as it needs, each with its number and their count."""
     step = _MOST_IN_SEGMENT - len(_ICC_PREFIX) - 2
     starts = range(0, len(profile), step)
 
@@ -308,7 +308,7 @@ def _profile_segments(profile: bytes) -> bytes:
 
 
 def _without_application_segments(plain: bytes) -> bytes:
-    """The tables and the scans of a JPEG: what stands behind its start and its application segments."""
+    """Select the tables and the scans of a JPEG, which follow its start and its application segments."""
     place = 2
     while plain[place] == 0xFF and _APP0 <= plain[place + 1] <= _APP15:
         (length,) = struct.unpack_from(">H", plain, place + 2)
@@ -317,11 +317,11 @@ def _without_application_segments(plain: bytes) -> bytes:
 
 
 _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]", re.DOTALL)
-"""A marker within or behind a scan other than a stuffed byte or a restart."""
+"""This matches a marker within or after a scan, except for a stuffed byte or a restart."""
 
 
 def _end_of_picture(source: bytes) -> int:
-    """Where the first picture of a JPEG ends, behind its end-of-image marker; the file's end if it has none."""
+    """Find where the first picture of a JPEG ends, after its end-of-image marker or else at the file's end."""
     place = 2
     while (match := _MARKER.search(source, place)) is not None:
         marker = source[match.start() + 1]
@@ -336,7 +336,7 @@ def _end_of_picture(source: bytes) -> int:
 
 
 def _with_places(new: bytes, segments: list[Segment], source: bytes, end: int) -> bytes:
-    """The new first picture, whose list of pictures (MPF), if it has one, says where the others now stand."""
+    """Update the list of pictures (MPF) of the new first picture, if it has one, with the others' new places."""
     listing = _listing_of(segments)
     if listing is None:
         return new
@@ -364,7 +364,7 @@ def _with_places(new: bytes, segments: list[Segment], source: bytes, end: int) -
 
 
 def _listing_of(segments: Iterable[Segment]) -> bytes | None:
-    """The list of pictures of a JPEG of several."""
+    """Find the list of pictures in a JPEG of several."""
     for segment in segments:
         if segment.marker == _APP2 and segment.data.startswith(_MPF_PREFIX):
             return segment.data
@@ -375,7 +375,7 @@ def _listing_of(segments: Iterable[Segment]) -> bytes | None:
 
 
 def dress_png(plain: bytes, metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -> bytes:
-    """A PNG as an encoder writes it, with the metadata of the source in their places."""
+    """Give a PNG, as an encoder writes it, the metadata of the source in their places."""
     before, behind = _png_parts(metadata, thumbnail, upright)
     header: list[bytes] = []
     pixels: list[bytes] = []
@@ -390,12 +390,12 @@ def dress_png(plain: bytes, metadata: Metadata, thumbnail: Thumbnail | None, upr
 
 
 def pack_chunk(name: bytes, data: bytes) -> bytes:
-    """A chunk of a PNG."""
+    """Pack a chunk of a PNG."""
     return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
 def _png_parts(metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -> tuple[list[bytes], list[bytes]]:
-    """The chunks of metadata before and behind the pixels."""
+    """Collect the chunks of metadata before and after the pixels."""
     if metadata.format != "PNG":
         return _new_chunks(metadata, thumbnail, upright), []
 
@@ -416,7 +416,7 @@ def _png_parts(metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -
 
 
 def _new_chunks(metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) -> list[bytes]:
-    """The profile, EXIF and XMP of another kind of file."""
+    """Make chunks of the profile, EXIF and XMP of another kind of file."""
     chunks = []
     if metadata.profile is not None:
         chunks.append(pack_chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(metadata.profile)))
@@ -428,7 +428,7 @@ def _new_chunks(metadata: Metadata, thumbnail: Thumbnail | None, upright: bool) 
 
 
 def _is_copied(name: bytes) -> bool:
-    """Whether a chunk may stand beside other pixels: it is known to, or its name says so."""
+    """Tell whether a chunk may go with other pixels: it is known to, or its name says so."""
     if name in _OF_PNG_CODING:
         return False
     return name in _KEPT_OF_PNG or bool(name[3:4].islower())
@@ -438,9 +438,9 @@ def _is_copied(name: bytes) -> bool:
 
 
 def dress_tiff(plain: bytes, metadata: Metadata, upright: bool) -> bytes:
-    """A TIFF as an encoder writes it, in the byte order of the block, with the tags of the source.
+    """Give a TIFF, as an encoder writes it, the tags of the source, in the byte order of the block.
 
-    The block of EXIF comes first, at the offsets that it has: makers' notes may hold such. Its thumbnail is not
+    The block of EXIF comes first and keeps its offsets, since makers' notes may hold such offsets. Its thumbnail is not
     linked, since readers would take it for a second page.
     """
     tiff = TiffFile(BytesIO(plain))
@@ -471,14 +471,14 @@ def dress_tiff(plain: bytes, metadata: Metadata, upright: bool) -> bytes:
 
 
 def byte_order(metadata: Metadata) -> str:
-    """The byte order of the metadata, ``<`` or ``>``, which a TIFF that holds them must have."""
+    """Find the byte order of the metadata, ``<`` or ``>``, which a TIFF that holds them must have."""
     if metadata.exif is not None and metadata.exif.startswith(b"MM"):
         return ">"
     return "<"
 
 
 def _tags_of_block(block: bytes) -> list[Tag]:
-    """The tags of a block's first directory that a picture's can have, with the pointers to EXIF and GPS."""
+    """Select the tags of a block's first directory that a picture's can have, with the pointers to EXIF and GPS."""
     tiff = TiffFile(BytesIO(block))
     entries = tiff.directory(tiff.first).entries
     pointers = [entries[code] for code in (EXIF, GPS) if code in entries]
@@ -486,7 +486,7 @@ def _tags_of_block(block: bytes) -> list[Tag]:
 
 
 def _block_of(metadata: Metadata, order: str, upright: bool) -> bytes:
-    """The EXIF block, or an empty one where there is none, or a damaged one."""
+    """Return the EXIF block, or an empty one if there is none or it is damaged."""
     if metadata.exif is not None:
         try:
             _tags_of_block(metadata.exif)
@@ -498,7 +498,7 @@ def _block_of(metadata: Metadata, order: str, upright: bool) -> bytes:
 
 
 def _tags_of_parts(metadata: Metadata, order: str) -> list[Tag]:
-    """XMP, the profile, and of a TIFF its IPTC and Photoshop's resources."""
+    """Make tags of XMP and the profile, and for a TIFF also of its IPTC and Photoshop's resources."""
     if metadata.format == "TIFF":
         with metadata.source.open("rb") as file:
             tiff = TiffFile(file)

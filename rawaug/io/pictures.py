@@ -5,7 +5,7 @@ The display transfer of sRGB (IEC 61966-2-1:1999), for linear light l and displa
     v = 12.92 l                      for l <= 0.0031308
     v = 1.055 l^(1/2.4) - 0.055      otherwise
 
-OpenEXR and Radiance files hold l, everything else is taken to hold v. An embedded ICC profile of another space (Display
+OpenEXR and Radiance files hold l; everything else is taken to hold v. An embedded ICC profile of another space (Display
 P3, Adobe RGB, linear light, grey of another gamma) is applied by :mod:`rawaug.io.profiles`; without one, a picture is
 taken to be sRGB whatever else its tags say. Pictures that are denoised are read by :mod:`rawaug.io.stored`.
 """
@@ -33,36 +33,36 @@ from rawaug.io.metadata import read_exif
 from rawaug.io.profiles import to_srgb
 
 _VIEW_OF_EXIF_ORIENTATION = (0, 1, 3, 2, 4, 5, 7, 6)
-"""Views of :func:`rawaug.bayer.turn` that bring EXIF orientations 1 to 8 upright."""
+"""These views of :func:`rawaug.bayer.turn` bring EXIF orientations 1 to 8 upright."""
 
 _HALF_LEVEL = 0.5 / 255
 
 
 def encode_srgb(linear: Tensor) -> Tensor:
-    """Linear light in [0, 1] to display values in [0, 1], any shape."""
+    """Convert linear light in [0, 1] to display values in [0, 1], of any shape."""
     curve = 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
     return torch.where(linear <= 0.0031308, 12.92 * linear, curve)
 
 
 def decode_srgb(display: Tensor) -> Tensor:
-    """Display values in [0, 1] to linear light in [0, 1], any shape; the inverse of :func:`encode_srgb`."""
+    """Convert display values in [0, 1] to linear light in [0, 1], of any shape; the inverse of :func:`encode_srgb`."""
     curve = ((display.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(display <= 0.04045, display / 12.92, curve)
 
 
 def view_of_orientation(orientation: int) -> int:
-    """The view of :func:`rawaug.bayer.turn` that shows a picture of this EXIF orientation upright; 0 if unknown."""
+    """Find the view of :func:`rawaug.bayer.turn` that turns this EXIF orientation upright; 0 if it is unknown."""
     if not 1 <= orientation <= 8:
         return 0
     return _VIEW_OF_EXIF_ORIENTATION[orientation - 1]
 
 
 def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
-    """The first picture of a file as sRGB, uint8 ``(3, H, W)``, upright as its EXIF orientation says.
+    """Read the first picture of a file as sRGB, uint8 ``(3, H, W)``, upright as its EXIF orientation says.
 
     Grey becomes three equal channels. Transparency is composited over black. 16 bits become 8 by rounding to the
-    nearest level; floating point too, and must lie in [0, 1] (half an 8-bit level aside). Of a JPEG with a gain map
-    ("Ultra HDR") it is the picture that any viewer shows.
+    nearest level. So does floating point, which must lie in [0, 1] (half an 8-bit level aside). A JPEG with a gain map
+    ("Ultra HDR") gives the picture that any viewer shows.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -78,7 +78,7 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
     path = Path(path)
     picture = decode(path, max_pixels, coarse=True)
     pixels = _as_srgb(_over_black(picture), picture, path)
-    # NumPy puts the planes apart several times faster than PyTorch
+    # NumPy separates the planes several times faster than PyTorch
     planes = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
 
     view = view_of_orientation(picture.orientation)
@@ -88,7 +88,7 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
 
 
 def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """The numbers of a file with one channel as they are stored, uint8 or uint16 ``(H, W)``: a mosaic kept as a PNG."""
+    """Read the stored numbers of a file with one channel, uint8 or uint16 ``(H, W)``, such as a mosaic in a PNG."""
     picture = decode(Path(path), max_pixels)
     numbers = picture.colours
     if numbers.shape[-1] != 1 or picture.alpha is not None or numbers.dtype not in (np.uint8, np.uint16):
@@ -104,7 +104,7 @@ def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
 
 
 def _over_black(picture: Decoded) -> np.ndarray:
-    """The colours multiplied by alpha, in their own type."""
+    """Multiply the colours by alpha, in their own type."""
     if picture.alpha is None or picture.associated:
         return picture.colours
     if picture.colours.dtype.kind == "f":
@@ -116,7 +116,7 @@ def _over_black(picture: Decoded) -> np.ndarray:
 
 
 def _as_srgb(colours: np.ndarray, picture: Decoded, path: Path) -> np.ndarray:
-    """Colours of a picture as sRGB, uint8 ``(H, W, 3)``."""
+    """Convert the colours of a picture to sRGB, uint8 ``(H, W, 3)``."""
     pixels = colours
     if pixels.shape[-1] == 1:
         pixels = np.repeat(pixels, 3, axis=-1)
@@ -136,7 +136,7 @@ def _as_srgb(colours: np.ndarray, picture: Decoded, path: Path) -> np.ndarray:
 
 
 def require_unit_range(pixels: np.ndarray, path: str | Path) -> np.ndarray:
-    """Floating point in [0, 1]; ValueError if a number leaves it by more than half an 8-bit level."""
+    """Clip floating point to [0, 1]; raise ValueError if a number leaves it by more than half an 8-bit level."""
     low, high = float(pixels.min()), float(pixels.max())
     if not (low >= -_HALF_LEVEL and high <= 1 + _HALF_LEVEL):
         raise ValueError(f"{path}: has values from {low:.4g} to {high:.4g}, expected [0, 1]; scale or tone-map it")
@@ -167,13 +167,13 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
 
 
 def require_written(output: Any, success: bool, path: str | Path) -> None:
-    """Close OpenImageIO's ``output``; OSError if that fails, or writing to it was no ``success``."""
+    """Close OpenImageIO's ``output``; raise OSError if that fails, or if writing to it was no ``success``."""
     if not (output.close() and success):
         raise OSError(f"{path}: cannot be written (OpenImageIO: {reason(output) or 'no reason given'})")
 
 
 def encode_png(srgb: Tensor) -> bytes:
-    """sRGB ``(3, H, W)`` in [0, 1] as a PNG file of 8 bits."""
+    """Encode sRGB ``(3, H, W)`` in [0, 1] as a PNG file of 8 bits."""
     with extra("raw"):
         from PIL import Image
 
@@ -187,9 +187,9 @@ _EXPOSURE_TIME, _F_NUMBER, _ISO, _EXPOSURE_INDEX = 33434, 33437, 34855, 34866
 
 
 def read_exposure(path: str | Path) -> float:
-    """The exposure in stops, ``log2(t S / (100 N^2))`` of its EXIF's seconds t, ISO S and f-number N.
+    """Read the exposure in stops, ``log2(t S / (100 N^2))``, from EXIF's seconds t, ISO S and f-number N.
 
-    One stop more is twice the RAW value; unlike the exposure value of ISO 2720 it grows with exposure.
+    One stop more is twice the RAW value; unlike the exposure value of ISO 2720, it grows with exposure.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -206,7 +206,7 @@ def read_exposure(path: str | Path) -> float:
 
 
 def _exposure_of(path: Path) -> dict[str, float]:
-    """Seconds, f-number and ISO as EXIF states them, 0 for none."""
+    """Read seconds, f-number and ISO as EXIF states them, with 0 for none."""
     values = {"exposure time": 0.0, "f-number": 0.0, "ISO": 0.0}
     exif = read_exif(path, content_of(path).format)
     if exif is None:
@@ -231,7 +231,7 @@ def _exposure_of(path: Path) -> dict[str, float]:
 
 
 def recode_jpeg(srgb: Tensor, quality: int, chroma: str = "4:2:2") -> Tensor:
-    """sRGB ``(3, H, W)`` uint8, encoded at ``quality`` (1 to 100) and decoded again; ``chroma`` is its subsampling."""
+    """Encode sRGB ``(3, H, W)`` uint8 at ``quality`` (1 to 100) and decode it; ``chroma`` is its subsampling."""
     with extra("raw"):
         from PIL import Image
 

@@ -1,9 +1,9 @@
-"""ICC profiles: pixels of another space as sRGB, by LittleCMS, relative colorimetric with black point compensation.
+"""ICC profiles: conversion to sRGB by LittleCMS, relative colorimetric with black point compensation.
 
-8 bits are converted in 8 bits by Pillow, which is fast. 16 bits and floating point are converted in floating point,
-since 8 bits of a linear profile are too coarse in the shadows, and are rounded once, afterwards. HEIF files without a
-profile name primaries and a transfer function by the numbers of ITU-T H.273 instead, of which a profile is made.
-Source: ICC.1:2022.
+Pillow converts 8 bits in 8 bits, which is fast. 16 bits and floating point are converted in floating point, since 8
+bits of a linear profile are too coarse in the shadows, and are rounded once, afterwards. HEIF files without a profile
+name primaries and a transfer function by the numbers of ITU-T H.273 instead, from which a profile is made. Source:
+ICC.1:2022.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _PRIMARIES = {
     11: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
     12: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
 }
-"""Chromaticities of the primaries of BT.2020 and of P3."""
+"""The primaries of BT.2020 and of P3 have these chromaticities."""
 _HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
 
 
 def to_srgb(pixels: np.ndarray, profile: bytes, path: Path) -> np.ndarray:
-    """Pixels in the space of ``profile`` as sRGB; the same pixels where that is sRGB by name.
+    """Convert pixels in the space of ``profile`` to sRGB; return the same pixels if it is sRGB by name.
 
     Args:
         pixels: ``(H, W, 3)``, uint8, uint16 or float32 in [0, 1]; grey has three equal channels.
@@ -37,7 +37,7 @@ def to_srgb(pixels: np.ndarray, profile: bytes, path: Path) -> np.ndarray:
         path: the file, for errors.
 
     Returns:
-        uint8 of uint8; float32 in [0, 1] of others, unless nothing had to be done.
+        uint8 for uint8; float32 in [0, 1] for others, unless nothing had to be done.
 
     Raises:
         ValueError: if the profile is damaged, or of another kind of space.
@@ -95,7 +95,7 @@ def _srgb() -> bytes:
 
 @lru_cache(maxsize=8)
 def _transform(profile: bytes) -> tuple[str, Any]:
-    """The mode of the stored pixels, and the conversion of 8 bits; None for sRGB."""
+    """Find the mode of the stored pixels, and the conversion of 8 bits, which is None for sRGB."""
     from PIL import ImageCms
 
     source = ImageCms.ImageCmsProfile(BytesIO(profile))
@@ -109,9 +109,9 @@ def _transform(profile: bytes) -> tuple[str, Any]:
 
 
 def profile_of_code_points(primaries: int, transfer: int, path: Path) -> bytes | None:
-    """The profile of primaries and transfer function that a HEIF file names; None for those of sRGB.
+    """Make the profile of the primaries and transfer function that a HEIF file names; return None for sRGB's.
 
-    All transfer functions of standard dynamic range are taken for that of sRGB, as phones and browsers do.
+    All transfer functions of standard dynamic range are taken for that of sRGB, as on phones and in browsers.
 
     Raises:
         ValueError: if the picture is HDR, which has to be tone-mapped first.

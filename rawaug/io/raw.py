@@ -2,11 +2,11 @@ r"""RAW files, through LibRaw: the mosaic as the sensor gave it, and LibRaw's ow
 
     y = min((d - black) / (white - black), 1)
 
-for a digital number d and the black level of its site: black is 0, white is 1, and nothing is clipped at black, since
-that would bias the noise in the shadows. Colour follows dcraw's convention: ``color_matrix`` M takes white-balanced
-camera colour to linear sRGB and keeps grey (each row sums to 1), so that ``rgb = M diag(white_balance) camera``. With a
-matrix X from XYZ to the camera (LibRaw's table, a DNG's ColorMatrix) M is the inverse of X S with its rows scaled to
-sum 1, where S takes linear sRGB to XYZ (IEC 61966-2-1).
+where d is a digital number and black is the level of its site. Black becomes 0 and white becomes 1, and nothing is
+clipped at black, since that would bias the noise in the shadows. Colour follows dcraw's convention: ``color_matrix`` M
+takes white-balanced camera colour to linear sRGB and keeps grey (each row sums to 1), so that ``rgb = M
+diag(white_balance) camera``. With a matrix X from XYZ to the camera (LibRaw's table, a DNG's ColorMatrix) M is the
+inverse of X S with its rows scaled to sum 1, where S takes linear sRGB to XYZ (IEC 61966-2-1).
 
 A monochrome sensor has no colours: its frame has one level, gains of 1 and the matrix of ones on the diagonal.
 
@@ -38,23 +38,23 @@ from rawaug.io.libraw import KNOWN_PATTERNS, caught_stderr, is_stack, opened_raw
 from rawaug.io.tiff import MAKE, MODEL, TiffTags
 
 MONOCHROME = "MONOCHROME"
-"""The pattern of a sensor without colour filters."""
+"""A sensor without colour filters has this pattern."""
 
 XYZ_FROM_SRGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 _TYPICAL_COLOR_MATRIX = np.array([[1.60, -0.45, -0.15], [-0.25, 1.60, -0.35], [0.00, -0.50, 1.50]])
 
 _LARGEST_NUMBER = 1e6
-"""Upper limit of plausible exposure times, f-numbers and focal lengths."""
+"""Plausible exposure times, f-numbers and focal lengths are at most this."""
 
 _RENDERING = {"use_camera_wb": True, "no_auto_bright": True, "output_bps": 8, "user_flip": 0}
 
 _rendering_process: int | None = None
-"""The process that started LibRaw's OpenMP threads, which a fork does not have; LibRaw would wait for them."""
+"""This process started LibRaw's OpenMP threads, which a fork does not have; LibRaw would wait for them."""
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """How a shot was taken; None where the file does not say."""
+    """How a shot was taken; a value is None if the file does not say."""
 
     seconds: float | None = None
     f_number: float | None = None
@@ -67,29 +67,29 @@ UNKNOWN = Exposure()
 
 @dataclass(frozen=True)
 class RawFrame:
-    """A mosaic, and what its file states of it.
+    """A mosaic, and what its file states about it.
 
     Attributes:
-        mosaic: float32 ``(1, H, W)``, sides even (of an odd side the last line is left out).
+        mosaic: float32 ``(1, H, W)``, with even sides (the last line of an odd side is left out).
         cfa: the pattern of ``mosaic``: a :class:`rawaug.bayer.CFA`, or the name of another of
             :func:`rawaug.bayer.pattern`, X-Trans or Quad-Bayer from any origin; or :data:`MONOCHROME`.
         black: levels of the sites R, Gr, Gb, B, in digital numbers, with a DNG's fractions; other patterns have one
             for all greens.
         white: the saturated level, in digital numbers.
-        white_balance: as-shot multipliers of R, G, B, green being 1; LibRaw's daylight ones where the file has none.
-        daylight: the multipliers for the white of sRGB (D65), green being 1.
+        white_balance: as-shot multipliers of R, G, B, with green at 1; LibRaw's daylight ones if the file has none.
+        daylight: the multipliers for the white of sRGB (D65), with green at 1.
         color_matrix: float32 ``(3, 3)``, white-balanced camera colour to linear sRGB, rows summing to 1: the one that
             LibRaw renders with, or a typical camera's if neither the file nor LibRaw has one.
         camera: make and model, or ``"unknown"``.
         iso: None if unknown.
-        noise_profile: (shot_var, read_var) that the file states (of a DNG's NoiseProfile the mean over planes); None
+        noise_profile: (shot_var, read_var) that the file states (for a DNG's NoiseProfile, the mean over planes); None
             if it states none.
         orientation: LibRaw's flip: 0, or a sum of 1 (columns reversed), 2 (rows reversed), 4 (transposed last).
         name: the file's name without extension.
-        color_known: false where ``color_matrix`` is not this camera's.
+        color_known: False if ``color_matrix`` is not this camera's.
         gain_maps: a DNG's correction of the lens shading, which is not applied to ``mosaic``.
         exposure: seconds, f-number, focal length in mm and EXIF date, each None if unknown.
-        remarks: what the file states that cannot be right and is not used, a clause each.
+        remarks: statements of the file that cannot be right and are not used, a clause each.
     """
 
     mosaic: Tensor
@@ -114,7 +114,7 @@ class RawFrame:
         """The view of :func:`rawaug.bayer.turn` that shows the frame upright."""
         if not self.orientation & 4:
             return self.orientation
-        # `turn` transposes first: the two flips change places
+        # `turn` transposes first, so the two flips change places
         return 4 | (self.orientation & 1) << 1 | (self.orientation & 2) >> 1
 
 
@@ -123,7 +123,7 @@ def read_raw(path: str | Path, monochrome: bool = False) -> RawFrame:
 
     Args:
         path: the file.
-        monochrome: take RAW of sensors without colour filters, too.
+        monochrome: also take RAW of sensors without colour filters.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -138,7 +138,7 @@ def read_raw(path: str | Path, monochrome: bool = False) -> RawFrame:
 
 
 def develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> Tensor:
-    """LibRaw's rendering, uint8 ``(3, H, W)``: see :func:`read_raw_and_develop`; of a monochrome file, too."""
+    """Render a file by LibRaw, uint8 ``(3, H, W)``, even a monochrome one; see :func:`read_raw_and_develop`."""
     with opened_raw(Path(path)) as (raw, _):
         pixels = _render(raw, adjust_maximum_thr)
 
@@ -150,11 +150,11 @@ def read_raw_and_develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> t
     """Read a RAW file and render it, uint8 ``(3, H, W)`` of the mosaic's size, not turned upright.
 
     The rendering has the camera's white balance, no automatic brightness, and LibRaw's default tone curve (that of
-    BT.709). ``adjust_maximum_thr`` above 0 lets LibRaw scale a frame by its own maximum where that exceeds this part of
-    white (its default is 0.75): a digital gain that is not recorded in the file.
+    BT.709). ``adjust_maximum_thr`` above 0 lets LibRaw scale a frame by its own maximum if that exceeds this part of
+    white (its default is 0.75), which is a digital gain that is not recorded in the file.
 
-    LibRaw renders with OpenMP, whose threads do not survive a fork: a process forked from one that has rendered, such
-    as a DataLoader's worker, renders on one thread.
+    LibRaw renders with OpenMP, whose threads do not survive a fork. A process forked from one that has rendered, such
+    as a DataLoader's worker, therefore renders on one thread.
 
     Raises:
         FileNotFoundError, OSError, ValueError: as :func:`read_raw`.
@@ -171,7 +171,7 @@ def read_raw_and_develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> t
 
 
 def _render(raw: Any, adjust_maximum_thr: float) -> np.ndarray:
-    """LibRaw's rendering, uint8 ``(H, W, 3)``, of one channel for a monochrome file."""
+    """Render a file by LibRaw, uint8 ``(H, W, 3)``, or with one channel if it is monochrome."""
     global _rendering_process
     if _rendering_process is None:
         _rendering_process = os.getpid()
@@ -182,7 +182,7 @@ def _render(raw: Any, adjust_maximum_thr: float) -> np.ndarray:
 
 
 def _even_sides(pixels: np.ndarray) -> tuple[int, int]:
-    """Height and width of ``(H, W, ...)`` without the last line of an odd side."""
+    """Compute height and width of ``(H, W, ...)`` without the last line of an odd side."""
     height, width = pixels.shape[:2]
     return height // 2 * 2, width // 2 * 2
 
@@ -193,7 +193,7 @@ def _picture(pixels: np.ndarray, height: int, width: int) -> Tensor:
 
 
 def read_preview(path: str | Path) -> bytes | np.ndarray | None:
-    """The largest preview that a RAW file holds: a JPEG, or uint8 ``(H, W, 3)``; None if it holds none."""
+    """Read the largest preview in a RAW file: a JPEG, or uint8 ``(H, W, 3)``; return None if there is none."""
     with extra("raw"):
         import rawpy
 
@@ -242,7 +242,7 @@ def _mosaic_frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
 
 
 def is_monochrome(raw: Any) -> bool:
-    """Whether a file is of a sensor without colour filters."""
+    """Tell whether a file is from a sensor without colour filters."""
     return not is_stack(raw) and raw.num_colors == 1
 
 
@@ -267,7 +267,7 @@ def _monochrome_frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
 
 
 def _about_the_shot(path: Path, raw: Any, tags: TiffTags) -> dict[str, Any]:
-    """The fields of a frame that have nothing to do with its pattern."""
+    """Collect the fields of a frame that have nothing to do with its pattern."""
     remarks: tuple[str, ...] = ()
     if tags.noise_fault:
         remarks = (f"NoiseProfile {tags.noise_fault}",)
@@ -287,7 +287,7 @@ def _about_the_shot(path: Path, raw: Any, tags: TiffTags) -> dict[str, Any]:
 
 
 def _orientation(raw: Any, tags: TiffTags) -> int:
-    """LibRaw's flip; 0 where the file only states numbers that EXIF does not have, which LibRaw takes for turns."""
+    """Find LibRaw's flip; 0 if the file states only numbers unknown to EXIF, which LibRaw takes for turns."""
     exif_orientations = range(1, 9)
     if tags.orientations and not set(exif_orientations).intersection(tags.orientations):
         return 0
@@ -295,9 +295,9 @@ def _orientation(raw: Any, tags: TiffTags) -> int:
 
 
 def exposure_of(path: Path, raw: Any) -> Exposure:
-    """Exposure as the file states it; 0, the year 1970 and absurd values mean unknown.
+    """Read the exposure that the file states; 0, the year 1970 and absurd values mean unknown.
 
-    LibRaw gives what a CRW's automatic exposure aimed at; what the camera did is in its ShotInfo.
+    LibRaw gives the exposure that a CRW's automatic mode aimed at; the camera's actual one is in its ShotInfo.
     """
     other = getattr(raw, "other", None)  # rawpy 0.27 or newer
     seconds = _plausible(getattr(other, "shutter_speed", 0))
@@ -317,14 +317,14 @@ def exposure_of(path: Path, raw: Any) -> Exposure:
 
 
 def _plausible(number: float) -> float | None:
-    """A positive number of a moderate size; None for others."""
+    """Return a positive number of a moderate size, and None for others."""
     if not 0 < number < _LARGEST_NUMBER:
         return None
     return float(number)
 
 
 def camera_of(raw: Any, tags: TiffTags) -> str:
-    """Make and model, from the file's tags or from its thumbnail's EXIF."""
+    """Read make and model from the file's tags or from its thumbnail's EXIF."""
     make, model = tags.make, tags.model
     if not model:
         make, model = _thumbnail_camera(raw)
@@ -359,9 +359,9 @@ def _thumbnail_camera(raw: Any) -> tuple[str | None, str | None]:
 
 
 def _cell(path: Path, raw: Any, tags: TiffTags) -> tuple[np.ndarray, str]:
-    """LibRaw's colour indices of the cell at the top left of the visible mosaic, ``(n, n)``, and the pattern's name.
+    """Read LibRaw's colour indices ``(n, n)`` of the visible mosaic's top left cell, and the pattern's name.
 
-    0 to 3 are R, G, B, G; LibRaw knows no cells of 4 x 4, so that those of Quad-Bayer are the tags'.
+    0 to 3 are R, G, B, G. LibRaw knows no cells of 4 x 4, so those of Quad-Bayer come from the tags.
     """
     cell = np.empty((0, 0), int)
     if not is_stack(raw):
@@ -383,7 +383,7 @@ def _cell(path: Path, raw: Any, tags: TiffTags) -> tuple[np.ndarray, str]:
 
 
 def _stated_cell(raw: Any, tags: TiffTags) -> np.ndarray:
-    """The cell of a mosaic; of none that could be known, an empty one."""
+    """Read the cell of a mosaic; return an empty one if there is none that could be known."""
     if tags.cfa is not None and len(tags.cfa) == 4:
         indices = []
         for row in tags.cfa:
@@ -395,7 +395,7 @@ def _stated_cell(raw: Any, tags: TiffTags) -> np.ndarray:
     if raw.raw_pattern is not None and raw.raw_pattern.shape in ((2, 2), (6, 6)):
         size = len(raw.raw_pattern)
         rows_of_tag = tags.cfa or ()
-        if rows_of_tag[size:] == rows_of_tag[:-size]:  # of 8 rows rawpy sees the first two
+        if rows_of_tag[size:] == rows_of_tag[:-size]:  # rawpy sees only the first two of 8 rows
             return np.asarray(raw.raw_colors_visible[:size, :size])
     return np.empty((0, 0), int)
 
@@ -414,12 +414,12 @@ def _kind(raw: Any) -> str:
 
 
 def _cell_levels(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
-    """Black levels of a cell that repeats over the visible mosaic: LibRaw's whole numbers, or the tags' exact ones.
+    """Find the black levels of a cell that repeats over the mosaic: LibRaw's whole numbers or the tags' exact ones.
 
-    Of a DNG whose levels repeat in other steps than its colours, the cell is the smallest that both fill.
+    For a DNG whose levels repeat in other steps than its colours, the cell is the smallest that both fill.
     """
-    # where a DNG's active area begins at an odd row or column, LibRaw leaves that one out, and gives the remaining
-    # sites the levels of their neighbours
+    # if a DNG's active area begins at an odd row or column, LibRaw leaves that one out and gives the remaining sites
+    # the levels of their neighbours
     per_channel = np.asarray(raw.black_level_per_channel, np.float32)
     levels = per_channel[cell]
     if tags.black is None:
@@ -429,7 +429,7 @@ def _cell_levels(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
     columns = math.lcm(len(cell), tags.black.shape[1])
     exact = _tiled(tags.black.astype(np.float32), rows, columns)
 
-    # LibRaw rounds the means of rows and columns as well
+    # LibRaw also rounds the means of rows and columns
     allowed = 2 if tags.black_rows or tags.black_columns else 1
     if exact.shape == (2, 2) and np.abs(exact - levels).max() >= allowed:
         return levels
@@ -439,7 +439,7 @@ def _cell_levels(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
 
 
 def _black_levels(path: Path, raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
-    """Levels ``(H, W)`` of a DNG whose rows or columns have their own; of all others, of a cell that repeats."""
+    """Find levels ``(H, W)`` of a DNG whose rows or columns have their own, else those of a cell that repeats."""
     levels = _cell_levels(raw, cell, tags)
     if not (tags.black_rows or tags.black_columns):
         return levels
@@ -452,7 +452,7 @@ def _black_levels(path: Path, raw: Any, cell: np.ndarray, tags: TiffTags) -> np.
 
 
 def _line_levels(path: Path, levels: Sequence[float], first: int, count: int) -> np.ndarray:
-    """The levels of the visible rows or columns, ``(count,)``; zeros where the file states none."""
+    """Find the levels ``(count,)`` of the visible rows or columns; they are zeros if the file states none."""
     if not levels:
         return np.zeros(count, np.float32)
     if len(levels) != first + count:
@@ -462,7 +462,7 @@ def _line_levels(path: Path, levels: Sequence[float], first: int, count: int) ->
 
 
 def _left_out(raw: Any, tags: TiffTags) -> tuple[int, int]:
-    """The rows and columns of a DNG's active area that the visible mosaic begins after, 0 or 1 of each."""
+    """Count the rows and columns of a DNG's active area before the visible mosaic, 0 or 1 of each."""
     rows = raw.sizes.top_margin - tags.area[0]
     columns = raw.sizes.left_margin - tags.area[1]
     if {rows, columns} <= {0, 1}:
@@ -471,13 +471,13 @@ def _left_out(raw: Any, tags: TiffTags) -> tuple[int, int]:
 
 
 def _tiled(cell: np.ndarray, height: int, width: int) -> np.ndarray:
-    """A cell again and again, ``(height, width)``."""
+    """Repeat a cell to ``(height, width)``."""
     rows, columns = cell.shape
     return np.tile(cell, (-(-height // rows), -(-width // columns)))[:height, :width]
 
 
 def _mean_levels(black: np.ndarray, cfa: str) -> tuple[float, float, float, float]:
-    """Levels of R, Gr, Gb, B from those of a cell; where all greens are one, its mean twice."""
+    """Average a cell's levels to those of R, Gr, Gb, B; if all greens are one, their mean comes twice."""
     kinds = _tiled(plane_indices(cfa).numpy(), *black.shape)
     means = {}
     for kind in np.unique(kinds).tolist():
@@ -486,7 +486,7 @@ def _mean_levels(black: np.ndarray, cfa: str) -> tuple[float, float, float, floa
 
 
 def _normalised(numbers: np.ndarray, black: np.ndarray, white: float) -> Tensor:
-    """Digital numbers ``(H, W)`` to RAW float32 ``(1, H, W)``, a copy; ``black`` is of a cell, or ``(H, W)``."""
+    """Convert digital numbers ``(H, W)`` to RAW float32 ``(1, H, W)``; ``black`` is a cell's, or ``(H, W)``."""
     height, width = _even_sides(numbers)
     numbers = numbers[:height, :width]
     if black.shape != (2, 2):
@@ -505,7 +505,7 @@ def _normalised(numbers: np.ndarray, black: np.ndarray, white: float) -> Tensor:
 
 
 def _white_balance(raw: Any) -> tuple[float, float, float]:
-    """As-shot multipliers, or those for daylight if the file has none."""
+    """Read the as-shot multipliers, or those for daylight if the file has none."""
     as_shot = raw.camera_whitebalance
     if min(as_shot[:3]) > 0:
         return _green_is_1(as_shot)
@@ -519,7 +519,7 @@ def _green_is_1(gains: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _color_matrix(raw: Any) -> tuple[np.ndarray, bool]:
-    """The file's matrix, else LibRaw's for the model, else a typical one; and whether it is known."""
+    """Find the file's matrix, else LibRaw's for the model, else a typical one; tell whether it is known."""
     own = np.asarray(raw.color_matrix, np.float64)[:, :3]
     if own.any():
         return own / own.sum(axis=1, keepdims=True), True

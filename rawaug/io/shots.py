@@ -1,6 +1,6 @@
-"""A shot as sRGB and its exposure, whether its file is camera RAW or a developed picture.
+"""Reading of a shot as sRGB, and of its exposure, from camera RAW or from a developed picture.
 
-RAW is developed by LibRaw with the camera's white balance (:func:`rawaug.io.develop`), the rendering that
+RAW is developed by LibRaw with the camera's white balance (:func:`rawaug.io.develop`), which is the rendering that
 :func:`rawaug.fit` learns from. The thumbnails in RAW files are never shown.
 """
 
@@ -19,10 +19,10 @@ from rawaug.io.raw import read_raw, read_raw_and_develop
 
 
 def read_shot(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
-    """A picture, or RAW that is developed, as sRGB, uint8 ``(3, H, W)``, upright.
+    """Read a picture, or develop RAW, as upright sRGB, uint8 ``(3, H, W)``.
 
     Args:
-        path: a file of either kind, which its content tells.
+        path: a file of either kind, which is recognised by its content.
         max_pixels: a larger picture is refused before it is decoded.
 
     Raises:
@@ -39,7 +39,7 @@ def read_shot(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
 
 
 def read_shot_exposure(path: str | Path) -> float:
-    """The exposure in stops as :func:`rawaug.io.pictures.read_exposure` defines it.
+    """Read the exposure in stops as :func:`rawaug.io.pictures.read_exposure` defines it.
 
     Raises:
         FileNotFoundError, OSError: if the file is missing or damaged.

@@ -1,7 +1,7 @@
-"""Pictures to denoise: their numbers as the file has them, and back to a file with all that the first one said.
+"""Pictures to denoise: reading of their stored numbers, and writing of a file with all of the first one's metadata.
 
 A picture is neither turned nor converted: its EXIF, its ICC profile and its orientation go to the new file as they are
-(:mod:`rawaug.io.metadata`), and so does transparency. 8 and 16 bits, and floating point in TIFF, are kept where the new
+(:mod:`rawaug.io.metadata`), and so does transparency. 8 and 16 bits, and floating point in TIFF, are kept if the new
 format has them.
 """
 
@@ -34,14 +34,14 @@ from rawaug.io.metadata import (
 from rawaug.io.pictures import require_unit_range
 
 QUALITY = 97
-"""Quality of the JPEG and WebP files that are written; a JPEG has chroma at full size."""
+"""JPEG and WebP files are written at this quality; a JPEG has chroma at full size."""
 PICTURE_FORMATS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
-"""Extensions of the files that can be written."""
+"""Files with these extensions can be written."""
 
 _TURNED_BY_DECODER = ("HEIC", "JPEG XL", "JPEG 2000")
 _LARGEST_WEBP = 16383
 _TIFF_COMPRESSIONS = {1: None, 5: "lzw"}
-"""Compression of a TIFF that is written, by that of its source; any other becomes Deflate."""
+"""This maps the compression of a source TIFF to that of the result; any other becomes Deflate."""
 
 
 class StoredPicture(NamedTuple):
@@ -49,8 +49,8 @@ class StoredPicture(NamedTuple):
 
     Args:
         colours: ``(H, W, 1)`` or ``(H, W, 3)``, uint8, uint16 or float32, display values, not turned upright.
-        alpha: ``(H, W, 1)`` of the same type, where there is transparency; ``colours`` are not multiplied by it.
-        metadata: what the file says beside its pixels.
+        alpha: ``(H, W, 1)`` of the same type, if there is transparency; ``colours`` are not multiplied by it.
+        metadata: the metadata besides the pixels.
     """
 
     colours: np.ndarray
@@ -73,7 +73,7 @@ class StoredPicture(NamedTuple):
 
 
 def read_stored(path: str | Path, max_pixels: int = MAX_PIXELS) -> StoredPicture:
-    """A picture of 8 or 16 bits, or of floating-point numbers in [0, 1].
+    """Read a picture of 8 or 16 bits, or of floating-point numbers in [0, 1].
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -103,7 +103,7 @@ def read_stored(path: str | Path, max_pixels: int = MAX_PIXELS) -> StoredPicture
 
 
 def write_stored(path: str | Path, srgb: Tensor, like: StoredPicture) -> None:
-    """Write sRGB ``(3, H, W)`` in [0, 1] with the channels, bits and metadata of ``like``, whole or not at all.
+    """Write sRGB ``(3, H, W)`` in [0, 1], completely or not at all, with channels, bits and metadata of ``like``.
 
     Raises:
         ValueError: if the extension is none of :data:`PICTURE_FORMATS`, or the format cannot hold the picture.
@@ -134,7 +134,7 @@ def write_stored(path: str | Path, srgb: Tensor, like: StoredPicture) -> None:
 
 
 def _numbers(planes: Tensor, dtype: np.dtype) -> np.ndarray:
-    """Planes in [0, 1] as ``(H, W, C)`` of a type."""
+    """Convert planes in [0, 1] to ``(H, W, C)`` of a type."""
     pixels = planes.permute(1, 2, 0).numpy()
     if dtype.kind != "f":
         pixels = np.rint(pixels * np.iinfo(dtype).max)
@@ -142,14 +142,14 @@ def _numbers(planes: Tensor, dtype: np.dtype) -> np.ndarray:
 
 
 def _white(dtype: np.dtype) -> float:
-    """The number that stands for white."""
+    """Return the number that stands for white."""
     if dtype.kind == "f":
         return 1.0
     return float(np.iinfo(dtype).max)
 
 
 def _with_alpha(pixels: np.ndarray, alpha: np.ndarray | None) -> np.ndarray:
-    """Colours with alpha behind them, in the type of the colours."""
+    """Append alpha to colours, in the type of the colours."""
     if alpha is None:
         return pixels
 
@@ -160,7 +160,7 @@ def _with_alpha(pixels: np.ndarray, alpha: np.ndarray | None) -> np.ndarray:
 
 
 def _divided(colours: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Colours that were multiplied by alpha, without it; black where alpha is 0."""
+    """Divide colours that were multiplied by alpha by it; they become black where alpha is 0."""
     white = _white(colours.dtype)
     quotient = colours * (white / np.maximum(alpha.astype(np.float64), white * 1e-6))
     quotient = np.clip(quotient, 0.0, white)
@@ -170,14 +170,14 @@ def _divided(colours: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def _without_last_axis(pixels: np.ndarray) -> np.ndarray:
-    """Pixels ``(H, W, C)`` as encoders take them: ``(H, W)`` of one channel."""
+    """Reshape pixels ``(H, W, C)`` as encoders take them: one channel becomes ``(H, W)``."""
     if pixels.shape[-1] == 1:
         return pixels[..., 0]
     return pixels
 
 
 def _renderer(planes: Tensor) -> Thumbnail:
-    """What renders thumbnails of a picture."""
+    """Make the function that renders thumbnails of a picture."""
 
     def render(height: int, width: int) -> np.ndarray:
         small = F.interpolate(planes[None], (height, width), mode="area")[0]
@@ -231,7 +231,7 @@ def _webp(path: Path, planes: Tensor, like: StoredPicture, upright: bool) -> byt
 
 
 def _is_lossless(metadata: Metadata) -> bool:
-    """Whether a picture comes from a format without losses, and so keeps every bit."""
+    """Tell whether a picture comes from a lossless format and therefore keeps every bit."""
     if metadata.format in ("JPEG", "HEIC", "AVIF"):
         return False
     if metadata.format != "WebP":
@@ -266,7 +266,7 @@ def _tiff(planes: Tensor, like: StoredPicture, upright: bool) -> bytes:
 
 
 def _compression(metadata: Metadata) -> str | None:
-    """That of the source where it is a TIFF; none of other pictures."""
+    """Choose the compression of the source if it is a TIFF; other pictures have none."""
     if metadata.format != "TIFF":
         return None
 

@@ -1,7 +1,8 @@
 """TIFF-based RAW files (DNG, NEF, CR2, ...): the tags that LibRaw does not expose, read by tifffile.
 
-A DNG's NoiseProfile (tag 51041, DNG specification 1.3 and later) holds pairs (S, O), one for all colour planes or one a
-plane, with noise variance S y + O for a signal y whose black is 0 and white 1: our ``shot_var`` and ``read_var``.
+A DNG's NoiseProfile (tag 51041, DNG specification 1.3 and later) holds pairs (S, O), one for all colour planes or one
+for each. The noise variance is S y + O for a signal y whose black is 0 and white is 1: S and O are our ``shot_var`` and
+``read_var``.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from rawaug.io.gain_map import GainMap, parse_gain_maps
 from rawaug.io.isolated import damage_as_os_error
 
 MOST_PAGES = 64
-"""Maximum number of directories in a TIFF. Damaged offsets can link directories in a circle."""
+"""A TIFF has at most this many directories. Damaged offsets can link directories in a circle."""
 
 MAKE, MODEL, ORIENTATION, DNG_VERSION, NOISE_PROFILE = 271, 272, 274, 50706, 51041
 _LINEARIZATION, _RAW_DIGEST, _NEW_RAW_DIGEST = 50712, 50972, 51111
@@ -67,7 +68,7 @@ class StoredMosaic:
 
 @dataclass(frozen=True)
 class TiffTags:
-    """Tags of a RAW file; each field has its default where the tag is missing or the file is not a TIFF.
+    """Tags of a RAW file; a field has its default if the tag is missing or the file is not a TIFF.
 
     Attributes:
         make, model: the camera.
@@ -149,7 +150,7 @@ def _tags_of(pages: list[Any]) -> TiffTags:
 
 
 def is_dng(pages: list[Any]) -> bool:
-    """Whether any directory states a DNG version."""
+    """Tell whether any directory states a DNG version."""
     return any(DNG_VERSION in page.tags for page in pages)
 
 
@@ -171,7 +172,7 @@ def _digest(page: Any, code: int) -> bytes | None:
         return None
 
     digest = bytes(value)
-    is_empty = not any(digest)  # GoPros write zeros
+    is_empty = not any(digest)  # GoPro cameras write zeros
     if len(digest) != _DIGEST_BYTES or is_empty:
         return None
     return digest
@@ -212,7 +213,7 @@ def tag_damage(path: Path) -> AbstractContextManager[None]:
 
 
 def all_pages(tiff: Any) -> list[Any]:
-    """All pages of a file; the pages of a SubIFD follow their parent."""
+    """List all pages of a file; the pages of a SubIFD follow their parent."""
     pages = list(islice(_pages(tiff.pages), MOST_PAGES + 1))
     if len(pages) > MOST_PAGES:
         raise ValueError(f"it has more than {MOST_PAGES} directories, or they point at one another in a circle")
@@ -226,7 +227,7 @@ def _pages(pages: Any) -> Iterator[Any]:
 
 
 def main_mosaic(pages: list[Any]) -> Any:
-    """The largest mosaic, which is the page that LibRaw reads; None if there is no mosaic.
+    """Find the largest mosaic, which is the page that LibRaw reads; return None if there is no mosaic.
 
     Phones write several mosaics. The single plane of a monochrome sensor counts as a mosaic.
     """
@@ -241,7 +242,7 @@ def main_mosaic(pages: list[Any]) -> Any:
 
 
 def _noise_profile(pages: list[Any]) -> tuple[tuple[float, float] | None, str]:
-    """The mean over planes of the first profile, and the reason if the profile is unusable."""
+    """Return the mean over planes of the first profile, and the reason if the profile is unusable."""
     for page in pages:
         tag = page.tags.get(NOISE_PROFILE)
         if tag is None:
@@ -265,7 +266,7 @@ def _noise_profile(pages: list[Any]) -> tuple[tuple[float, float] | None, str]:
 
 
 def _numbers(tag: Any) -> Any:
-    """The values of a tag as float64 ``(N,)``; rationals are divided."""
+    """Return the values of a tag as float64 ``(N,)``; rationals are divided."""
     values = np.ravel(tag.value).astype(np.float64)
     if tag.dtype not in _RATIONALS:
         return values
@@ -274,7 +275,7 @@ def _numbers(tag: Any) -> Any:
 
 
 def _deltas(mosaic: Any, code: int) -> tuple[float, list[float]]:
-    """The mean of the black level offsets of all rows or columns, and the deviation of each from it.
+    """Compute the mean of the black level offsets of all rows or columns, and the deviation of each from it.
 
     There are no deviations if the tag is missing or its values are equal.
     """
@@ -294,7 +295,7 @@ def _deltas(mosaic: Any, code: int) -> tuple[float, list[float]]:
 
 
 def _black(mosaic: Any, offset: float) -> np.ndarray | None:
-    """The black levels of the repeating cell, ``(rows, columns)``, plus ``offset``; None if the file states none."""
+    """Read the black levels of the repeating cell, ``(rows, columns)``, plus ``offset``; return None without any."""
     tag = mosaic.tags.get(_BLACK)
     if tag is None and not offset:
         return None
@@ -312,7 +313,7 @@ def _black(mosaic: Any, offset: float) -> np.ndarray | None:
 
 
 def _cfa(mosaic: Any) -> tuple[str, ...] | None:
-    """The rows of the pattern's cell in the letters R, G and B; None if the cell has other colours."""
+    """Return the rows of the pattern's cell in the letters R, G and B; return None if the cell has other colours."""
     size = mosaic.tags.valueof(_CFA_REPEATS)
     colours = mosaic.tags.valueof(_CFA_PATTERN)
     if size is None or colours is None:

@@ -1,11 +1,11 @@
-"""Cameras by the names that people have for them: published tables hold those of the files' EXIF tags.
+"""Cameras by the names that people use for them; published tables hold the names in the files' EXIF tags.
 
-Two names are alike if they have the same letters and digits after these changes, which leave each camera its own:
+Two names are alike if they have the same letters and digits after these changes, which keep cameras apart:
 
 - a mark is ``M2`` whether it is written ``Mark II``, ``MkII``, ``II`` or Nikon's ``_2``;
 - Sony's ILCE, ILCA, SLT and DSLR are the line A, so that the A7 III is the ILCE-7M3; DSC, DMC and DC, and the words EOS
   and Lumix, are left out;
-- what Canon sells under three names is its number: the Rebel T4i and the Kiss X6i are the 650D.
+- a camera that Canon sells under three names goes by its number: the Rebel T4i and the Kiss X6i are the 650D.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def camera_key(name: str) -> str:
 
 
 def _mark_in_digits(match: re.Match[str]) -> str:
-    """Write a mark as ``m2``, whatever its form was."""
+    """Write a mark as ``m2``, however it was written."""
     mark = "m"
     for part in match.groups(default=""):
         mark += str(_MARKS.get(part, part))
@@ -68,7 +68,7 @@ def _letters_and_digits(text: str) -> str:
 
 @lru_cache(maxsize=1)
 def _canon_keys() -> dict[str, str]:
-    """The keys of EOS cameras by the keys of their other names."""
+    """Map the keys of the other names of EOS cameras to the keys of the cameras."""
     keys = {}
     for row in _CANON.split(";"):
         number, names = row.split(maxsplit=1)
@@ -97,7 +97,7 @@ def similar_cameras(part: str, known: Iterable[str]) -> list[str]:
 
 
 def find_camera(name: str, known: Iterable[str]) -> str:
-    """Find the known camera, maker and model, that goes by ``name``; of several it is the first.
+    """Find the known camera, maker and model, that goes by ``name``; if there are several, take the first.
 
     Raises:
         ValueError: if there is no such name; similar ones are suggested.

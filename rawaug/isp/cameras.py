@@ -4,18 +4,18 @@ A camera is a 3 x 3 matrix M from CIE XYZ to its linear RGB. Its response to a l
 
 .. math:: \mathrm{wb} = (M L)_G / (M L), \qquad C = \mathrm{diag}(M S 1)^{-1} M S
 
-with S from linear sRGB to XYZ: the rows of C sum to 1, so white stays white and the gains carry all of the balance
-(Brooks et al., CVPR 2019). The matrices are those of LibRaw and rawspeed, most of them Adobe's for D65; under other
+with S from linear sRGB to XYZ. The rows of C sum to 1, so white stays white and the gains carry all of the balance
+(Brooks et al., CVPR 2019). The matrices are those of LibRaw and rawspeed, most of them Adobe's for D65. Under other
 lights they are an approximation, as in those developers.
 
-A light is drawn uniformly in mired, :math:`10^6 / T` of its colour temperature T; or, as most photographs are taken, on
+A light is drawn uniformly in mired, :math:`10^6 / T` of its colour temperature T, or, as most photographs are taken, on
 the daylight locus at T near 5,300 K. On the Planckian locus (Krystek, 1985)
 
 .. math:: u = \frac{0.860117757 + 1.54118254 \cdot 10^{-4} T + 1.28641212 \cdot 10^{-7} T^2}
                    {1 + 8.42420235 \cdot 10^{-4} T + 7.08145163 \cdot 10^{-7} T^2}
 
-and v alike; on the daylight locus :math:`y = -3 x^2 + 2.87 x - 0.275` (CIE 15:2018, 4,000 to 25,000 K). Real lights lie
-a step Duv off both, along the normal in CIE 1960 (u, v), positive towards green.
+and v likewise; on the daylight locus :math:`y = -3 x^2 + 2.87 x - 0.275` (CIE 15:2018, 4,000 to 25,000 K). Real lights
+lie a step Duv off both, along the normal in CIE 1960 (u, v), positive towards green.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from rawaug.isp.camera_names import find_camera
 from rawaug.registry import suggest
 
 Array = NDArray[np.float64]
-"""Lights are a few numbers a batch, on the CPU: NumPy's calls cost a fifth of PyTorch's."""
+"""The type of lights, which are a few numbers a batch on the CPU: NumPy's calls cost a fifth of PyTorch's."""
 
 SRGB_TO_XYZ = torch.tensor(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]],
     dtype=torch.float64,
     device="cpu",
 )
-"""Linear sRGB (IEC 61966-2-1, D65) to CIE XYZ."""
+"""The matrix from linear sRGB (IEC 61966-2-1, D65) to CIE XYZ."""
 XYZ_TO_SRGB = torch.linalg.inv(SRGB_TO_XYZ)
 
 
@@ -57,7 +57,7 @@ class CameraMatrices(NamedTuple):
     xyz_to_camera: Tensor
 
     def select(self, names: Sequence[str]) -> Tensor:
-        """The matrices ``(N, 3, 3)`` of N cameras by name, whatever the case of the letters; ValueError if unknown."""
+        """Get the matrices ``(N, 3, 3)`` of N cameras by name, in upper or lower case; ValueError if unknown."""
         rows = []
         for name in names:
             listed_name = find_camera(name, self.names)
@@ -67,7 +67,7 @@ class CameraMatrices(NamedTuple):
 
 @cache
 def load_cameras() -> CameraMatrices:
-    """Load the cameras of the package's table; where two sources name one camera, LibRaw's comes first."""
+    """Load the cameras of the package's table; if two sources name one camera, LibRaw's comes first."""
     text = resources.files("rawaug.isp").joinpath("facts/camera_matrices.tsv").read_text("utf-8")
     names = []
     rows = []
@@ -126,14 +126,14 @@ _DAYLIGHT_FROM = 4_000.0
 """The lowest colour temperature of the daylight locus, in kelvin."""
 _DAYLIGHT_SHARE = 0.9
 _DAYLIGHT_MIRED = (190.0, 25.0)
-"""Mean and standard deviation; as-shot balances of photographs lie between 4,000 and 6,500 K mostly."""
+"""Mean and standard deviation; as-shot balances of photographs are mostly between 4,000 and 6,500 K."""
 _LAMP_SHARE = 0.1
 _DUV_SPREAD = 0.003
-"""Standard deviation of Duv; lamps sold as white keep within 0.006 (ANSI C78.377)."""
+"""Standard deviation of Duv; lamps sold as white stay within 0.006 (ANSI C78.377)."""
 
 
 class LightRange(NamedTuple):
-    """The lights that pictures are taken in: on both loci alike within limits, among lamps, and by day.
+    """The lights that pictures are taken in: equally on both loci within limits, among lamps, and in daylight.
 
     Args:
         kelvin: limits of the colour temperature, within 1,000 to 15,000.
@@ -150,11 +150,11 @@ class LightRange(NamedTuple):
 
 _ALL_LIGHTS = LightRange()
 PHOTOGRAPHS = LightRange(by_day=_DAYLIGHT_SHARE)
-"""The lights of photographs, most of them taken by day."""
+"""The lights of photographs, most of which are taken by day."""
 
 
 def light_range(light: float | str | None) -> LightRange:
-    """The lights of one colour temperature in kelvin, one of :data:`LAMPS` by name, or those of :data:`PHOTOGRAPHS`."""
+    """The lights of a colour temperature in kelvin, one of :data:`LAMPS` by name, or :data:`PHOTOGRAPHS` by default."""
     if light is None:
         return PHOTOGRAPHS
 
@@ -200,7 +200,7 @@ def white_point(xy: Array | tuple[float, float]) -> Tensor:
 
 
 def sample_lights(batch: int, generator: torch.Generator, lights: LightRange = _ALL_LIGHTS) -> Array:
-    """Draw white points ``(batch, 3)``, XYZ with Y = 1; where both loci are defined, each as often as the other."""
+    """Draw white points ``(batch, 3)``, XYZ with Y = 1; if both loci are defined, each is used equally often."""
     kelvin, lamps, among, by_day = lights
     uniform = torch.rand(batch, 4, generator=generator, dtype=torch.float64).numpy()
     duv = _DUV_SPREAD * torch.randn(batch, generator=generator, dtype=torch.float64).numpy()
@@ -222,7 +222,7 @@ def sample_lights(batch: int, generator: torch.Generator, lights: LightRange = _
 
 
 def _planckian_uv(kelvin: Array) -> tuple[Array, Array]:
-    """Krystek's (u, v) ``(..., 2)`` of a black body, and their rates of change with the temperature."""
+    """Compute Krystek's (u, v) ``(..., 2)`` of a black body, and their derivatives by the temperature."""
     t = kelvin[..., None]
     c0, c1, c2 = _PLANCKIAN
     value = (c2 * t + c1) * t + c0
@@ -252,6 +252,6 @@ _PLANCKIAN = np.array(
         [1.28641212e-7, 4.20481691e-8, 7.08145163e-7, 1.61456053e-7],
     ]
 )
-"""Coefficients of 1, T and T^2: numerators of u and v, then their denominators."""
+"""Coefficients of 1, T and T^2: the numerators of u and v, then their denominators."""
 _DAYLIGHT = np.array([[0.244063, 0.237040], [0.09911, 0.24748], [2.9678, 1.9018], [-4.6070, -2.0064]])
 """Coefficients of the powers of 1000 / T in x: up to 7,000 K, and above."""

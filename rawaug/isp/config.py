@@ -26,18 +26,19 @@ class ISPConfig:
     """Configuration of a :class:`DictionaryISP`, stored in the header of its file.
 
     Args:
-        colour_atoms: N, colour correction matrices in the dictionary.
-        gain_atoms: M, triplets of gains in the dictionary.
+        colour_atoms: N, the number of colour correction matrices in the dictionary.
+        gain_atoms: M, the number of triplets of gains in the dictionary.
         encoder_widths: features of the encoders' three convolutions.
         cfa: pattern of the RAW it makes.
-        stages: the stages in reverse order, of ``tone gamma colour gains shading`` and whatever else is registered in
-            :data:`rawaug.isp.stages.STAGES`; ``curve`` stands in place of ``tone gamma``.
+        stages: the stages in reverse order, from ``tone gamma colour gains shading`` and whatever else is registered in
+            :data:`rawaug.isp.stages.STAGES`; ``curve`` replaces ``tone gamma``.
         encoders: whether encoders look at the picture; if not, there are only learned constant weights.
         attention: whether the shading stage has its attention mask.
-        knee: where Brooks' inverse gains start to spare highlights; null for gains that each channel divides by alone.
-        tone_atoms: K, inverse tone curves in the dictionary of the stage ``curve``; 0 without it.
-        cameras: P, published cameras that are mixtures of the colour atoms, whose gains follow from the light; 0 where
-            the atoms are fitted.
+        knee: value above which Brooks' inverse gains start to spare highlights; null to divide each channel by its gain
+            alone.
+        tone_atoms: K, the number of inverse tone curves in the dictionary of the stage ``curve``; 0 without it.
+        cameras: P, the number of published cameras that are mixtures of the colour atoms, whose gains follow from the
+            light; 0 if the atoms are fitted.
     """
 
     colour_atoms: int = 16
@@ -52,7 +53,7 @@ class ISPConfig:
     cameras: int = 0
 
     def __post_init__(self) -> None:
-        CFA(self.cfa)  # raises for an unknown pattern
+        CFA(self.cfa)  # raises ValueError for an unknown pattern
 
         for key in ("stages", "encoder_widths"):
             values = getattr(self, key)
@@ -95,14 +96,14 @@ SMALL = ISPConfig(colour_atoms=8, gain_atoms=8, encoder_widths=(16, 32, 64))
 
 
 class ISPParams(NamedTuple):
-    """The camera settings of B pictures, which replay a pass.
+    """The camera settings of B pictures; with them a pass can be repeated.
 
     Args:
         colour_weights: ``(B, N)`` weights of the colour atoms.
-        gain_weights: ``(B, M)`` weights of the gain atoms; ``(B, 0)`` where the gains follow from a light.
+        gain_weights: ``(B, M)`` weights of the gain atoms; ``(B, 0)`` if the gains follow from a light.
         matrix: ``(B, 3, 3)`` sRGB to camera.
         gains: ``(B, 3)`` white balance times digital gain, forward direction.
-        tone_weights: ``(B, K)`` weights of the tone curves; ``(B, 0)`` where the tone is learned.
+        tone_weights: ``(B, K)`` weights of the tone curves; ``(B, 0)`` if the tone is learned.
     """
 
     colour_weights: Tensor
@@ -122,8 +123,8 @@ class ISPResult:
 
     Args:
         image: the mosaic ``(B, 1, H, W)`` or the picture ``(B, 3, H, W)``, also called ``raw`` and ``srgb``.
-        params: the settings that were used, which replay the pass.
-        intermediates: x1 ... x5 by name, where they were asked for.
+        params: the settings that were used; with them the pass can be repeated.
+        intermediates: x1 ... x5 by name, if they were requested.
     """
 
     image: Tensor

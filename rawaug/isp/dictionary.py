@@ -1,10 +1,11 @@
 r"""Dictionaries of camera parameters: atoms, their convex hull, and settings drawn from it.
 
 ``C = sum_i w_i D_ccm[i]`` and ``1 / g = sum_i w_i / D_wb[i]``, with ``w`` on the simplex (Conde et al., AAAI 2022,
-"Parameter Dictionaries"). Colour atoms act from sRGB to camera; each row of theirs (a column in the paper, where pixels
-are row vectors) has l1 norm 1. The atoms of published cameras have rows of sum 1 instead, negative entries or not.
+"Parameter Dictionaries"). Colour atoms act from sRGB to camera. Each of their rows (a column in the paper, where pixels
+are row vectors) has l1 norm 1. The atoms of published cameras have rows of sum 1 instead, with or without negative
+entries.
 
-*Sampling.* One draw is a camera in a light, not a colour matrix and gains on their own:
+*Sampling.* One draw is a camera in a light, not a colour matrix and gains independently of each other:
 
 .. math:: y = h(C\,T(x);\, g \, 2^{-e}), \qquad g = \mathrm{wb}(M, L) / \min \mathrm{wb}(M, L),
     \quad (C, M) = D_\mathrm{cam} w, \quad T = \textstyle\sum_k v_k T_k
@@ -12,7 +13,7 @@ are row vectors) has l1 norm 1. The atoms of published cameras have rows of sum 
 with h Brooks' highlight-preserving inverse gains, w a mixture of two of the cameras that the hull was made for, a light
 L (:mod:`rawaug.isp.cameras`), a mixture v of up to three inverse tone curves, and e an exposure in stops. The smallest
 gain is 1, so that clipped RAW develops to white. Shares of a mixture follow the Dirichlet distribution of concentration
-1/2, so that most draws are near one camera: flat weights would crowd the middle of the hull, where cameras are rare.
+1/2, so that most draws are near one camera. Flat weights would crowd the middle of the hull, where cameras are rare.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ from rawaug.isp.cameras import XYZ_TO_SRGB, Array, LightRange, camera_from_srgb,
 from rawaug.isp.config import ISPParams
 
 PLAUSIBLE_GAINS = (0.4, 6.0)
-"""Red and blue gains over green that are kept; a matrix made for D65 says nothing of light that needs more."""
+"""Range of red and blue gains over green that are kept; a D65 matrix says nothing about light that needs more."""
 EXPOSURE = (-0.5, 1.0)
-"""Stops, drawn uniformly: what cameras leave between the white of RAW and that of their pictures is not published. With
-these the mean RAW of photographs is 0.136, and 71 % of the cells whose green is clipped have red to spare, as in real
-files; with a ceiling of 1.5 stops 45 %."""
+"""Limits of the uniform draw in stops. The headroom that cameras leave between the white of RAW and that of their
+pictures is not published. With these the mean RAW of photographs is 0.136, and 71 % of the cells whose green is clipped
+have red to spare, as in real files; with a ceiling of 1.5 stops it is 45 %."""
 CAMERAS_MIXED, _TONES_MIXED = 2, 3
 _ROUNDS = 100
 _STEPS = 400
@@ -45,7 +46,7 @@ def l1_normalise(matrices: Tensor) -> Tensor:
 class ColourDictionary(nn.Module):
     """N colour correction matrices, sRGB to camera, each with the light that it was seen in.
 
-    So a known white balance can choose among them, as among a DNG's two illuminants.
+    So a known white balance can choose among them, as among the two illuminants of a DNG.
     """
 
     light: Tensor
@@ -75,7 +76,7 @@ class ColourDictionary(nn.Module):
     def gains_for(self, white_balance: Tensor, weights: Tensor) -> Tensor:
         """Compute the gains ``(B, 3)`` under which grey becomes ``1 / white_balance``, digital gain included.
 
-        ``white_balance`` is ``(B, 3)``, and ``weights`` ``(B, N)`` are those of the atoms.
+        ``white_balance`` is ``(B, 3)``; ``weights`` ``(B, N)`` are the weights of the atoms.
         """
         return white_balance * (weights @ self.neutral).exp() * self.combine(weights).sum(2)
 
@@ -83,7 +84,7 @@ class ColourDictionary(nn.Module):
 class CameraDictionary(ColourDictionary):
     """N cameras: matrices from sRGB to white-balanced camera RGB, rows of sum 1, and the white balance of each in D65.
 
-    Matrix and balance together are the matrix from XYZ, so that the gains of a mixture follow from any light:
+    Matrix and balance together give the matrix from XYZ, so the gains of a mixture follow from any light:
 
     ``M = diag(r) C S^-1`` with ``C = sum_i w_i C_i``, ``r = sum_i w_i r_i``, the response to D65 (green 1), and S from
     linear sRGB to XYZ.
@@ -97,7 +98,7 @@ class CameraDictionary(ColourDictionary):
 
     @property
     def typical(self) -> Tensor:
-        """The weights ``(N,)`` where nothing is known of the camera: the mean over the known ones."""
+        """The weights ``(N,)`` to use if the camera is unknown: the mean over the known ones."""
         return self.known.mean(dim=0)
 
     @torch.no_grad()
@@ -124,7 +125,7 @@ class CameraDictionary(ColourDictionary):
         return (weights @ self.responses())[:, :, None] * matrix @ XYZ_TO_SRGB.to(matrix)
 
     def weights_for(self, white_balance: Tensor) -> Tensor:
-        """The typical weights ``(B, N)``: multipliers ``(B, 3)`` of an unknown light tell nothing of the camera."""
+        """The typical weights ``(B, N)``: multipliers ``(B, 3)`` of an unknown light say nothing about the camera."""
         return self.typical.expand(len(white_balance), -1)
 
 
@@ -134,7 +135,7 @@ def log_light(white_balance: Tensor) -> Tensor:
 
 
 class GainDictionary(nn.Module):
-    """M triplets (digital gain, red gain, blue gain) as in the paper, from U(1, 2) at first; kept as logarithms."""
+    """M triplets (digital gain, red gain, blue gain) as in the paper, from U(1, 2) at first; stored as logarithms."""
 
     def __init__(self, atoms: int) -> None:
         super().__init__()
@@ -186,8 +187,8 @@ def sparse_shares(batch: int, atoms: int, mixed: int, generator: torch.Generator
     Args:
         batch: number of pictures B.
         atoms: number of atoms to draw from.
-        mixed: how many are drawn for each picture.
-        generator: on the CPU.
+        mixed: number of atoms to draw for each picture.
+        generator: a generator on the CPU.
 
     Returns:
         Indices and float64 shares, both ``(batch, mixed)``.
@@ -201,7 +202,7 @@ def sparse_shares(batch: int, atoms: int, mixed: int, generator: torch.Generator
 def nearest_in_hull(points: Tensor, atoms: Tensor) -> tuple[Tensor, Tensor]:
     """Find the convex combinations of ``atoms`` ``(..., N, D)``, one hull or several, nearest to points ``(P, D)``.
 
-    By accelerated projected gradients (Beck and Teboulle, FISTA, 2009) with restarts.
+    It uses accelerated projected gradients (Beck and Teboulle, FISTA, 2009) with restarts.
 
     Returns:
         Weights ``(..., P, N)`` and squared errors ``(..., P)``.
@@ -228,10 +229,10 @@ class CameraSampler:
     """Draws settings of an ISP whose colour atoms are published cameras, on the CPU.
 
     Args:
-        cameras: the atoms; later changes of them do not reach the sampler.
-        tone_atoms: number of tone curves, 0 where the tone is learned.
-        lights: what lights are drawn.
-        consistent: whether colour and gains are of one camera in one light; if not, the gains are drawn apart.
+        cameras: the atoms; later changes to them do not affect the sampler.
+        tone_atoms: number of tone curves, 0 if the tone is learned.
+        lights: the lights to draw from.
+        consistent: whether colour and gains are of one camera in one light; if not, the gains are drawn separately.
     """
 
     def __init__(self, cameras: CameraDictionary, tone_atoms: int, lights: LightRange, consistent: bool = True) -> None:
@@ -260,7 +261,7 @@ class CameraSampler:
         return ISPParams(colour_weights, none, matrices, gains, tones)
 
     def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Array, Array]:
-        """Draw weights ``(B, N)`` and balances ``(B, 3)``, again where the gains are implausible."""
+        """Draw weights ``(B, N)`` and balances ``(B, 3)``, and repeat the draw if the gains are implausible."""
         weights, balance = np.empty((batch, self.known.shape[1])), np.empty((batch, 3))
         rest = np.arange(batch)
         for _ in range(_ROUNDS):

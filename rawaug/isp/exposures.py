@@ -4,16 +4,16 @@ Pictures k of one scene, of exposures t_k (2^EV) and RAW y_k = t_k E, give at ea
 
     E = sum_k m_k y_k / sum_k m_k t_k,        m_k = clip((0.95 - max_c x_k) / 0.1, 0, 1),
 
-the maximum-likelihood estimate under Poisson statistics of what m_k keeps: a pixel whose brightest sRGB channel comes
-close to white may be clipped. Where every picture is, the shortest exposure alone decides (after Debevec and Malik,
-SIGGRAPH 1997).
+the maximum-likelihood estimate under Poisson statistics from the readings that m_k keeps: a pixel whose brightest sRGB
+channel comes close to white may be clipped. Where this holds for every picture, the shortest exposure alone decides
+(after Debevec and Malik, SIGGRAPH 1997).
 
-On the way to sRGB, RAW is scaled by 2^EV, and by f(L) / L where its largest linear channel L exceeds middle grey a:
+On the way to sRGB, RAW is scaled by 2^EV, and by f(L) / L if its largest linear channel L exceeds middle grey a:
 
     f(L) = a + (1 - a) g((L - a) / (1 - a)),        g(u) = u (1 + u / v^2) / (1 + u),
 
 with g from Reinhard et al., SIGGRAPH 2002, eq. 4, and v such that f takes the scene's white to 1. RAW has all three
-colours at every pixel here (x5): merging and scaling commute with the mosaic, but no detail is lost to demosaicing.
+colours at every pixel here (x5). Merging and scaling commute with the mosaic, but no detail is lost to demosaicing.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _SCENE_WHITE = 0.999
 
 
 def confidence(srgb: Tensor) -> Tensor:
-    """Compute m ``(B, 1, H, W)``: how sure it is that a pixel of sRGB ``(B, 3, H, W)`` in [0, 1] is not clipped."""
+    """Compute m ``(B, 1, H, W)``: how certain it is that a pixel of sRGB ``(B, 3, H, W)`` in [0, 1] is not clipped."""
     return ((_CLIPPED - srgb.amax(dim=1, keepdim=True)) / _RAMP).clamp(0.0, 1.0)
 
 
@@ -53,11 +53,11 @@ def merge_exposures(isp: DictionaryISP, pictures: Sequence[Tensor], ev: Sequence
     Args:
         isp: the camera.
         pictures: sRGB ``(B, 3, H, W)`` each, uint8 or float in [0, 1].
-        ev: exposure of each in stops.
+        ev: exposure of each picture in stops.
 
     Returns:
-        The RAW ``(B, 3, H, W)`` as ``image``, with all colours at every pixel, above 1 where the scene is brighter
-        than white at 0 EV, and the setting.
+        The RAW ``(B, 3, H, W)`` as ``image``, with all colours at every pixel, and the setting. RAW exceeds 1 where the
+        scene is brighter than white at 0 EV.
 
     Raises:
         ValueError: if exposures or shapes do not fit the pictures, or two exposures are equal.
@@ -82,7 +82,7 @@ def merge_exposures(isp: DictionaryISP, pictures: Sequence[Tensor], ev: Sequence
 
 @torch.no_grad()
 def render_exposure(isp: DictionaryISP, raw: Tensor, params: ISPParams, ev: float = 0.0) -> Tensor:
-    """Develop the RAW of :func:`merge_exposures` at another exposure, highlights compressed.
+    """Develop the RAW of :func:`merge_exposures` at another exposure, with highlights compressed.
 
     Args:
         isp: the camera that merged it.
@@ -105,7 +105,7 @@ def render_exposure(isp: DictionaryISP, raw: Tensor, params: ISPParams, ev: floa
 
 
 def _linear_reverse(isp: DictionaryISP, x: Tensor, params: ISPParams) -> Tensor:
-    """Compute x5 from x, dividing plainly by the gains: highlight-safe gains are not linear in the scene."""
+    """Compute x5 from x with a plain division by the gains, as highlight-safe gains are not linear in the scene."""
     for stage in isp.ordered_stages:
         if isinstance(stage, WhiteBalance):
             x = inverse_gains(x, params.gains, knee=None)

@@ -1,13 +1,14 @@
-r"""The passes of an ISP as a table and a matrix each: the same RAW and the same sRGB, dozens of times faster.
+r"""The passes of an ISP, each as a table and a matrix: the same RAW and the same sRGB, dozens of times faster.
 
 ``y_c = sum_k C[c, k] T_k(x) * max(m + (1 - m) / g_c, 1 / g_c) * G(p) A(x4)``
 
-Tone network and gamma are the same for every picture, and pointwise: ``T`` is their table over the sRGB cube, read by
-trilinear interpolation (65 nodes a side: above 75 dB against the network), and so is the attention mask ``A``. Colour
-and gains are one matrix and three numbers a picture. Every site computes its own colour alone, hence packed RAW.
+Tone network and gamma are the same for every picture, and pointwise. ``T`` is their table over the sRGB cube, read by
+trilinear interpolation (65 nodes a side: above 75 dB against the network), and ``A`` is the same for the attention
+mask. Colour and gains are one matrix and three numbers per picture. Every site computes its own colour alone, hence
+packed RAW.
 
-The forward pass of demosaiced RAW is ``x = T'(sqrt(pinv(C) min(g x5 / G(p) A', min g)))``, with the forward network
-and gamma in a table over the roots of linear light, or the picture's own tone curve inverted.
+The forward pass of demosaiced RAW is ``x = T'(sqrt(pinv(C) min(g x5 / G(p) A', min g)))``, with the forward network and
+gamma in a table over the roots of linear light, or the picture's own tone curve inverted.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ from rawaug.kernels.runtime import one_thread
 NODES = 65
 """Number of nodes of the table along each axis of the sRGB cube."""
 _CURVE_NODES = 1025
-"""Number of nodes of an inverted tone curve, over the root of linear light."""
+"""Number of nodes of an inverted tone curve over the root of linear light."""
 _PLACE_NODES = 33
-"""Number of nodes along each side of a picture between which gains by place are interpolated."""
+"""Number of nodes along each side of a picture, between which place-dependent gains are interpolated."""
 
 
 class BakedISP(nn.Module):
-    """The reverse pass of an ISP as it is now; later changes of the ISP do not reach it."""
+    """The reverse pass of an ISP as it is now; later changes to the ISP do not affect it."""
 
     table: Tensor
     attention: Tensor
@@ -58,7 +59,7 @@ class BakedISP(nn.Module):
 
     @torch.no_grad()
     def choose(self, srgb: Tensor) -> ISPParams:
-        """The setting that the encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``, as the ISP would."""
+        """The setting that the encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``, as in the ISP."""
         if not self.config.encoders:
             return self.isp.choose(srgb)
         with one_thread():  # the same choice in every process
@@ -71,8 +72,9 @@ class BakedISP(nn.Module):
         Args:
             srgb: ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides.
             params: the settings of the pictures.
-            place: where each lies in its frame, ``(B, 4 to 6)``: top, left, height and width of the frame, and, if the
-                crop was turned or enlarged, its view and how many rows of the frame it has; None for full frames.
+            place: where each picture lies in its frame, ``(B, 4 to 6)``: top, left, height and width of the frame, and,
+                if the crop was turned or enlarged, its view and how many rows of the frame it has; None for full
+                frames.
             white: the RAW value to clip at; nothing is clipped by default.
 
         Returns:
@@ -102,7 +104,7 @@ class BakedISP(nn.Module):
             params: the settings of the pictures.
             place: as in :meth:`forward`.
             white: as in :meth:`forward`.
-            shaded: whether the lens acts; if not, the result is x4, for :meth:`shade`.
+            shaded: whether the lens is applied; if not, the result is x4, for :meth:`shade`.
 
         Returns:
             float32 ``(B, 3, H, W)``.
@@ -168,7 +170,7 @@ class BakedISP(nn.Module):
 
 
 class FastForward(nn.Module):
-    """The forward pass of an ISP as it is now, after demosaicing; later changes of the ISP do not reach it."""
+    """The forward pass of an ISP as it is now, after demosaicing; later changes to the ISP do not affect it."""
 
     table: Tensor
     attention: Tensor
@@ -185,8 +187,8 @@ class FastForward(nn.Module):
     def forward(self, linear: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor:
         """Develop linear camera RGB x5 ``(B, 3, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1], float32.
 
-        Balanced light is clipped at the least gain, where a saturated sensor is neutral, as RAW developers do; the
-        ISP's own pass clips sRGB alone, and its saturated highlights are magenta.
+        Balanced light is clipped at the smallest gain, where a saturated sensor is neutral, as RAW developers do. The
+        ISP's own pass clips only sRGB, and its saturated highlights are magenta.
         Differentiable with respect to ``linear`` and to the matrix and gains of ``params``.
         """
         _require_batch(linear, params, place)
@@ -210,12 +212,12 @@ class FastForward(nn.Module):
 
         Args:
             raws: mosaics ``(B, 1, H, W)`` of the same B pictures, such as the noisy and the clean ones.
-            methods: B of :data:`rawaug.bayer.METHODS`.
+            methods: B names from :data:`rawaug.bayer.METHODS`.
             params: the settings of the pictures.
             place: as in :meth:`BakedISP.forward`.
 
         Returns:
-            For each of ``raws`` sRGB ``(B, 3, H, W)`` in [0, 1].
+            sRGB ``(B, 3, H, W)`` in [0, 1] for each of ``raws``.
         """
         directional = any(method in bayer.DIRECTIONAL for method in methods)
         if directional and len(methods) > 1:
@@ -223,7 +225,7 @@ class FastForward(nn.Module):
 
         display = self._display(raws[0], params, place)
         gain = self._gain(raws[0], place)
-        if gain is not None:  # the gains change slowly: it is alike before demosaicing and after
+        if gain is not None:  # the gains change slowly, so they are about the same before demosaicing and after
             raws = [raw * gain for raw in raws]
 
         def in_steps(raw: Tensor) -> Tensor:
@@ -245,7 +247,7 @@ class FastForward(nn.Module):
     def _develop_each(
         self, raws: Sequence[Tensor], methods: Sequence[str], params: ISPParams, place: Tensor | None
     ) -> list[Tensor]:
-        """Develop picture by picture, so that each is the same whatever is beside it."""
+        """Develop picture by picture, so that the result does not depend on the rest of the batch."""
         pictures = []
         for i, method in enumerate(methods):
             own_params = ISPParams(*[value[i, None] for value in params])
@@ -262,7 +264,7 @@ class FastForward(nn.Module):
         return _place_gain(self.isp.ordered_stages, place, size, self.table, forward=True, batch=len(image))
 
     def _demosaic_balanced(self, raw: Tensor, method: str, gains: Tensor) -> Tensor:
-        """Demosaic ``(1, 1, H, W)``; a choice of direction needs balanced RAW clipped at black, as developers do it."""
+        """Demosaic ``(1, 1, H, W)``; choosing a direction needs balanced RAW clipped at black, as developers do it."""
         if method not in bayer.DIRECTIONAL:
             return bayer.demosaic(raw, self.cfa, method)
 
@@ -291,7 +293,7 @@ class FastForward(nn.Module):
 @torch.no_grad()
 @one_thread()  # the same tables in every process
 def _tables(isp: DictionaryISP, nodes: int, forward: bool = False) -> tuple[Tensor, Tensor]:
-    """Make the tables of a pass: x2, or sRGB of the forward pass, and attention, which is empty for none."""
+    """Make the tables of a pass: x2, or sRGB of the forward pass, and attention, which is empty if there is none."""
     if any(first.makes >= second.makes for first, second in pairwise(isp.ordered_stages)):
         order = " ".join(isp.config.stages)
         raise ValueError(f"augmentation needs the ISP's stages in the usual order, got {order}; fit it anew")
@@ -338,7 +340,7 @@ def _place_gain(
     forward: bool,
     batch: int = 1,
 ) -> Tensor | None:
-    """Compute the gains by place ``(B, 1, H, W)`` of pictures of a size, between :data:`_PLACE_NODES` a side."""
+    """Compute place-dependent gains ``(B, 1, H, W)`` of pictures of a size, from :data:`_PLACE_NODES` nodes a side."""
     gaining = [stage for stage in stages if stage.has_place_gain]
     if not gaining:
         return None
@@ -356,7 +358,7 @@ def _place_gain(
     x = start_x + down * down_x + right * right_x
     coordinates = torch.stack([y, x], dim=1)
 
-    # One picture at a time: on a GPU the bits of a convolution depend on how many pictures there are.
+    # One picture at a time: on a GPU the bits of a convolution depend on the number of pictures.
     gains = []
     for picture in coordinates.split(1):
         gain = torch.ones_like(picture[:, :1])
@@ -383,6 +385,6 @@ def _require_batch(srgb: Tensor, params: ISPParams, place: Tensor | None) -> Non
 
 
 def _as_table(values: Tensor, nodes: int) -> Tensor:
-    """Bring values on the cube ``(1, C, N, N * N)`` to ``(N, N, N, 4)``; missing channels are 0."""
+    """Arrange values on the cube ``(1, C, N, N * N)`` as ``(N, N, N, 4)``; missing channels are 0."""
     channels_last = values[0].permute(1, 2, 0).reshape(nodes, nodes, nodes, -1)
     return F.pad(channels_last, (0, 4 - channels_last.shape[-1])).contiguous()

@@ -1,7 +1,7 @@
-r"""What the stages of an ISP compute, as functions of images ``(B, 3, H, W)``; :mod:`rawaug.isp.stages` uses them.
+r"""The computations of an ISP's stages, as functions of images ``(B, 3, H, W)``; :mod:`rawaug.isp.stages` uses them.
 
 Images are display-referred up to the gamma and linear after it, with white at 1. The coordinates of pixels are those of
-the full frame, of which a crop is a part.
+the full frame that a crop is part of.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from torch import Tensor
 from rawaug.isp.config import HIGHLIGHT_KNEE
 
 EPS = 1e-6
-"""Floor under a power: keeps the gradient of x ** (1 / gamma) finite at black."""
+"""Floor under a power, which keeps the gradient of x ** (1 / gamma) finite at black."""
 
 _HALF_LEVEL = 0.5 / 255
 """Half an 8-bit level."""
 _OVERSHOOT = 0.5
-"""Bicubic interpolation goes beyond [0, 1] by less."""
+"""Upper bound of how far bicubic interpolation exceeds [0, 1]."""
 
 
 def as_float(srgb: Tensor) -> Tensor:
-    """Convert a picture ``(..., 3, H, W)`` from uint8 to float32 in [0, 1]; floats pass as they are."""
+    """Convert a picture ``(..., 3, H, W)`` from uint8 to float32 in [0, 1]; floats are returned as they are."""
     if srgb.dtype == torch.uint8:
         return srgb.float() / 255.0
     return srgb
@@ -40,7 +40,7 @@ def as_display_referred(srgb: Tensor) -> Tensor:
 
 def require_display_range(image: Tensor) -> None:
     """Raise ValueError if floats of an image of any shape leave [0, 1] by more than half an 8-bit level, or are NaN."""
-    # Only on the CPU: elsewhere reading a value back would stall the device.
+    # This is checked on the CPU only; reading a value back would stall other devices.
     if image.device.type != "cpu" or image.dtype == torch.uint8 or not image.numel():
         return
 
@@ -60,27 +60,27 @@ def require_display_range(image: Tensor) -> None:
 
 
 def gamma_expand(x: Tensor, gamma: Tensor | float) -> Tensor:
-    """f2 reversed: display-referred to linear ``(B, 3, H, W)``, ``max(x, eps) ** gamma``."""
+    """Reverse f2: display-referred to linear ``(B, 3, H, W)``, ``max(x, eps) ** gamma``."""
     return x.clamp_min(EPS) ** gamma
 
 
 def gamma_compress(x: Tensor, gamma: Tensor | float) -> Tensor:
-    """f2: linear to display-referred ``(B, 3, H, W)``, ``max(x, eps) ** (1 / gamma)``."""
+    """Apply f2: linear to display-referred ``(B, 3, H, W)``, ``max(x, eps) ** (1 / gamma)``."""
     return x.clamp_min(EPS) ** (1.0 / gamma)
 
 
 def correct_colour(x: Tensor, matrix: Tensor) -> Tensor:
-    """f3 in either direction: multiply the colours of ``x`` ``(B, 3, H, W)`` by ``matrix`` ``(B, 3, 3)``."""
+    """Apply f3 in either direction: multiply the colours of ``x`` ``(B, 3, H, W)`` by ``matrix`` ``(B, 3, 3)``."""
     return torch.einsum("bij,bjhw->bihw", matrix, x)
 
 
 def inverse_gains(x: Tensor, gains: Tensor, knee: float | None = HIGHLIGHT_KNEE) -> Tensor:
-    """f4 reversed: divide ``x`` ``(B, 3, H, W)`` by ``gains`` ``(B, 3)``, sparing highlights; None divides plainly.
+    """Reverse f4: divide ``x`` ``(B, 3, H, W)`` by ``gains`` ``(B, 3)``, sparing highlights unless ``knee`` is None.
 
     ``m = clip((mean(x) - knee) / (1 - knee), 0)^2`` and the factor is ``max(m + (1 - m) / g, 1 / g)``.
     """
-    # Where a gain is above 1, clipped sRGB must come back as saturated RAW, not as a coloured grey; where it is below
-    # 1, bending its factor towards 1 would darken highlights, hence the maximum.
+    # If a gain is above 1, clipped sRGB must come back as saturated RAW, not as a coloured grey. If it is below 1,
+    # bending its factor towards 1 would darken highlights, hence the maximum.
     inverse = (1.0 / gains)[:, :, None, None]
     if knee is None:
         return x * inverse
@@ -90,26 +90,26 @@ def inverse_gains(x: Tensor, gains: Tensor, knee: float | None = HIGHLIGHT_KNEE)
 
 
 def highlight_rise(floor: Tensor, knee: float | None) -> Tensor:
-    """How much brighter a spared highlight is where the mask is 1; ``floor`` ``(..., 3)`` is one over the gains."""
+    """Compute the rise of a spared highlight where the mask is 1; ``floor`` ``(..., 3)`` is one over the gains."""
     if knee is None:
         return torch.zeros_like(floor)
     return (1.0 - floor).clamp_min(0.0)
 
 
 def apply_gains(x: Tensor, gains: Tensor) -> Tensor:
-    """f4: multiply ``x`` ``(B, 3, H, W)`` by ``gains`` ``(B, 3)``."""
+    """Apply f4: multiply ``x`` ``(B, 3, H, W)`` by ``gains`` ``(B, 3)``."""
     return x * gains[:, :, None, None]
 
 
 def frame_coordinates(
     height: int, width: int, offset: tuple[int, int] = (0, 0), frame: tuple[int, int] | None = None
 ) -> Tensor:
-    """Coordinates (y, x) of a crop's pixels in its *full* frame, whose centre is 0 and half of whose diagonal is 1.
+    """Compute coordinates (y, x) of a crop's pixels in its *full* frame, with centre 0 and half the diagonal 1.
 
     Args:
         height, width: sides of the crop.
         offset: its top and left in the frame.
-        frame: height and width of the frame; the crop is one by default.
+        frame: height and width of the frame; by default the crop is the full frame.
 
     Returns:
         float32 ``(1, 2, H, W)``.
@@ -123,7 +123,7 @@ def frame_coordinates(
 
 
 def coordinates_or_full(x: Tensor, coordinates: Tensor | None) -> Tensor:
-    """``coordinates`` ``(B, 2, H, W)``, or those of a full frame, in the type of the image ``x`` ``(B, 3, H, W)``."""
+    """Get ``coordinates`` ``(B, 2, H, W)``, or those of a full frame, in the type of ``x`` ``(B, 3, H, W)``."""
     if coordinates is None:
         coordinates = frame_coordinates(*x.shape[-2:])
     return coordinates.to(x)

@@ -1,6 +1,6 @@
 """The learned parts of the stages: tone network, Gaussian mask and attention mask.
 
-Each is the identity at first, or nearly so, and works on each pixel by itself.
+Each starts as the identity, or nearly so, and works on each pixel separately.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 WIDTH = 32
 """Number of features of the networks."""
 _LEAST_FACTOR = 0.02
-"""Initial entries of L of a Gaussian mask."""
+"""Initial value of the diagonal entries of L in a Gaussian mask."""
 
 
 def _pixelwise(hidden: int, outputs: int, inputs: int = 3) -> nn.Sequential:
@@ -36,13 +36,13 @@ class ToneNetwork(nn.Module):
         self.layers = _pixelwise(hidden=3, outputs=3)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map colours ``(B, 3, H, W)`` to colours of the same shape, each pixel by itself."""
+        """Map colours ``(B, 3, H, W)`` to colours of the same shape, each pixel separately."""
         return x + self.layers(x)
 
     @torch.no_grad()
     def start_from(self, toe: float) -> None:
-        """Start as ``x1 = x + toe (1 - x)``: with the gamma stage that is the curve of sRGB and of BT.709."""
-        # Three hidden features pass x on (it is not negative, so ReLU keeps it), and the last layer adds the rest.
+        """Start as ``x1 = x + toe (1 - x)``; with the gamma stage this is the curve of sRGB and of BT.709."""
+        # Three hidden features pass x on (ReLU keeps it, as it is not negative), and the last layer adds the rest.
         *hidden, last = (layer for layer in self.layers if isinstance(layer, nn.Conv2d))
         through = torch.eye(3)[..., None, None]
 
@@ -60,7 +60,7 @@ class GaussianMask(nn.Module):
     """The sensor's fall-off ``G(p) = exp(-||L^T (p - mu)||^2 / 2)``, precision ``Sigma^-1 = L L^T``.
 
     ``p`` are the coordinates of :func:`frame_coordinates`. A flat mask, L = 0, is a saddle, which gradient descent
-    never leaves; the mask starts with :data:`_LEAST_FACTOR` instead, which takes 0.02 % of the light from the corners.
+    never leaves. So the mask starts with :data:`_LEAST_FACTOR`, which takes 0.02 % of the light from the corners.
     """
 
     def __init__(self) -> None:
@@ -84,7 +84,7 @@ class GaussianMask(nn.Module):
 
     @torch.no_grad()
     def set(self, mean: Tensor, precision: Tensor) -> None:
-        """Set the mean ``(2,)`` and the precision ``(2, 2)``; less curvature than at the start is taken as that."""
+        """Set the mean ``(2,)`` and the precision ``(2, 2)``; curvature below that of the start is raised to it."""
         values, vectors = torch.linalg.eigh(precision)
         root = vectors @ torch.diag(values.clamp_min(_LEAST_FACTOR**2).sqrt())
         lower = torch.linalg.qr(root.T).R.T
@@ -96,8 +96,8 @@ class GaussianMask(nn.Module):
 class AttentionMask(nn.Module):
     """A gain for each pixel by its colour and by its place, ``A = 2 sigmoid(a(x)) 2 sigmoid(b(p))``, in (0, 4).
 
-    Both networks are zero at first, so that the mask is the identity, for which the paper's sigmoid has no factor of 2.
-    Colour and place are factors of their own, so that the baked pass can look the first one up in a table.
+    Both networks are zero at first, so that the mask starts as the identity; the paper's sigmoid lacks the factor of 2
+    for this. Colour and place are separate factors, so that the baked pass can look up the first one in a table.
     """
 
     def __init__(self) -> None:
@@ -106,11 +106,11 @@ class AttentionMask(nn.Module):
         self.place_layers = _pixelwise(hidden=2, outputs=1, inputs=2)
 
     def of_colour(self, x: Tensor) -> Tensor:
-        """Compute the gains ``(B, 1, H, W)`` by the colours of an image ``(B, 3, H, W)``."""
+        """Compute the colour-dependent gains ``(B, 1, H, W)`` of an image ``(B, 3, H, W)``."""
         return 2.0 * torch.sigmoid(self.layers(x))
 
     def of_place(self, coordinates: Tensor) -> Tensor:
-        """Compute the gains ``(B, 1, H, W)`` by the coordinates ``(B, 2, H, W)`` of the pixels in the full frame."""
+        """Compute the place-dependent gains ``(B, 1, H, W)`` at coordinates ``(B, 2, H, W)`` in the full frame."""
         return 2.0 * torch.sigmoid(self.place_layers(coordinates))
 
     def forward(self, x: Tensor, coordinates: Tensor) -> Tensor:

@@ -1,15 +1,15 @@
-r"""Lights by name or colour temperature, and what is between two of them.
+r"""Lights by name or colour temperature, and interpolation between two of them.
 
 Bradford's adaptation takes XYZ from the white point w of one light to w' of another,
 
 .. math:: B = M^{-1} \, \mathrm{diag}(M w' / M w) \, M .
 
 The correlated colour temperature is McCamy's (1992). Between two lights of temperatures :math:`T_1 < T < T_2` figures
-are mixed linearly in mired, a million over the temperature, as the DNG specification does (Adobe, 1.7),
+are mixed linearly in mired, a million over the temperature, as in the DNG specification (Adobe, 1.7),
 
 .. math:: w_1 = \frac{1/T - 1/T_2}{1/T_1 - 1/T_2}, \qquad w_2 = 1 - w_1,
 
-and beyond the outermost light its figures stay.
+and beyond the outermost light its figures stay constant.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ ILLUMINANTS = {
 _BRADFORD = torch.tensor(
     [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]], dtype=torch.float64
 )
-"""M, from XYZ to the responses of the cones."""
+"""The matrix M, from XYZ to the responses of the cones."""
 
 
 def _light_chromaticity(light: str) -> tuple[float, float]:
@@ -105,7 +105,7 @@ def weights_in_light(anchors: Sequence[float], mired: Array) -> Array:
 
 
 def mix_by_light(matrices: Mapping[str, Tensor], light: str) -> Tensor:
-    """The matrix of a light, or the mixture of those of the lights beside it."""
+    """Get the matrix of a light, or the mixture of the matrices of the lights beside it."""
     if light in matrices:
         return matrices[light]
 

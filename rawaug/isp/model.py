@@ -1,4 +1,4 @@
-r"""The dictionary ISP: sRGB to RAW and back, six stages whose parameters come from two dictionaries.
+r"""The dictionary ISP: sRGB to RAW and back, in six stages whose parameters come from two dictionaries.
 
 ``y = f6^-1 . f5^-1 . f4^-1 . f3^-1 . f2^-1 . f1^-1 (x)`` and ``x = f1 . f2 . f3 . f4 . f5 . f6 (y)``
 
@@ -37,7 +37,7 @@ _INFINITE = ("colour.spread",)
 
 
 class DictionaryISP(StagedISP):
-    """A learned, interpretable camera: ``config`` says what it is made of, ``seed`` how it starts.
+    """A learned, interpretable camera: ``config`` says what it consists of, ``seed`` sets its initial values.
 
     Example:
         >>> isp = DictionaryISP()
@@ -47,7 +47,7 @@ class DictionaryISP(StagedISP):
     """
 
     def __repr__(self) -> str:
-        """Tell the pattern, the stages and the sizes of the dictionaries in a line."""
+        """Describe the pattern, the stages and the sizes of the dictionaries in a line."""
         config = self.config
         colours = count_of(config.colour_atoms, "colour atom")
         if config.cameras:
@@ -66,7 +66,7 @@ class DictionaryISP(StagedISP):
         Args:
             colour_weights: ``(B, N)``, weights of the colour atoms.
             gain_weights: ``(B, M)``, weights of the gain atoms.
-            tone_weights: ``(B, K)``, weights of the tone curves; the typical ones by default.
+            tone_weights: ``(B, K)``, weights of the tone curves; the typical weights by default.
         """
         matrix, gains = self.colour.combine(colour_weights), self.gain.combine(gain_weights)
         if tone_weights is None:
@@ -74,9 +74,9 @@ class DictionaryISP(StagedISP):
         return ISPParams(colour_weights, gain_weights, matrix, gains, tone_weights)
 
     def draw_setting(self, batch: int, generator: torch.Generator) -> ISPParams:
-        """Settings of ``batch`` pictures, drawn without looking at them from a generator on the CPU.
+        """Draw the settings of ``batch`` pictures from a generator on the CPU, without looking at the pictures.
 
-        A camera in a light where the atoms are published cameras, else mixtures of the atoms with uniform weights.
+        If the atoms are published cameras, it draws a camera in a light, else mixtures of atoms with uniform weights.
         """
         config, device = self.config, self.colour.matrices.device
         sampler = self.camera_sampler()
@@ -92,10 +92,10 @@ class DictionaryISP(StagedISP):
     def camera_sampler(self, consistent: bool = True, light: float | str | None = None) -> CameraSampler | None:
         """Make the sampler that draws cameras in a light; None unless the colour atoms are published cameras.
 
-        Later changes of the atoms do not reach it.
+        Later changes to the atoms do not affect it.
 
         Args:
-            consistent: whether colour and gains are of one camera in one light; if not, the gains are drawn apart.
+            consistent: whether colour and gains are of one camera in one light; if not, gains are drawn separately.
             light: a colour temperature in kelvin or one of :data:`rawaug.isp.cameras.LAMPS`; any light by default.
         """
         if not isinstance(self.colour, CameraDictionary):
@@ -150,16 +150,16 @@ class DictionaryISP(StagedISP):
         Args:
             srgb: ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides.
             params: the settings of the pictures; by default the encoders, or their constants, choose them.
-            white_balance: the camera's as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``; green is made 1. They
-                choose the colour atoms of such light as well.
+            white_balance: the camera's as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``, scaled so that green is 1.
+                They also choose the colour atoms of that light.
             digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
-            tone: the tone curve that the picture was rendered with, where the ISP has a dictionary of them
+            tone: the tone curve that the picture was rendered with, if the ISP has a dictionary of them
                 (``isp.info["tones"]``): a name such as ``"linear"``, which is LibRaw's rendering, or a mixture
-                (:func:`rawaug.isp.staged.with_tone`); what the ISP chooses by default.
-            raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are solved for from these few readings
+                (:func:`rawaug.isp.staged.with_tone`). By default the ISP chooses it.
+            raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are computed from these few readings
                 (:func:`rawaug.isp.staged.with_raw_samples`).
             coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame
-                (:func:`rawaug.isp.functional.frame_coordinates`); the picture is taken for a full frame by default.
+                (:func:`rawaug.isp.functional.frame_coordinates`); by default the picture is taken for a full frame.
             intermediates: also return x1 ... x5.
 
         Returns:
@@ -167,7 +167,7 @@ class DictionaryISP(StagedISP):
 
         Raises:
             ValueError: if the shape is not ``(B, 3, H, W)``, a side is odd, the picture or a gain is out of range, or
-                what is given is for another number of pictures.
+                an argument is for another number of pictures.
         """
         if srgb.ndim != 4 or srgb.shape[1] != 3 or min(srgb.shape[2:]) < 2:
             raise ValueError(f"sRGB must have shape (B, 3, H >= 2, W >= 2), got {tuple(srgb.shape)}")
@@ -189,7 +189,7 @@ class DictionaryISP(StagedISP):
             return ISPResult(bayer.mosaic(x5, self.cfa), params, images)
 
     def _float32(self, like: Tensor) -> torch.autocast:
-        """Keep the pass in float32, in mixed precision too; ValueError if the ISP is of another type or device."""
+        """Keep the pass in float32, also in mixed precision; ValueError if the ISP has another type or device."""
         own = self.gain.log_gains
         if own.dtype != torch.float32:
             raise ValueError(f"RAW is float32, but this ISP was converted to {own.dtype}; call isp.float()")
@@ -221,7 +221,7 @@ class DictionaryISP(StagedISP):
             A :class:`ISPResult` whose ``srgb`` is ``(B, 3, H, W)`` in [0, 1].
 
         Raises:
-            ValueError: if ``raw`` is no such mosaic or not finite, or what is given is for another number of pictures.
+            ValueError: if ``raw`` is no such mosaic or not finite, or an argument is for another number of pictures.
         """
         with self._float32(raw):
             x5 = bayer.demosaic(_require_mosaic(raw), self.cfa)
@@ -241,7 +241,7 @@ class DictionaryISP(StagedISP):
     # -- as numbers -------------------------------------------------------------------------------------------------
 
     def typical_setting(self, white_balance: Sequence[float] | None = None) -> ISPParams:
-        """The setting of one picture that the constants choose, under as-shot multipliers R, G, B if there are any."""
+        """The setting of one picture that the constants choose, under as-shot multipliers R, G, B if given."""
         encoders = self.reverse_encoders
         colour_weights = encoders.colour.prior.softmax(0)[None]
         gain_weights = encoders.gain.prior.softmax(0)[None]
@@ -253,7 +253,7 @@ class DictionaryISP(StagedISP):
 
     @torch.no_grad()
     def reverse_table(self, setting: ISPParams, nodes: int = 33) -> Tensor:
-        """Tabulate the reverse pass up to the mosaic, at the centre of the shading, over ``nodes`` sRGB values an axis.
+        """Tabulate the reverse pass up to the mosaic, at the centre of the shading, with ``nodes`` sRGB values an axis.
 
         Returns:
             Linear camera RGB ``(nodes ** 3, 3)``, black 0 and white 1, red changing fastest.
@@ -269,12 +269,12 @@ class DictionaryISP(StagedISP):
 
     @torch.no_grad()
     def tone_curve(self) -> Tensor:
-        """Compute linear x2 of the 256 greys of sRGB, ``(256, 3)``: tone and gamma in one curve a channel."""
+        """Compute linear x2 of the 256 greys of sRGB, ``(256, 3)``: tone and gamma in one curve per channel."""
         return self.linear(torch.linspace(0.0, 1.0, 256).expand(1, 3, 1, -1))[0, :, 0].T.contiguous()
 
     @torch.no_grad()
     def description(self) -> dict[str, Any]:
-        """Describe the ISP as JSON: its atoms, curves and mask, :meth:`typical_setting`, and what the fit recorded."""
+        """Describe the ISP as JSON: its atoms, curves and mask, :meth:`typical_setting`, and the record of the fit."""
         setting, shading, info = self.typical_setting(), self.find(stages.LensShading), dict(self.info)
         mask = shading and {"mean": shading.mask.mean.tolist(), "precision": shading.mask.precision.tolist()}
         return {
@@ -300,7 +300,7 @@ class DictionaryISP(StagedISP):
     # -- files ------------------------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> None:
-        """Write weights, configuration and ``info`` to one safetensors file, whole or not at all."""
+        """Write weights, configuration and ``info`` to one safetensors file, completely or not at all."""
         header = {"format": "rawaug", "kind": "isp", "config": to_json(asdict(self.config)), "info": to_json(self.info)}
         write_tensors(self.state_dict(), header, path)
 
@@ -312,7 +312,7 @@ class DictionaryISP(StagedISP):
 
         Raises:
             FileNotFoundError: if there is no such file or name.
-            ValueError: if the file is not that of an ISP, or is damaged.
+            ValueError: if the file does not contain an ISP, or is damaged.
         """
         if is_camera_file(name):
             return restrict_to_cameras(cls.from_pretrained("universal"), name)
@@ -340,10 +340,10 @@ class DictionaryISP(StagedISP):
 def restrict_to_cameras(
     isp: DictionaryISP, names: str | Path | Camera | Sequence[str | Path | Camera]
 ) -> DictionaryISP:
-    """Make an ISP whose atoms are some cameras; tones and lights stay those of ``isp``.
+    """Make an ISP whose atoms are some cameras; the tones and lights stay those of ``isp``.
 
     Args:
-        isp: of published cameras, such as ``universal``.
+        isp: an ISP of published cameras, such as ``universal``.
         names: names of published cameras, cameras of your own (:class:`rawaug.Camera`) or paths of their YAML files.
 
     Raises:
@@ -379,7 +379,7 @@ def restrict_to_cameras(
 
 
 def _without_colour(isp: DictionaryISP, **changes: Any) -> DictionaryISP:
-    """An ISP with other colour atoms, and with ``tone_atoms`` other tone curves, which are yet to be set."""
+    """Copy an ISP with other colour atoms, and with ``tone_atoms`` other tone curves; both have yet to be set."""
     other = DictionaryISP(replace(isp.config, encoders=False, **changes))
     state = other.state_dict()
     for key, value in isp.state_dict().items():
@@ -391,7 +391,7 @@ def _without_colour(isp: DictionaryISP, **changes: Any) -> DictionaryISP:
 
 
 def _with_own_cameras(isp: DictionaryISP, cameras: Sequence[Camera]) -> DictionaryISP:
-    """An ISP of cameras of one's own: an atom for each light of a camera."""
+    """Make an ISP of the user's own cameras, with an atom for each light of a camera."""
     anchors = [camera.anchors() for camera in cameras]
     count = sum(map(len, anchors))
 
@@ -436,7 +436,7 @@ def _with_own_cameras(isp: DictionaryISP, cameras: Sequence[Camera]) -> Dictiona
 
 
 def _tones_of(isp: DictionaryISP, cameras: Sequence[Camera]) -> tuple[list[str], Tensor]:
-    """The names and inverse curves ``(K, 1021)`` that cameras are drawn with: theirs, and the ISP's where one has none.
+    """The names and inverse curves ``(K, 1021)`` to draw cameras with: their own, or the ISP's if one has none.
 
     Raises:
         ValueError: if a camera names a curve that the ISP does not have.
@@ -470,7 +470,7 @@ def _of_colour(key: str) -> bool:
 
 
 def _require_mosaic(raw: Tensor) -> Tensor:
-    """RAW as float32; ValueError unless it is a floating-point mosaic ``(B, 1, H, W)`` of finite values."""
+    """Return RAW as float32; ValueError unless it is a floating-point mosaic ``(B, 1, H, W)`` of finite values."""
     if raw.ndim != 4 or raw.shape[1] != 1 or not raw.is_floating_point():
         raise ValueError(f"RAW must be a floating-point mosaic (B, 1, H, W), got {tuple(raw.shape)} {raw.dtype}")
     if raw.device.type == "cpu" and (damaged := int((~raw.detach().isfinite()).sum())):

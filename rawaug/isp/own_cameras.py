@@ -1,4 +1,4 @@
-r"""A camera of one's own, by the figures of its data sheet: no RAW file is needed.
+r"""A camera of your own, defined by the figures of its data sheet: no RAW file is needed.
 
 A camera is known in one light or several. In each it has a matrix C from linear sRGB to white-balanced camera RGB,
 whose rows sum to 1, and gains g (green 1) that make white grey. With S from linear sRGB to XYZ and B(L) Bradford's
@@ -6,19 +6,19 @@ adaptation from the light's white point to D65, the matrix from XYZ under that l
 
 .. math:: X = \mathrm{diag}(1 / g) \; C \; S^{-1} B(L) .
 
-In other light the matrices of the lights beside it are mixed, with the weights of :mod:`rawaug.isp.lights`,
+In other light the matrices of the neighbouring lights are mixed, with the weights of :mod:`rawaug.isp.lights`,
 
 .. math:: C = \sum_i w_i C_i, \qquad g(L) = \frac{(X L)_G}{X L}, \quad X = \sum_i w_i X_i,
 
 so that the gains of a light on the data sheet are exactly those stated.
 
-*Noise.* A gain of K digital numbers (DN) for an electron, read noise of :math:`\sigma` DN and V = white level - black
+*Noise.* A gain of K digital numbers (DN) per electron, read noise of :math:`\sigma` DN and V = white level - black
 level give the variances on the scale white = 1:
 
 .. math:: \mathrm{shot\_var} = K / V, \qquad \mathrm{read\_var} = \sigma^2 / V^2 .
 
-Where ``bits`` is given, RAW is rounded to whole DN. Noise that is measured on RAW files contains this rounding,
-a variance of :math:`1 / (12 V^2)`, so it is taken off ``read_var`` before the rounding adds it again.
+If ``bits`` is given, RAW is rounded to whole DN. Noise that is measured on RAW files contains this rounding, a variance
+of :math:`1 / (12 V^2)`, so it is subtracted from ``read_var`` before the rounding adds it again.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ MatrixKind = Literal["xyz_to_camera", "srgb_to_camera", "camera_to_srgb"]
 NoiseUnit = Literal["variance", "DN"]
 
 _LARGEST_VAR = 0.2
-"""A shot_var above it means fewer than five electrons at white: such numbers are more likely in DN."""
+"""A shot_var above it means fewer than five electrons at white; such numbers are more likely in DN."""
 
 
 class Level(NamedTuple):
-    """The noise of a camera at one ISO: variances, white = 1; the ISO is None where it is not stated."""
+    """The noise of a camera at one ISO, as variances with white = 1; the ISO is None if it is not stated."""
 
     iso: float | None
     shot_var: float
@@ -87,25 +87,25 @@ class Anchor(NamedTuple):
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera of your own, by the figures of its data sheet.
+    """A camera of your own, defined by the figures of its data sheet.
 
     Args:
         name: maker and model, for reports.
         matrix: 3 x 3, or a mapping of lights to such matrices. A light is ``"A"``, ``"D50"``, ``"D55"``, ``"D65"``,
             ``"D75"``, a lamp of :data:`rawaug.isp.cameras.LAMPS`, or a colour temperature in kelvin. A single matrix is
             that of D65.
-        matrix_is: what the matrix does. ``"xyz_to_camera"``: CIE XYZ under the light to camera RGB before white
+        matrix_is: direction of the matrix. ``"xyz_to_camera"``: CIE XYZ under the light to camera RGB before white
             balance, as ColorMatrix in a DNG. ``"srgb_to_camera"``: linear sRGB to white-balanced camera RGB.
             ``"camera_to_srgb"``: the opposite, the colour correction matrix of most ISPs.
         white_balance: gains of R, G and B that make white grey, or a mapping of lights to them. They may be left out
-            with ``"xyz_to_camera"``, from which they follow.
+            with ``"xyz_to_camera"``, which determines them.
         cfa: pattern of the sensor.
-        black_level: in DN.
+        black_level: black level in DN.
         white_level: DN at which the sensor saturates; by default the largest number of ``bits``.
         bits: depth of the RAW, 1 to 16; RAW is then rounded to whole DN. By default nothing is rounded.
-        noise: levels by ISO, each ``(shot_var, read_var)``, variances on the scale white = 1, or ``(K, sigma)`` in DN,
-            where ``noise_in`` says so; a mapping with these names says by itself what it is. A single level without an
-            ISO may be given as it is. None if unknown.
+        noise: levels by ISO. Each is ``(shot_var, read_var)``, variances on the scale white = 1, or ``(K, sigma)`` in
+            DN, as ``noise_in`` says; a mapping with these names needs no ``noise_in``. A single level without an ISO
+            may be given as it is. None if unknown.
         noise_in: unit of levels without names, ``"variance"`` or ``"DN"``.
         tone: name of one of the ISP's tone curves, or points ``(linear light, value of the picture)``, both from 0 to 1
             and ascending. By default any of the ISP's curves is drawn.
@@ -145,7 +145,7 @@ class Camera:
         if not isinstance(self.name, str) or not self.name.strip():
             raise ValueError(f"a camera needs a name, got {self.name!r:.100}")
 
-        # Whatever was given is kept as plain values, so that a camera can be printed, compared and stored.
+        # Everything that was given is kept as plain values, so that a camera can be printed, compared and stored.
         object.__setattr__(self, "matrix", _plain(self.matrix))
         object.__setattr__(self, "white_balance", _plain(self.white_balance))
         object.__setattr__(self, "noise", _plain(self.noise))
@@ -153,9 +153,9 @@ class Camera:
 
         self._check_choices()
         self._check_grid()
-        self.anchors()  # raises for matrices and gains
+        self.anchors()  # raises ValueError for matrices and gains
         self._check_levels()
-        self.inverse_curve(2)  # raises for points of the tone curve
+        self.inverse_curve(2)  # raises ValueError for points of the tone curve
 
     def _check_choices(self) -> None:
         if self.matrix_is not in get_args(MatrixKind):
@@ -205,7 +205,7 @@ class Camera:
 
     @property
     def white(self) -> float:
-        """The DN at which the sensor saturates; 1 where neither ``white_level`` nor ``bits`` is given."""
+        """The DN at which the sensor saturates; 1 if neither ``white_level`` nor ``bits`` is given."""
         if self.white_level is not None:
             return float(self.white_level)
         return 1.0 if self.bits is None else float(2**self.bits - 1)
@@ -217,14 +217,14 @@ class Camera:
 
     @property
     def quantum(self) -> float:
-        """The step of the rounding on the scale white = 1; 0 where nothing is rounded."""
+        """The step of the rounding on the scale white = 1; 0 if nothing is rounded."""
         return 0.0 if self.bits is None else 1.0 / self.full_scale
 
     # -- noise --------------------------------------------------------------------------------------------------------
 
     @property
     def levels(self) -> list[Level]:
-        """The noise by ISO, ascending, as variances with white = 1; empty where it is not known."""
+        """The noise by ISO, ascending, as variances with white = 1; empty if it is not known."""
         if self.noise is None:
             return []
         if not isinstance(self.noise, dict) or set(self.noise) <= {"shot_var", "read_var", "K", "sigma"}:
@@ -275,7 +275,7 @@ class Camera:
     def noise_spec(self) -> dict[str, Any] | None:
         """The noise as a name with settings, which :func:`rawaug.noise.noise_model` reads; None if unknown.
 
-        The grid of digital numbers is part of it where ``bits`` is given.
+        It includes the grid of digital numbers if ``bits`` is given.
         """
         if not self.levels:
             return None
@@ -297,14 +297,14 @@ class Camera:
         matrices = self._by_light("matrix", self.matrix, (3, 3))
         gains = self._by_light("white_balance", self.white_balance, (3,))
         if len(matrices) == 1 and gains and not isinstance(self.white_balance, dict):
-            gains = dict.fromkeys(matrices, gains[REFERENCE])  # both are of one light, that of the matrix
+            gains = dict.fromkeys(matrices, gains[REFERENCE])  # both are for the same light, that of the matrix
 
         from_srgb = {}
         for light, matrix in matrices.items():
             from_srgb[light] = self._from_srgb(light, matrix)
         lights = {*matrices, *gains}
         if gains and not isinstance(self.matrix, dict):
-            lights = {*gains}  # the one matrix serves in all of them
+            lights = {*gains}  # the single matrix serves in all of them
 
         anchors = []
         for light in sorted(lights, key=light_mired, reverse=True):
@@ -365,7 +365,7 @@ class Camera:
         return matrix / rows
 
     def _implied_gains(self, light: str, matrices: Mapping[str, Tensor]) -> Tensor:
-        """The gains of a light by the matrix from XYZ."""
+        """The gains of a light that follow from the matrix from XYZ."""
         if self.matrix_is != "xyz_to_camera":
             raise self._error("white_balance", f"needs the gains of light {light} as well")
 
@@ -375,9 +375,10 @@ class Camera:
         return gains_in_light(matrices[light], light_xyz(light))
 
     def matrix_for(self, white_balance: Sequence[float]) -> Tensor:
-        """The matrix ``(3, 3)`` from linear sRGB to white-balanced camera RGB in the light of as-shot gains.
+        """Compute the matrix ``(3, 3)`` from linear sRGB to white-balanced camera RGB in the light of as-shot gains.
 
-        It is that of the colour temperature on the Planckian or daylight locus whose gains are nearest, in logarithms.
+        It is the matrix of the colour temperature, on the Planckian or daylight locus, whose gains are nearest in
+        logarithms.
         """
         mireds = np.linspace(100.0, 500.0, 81)
         lights = torch.stack([light_xyz(f"{1e6 / mired:.6f}") for mired in mireds])
@@ -394,7 +395,7 @@ class Camera:
     # -- tone ---------------------------------------------------------------------------------------------------------
 
     def inverse_curve(self, nodes: int) -> Tensor | None:
-        """Linear light ``(nodes,)`` over the values of the picture; None unless ``tone`` is points."""
+        """Linear light ``(nodes,)`` as a function of the picture's values; None unless ``tone`` is points."""
         if self.tone is None or isinstance(self.tone, str):
             return None
 
@@ -417,7 +418,7 @@ class Camera:
     # -- files --------------------------------------------------------------------------------------------------------
 
     def to_json(self) -> dict[str, Any]:
-        """The figures as plain values, without those that have their defaults; :meth:`from_json` reads them back."""
+        """Write the figures as plain values, without those at their defaults; :meth:`from_json` reads them back."""
         figures = asdict(self)
         for field in fields(self):
             if figures[field.name] == field.default:
@@ -426,11 +427,11 @@ class Camera:
 
     @classmethod
     def from_json(cls, content: Any, where: str = "camera") -> Camera:
-        """A camera of plain values.
+        """Make a camera from plain values.
 
         Args:
             content: a mapping with the names of the arguments.
-            where: opens the messages.
+            where: text at the beginning of the messages.
 
         Raises:
             ValueError: if a key is unknown or missing, or a figure is wrong.
@@ -454,7 +455,7 @@ class Camera:
 
     @classmethod
     def load(cls, path: str | Path) -> Camera:
-        """A camera from a YAML file with the names of the arguments as keys.
+        """Read a camera from a YAML file with the names of the arguments as keys.
 
         Raises:
             FileNotFoundError: if there is no such file.
@@ -475,7 +476,7 @@ def is_camera_file(name: object) -> bool:
 
 
 def as_camera(camera: str | Path | Camera) -> Camera:
-    """A camera as it is, from its YAML file, or a published one by its name."""
+    """Return a camera as it is, or read it from its YAML file, or find a published one by its name."""
     if isinstance(camera, Camera):
         return camera
     return Camera.load(camera) if is_camera_file(camera) else Camera.published(str(camera))
@@ -486,7 +487,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """Arrays, tensors, tuples and mappings as lists and dicts of plain values."""
+    """Convert arrays, tensors, tuples and mappings to lists and dicts of plain values."""
     if isinstance(value, Mapping):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, (Tensor, np.ndarray)):

@@ -1,4 +1,4 @@
-"""Settings of cameras of one's own: a camera in a light, mixtures of two where there are several."""
+"""Settings of the user's own cameras: a camera in a light, or mixtures of two if there are several."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _ROUNDS = 100
 
 
 class OwnCameraSampler(CameraSampler):
-    """Draws settings of cameras of one's own, on the CPU.
+    """Draws settings of the user's own cameras, on the CPU.
 
-    A light of their data sheets, by its name, is exactly that light; all others scatter as those of published cameras.
+    A light that is named in their data sheets is exactly that light; all others scatter as for published cameras.
 
     Args:
         atoms: the dictionary of the ISP.
         cameras: the cameras; an atom is one of them in one of its lights, in this order.
         tone_atoms: number of tone curves.
         light: as in :class:`rawaug.Draw`.
-        consistent: whether colour and gains are of one camera in one light; if not, the gains are drawn apart.
+        consistent: whether colour and gains are of one camera in one light; if not, the gains are drawn separately.
 
     Raises:
         ValueError: if the light is unknown.
@@ -54,7 +54,7 @@ class OwnCameraSampler(CameraSampler):
             self._mireds.append([anchor.mired for anchor in in_lights])
         self._from_xyz = np.stack([anchor.from_xyz.numpy() for anchor in anchors])
 
-        # Gains of the data sheets are plausible, whatever they are.
+        # Gains from the data sheets count as plausible, whatever they are.
         gains = np.stack([anchor.gains.numpy() for anchor in anchors])
         self._lowest = min(PLAUSIBLE_GAINS[0], float(gains.min()))
         self._highest = max(PLAUSIBLE_GAINS[1], float(gains.max()))
@@ -92,7 +92,7 @@ class OwnCameraSampler(CameraSampler):
         return sample_lights(batch, generator, self.lights)
 
     def _weights(self, cameras: Array, shares: Array, light: Array) -> Array:
-        """Weights ``(B, N)`` of the atoms for ``(B, 2)`` cameras and their shares in lights ``(B, 3)``."""
+        """Compute weights ``(B, N)`` of the atoms for cameras ``(B, 2)`` and their shares in lights ``(B, 3)``."""
         mired = mired_of(light)
         blocks = []
         for number, mireds in enumerate(self._mireds):
@@ -108,6 +108,6 @@ class OwnCameraSampler(CameraSampler):
 
 
 def own_cameras(info: Mapping[str, Any]) -> list[Camera]:
-    """The cameras of one's own that an ISP was made of, by its ``info``; none of other ISPs."""
+    """Get the user's own cameras that an ISP was made of, from its ``info``; other ISPs have none."""
     contents: Sequence[Mapping[str, Any]] = info.get("own_cameras", [])
     return [Camera.from_json(content, "the ISP's camera") for content in contents]

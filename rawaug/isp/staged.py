@@ -1,13 +1,13 @@
-"""The parts of an ISP (stages, dictionaries, encoders that choose among atoms), and settings from what a file states.
+r"""The parts of an ISP (stages, dictionaries, encoders that choose atoms), and settings from what a file states.
 
 An encoder gives the weights of a dictionary's atoms, ``w = softmax(b + E(I))``, from the N images ``I`` that the atoms
-make of one picture (Conde et al., AAAI 2022, "Parameter Dictionaries"); ``b`` is a learned constant, which decides
-alone where there is no network ``E``.
+make of one picture (Conde et al., AAAI 2022, "Parameter Dictionaries"). ``b`` is a learned constant, which decides
+alone if there is no network ``E``.
 
-A file states the white balance wb and the digital gain d: grey ``(1, 1, 1)`` becomes ``C 1 / g`` here and ``1 / (wb
+A file states the white balance wb and the digital gain d. Grey ``(1, 1, 1)`` becomes ``C 1 / g`` here and ``1 / (wb
 d)`` in the file, hence ``g = wb d (C 1)``. RAW readings ``y_k`` of a channel give its gain by least squares, ``1 / g =
-sum w x5 y / sum w x5^2`` with ``x5`` made under gain 1, weighted by ``w = 1 / (y + 0.01)`` for shot noise and
-reweighted (Cauchy) against readings that lie on edges. Where tone is a mixture of curves, and the camera one of
+sum w x5 y / sum w x5^2`` with ``x5`` made under gain 1. They are weighted by ``w = 1 / (y + 0.01)`` for shot noise and
+reweighted (Cauchy) against readings that lie on edges. If tone is a mixture of curves and the camera a mixture of
 cameras, readings choose these as well, in turn: given the gains, ``g_c y = sum_k v_k (C T_k(x))_c`` is linear in the
 weights v, and ``sum_n w_n (C_n T(x))_c`` in w.
 """
@@ -38,14 +38,14 @@ THUMBNAIL = 48
 """Longest side of an encoder's input, in pixels."""
 CLIPPED = 0.98
 _SHADOW = 0.01
-"""The share of read noise that is added to a reading used as a variance."""
+"""The share of read noise, which is added to a reading that serves as a variance."""
 ROUNDS = 4
 _PULL = 1e-4
-"""Strength of the pull of weights to the typical ones, as a share of the readings' mean square."""
+"""Strength of the pull of weights towards the typical ones, as a share of the readings' mean square."""
 
 
 class Encoder(nn.Module):
-    """A learned constant ``prior`` ``(N,)``, as logits, and convolutions if it looks at the picture."""
+    """A learned constant ``prior`` ``(N,)``, as logits, and convolutions if the encoder looks at the picture."""
 
     def __init__(self, atoms: int) -> None:
         super().__init__()
@@ -58,9 +58,9 @@ class Encoder(nn.Module):
         return self.layers is not None
 
     def add_layers(self, widths: tuple[int, int, int]) -> None:
-        """Let it look at the picture from now on, by three convolutions; untrained, they change no weight.
+        """Let the encoder look at the picture from now on, by three convolutions; untrained, they change no weight.
 
-        ``widths`` are their features.
+        ``widths`` are the numbers of their features.
         """
         atoms = len(self.prior)
         layers: list[nn.Module] = []
@@ -112,7 +112,7 @@ class StagedISP(nn.Module):
         self.info: dict[str, Any] = {}
         """The record of the fit, as plain values by name."""
         self.config = config or ISPConfig()
-        """The parts that it is made of; :meth:`configure` and :meth:`use_encoders` change them."""
+        """The parts that the ISP consists of; :meth:`configure` and :meth:`use_encoders` change them."""
 
         with initialise_from(seed):
             self.colour = ColourDictionary(self.config.colour_atoms)
@@ -158,7 +158,7 @@ class StagedISP(nn.Module):
             stage.config = config
 
     def use_encoders(self, enabled: bool, seed: int = 0) -> None:
-        """Make networks for the encoders, drawn from ``seed``, or remove them; existing ones stay as they are."""
+        """Make the encoders' networks, drawn from ``seed``, or remove them; existing networks stay as they are."""
         with initialise_from(derive_seed(seed, "encoders")):
             for module in list(self.modules()):
                 if not isinstance(module, Encoder):
@@ -172,14 +172,14 @@ class StagedISP(nn.Module):
 
     @property
     def tone(self) -> ToneDictionary | None:
-        """The dictionary of tone curves; None where the curve is learned."""
+        """The dictionary of tone curves; None if the curve is learned."""
         stage = self.find(ToneCurve)
         if stage is None:
             return None
         return stage.dictionary
 
     def typical_tones(self) -> Tensor:
-        """Weights ``(K,)`` of the tone curves where nothing is known of a picture; none where the curve is learned."""
+        """Weights ``(K,)`` of the tone curves for a picture of which nothing is known; none if the curve is learned."""
         if self.tone is None:
             return self.colour.matrices.new_zeros(0)
         return self.tone.typical
@@ -192,8 +192,8 @@ class StagedISP(nn.Module):
         Args:
             x: sRGB as float ``(B, 3, H, W)``; or P pixels of it ``(B, 3, 1, P)``, as the pass is pointwise.
             params: the settings of the pictures.
-            coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame; the picture is one by default.
-            seen: is filled with x1 ... x5 by name.
+            coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame; by default the picture is the frame.
+            seen: a dict to fill with x1 ... x5 by name.
 
         Returns:
             Linear camera colour x5, of the shape of ``x``.
@@ -213,7 +213,7 @@ class StagedISP(nn.Module):
             x: linear camera colour x5 ``(B, 3, H, W)``.
             params: the settings of the pictures.
             coordinates: as in :meth:`reverse_pixels`.
-            seen: is filled with x4 ... x1 by name.
+            seen: a dict to fill with x4 ... x1 by name.
 
         Returns:
             sRGB, of the shape of ``x``.
@@ -248,16 +248,17 @@ def with_white_balance(
     white_balance: Tensor | tuple[float, ...] | None,
     digital_gain: Tensor | float | None,
 ) -> ISPParams:
-    """Replace the gains of a setting, and its colour atoms by those of such light, by what the camera states.
+    """Replace the gains of a setting by what the camera states, and its colour atoms by those of that light.
 
     Args:
-        isp: whose dictionaries are used.
+        isp: the ISP whose dictionaries are used.
         params: the settings of B pictures.
-        white_balance: as-shot multipliers of R, G, B, ``(3,)`` or ``(B, 3)``; green is made 1. None keeps the gains.
+        white_balance: as-shot multipliers of R, G, B, ``(3,)`` or ``(B, 3)``, scaled so that green is 1. None keeps the
+            gains.
         digital_gain: the factor on all channels, a scalar or ``(B,)``. None keeps the setting's own.
 
     Raises:
-        ValueError: if a multiplier is not positive, or the shapes are of another number of pictures.
+        ValueError: if a multiplier is not positive, or the shapes are for another number of pictures.
     """
     batch = len(params.gains)
     if white_balance is not None:
@@ -284,14 +285,14 @@ def with_white_balance(
 
 
 Tone = str | Mapping[str, float] | Tensor
-"""A tone curve by name, a mixture of them (shares by name), or weights ``(K,)`` or ``(B, K)`` of all of them."""
+"""A tone curve by name, a mixture of curves (shares by name), or weights ``(K,)`` or ``(B, K)`` of all of them."""
 
 
 def with_tone(isp: StagedISP, params: ISPParams, tone: Tone | None) -> ISPParams:
     """Replace the tone curves of a setting by a known one, or by a mixture.
 
     Args:
-        isp: whose dictionary of tone curves is used; ``isp.info["tones"]`` has their names.
+        isp: the ISP whose dictionary of tone curves is used; ``isp.info["tones"]`` has their names.
         params: the settings of B pictures.
         tone: a name such as ``"linear"``, shares by name such as ``{"linear": 0.5, "upi": 0.5}``, or weights ``(K,)``
             or ``(B, K)``. Shares and weights are divided by their sum. None keeps the setting's own.
@@ -339,7 +340,7 @@ def _require_factor(name: str, value: Tensor) -> None:
 def with_raw_samples(
     isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: Tensor, coordinates: Tensor
 ) -> ISPParams:
-    """Solve for the gains from RAW readings, choose the colour atoms of that light, and solve for the gains again.
+    """Compute the gains from RAW readings, choose the colour atoms of that light, and compute the gains again.
 
     Clipped readings do not count.
 
@@ -380,7 +381,7 @@ def with_raw_samples(
 def _fit_mixtures(
     cameras: CameraDictionary, tones: ToneDictionary, pixels: Tensor, own: Tensor, value: Tensor, params: ISPParams
 ) -> ISPParams:
-    """Fit the mixture of curves, then that of cameras, under the gains that ``params`` have."""
+    """Fit the mixture of curves, then that of cameras, under the gains in ``params``."""
     target = value * torch.einsum("bck,bc->bk", own, params.gains)
     weight = ((value < CLIPPED) / (value.clamp_min(0.0) + _SHADOW)).sqrt()
     rows = torch.einsum("bck,bcd->bkd", own, params.matrix)
@@ -399,7 +400,7 @@ def _nearest(target: Tensor, readings: Tensor, typical: Tensor) -> Tensor:
     """Find weights ``(B, N)`` whose mixture of ``readings`` ``(B, N, K)`` is nearest to ``target`` ``(B, K)``."""
     rows = []
     for row, atoms in zip(target.double(), readings.double(), strict=True):
-        # A mixture that the readings leave open falls back on the typical weights.
+        # A mixture that the readings do not determine falls back on the typical weights.
         pull = (_PULL * atoms.square().mean() * atoms.shape[1]).sqrt() * torch.eye(len(atoms)).to(atoms)
         point = torch.cat([row, typical.to(atoms) @ pull])
 

@@ -1,4 +1,4 @@
-r"""The stages of the ISP between sRGB and the mosaic, each with its inverse, and how each enters the baked pass.
+r"""The stages of the ISP between sRGB and the mosaic, each with its inverse, and its part in the baked pass.
 
 ======  ===============  ==============================================  ==============================================
 stage   name             reverse (sRGB to RAW)                           forward (RAW to sRGB)
@@ -19,9 +19,9 @@ CVPR 2019. f6 is in :mod:`rawaug.bayer`; :class:`rawaug.isp.tone.ToneCurve` can 
 Everything but f6 is pointwise, given the parameters: a set of pixels ``(B, 3, 1, P)`` is as good as a picture.
 
 The baked pass (:mod:`rawaug.isp.fast`) is ``y_c = sum_k C[c, k] T_k(x) max(m + (1 - m) / g_c, 1 / g_c) G(p) A(x4)``.
-What a stage does to every picture alike goes into the tables ``T`` and ``A`` once (:meth:`Stage.bake`); what depends
-on a picture's setting or place goes into ``C``, ``1 / g`` and ``G`` for each batch (:meth:`Stage.adjust`), and what no
-table holds of the place multiplies the RAW (:meth:`Stage.place_gain`).
+The part of a stage that is the same for every picture goes into the tables ``T`` and ``A`` once (:meth:`Stage.bake`).
+The part that depends on a picture's setting or place goes into ``C``, ``1 / g`` and ``G`` for each batch
+(:meth:`Stage.adjust`). A place-dependent gain that no table holds multiplies the RAW (:meth:`Stage.place_gain`).
 
 A new kind of stage is a class with ``@STAGES.register(name)`` above it.
 """
@@ -57,7 +57,7 @@ class Tables(NamedTuple):
 
     Args:
         cube: the colours of the nodes, ``(1, 3, N, N * N)``.
-        x2: what the stages up to x2 make of them, of the same shape.
+        x2: the colours after the stages up to x2, of the same shape.
         attention: the attention mask there, ``(1, 1, N, N * N)``, if there is one.
     """
 
@@ -73,7 +73,7 @@ class BatchParams(NamedTuple):
         matrix: ``(B, 3, 3)``, x2 to x3.
         floor: ``(B, 1, 3)``, one over the gains.
         frame: ``(B, 6)``, where the picture lies; see :class:`rawaug.kernels.reference.Camera`.
-        curves: ``(B, T)``, inverse tone curves, or ``(B, 0)`` where the tone is in the tables.
+        curves: ``(B, T)``, inverse tone curves, or ``(B, 0)`` if the tone is in the tables.
         shading: ``(3,)``, exponents of the mask, or ``(0,)`` without one.
     """
 
@@ -103,7 +103,7 @@ class Stage(nn.Module, ABC):
     def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute ``x_k`` from ``x_(k-1)``, both ``(B, 3, H, W)``.
 
-        ``params`` are the settings of the pictures, which stages up to x2 do without, and ``coordinates``
+        ``params`` are the settings of the pictures, which stages up to x2 do not need, and ``coordinates``
         ``(1 or B, 2, H, W)`` those of the pixels in the full frame.
         """
 
@@ -112,25 +112,26 @@ class Stage(nn.Module, ABC):
         """Compute ``x_(k-1)`` from ``x_k``, both ``(B, 3, H, W)``; arguments as in :meth:`reverse`."""
 
     def bake(self, tables: Tables) -> Tables:
-        """Put what this stage does to every picture alike into the tables of the reverse pass."""
+        """Add the part of this stage that is the same for every picture to the tables of the reverse pass."""
         if self.makes > 2:
             return tables
         return tables._replace(x2=self.reverse(tables.x2, None))
 
     def bake_forward(self, tables: Tables) -> Tables:
-        """Put what this stage does to every picture alike into the tables of the forward pass, whose x2 is sRGB."""
+        """Add the part of this stage that is the same for every picture to the forward tables, whose x2 is sRGB."""
         if self.makes > 2:
             return tables
         return tables._replace(x2=self.forward(tables.x2, None))
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
-        """Put what this stage does to these pictures into ``batch``.
+        """Add the part of this stage that depends on these pictures to ``batch``.
 
         Args:
-            batch: what the stages before this one have put there.
+            batch: the numbers from the stages before this one.
             params: the settings of the pictures.
-            place: where each lies in its frame, ``(B, 4 to 6)``: top, left, height and width of the frame, and, if the
-                crop was turned or enlarged, its view and how many rows of the frame it has; None for full frames.
+            place: where each picture lies in its frame, ``(B, 4 to 6)``: top, left, height and width of the frame, and,
+                if the crop was turned or enlarged, its view and how many rows of the frame it has; None for full
+                frames.
             size: height and width of the pictures.
         """
         return batch
@@ -141,16 +142,16 @@ class Stage(nn.Module, ABC):
 
     @property
     def has_place_gain(self) -> bool:
-        """Whether this stage multiplies RAW by what :meth:`place_gain` computes."""
+        """Whether this stage multiplies RAW by the result of :meth:`place_gain`."""
         return False
 
     def place_gain(self, coordinates: Tensor, forward: bool) -> Tensor:
-        """Compute what this stage multiplies RAW by besides, by place alone, which no table holds.
+        """Compute the gains of this stage that depend on place alone and that no table holds; they multiply RAW.
 
         Args:
             coordinates: ``(B, 2, H, W)`` of pixels in the full frame.
-            forward: whether it is the forward pass, which multiplies RAW before all else, or the reverse pass, which
-                does so after all else.
+            forward: True for the forward pass, which multiplies RAW before everything else; False for the reverse pass,
+                which does so after everything else.
 
         Returns:
             ``(B, 1, H, W)``, ones by default.
@@ -164,9 +165,9 @@ class Stage(nn.Module, ABC):
         return {}
 
     def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
-        """Compute the reverse pass ``(B, 3, H, W)`` in a few numbers, from which a fit starts.
+        """Compute the reverse pass ``(B, 3, H, W)`` from a few numbers, with which a fit starts.
 
-        A stage whose parameters each frame has for itself does nothing here.
+        A stage whose parameters differ from frame to frame does nothing here.
         """
         return x
 
@@ -221,11 +222,11 @@ class ToneMap(Stage):
         return {"toe": self.toe}
 
     def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
-        """Compute ``x + toe (1 - x)``, ``(B, 3, H, W)``: with a gamma behind it the curve of sRGB."""
+        """Compute ``x + toe (1 - x)``, ``(B, 3, H, W)``; followed by a gamma this is the curve of sRGB."""
         return x + self.toe * (1.0 - x)
 
     def start_coarse(self, gamma: float, toe: float) -> None:
-        """Take the toe of the curve; the stage gamma takes its power."""
+        """Use the toe of the curve; the stage gamma uses its power."""
         self.toe.fill_(toe)
 
     def start_fine(self) -> None:
@@ -261,12 +262,12 @@ class Gamma(Stage):
         return {"gamma": self.reverse_gamma}
 
     def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
-        """Compute the reverse pass itself, ``(B, 3, H, W)``, which is one number already."""
+        """Compute the reverse pass itself, ``(B, 3, H, W)``, which is a single number already."""
         return self.reverse(x, None)
 
     @torch.no_grad()
     def start_coarse(self, gamma: float, toe: float) -> None:
-        """Take the power of the curve; the stage tone takes its toe."""
+        """Use the power of the curve; the stage tone uses its toe."""
         self.reverse_gamma.fill_(gamma)
 
     @torch.no_grad()
@@ -296,7 +297,7 @@ class ColorCorrection(Stage):
 
 @STAGES.register("gains")
 class WhiteBalance(Stage):
-    """f4: each picture's own gains, with Brooks' care for highlights on the way back."""
+    """f4: each picture's own gains, with Brooks' protection of highlights in the reverse pass."""
 
     name, makes = "gains", 4
 
@@ -340,7 +341,7 @@ class LensShading(Stage):
     def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x4 from x5, both ``(B, 3, H, W)``: divide by the mask, then apply the forward attention.
 
-        The attention's gains by place come first, those by colour last.
+        The attention's place-dependent gains come first, its colour-dependent ones last.
         """
         where = coordinates_or_full(x, coordinates)
         if self.forward_attention is None:
@@ -350,11 +351,11 @@ class LensShading(Stage):
         return x * self.forward_attention.of_colour(x)
 
     def bake(self, tables: Tables) -> Tables:
-        """Put the reverse attention mask by colour into the tables."""
+        """Put the colour-dependent reverse attention mask into the tables."""
         return _bake_attention(tables, self.reverse_attention)
 
     def bake_forward(self, tables: Tables) -> Tables:
-        """Put the forward attention mask by colour into the tables."""
+        """Put the colour-dependent forward attention mask into the tables."""
         return _bake_attention(tables, self.forward_attention)
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
@@ -379,7 +380,7 @@ class LensShading(Stage):
         return self.reverse_attention is not None
 
     def place_gain(self, coordinates: Tensor, forward: bool) -> Tensor:
-        """Compute the attention's gains by place ``(B, 1, H, W)``, in the direction asked for."""
+        """Compute the attention's place-dependent gains ``(B, 1, H, W)``, in the requested direction."""
         attention = self.reverse_attention
         if forward:
             attention = self.forward_attention
@@ -410,7 +411,7 @@ def _bake_attention(tables: Tables, mask: AttentionMask | None) -> Tables:
 
 
 def _require_params(params: ISPParams | None) -> ISPParams:
-    """The settings, which every stage after x2 needs; ValueError if there are none yet."""
+    """Return the settings, which every stage after x2 needs; ValueError if there are none yet."""
     if params is None:
         raise ValueError("this stage needs the pictures' parameters; choose them first")
     return params

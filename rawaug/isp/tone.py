@@ -1,16 +1,16 @@
 r"""Tone without a network: inverse tone curves by name, mixtures of them, and the stage that applies them.
 
-A camera's engine takes linear light l to linear display light d = t(l), monotone, and encodes it as sRGB. The inverse
-is kept as a table over the sRGB code s,
+A camera's engine maps linear light l to linear display light d = t(l), monotonically, and encodes it as sRGB. The
+inverse is kept as a table over the sRGB code s,
 
 .. math:: T(s) = t^{-1}(\mathrm{EOTF}(s)), \qquad s = 0, \tfrac{1}{4 \cdot 255}, \dots, 1,
 
 of which every fourth entry is an 8-bit code, without interpolation (EOTF: IEC 61966-2-1). A convex combination of
-tables is monotone as they are.
+tables is monotone like the tables themselves.
 
-The stage :class:`ToneCurve` is ``x2 = T(x)`` with ``T = sum_k v_k T_k``, in place of the paper's tone network and
-gamma. The forward pass looks the code up on the same curve; where the curve is flat, the lowest code is taken. A fit
-bends a standard's curve :math:`T_0` by scaling its slope on each of 51 pieces of five codes:
+The stage :class:`ToneCurve` is ``x2 = T(x)`` with ``T = sum_k v_k T_k``; it replaces the paper's tone network and
+gamma. The forward pass looks the code up on the same curve; if the curve is flat, it takes the lowest code. A fit bends
+a standard's curve :math:`T_0` by scaling its slope on each of 51 pieces of five codes:
 
 .. math:: T(s) = \int_0^s e^{l(u)} T_0'(u) \, du \Big/ \int_0^1 e^{l(u)} T_0'(u) \, du .
 """
@@ -27,7 +27,7 @@ from rawaug.isp.stages import STAGES, BatchParams, Stage
 from rawaug.kernels.reference import apply_curves
 
 STEPS = 4
-"""Entries of a table for each 8-bit level."""
+"""Number of entries of a table for each 8-bit level."""
 NODES = 255 * STEPS + 1
 _PIECES = 51
 """Number of pieces of a curve whose slopes a fit scales."""
@@ -68,7 +68,7 @@ class ToneDictionary(nn.Module):
         self.register_buffer("typical", torch.full((atoms,), 1.0 / atoms))
 
     def combine(self, weights: Tensor) -> Tensor:
-        """Mix the curves by weights ``(B, K)`` into tables ``(B, 1021)``: the same bits in a batch of any size."""
+        """Mix the curves by weights ``(B, K)`` into tables ``(B, 1021)``, with the same bits in a batch of any size."""
         table = weights.new_zeros(len(weights), self.curves.shape[1])
         for weight, curve in self._pair_weights(weights):
             table += weight[:, None] * curve
@@ -76,7 +76,7 @@ class ToneDictionary(nn.Module):
 
     def _pair_weights(self, weights: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """Pair weights ``(B,)`` with one curve ``(1021,)`` or one for each picture ``(B, 1021)``, in order of atoms."""
-        # Weights of 0 are skipped on a CPU, unless they are being fitted; on a GPU looking for them would stall it, and
+        # Weights of 0 are skipped on a CPU, unless they are being fitted. On a GPU looking for them would stall it, and
         # an exported pass has no values to look at.
         if weights.is_cuda or weights.requires_grad or torch.compiler.is_compiling():
             yield from zip(weights.unbind(1), self.curves, strict=True)
@@ -91,7 +91,7 @@ class ToneDictionary(nn.Module):
 
 @STAGES.register("curve")
 class ToneCurve(Stage):
-    """f1 and f2 in one: each picture's inverse tone curve, or the typical one while no setting is chosen."""
+    """f1 and f2 in one: each picture's inverse tone curve, or the typical one if no setting is chosen yet."""
 
     name, makes = "curve", 2
 
@@ -117,7 +117,7 @@ class ToneCurve(Stage):
         return batch._replace(curves=self.dictionary.combine(weights))
 
     def describe(self) -> str:
-        """Say how many curves there are, and their light at code 128."""
+        """Describe the number of curves, and their light at code 128."""
         light = self.dictionary.curves[:, 128 * STEPS].tolist()
         values = " ".join(f"{value:.3f}" for value in light)
         return f"tone curves: {self.config.tone_atoms}, at code 128 {values}"
@@ -134,7 +134,7 @@ class ToneCurve(Stage):
 
     @torch.no_grad()
     def start_coarse(self, gamma: float, toe: float) -> None:
-        """Start all curves as ``(x + toe (1 - x))^gamma``, less its value at black, and all slopes as 1."""
+        """Start all curves as ``(x + toe (1 - x))^gamma``, minus its value at black, and all slopes as 1."""
         code = torch.linspace(0.0, 1.0, NODES, dtype=torch.float64)
         curve = (code + toe * (1.0 - code)) ** gamma
         self.dictionary.curves.copy_((curve - curve[0]) / (1.0 - curve[0]))
@@ -148,7 +148,7 @@ class ToneCurve(Stage):
         self.slopes = None
 
     def parameters_of(self, forward: bool) -> dict[str, Tensor]:
-        """The slopes for a fit of the reverse pass, nothing for one of the forward pass."""
+        """The slopes for a fit of the reverse pass, nothing for a fit of the forward pass."""
         if forward or self.slopes is None:
             return {}
         return {f"{self.name}.slopes": self.slopes}
@@ -164,7 +164,7 @@ class ToneCurve(Stage):
         return heights / heights[:, -1:]
 
     def _curves(self, batch: int, params: ISPParams | None) -> Tensor:
-        """One curve a picture; the typical one where none is chosen."""
+        """Get a curve for each picture; the typical one if none is chosen."""
         weights = self.dictionary.typical[None]
         if params is not None and params.tone_weights.shape[1]:
             weights = params.tone_weights.to(weights)

@@ -1,8 +1,8 @@
 """Passes over pixels, each with one result in up to three forms, among which :func:`fastest` chooses.
 
-They are in PyTorch (:mod:`rawaug.kernels.reference`), as loops for the CPU (:mod:`rawaug.kernels.cpu`), and as Triton
-kernels for CUDA (:mod:`rawaug.kernels.gpu`). PyTorch runs where Numba or Triton is missing, is switched off
-(``NUMBA_DISABLE_JIT=1``), or fails to compile. With ``TRITON_INTERPRET=1`` Triton's kernels run step by step on CPU
+They exist in PyTorch (:mod:`rawaug.kernels.reference`), as loops for the CPU (:mod:`rawaug.kernels.cpu`), and as Triton
+kernels for CUDA (:mod:`rawaug.kernels.gpu`). PyTorch runs if Numba or Triton is missing, is switched off
+(``NUMBA_DISABLE_JIT=1``), or fails to compile. With ``TRITON_INTERPRET=1``, Triton's kernels run step by step on CPU
 tensors, for tests.
 """
 
@@ -22,14 +22,14 @@ from rawaug.kernels import runtime
 R = TypeVar("R")
 
 _ON_GPU = ("unprocess", "shot_read")
-"""The passes that have a Triton kernel."""
+"""These passes have a Triton kernel."""
 
 _failed: list[str] = []
-"""Names of the errors that Triton's kernels have raised; after one they are not tried again."""
+"""Triton's kernels have raised errors of these names; after one error they are not tried again."""
 
 
 def can_use_triton(image: Tensor) -> bool:
-    """Whether to try a Triton kernel on an image of any shape."""
+    """Tell whether to try a Triton kernel on an image of any shape."""
     return image.device.type == "cuda" and not _failed and find_spec("triton") is not None
 
 
@@ -37,9 +37,9 @@ def fastest(name: str, image: Tensor, *args: Any, otherwise: Callable[[], R]) ->
     """Run a pass by the kernel for the device of an image.
 
     Args:
-        name: of the pass, a function of :mod:`rawaug.kernels.cpu` or :mod:`rawaug.kernels.gpu`.
-        image: of any shape.
-        args: what the pass takes besides.
+        name: name of the pass, a function of :mod:`rawaug.kernels.cpu` or :mod:`rawaug.kernels.gpu`.
+        image: the image, of any shape.
+        args: further arguments of the pass.
         otherwise: the same pass in PyTorch, for devices without a kernel.
     """
     if name in _ON_GPU and can_use_triton(image):

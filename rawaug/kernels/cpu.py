@@ -1,7 +1,7 @@
 """The passes of :mod:`rawaug.kernels.reference` as loops for the CPU, compiled by Numba.
 
-A row is worked on in tiles that fit the fastest cache, each step a loop of its own, which the compiler turns into
-vector instructions. It does not find those for the table's look-up, so :func:`_interpolate` spells them out: four
+A row is processed in tiles that fit the fastest cache. Each step is a separate loop, which the compiler turns into
+vector instructions. It does not find those for the table's look-up, so :func:`_interpolate` spells them out, for four
 colours of two neighbouring nodes at a time. Exponential, logarithm and sine are minimax polynomials.
 """
 
@@ -28,14 +28,14 @@ from rawaug.kernels.reference import INCREMENTS, MULTIPLIERS, ROUNDS, Camera, Di
 from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
 
 _TILE = 256
-"""Number of cells of RAW in a tile."""
+"""A tile has this many cells of RAW."""
 
 _NOISE_TILE = 512
-"""Number of cells of noise in a tile."""
+"""A tile has this many cells of noise."""
 
 _ZERO, _ONE, _FAR = np.float32(0), np.float32(1), np.float32(np.inf)
 _LEAST = np.float32(-125)
-"""The exponent at which a mask counts as 0; below it floats would become denormal."""
+"""A mask counts as 0 at this exponent; below it, floats would become denormal."""
 
 _M0, _M1 = np.uint64(MULTIPLIERS[0]), np.uint64(MULTIPLIERS[1])
 _K0, _K1 = np.uint32(INCREMENTS[0]), np.uint32(INCREMENTS[1])
@@ -44,20 +44,20 @@ _QUARTER_TURN = np.int32(2**30)
 
 
 def _polynomial(*coefficients: float) -> tuple[np.float32, ...]:
-    """The coefficients of a polynomial, in falling powers."""
+    """Store the coefficients of a polynomial, in falling powers."""
     return tuple(np.float32(coefficient) for coefficient in coefficients)
 
 
 _EXP2 = _polynomial(1.8775839e-3, 8.9893471e-3, 0.055826288, 0.24015364, 0.69315308, 0.99999994)
-"""2^f, within 7.5e-8 on [0, 1], relative."""
+"""This approximates 2^f on [0, 1], within 7.5e-8, relative."""
 
 _LOG = _polynomial(
     0.08960108, -0.14482562, 0.14917466, -0.16543691, 0.19958405, -0.25002947, 0.3333416, -0.49999979, 1.0
 )
-"""ln(1 + m) / m, within 2.6e-8 for 1 + m between sqrt(1/2) and sqrt(2)."""
+"""This approximates ln(1 + m) / m, within 2.6e-8 for 1 + m between sqrt(1/2) and sqrt(2)."""
 
 _SINE = _polynomial(1.5167854e-4, -4.6741581e-3, 0.079689927, -0.64596379, 1.57079637)
-"""sin(pi / 2 sqrt(s)) / sqrt(s), within 6.7e-9 on [0, 1]."""
+"""This approximates sin(pi / 2 sqrt(s)) / sqrt(s), within 6.7e-9 on [0, 1]."""
 
 
 def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
@@ -96,7 +96,7 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
 
 
 def _present(part: Tensor) -> np.ndarray | None:
-    """A part of the settings as an array; None if it is empty, so that no code is compiled for it."""
+    """Return a part of the settings as an array, or None if it is empty, so that no code is compiled for it."""
     if not part.numel():
         return None
     return part.detach().contiguous().numpy()
@@ -119,7 +119,7 @@ def develop(raw: Tensor, display: Display, cfa: CFA | str, methods: Sequence[str
     Returns:
         sRGB ``(B, 3, H, W)`` in [0, 1].
     """
-    padded = F.pad(raw.detach(), (2, 2, 2, 2), mode="reflect")  # about the border sites: the pattern stays
+    padded = F.pad(raw.detach(), (2, 2, 2, 2), mode="reflect")  # about the border sites, so the pattern stays
     names = sorted(set(methods))
     weights = np.stack([_site_weights(CFA(cfa), name) for name in names])
     numbers = np.array([names.index(method) for method in methods])
@@ -148,7 +148,7 @@ def _site_weights(cfa: CFA, method: str) -> np.ndarray:
     edge = 2 - stencils.shape[-1] // 2
     around = F.pad(stencils, (edge, edge, edge, edge))
 
-    measured = torch.eye(6)[:1]  # a site that has the colour: its own value alone
+    measured = torch.eye(6)[:1]  # a site that has the colour keeps its own value
     sums = torch.stack([around[:, i, j] for i, j in ((2, 2), (2, 1), (1, 2), (1, 1), (2, 0), (0, 2))], dim=1)
     weights = torch.cat([measured, sums])[torch.tensor(kinds)]  # (colour, row, column, sum)
     return weights.permute(1, 0, 3, 2).repeat(1, 1, 1, _TILE // 2).contiguous().numpy()
@@ -158,7 +158,7 @@ def _site_weights(cfa: CFA, method: str) -> np.ndarray:
 def _interpolate(context, table, node, row, layer, u, v, w, out, at, plane):  # type: ignore[no-untyped-def]
     """Mix eight nodes of ``table``, to ``out[at]``, ``out[at + plane]`` and ``out[at + 2 plane]``, all flat float32.
 
-    ``node`` is the place of the first; a node is 4 numbers, the next along v ``row`` and along w ``layer`` ahead.
+    ``node`` is the place of the first. A node is 4 numbers; the next is ``row`` ahead along v and ``layer`` along w.
     """
     signature = types.void(table, node, row, layer, u, v, w, out, at, plane)
     return signature, _interpolation
@@ -202,19 +202,19 @@ def _interpolation(context, build, signature: Signature, values):  # type: ignor
 
 @compile_part
 def _at_least(x, limit):  # type: ignore[no-untyped-def]
-    """The larger of two numbers; the limit in place of NaN."""
+    """Take the larger of two numbers, or the limit in place of NaN."""
     return x if x > limit else limit
 
 
 @compile_part
 def _at_most(x, limit):  # type: ignore[no-untyped-def]
-    """The smaller of two numbers; the limit in place of NaN."""
+    """Take the smaller of two numbers, or the limit in place of NaN."""
     return x if x < limit else limit
 
 
 @compile_part
 def _clip(x, white):  # type: ignore[no-untyped-def]
-    """A signal, white at most; NaN stays NaN."""
+    """Limit a signal to white; NaN stays NaN."""
     return white if x > white else x
 
 
@@ -232,7 +232,7 @@ def _cell_of(value, scale, last):  # type: ignore[no-untyped-def]
 def _look_up(red, green, blue, scale, table, nodes, shares, halves, out):  # type: ignore[no-untyped-def]
     """Look up the table ``(N, N, N, 4)`` at colours ``(n,)``, and write to ``out`` ``(2, 3, _TILE)``.
 
-    With ``halves`` = 1 even and odd sites go apart, to the two halves of ``out``; with 0 all go to its first half.
+    With ``halves`` = 1, even and odd sites go to separate halves of ``out``; with 0, all go to its first half.
     """
     size = np.int32(len(table))
     last = np.int32(size - 2)
@@ -260,7 +260,7 @@ def _through_curve(plane, scale, curve, nodes, shares, out):  # type: ignore[no-
 
     even, odd = out[0], out[1]
     for j in range(len(plane) // 2):
-        a, b = np.uint32(nodes[2 * j]), np.uint32(nodes[2 * j + 1])  # unsigned, or negative ones are looked for
+        a, b = np.uint32(nodes[2 * j]), np.uint32(nodes[2 * j + 1])  # unsigned, as else negative ones are checked for
         even[j] = curve[a] + (curve[a + np.uint32(1)] - curve[a]) * share[2 * j]
         odd[j] = curve[b] + (curve[b + np.uint32(1)] - curve[b]) * share[2 * j + 1]
 
@@ -372,8 +372,8 @@ def _pairs(one, other, out):  # type: ignore[no-untyped-def]
 def _demosaic(mosaic, row, first, weights, sums, out):  # type: ignore[no-untyped-def]
     """Demosaic a row from ``first`` on to colours ``(3, n)``; the mosaic has margins of 2.
 
-    Stencils are symmetric: a colour is a sum, by the weights of its site, of the site's own value and those of its
-    neighbours along the row, the column and the diagonals, and of those two sites away along row and column.
+    Stencils are symmetric: with the weights of its site, a colour is the sum of the site's own value, of the values of
+    its neighbours along the row, the column and the diagonals, and of those two sites away along row and column.
     """
     n = out.shape[1]
     above, own, below = mosaic[row + 1, first:], mosaic[row + 2, first:], mosaic[row + 3, first:]
@@ -488,7 +488,7 @@ def shot_read(clean: Tensor, levels: Tensor, keys: list[int], white: float, mapp
         mapped: whether to compute the variance map of the noisy signal.
 
     Returns:
-        Noisy RAW and its variance map, both ``(B, 4, h, w)``; the map is empty if it was not asked for.
+        Noisy RAW and its variance map, both ``(B, 4, h, w)``; the map is empty if it was not requested.
     """
     noisy = torch.empty_like(clean, memory_format=torch.contiguous_format)
     variance = torch.empty_like(noisy if mapped else noisy[:, :, :0])
@@ -539,7 +539,7 @@ def _log(x):  # type: ignore[no-untyped-def]
 @compile_part
 def _sine(turn):  # type: ignore[no-untyped-def]
     """Compute the sine of an angle in units of 2^-32 turns: fold it to a quarter turn about 0, then a polynomial."""
-    # The overflow of int32 is the full turn, so no remainder has to be taken.
+    # int32 overflows at the full turn, so no remainder has to be taken.
     folded = turn
     if turn > _QUARTER_TURN or turn < -_QUARTER_TURN:
         folded = np.int32(np.int32(-(2**31)) - turn)

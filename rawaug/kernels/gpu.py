@@ -1,8 +1,8 @@
 """The passes of :mod:`rawaug.kernels.reference` as Triton kernels: a program works on a block of Bayer cells.
 
-RAW reads every pixel once and writes every site once, 3 bytes in and 4 out a pixel; the table, 4.4 MB at 65 nodes,
-stays in the GPU's cache. Triton's generator is Philox4x32-10 with the cell as its counter, so the noise is that of a
-CPU but for the rounding of logarithms.
+The pass to RAW reads every pixel once and writes every site once, with 3 bytes in and 4 out for each pixel. The table,
+4.4 MB at 65 nodes, stays in the GPU's cache. Triton's generator is Philox4x32-10 with the cell as its counter, so the
+noise is that of a CPU, except for the rounding of logarithms.
 """
 
 from __future__ import annotations

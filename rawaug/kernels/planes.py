@@ -13,7 +13,7 @@ from rawaug.bayer import CFA, demosaic
 from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
 
 _MARGIN = 6
-"""Number of sites around a picture: green looks 2 around, colour 1, its steps 1 and their count 1; it must be even."""
+"""A picture has this many sites around it: green looks 2 around, colour 1, steps 1, their count 1; it must be even."""
 _HALF, _QUARTER, _TWO = np.float32(0.5), np.float32(0.25), np.float32(2)
 
 
@@ -123,7 +123,7 @@ def _leads(pictures, lead):  # type: ignore[no-untyped-def]
                     warm, cold = red[i, j] - red[i2, j2] - light, blue[i, j] - blue[i2, j2] - light
                     steps[d, down, 0, i, j], steps[d, down, 1, i, j] = light * light, warm * warm + cold * cold
 
-    # The picture along rows is judged by its steps along rows, that along columns by its steps along columns.
+    # The picture along rows is judged by its steps along rows, the one along columns by its steps along columns.
     of_rows, of_columns = steps[0, 0], steps[1, 1]
     for i in range(4, rows - 4):
         for j in range(4, width - 4):
@@ -144,7 +144,7 @@ def _leads(pictures, lead):  # type: ignore[no-untyped-def]
 def smooth(planes: Tensor, taps: Tensor) -> Tensor:
     """Filter each picture of ``(B, N, H, W)``, float32 on the CPU, with its own taps ``(B, K)`` along both axes.
 
-    The first tap is the middle one, the others stand on both sides of it. Beyond the border the last values are
+    The first tap is the middle one, and the others are on both sides of it. Beyond the border the last values are
     repeated.
     """
     batch, count, height, width = planes.shape

@@ -8,7 +8,7 @@ The reverse pass of a baked ISP, pixel by pixel: look-up, colour, gains, shading
 with :math:`floor = 1 / g` and :math:`rise = \max(1 - 1 / g, 0)`, which is Brooks' ``max(m + (1 - m) / g, 1 / g)``.
 Each site computes only the colour that its mosaic keeps.
 
-Normal numbers by counting: number k of cell i is a function of (key, i, k) alone.
+Normal numbers are made by counting: number k of cell i is a function of (key, i, k) alone.
 
 .. math:: (w_0, w_1, w_2, w_3) = \mathrm{Philox4x32\text{-}10}(i; key), \qquad
     n_{0, 1} = \sqrt{-2 \ln u(w_0)} \, (\cos, \sin)(2 \pi w_1 / 2^{32}), \quad u(w) = (w + 1/2) / 2^{32}
@@ -32,7 +32,7 @@ ROUNDS = 10
 _LOW = 0xFFFFFFFF
 
 BAND = 2**19
-"""Number of pixels that a CPU works on at a time, which bounds its memory."""
+"""A CPU works on this many pixels at a time, which bounds its memory."""
 
 
 class Camera(NamedTuple):
@@ -77,7 +77,7 @@ def mask_frame(place: list[int], height: int, width: int, centre: tuple[float, f
     half_diagonal = 0.5 * math.hypot(frame_height, frame_width)
 
     def position(i: int, j: int) -> tuple[float, float]:
-        """Where pixel (i, j) of the picture lies in the frame; its view is undone first."""
+        """Find where pixel (i, j) of the picture lies in the frame; its view is undone first."""
         if view & 2:
             i = height - 1 - i
         if view & 1:
@@ -135,7 +135,7 @@ def look_up(table: Tensor, x: Tensor) -> Tensor:
 def apply_curves(curves: Tensor, x: Tensor) -> Tensor:
     """Map each picture of ``x`` ``(B, C, H, W)`` by its own curve of ``curves`` ``(B, T)``, interpolated linearly.
 
-    Curves of 256 entries have one for each code of uint8, where nothing is interpolated. Floats are held to [0, 1].
+    Curves of 256 entries have one for each code of uint8, and nothing is interpolated. Floats are held to [0, 1].
     """
     if x.dtype == torch.uint8 and curves.shape[1] == 256:
         return _take(curves, x.int())
@@ -185,8 +185,8 @@ def render(linear: Tensor, display: Display) -> Tensor:
     if display.attention.numel():
         x = x * look_up(display.attention, x)[:, :1]
 
-    # A saturated sensor is balanced at its least gain alone; as RAW developers do, all channels are clipped there, or
-    # highlights would turn magenta.
+    # A saturated sensor is balanced only at its least gain. As in RAW developers, all channels are clipped there, since
+    # highlights would otherwise turn magenta.
     gains, white = display.gains[:, :3, None, None], display.gains[:, 3:, None, None]
     x = torch.minimum(x * gains, white)
 

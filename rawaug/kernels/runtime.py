@@ -1,8 +1,8 @@
 """Where code runs: devices by name, threads, and loops compiled by Numba.
 
-PyTorch's loops divide a tensor among threads, and the ends of each share go through other instructions than its middle,
-so the last bit of a power depends on the number of threads; :func:`one_thread` gives the same bits everywhere. OpenMP's
-threads do not survive a fork, and a loop waiting for them never ends, so a forked child stays on one thread.
+PyTorch's loops divide a tensor among threads. The ends of each share go through other instructions than its middle, so
+the last bit of a power depends on the number of threads; :func:`one_thread` gives the same bits everywhere. OpenMP's
+threads do not survive a fork, and a loop that waits for them never ends, so a forked child stays on one thread.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 KINDS = ("auto", "cpu", "cuda", "gpu", "mps")
-"""``gpu`` is CUDA or Apple's MPS, whichever is there; ``auto`` is that, or else the CPU."""
+"""``gpu`` is CUDA or Apple's MPS, whichever is available; ``auto`` is that, or else the CPU."""
 
 
 def find_device(name: str, key: str = "device", count: int = 1) -> torch.device:
@@ -54,7 +54,7 @@ def find_device(name: str, key: str = "device", count: int = 1) -> torch.device:
 
 
 def has_fast_bfloat16(device: torch.device) -> bool:
-    """Whether dense convolutions take less time in bfloat16 there: with AVX-512 BF16, AMX, or on newer GPUs."""
+    """Tell whether dense convolutions are faster in bfloat16 there: with AVX-512 BF16, AMX, or on newer GPUs."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
     if device.type != "cpu":
@@ -77,9 +77,9 @@ def one_thread() -> Iterator[None]:
 
 
 def eager(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator: leave the function out of ``torch.compile``, without loading the compiler, which takes seconds.
+    """Leave the decorated function out of ``torch.compile``, without loading the compiler, which takes seconds.
 
-    Dynamo cannot trace Numba, and would make a constant of a generator's seed. A graph break gives the same bits.
+    Dynamo cannot trace Numba, and would turn a generator's seed into a constant. A graph break gives the same bits.
     """
 
     @wraps(function)
@@ -92,10 +92,10 @@ def eager(function: Callable[P, R]) -> Callable[P, R]:
 
 
 _GRAIN = 2**15
-"""The fewest numbers for which waking a thread pays."""
+"""Waking a thread pays from this many numbers."""
 
 _PIECES = 4
-"""Pieces of work for each thread, so that a late one does not hold up the others."""
+"""Each thread has this many pieces of work, so that a late one does not hold up the others."""
 
 _OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 """Fused multiply-adds are allowed: they do not depend on the order of pixels or threads."""
@@ -103,7 +103,7 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz
 
 @cache
 def has_numba() -> bool:
-    """Whether loops can be compiled for the CPU."""
+    """Tell whether loops can be compiled for the CPU."""
     try:
         import numba
     except ImportError:
@@ -112,7 +112,7 @@ def has_numba() -> bool:
 
 
 def compile_loop(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator: the function as machine code that releases the GIL, cached on disk where a folder is writable."""
+    """Compile the decorated function to machine code that releases the GIL, cached on disk if a folder is writable."""
     from numba import njit
 
     try:
@@ -122,14 +122,14 @@ def compile_loop(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def compile_part(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator: machine code for functions that only those of :func:`compile_loop` in the same module call."""
+    """Compile a decorated function that only those of :func:`compile_loop` in the same module call."""
     from numba import njit
 
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
 
 
 _pools: dict[int, ThreadPoolExecutor] = {}
-"""The pools by their number of threads."""
+"""This maps a number of threads to its pool."""
 
 
 def _after_fork() -> None:

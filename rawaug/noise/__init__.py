@@ -1,4 +1,4 @@
-"""Noise that real sensors make: models, published levels, the estimate of a camera's own, and stabilisation."""
+"""The noise of real sensors: models, published levels, estimation from a camera's own files, and stabilisation."""
 
 from rawaug.noise.calibrated import CalibratedNoise
 from rawaug.noise.cameras import NoiseSpec, camera_names, noise_levels, noise_model, noise_names

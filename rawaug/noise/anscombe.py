@@ -2,11 +2,11 @@ r"""Variance stabilisation: the generalised Anscombe transform and its exact unb
 
 .. math:: z = \frac{2}{s} \sqrt{\max(s y + \tfrac{3}{8} s^2 + r, 0)}
 
-with s = ``shot_var`` and r = ``read_var``, makes Poisson-Gaussian noise of variance s y + r into noise of variance 1,
-which a denoiser for white Gaussian noise can take (Starck, Murtagh and Bijaoui 1998). A denoiser gives the mean of z;
-the algebraic inverse of a mean is biased, because the root is concave. The exact unbiased inverse maps E[z | y] back
+with s = ``shot_var`` and r = ``read_var``, turns Poisson-Gaussian noise of variance s y + r into noise of variance 1,
+which a denoiser for white Gaussian noise can handle (Starck, Murtagh and Bijaoui 1998). A denoiser gives the mean of z.
+The algebraic inverse of a mean is biased, because the root is concave. The exact unbiased inverse maps E[z | y] back
 to y (Makitalo and Foi, "Optimal inversion of the generalized Anscombe transformation for Poisson-Gaussian noise",
-2013). Below :data:`TABLE_COUNTS` photons it is a table made by integration; above, its limit
+2013). Below :data:`TABLE_COUNTS` photons it is a table computed by integration; above, it is its limit
 :math:`y = s (z^2/4 - 1/8) - r/s`.
 """
 
@@ -42,7 +42,7 @@ def inverse(z: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Te
     """Invert :func:`forward` without bias.
 
     The result is the clean RAW whose transformed noisy RAW has the mean ``z`` ``(B, ...)``. It is never below
-    black; the levels are those of :func:`forward`.
+    black; the levels are as in :func:`forward`.
     """
     levels = torch.stack(_levels(z, shot_var, read_var)).flatten(1)
 
@@ -69,7 +69,7 @@ def _counts(z: Tensor, sigma: float) -> Tensor:
     counts, means = counts.to(z), means.to(z)
 
     right = torch.searchsorted(means, z.contiguous()).clamp_(1, len(means) - 1)
-    step = (means[right] - means[right - 1]).clamp_min(torch.finfo(z.dtype).tiny)  # the first ones at a high sigma: 0
+    step = (means[right] - means[right - 1]).clamp_min(torch.finfo(z.dtype).tiny)  # 0 for the first at a high sigma
 
     low = torch.lerp(counts[right - 1], counts[right], ((z - means[right - 1]) / step).clamp(0, 1))
     high = z.square() / 4 - 0.125 - sigma**2

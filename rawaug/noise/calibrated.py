@@ -1,7 +1,7 @@
 r"""Noise at a stated PSNR of the pairs.
 
-A picture of mean signal m has noise of mean square ``shot_var m + read_var`` before the clip at white, and a factor s
-on both variances shifts the PSNR of every pair by ``-10 log10(s)``. So a mean PSNR of P takes the factor
+A picture of mean signal m has noise of mean square ``shot_var m + read_var`` before the clip at white, and multiplying
+both variances by s shifts the PSNR of every pair by ``-10 log10(s)``. So a mean PSNR of P requires the factor
 
     s = 10^((P_0 - P) / 10),        P_0 = mean(-10 log10(shot_var m + read_var))
 
@@ -44,14 +44,14 @@ class ScaledLevels:
 class CalibratedNoise(ShotReadNoise):
     """Shot and read noise at a stated mean PSNR of the pairs; the ratio of read to shot noise is that of the law.
 
-    In recipes ``noise: {pair_psnr: 41.18}``.
+    A recipe writes it as ``noise: {pair_psnr: 41.18}``.
 
     Args:
-        pair_psnr: in dB, over all pairs; a single one scatters as the law and the pictures do.
-        signal: mean signal of the clean RAW, a number or one for each of some pictures; by default that of photographs
-            made RAW by ``universal``. Of other pictures or another ISP measure it, by
+        pair_psnr: mean PSNR over all pairs, in dB; single pairs scatter around it as the law and the pictures do.
+        signal: mean signal of the clean RAW, a number or one for each of some pictures. The default is that of
+            photographs made RAW by ``universal``. For other pictures or another ISP, measure it with
             :meth:`rawaug.RawAugment.measure_signals`.
-        levels: the law that is scaled, as :func:`rawaug.noise.noise_levels` knows it.
+        levels: the law to scale, as :func:`rawaug.noise.noise_levels` knows it.
 
     Raises:
         ValueError: if the PSNR is not finite, a signal is not in (0, 1], or the law has no noise.
@@ -82,7 +82,7 @@ class CalibratedNoise(ShotReadNoise):
 
 
 def _mean_psnr(law: NoiseLevels, signals: list[float]) -> float:
-    """P_0 of the module, in dB; infinite without noise."""
+    """Compute P_0 of the module, in dB; it is infinite without noise."""
     shot_var, read_var = law.sample(_DRAWS, keyed_generator(0, "pair_psnr"))
     shot_noise = torch.outer(torch.tensor(signals, dtype=torch.float64), shot_var.double())
     mean_square = shot_noise + read_var.double()

@@ -14,9 +14,9 @@ names                                                                what       
 ===================================================================  ===========================  ============
 
 The presets and the single cameras are in :mod:`rawaug.noise.levels`, the profiles in :mod:`rawaug.noise.profiles`.
-Anything in :data:`rawaug.noise.models.NOISE` goes by its name as well. ``{"name": ..., "settings": {...}}`` gives
-settings: ``iso`` and ``poisson`` for a name of the table, the keyword arguments of its class for a model.
-CalibratedNoise needs no name: ``{"pair_psnr": 41.18}``.
+Anything in :data:`rawaug.noise.models.NOISE` can be named as well. ``{"name": ..., "settings": {...}}`` adds settings:
+``iso`` and ``poisson`` for a name in the table, the keyword arguments of its class for a model. CalibratedNoise needs
+no name: ``{"pair_psnr": 41.18}``.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ from rawaug.noise.profiles import ANY_CAMERA, ProfileLevels, load_profiles
 from rawaug.registry import Spec, check_settings, split_spec, suggest
 
 NoiseSpec = Spec | Sequence[float] | Sequence[str]
-"""A name with or without settings, (shot_var, read_var), or several names of which each picture draws one."""
+"""A name with or without settings, (shot_var, read_var), or several names, of which each picture draws one."""
 
 
 @cache
 def _single_cameras() -> dict[str, Callable[[Iso], SiddLevels | PmridLevels | EldLevels]]:
-    """By name, how to make the levels of a camera that was measured on its own."""
+    """Map the name of each camera that was measured on its own to a function that makes its levels."""
     presets = load_presets()
     cameras: dict[str, Callable[[Iso], SiddLevels | PmridLevels | EldLevels]] = {}
     for phone in presets["sidd_noise_level_function"]["cameras"]:
@@ -81,12 +81,12 @@ def noise_names() -> list[str]:
 
 
 def noise_levels(spec: NoiseSpec | NoiseLevels | NoiseModel, *, iso: Iso = None) -> NoiseLevels:
-    """Make the levels of a name, of a mixture of names, or fixed ones of (shot_var, read_var).
+    """Make levels from a name, from a mixture of names, or fixed ones from (shot_var, read_var).
 
     Args:
-        spec: a preset or camera, several of which each picture draws one, or two variances, white = 1; or a law of your
-            own, such as :class:`MeasuredLevels`, a model with one, or ``{name: MeasuredNoise, settings: ...}``.
-        iso: of a camera: one ISO, limits, or None for its whole measured range.
+        spec: a preset or camera, several of them of which each picture draws one, or two variances, white = 1. Or a law
+            of your own, such as :class:`MeasuredLevels`, a model with one, or ``{name: MeasuredNoise, settings: ...}``.
+        iso: ISO of a camera: one value, limits, or None for its whole measured range.
 
     Raises:
         ValueError: if the name is unknown, has no law by ISO, or the ISO is outside the measured range.
@@ -108,7 +108,7 @@ def noise_levels(spec: NoiseSpec | NoiseLevels | NoiseModel, *, iso: Iso = None)
 
 
 def _own_law(spec: Any) -> NoiseLevels | None:
-    """The law of levels that is given as an object or as settings; None for names and pairs."""
+    """The law of levels that is given as an object or as settings; None for names and for pairs of variances."""
     if isinstance(spec, Mapping) and spec.get("name") == "MeasuredNoise":
         model: MeasuredNoise = NOISE.make(spec)
         return model.levels
@@ -125,7 +125,7 @@ def is_law(value: object) -> bool:
 
 
 def _levels_at(law: NoiseLevels, iso: Iso) -> NoiseLevels:
-    """A law of one's own at an ISO, or between two."""
+    """Restrict the user's own law to an ISO, or to the range between two."""
     if iso is None:
         return law
     if not isinstance(law, MeasuredLevels):
@@ -177,14 +177,14 @@ def _warn_of_swapped_levels(shot_var: float, read_var: float) -> None:
 
 
 def noise_model(spec: NoiseSpec | NoiseLevels | NoiseModel, *, iso: Iso = None, poisson: bool = False) -> NoiseModel:
-    """Make the noise model of a name or of (shot_var, read_var); a model is returned as it is.
+    """Make the noise model of a name or of (shot_var, read_var); a model is returned unchanged.
 
     Args:
         spec: one of :func:`noise_names`, with settings as ``{"name": ..., "settings": {...}}``, a list of names (each
             picture draws one), a pair of variances on the scale white = 1, a law such as :class:`MeasuredLevels`, or a
             :class:`NoiseModel`.
-        iso: of a camera: one ISO, limits, or None for its whole measured range.
-        poisson: exact photon statistics instead of the Gaussian.
+        iso: ISO of a camera: one value, limits, or None for its whole measured range.
+        poisson: use exact photon statistics instead of the Gaussian.
 
     Raises:
         ValueError: if a name or setting is unknown, ``iso`` does not fit it, or options are given beside a model.
@@ -237,14 +237,14 @@ def _model_by_name(spec: Spec, iso: Iso, poisson: bool) -> NoiseModel:
 
 
 def _has_levels(name: str) -> bool:
-    """Whether a name is that of a preset or camera; then no room of noise models has to be loaded."""
+    """Whether a name is that of a preset or camera, so that no package of noise models has to be loaded."""
     if name in load_presets()["presets"] or name in _single_cameras():
         return True
     return camera_key(name) in map(camera_key, (ANY_CAMERA, *load_profiles().names))
 
 
 def _model_at(model: ShotReadModel, iso: Iso) -> ShotReadModel:
-    """A copy of a model with a law by ISO, at one ISO or between two."""
+    """Copy a model whose law depends on the ISO, restricted to one ISO or to the range between two."""
     law = model.law if isinstance(model, MeasuredNoise) else model.levels
     other = copy(model)
     other.levels = _levels_at(law, iso)

@@ -20,13 +20,13 @@ from rawaug.noise.sensor import Range, draw_between, require_not_negative
 class DarkFrames(PoissonGaussianNoise):
     """Photons, and read noise cut out of a camera's own dark frames: ``shot_var Poisson(y / shot_var) + dark``.
 
-    Every picture has a patch of a random frame at a random place of the same CFA phase, with all that the sensor does
-    in it: tails, banding, offsets, hot pixels, rounding. At its edges a frame goes on at the other side.
+    Every picture gets a patch of a random frame, from a random place of the same CFA phase, with everything that the
+    sensor does in it: tails, banding, offsets, hot pixels, rounding. A frame wraps around at its edges.
 
     Args:
-        path: a RAW file taken with the lens capped, or a folder of them, of one camera; kept in memory.
-        shot_var: of the photons at the frames' ISO, white = 1, or limits that it is drawn between; by default that of
-            each file's NoiseProfile tag.
+        path: a RAW file taken with the lens capped, or a folder of such files from one camera; they are kept in memory.
+        shot_var: shot variance of the photons at the frames' ISO, white = 1, or limits to draw it between. The default
+            is that of each file's NoiseProfile tag.
 
     Example:
         >>> model = DarkFrames("darks/iso1600", shot_var=2e-3)  # doctest: +SKIP
@@ -82,6 +82,6 @@ class DarkFrames(PoissonGaussianNoise):
 
 
 def _draw_interval(length: int, side: int, generator: torch.Generator) -> Tensor:
-    """Draw where ``length`` lines begin among ``side``; after the last one the first follows: ``(length,)``."""
+    """Draw ``(length,)`` consecutive line numbers out of ``side``, wrapping around after the last."""
     first = int(torch.randint(side, (), generator=generator, device=generator.device))
     return (torch.arange(length) + first) % side

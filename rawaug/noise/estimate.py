@@ -4,14 +4,14 @@ r"""A camera's own noise, measured on its RAW files: photon transfer on flat blo
 
 is fitted to local mean and variance on same-colour sites (Janesick, "Photon transfer", 2007; Foi et al. 2008). Each
 packed plane is cut into 8 x 8 blocks and transformed by the orthonormal DCT, where white noise has the same variance in
-every coefficient. Low coefficients say whether a block is flat, high ones how noisy it is (Ponomarenko et al., 2007):
-as they are independent, the choice does not bias the measure. The first row and column are not used, so that banding
-does not count. A level whose noise is not white, smoothed by a codec or mixed with texture, is left out; do not trust
-``read_var`` on files that a codec quantised coarsely.
+every coefficient. Low coefficients say whether a block is flat, high ones how noisy it is (Ponomarenko et al., 2007).
+As they are independent, the choice of blocks does not bias the measurement. The first row and column are not used, so
+that banding does not count. A level is left out if its noise is not white, because a codec smoothed it or texture is
+mixed in. Do not trust ``read_var`` on files that a codec quantised coarsely.
 
-With the lens capped, :math:`y = b_c + r_{row} + n`. Differences between horizontal neighbours of one colour hold n
-alone, twice its variance; those between the means of successive sensor rows hold the banding as well (after Wei et al.
-2020). Slow gradients cancel in both.
+With the lens capped, :math:`y = b_c + r_{row} + n`. Differences between horizontal neighbours of one colour contain n
+alone, at twice its variance; those between the means of successive sensor rows contain the banding as well (after Wei
+et al. 2020). Slow gradients cancel in both.
 
 Signals are black-subtracted, white = 1; the variance of rounding to the sensor's grid is part of ``read_var``.
 """
@@ -55,11 +55,11 @@ _RELATIVE_SD = math.sqrt(2 / _DOF)
 """Relative standard deviation of one block's variance."""
 
 _FLAT = 1.2
-"""Largest ratio of low to expected energy in a flat block; 70 % of the blocks that hold noise alone have less."""
+"""Largest ratio of low to expected energy in a flat block; 70 % of the blocks that contain only noise have less."""
 _WHITE = 0.15
 """Largest relative difference between the bands' energies."""
 _CLIP_MARGIN = 4.0
-"""Least distance to clipping, in standard deviations of a pixel."""
+"""Minimum distance to clipping, in standard deviations of a pixel."""
 _MIN_BLOCKS = 30
 """Minimum number of blocks of a level."""
 _MIN_POINTS = 6
@@ -79,10 +79,10 @@ class NoisePoints:
 
     Args:
         signal: mean signal, white = 1.
-        variance: of the noise at this signal.
+        variance: variance of the noise at this signal.
         channel: 0 to 3 for R, Gr, Gb, B.
-        blocks: how many flat blocks were measured.
-        used: False where the point was left out of the line: of too few blocks, not white, or far from the others.
+        blocks: number of flat blocks that were measured.
+        used: False if the point was left out of the line: it had too few blocks, was not white, or was far from others.
     """
 
     signal: Tensor
@@ -110,7 +110,7 @@ class NoiseEstimate:
 
 
 class _Blocks(NamedTuple):
-    """Measures of each of N blocks, ``(N,)``: mean, mean energies of the DCT bands, and the room to clipping."""
+    """Measurements of N blocks, ``(N,)`` each: mean, mean energies of the DCT bands, and the distance to clipping."""
 
     channel: Tensor
     signal: Tensor
@@ -133,13 +133,13 @@ def estimate_noise(
 
     Args:
         mosaics: one or several ``(1, H, W)`` or ``(1, 1, H, W)``, black-subtracted, white = 1. Signals near white are
-            left out, and those near another level of clipping, where the file's lowest or highest value piles up.
-        cfa: the pattern, of all of them: Bayer's, or X-Trans or Quad-Bayer, of which each site of the cell is a plane
-            of its own, so that flat regions must be three or two times as wide.
-        read_var: if it is known from dark frames (:func:`estimate_dark_noise`); by default it is fitted, too.
+            left out, and so are those near another clipping level, where the file's lowest or highest value piles up.
+        cfa: the pattern of all mosaics: Bayer, X-Trans or Quad-Bayer. For the last two each site of the cell is a plane
+            of its own, so flat regions must be three or two times as wide.
+        read_var: the value known from dark frames (:func:`estimate_dark_noise`); by default it is fitted, too.
 
     Raises:
-        ValueError: if there are too few flat regions, or they do not span a range of signals.
+        ValueError: if there are too few flat regions, or they do not cover a range of signals.
 
     Example:
         >>> estimate = estimate_noise([mosaic], "RGGB")  # doctest: +SKIP
@@ -168,7 +168,7 @@ def estimate_noise(
 
 
 def _rounding(frame: Tensor) -> float:
-    """Compute twice the variance of rounding to the steps that a frame's values have."""
+    """Compute twice the variance of rounding to the steps between a frame's values."""
     stride = max(1, frame.numel() // 2**18)
     steps = frame.flatten()[::stride].double().unique().diff()
     if not len(steps):
@@ -211,12 +211,12 @@ def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
 
 
 def _band_energy(energy: Tensor, band: np.ndarray[Any, Any]) -> Tensor:
-    """The mean energy of a band of the coefficients ``(n, N, BLOCK, BLOCK)``, flat."""
+    """Compute the mean energy of a band of the coefficients ``(n, N, BLOCK, BLOCK)``, flattened."""
     return energy[..., torch.from_numpy(band)].mean(-1).flatten()
 
 
 def _planes(mosaic: Tensor, cfa: CFA | str) -> tuple[Tensor, Tensor]:
-    """Split a mosaic ``(1, H, W)`` into planes of one site of the cell each, ``(n, h, w)``, and say which they are."""
+    """Split a mosaic ``(1, H, W)`` into planes ``(n, h, w)``, one for each site of the cell, and say which they are."""
     if cfa in CFA.__members__:
         return pack(mosaic, cfa), torch.arange(4)
 
@@ -239,7 +239,7 @@ def _piles_up(frame: Tensor, extreme: Tensor, opposite: Tensor) -> bool:
 
 
 def _split_levels(blocks: _Blocks) -> list[_Blocks]:
-    """Split the blocks by colour and by signal into levels, with as many blocks in each level of a colour."""
+    """Split the blocks by colour and signal into levels, each with the same number of blocks within a colour."""
     levels = []
     for channel in range(4):
         index = torch.nonzero(blocks.channel == channel).flatten()
@@ -255,7 +255,7 @@ def _split_levels(blocks: _Blocks) -> list[_Blocks]:
 
 
 def _start(levels: list[_Blocks]) -> NoisePoints:
-    """Guess first from the twentieth of each level's blocks that varies least in the low frequencies."""
+    """Make a first guess from the twentieth of each level's blocks that varies least in the low frequencies."""
     flattest = []
     variances = []
     for level in levels:
@@ -279,7 +279,7 @@ def _points(levels: list[_Blocks], shot_var: float, read_var: float) -> NoisePoi
         if len(index) == 0:
             continue
 
-        # The median is taken of the ratio to the line, so that a wide level is not skewed by its spread of signals.
+        # Take the median of the ratio to the line, so that a wide level is not skewed by its spread of signals.
         flat, expected = level.take(index), expected[index]
         flat_levels.append(flat)
         variances.append((flat.high / expected).median() / _MEDIAN * expected.mean())
@@ -290,7 +290,7 @@ def _points(levels: list[_Blocks], shot_var: float, read_var: float) -> NoisePoi
 
 
 def _gather(levels: list[_Blocks], variances: list[Tensor]) -> NoisePoints:
-    """One point for each level, of its blocks and of their variance."""
+    """Make one point for each level from its blocks and their variance."""
     signals = []
     channels = []
     counts = []
@@ -315,7 +315,7 @@ def _gather(levels: list[_Blocks], variances: list[Tensor]) -> NoisePoints:
 def _fit(points: NoisePoints, dark_var: float | None) -> tuple[float, float, NoisePoints]:
     """Fit slope and intercept by robust weighted least squares, and mark outliers among the points as unused.
 
-    The intercept is ``dark_var`` where dark frames have given it.
+    The intercept is ``dark_var`` if dark frames have given it.
     """
     used = points.used
     x, y, n = points.signal, points.variance, points.blocks.double()
@@ -352,14 +352,14 @@ def _line(x: Tensor, y: Tensor, weight: Tensor, dark_var: float | None) -> tuple
 
 
 def own_noise(raw: Tensor, cfa: CFA | str) -> tuple[float, float] | None:
-    """Measure the noise that a reference has itself, on the whole frame as its camera gave it.
+    """Measure the noise of a reference itself, on the whole frame as its camera gave it.
 
     Args:
         raw: the mosaic ``(1, H, W)``, not binned.
         cfa: its pattern.
 
     Returns:
-        (shot_var, read_var), or None where too little of the frame is flat or its points follow no line.
+        (shot_var, read_var), or None if too little of the frame is flat or its points follow no line.
     """
     try:
         estimate = estimate_noise(raw, cfa)
@@ -372,7 +372,7 @@ def own_noise(raw: Tensor, cfa: CFA | str) -> tuple[float, float] | None:
 
 
 def own_noise_share(levels: tuple[float, float], reference: Tensor, squared_error: float) -> float:
-    """Compute which share of a mean squared error is the reference's own noise; a perfect denoiser reaches 1.
+    """Compute the share of a mean squared error that is the reference's own noise; a perfect denoiser reaches 1.
 
     ``levels`` are (shot_var, read_var) of the reference ``(..., H, W)``, white = 1.
     """
@@ -385,9 +385,9 @@ class DarkNoise:
     """The noise of a camera without light, white = 1.
 
     Args:
-        read_var: variance of the pixels; fixed pattern noise is part of it.
+        read_var: variance of the pixels, including fixed pattern noise.
         row_var: variance of banding along rows, 0 if it cannot be measured.
-        black_offset: the black level's error in R, Gr, Gb, B.
+        black_offset: error of the black level in R, Gr, Gb, B.
     """
 
     read_var: float
@@ -396,7 +396,7 @@ class DarkNoise:
 
 
 def estimate_dark_noise(frames: Sequence[Tensor], cfa: CFA | str) -> DarkNoise:
-    """Estimate the noise without light from dark frames ``(1, H, W)`` of one camera at one ISO; it is their mean.
+    """Estimate the noise without light as the mean over dark frames ``(1, H, W)`` of one camera at one ISO.
 
     Raises:
         ValueError: if there is no frame, or one is clipped at black.
@@ -434,7 +434,7 @@ def _measure_dark(planes: Tensor) -> Tensor:
         is_regular = difference.abs() <= limit
     read_var = difference[is_regular].square().mean() / 2
 
-    # A median is coarse on digital numbers: cap the outliers.
+    # A median is coarse on digital numbers, so cap the outliers.
     offsets = planes.flatten(1).median(-1).values
     levelled = (planes - offsets[:, None, None]).clamp(-limit, limit)
 

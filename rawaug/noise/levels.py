@@ -1,18 +1,18 @@
-r"""Noise levels: samplers of (shot_var, read_var) per picture, variances on the scale white = 1.
+r"""Noise levels: samplers of (shot_var, read_var) for each picture, as variances on the scale white = 1.
 
 A published preset draws shot_var log-uniformly and read_var around a line in the logarithms,
 
 .. math:: \log \mathrm{read\_var} = a \log \mathrm{shot\_var} + b + N(0, \sigma^2)
 
-(Brooks et al., 2019), natural in some sources and of base 10 in others; each preset keeps its own. A measured camera
-has levels by ISO: with a gain of K digital numbers (DN) an electron, V DN from black to white and read noise of
-:math:`\sigma` DN,
+(Brooks et al., 2019). The logarithms are natural in some sources and of base 10 in others; each preset keeps its own. A
+measured camera has levels by ISO. With a gain of K digital numbers (DN) per electron, V DN from black to white and read
+noise of :math:`\sigma` DN,
 
 .. math:: \mathrm{shot\_var} = K / V, \qquad \mathrm{read\_var} = \sigma^2 / V^2 .
 
-Published are five phones of SIDD (Abdelhamed et al. 2018; the numbers of Noise Flow, 2019), the line of PMRID for one
-phone (Wang et al. 2020), and the log-linear laws of ELD for five cameras (Wei et al. 2020). Outside the measured range
-an ISO is refused; without an ISO the whole range is sampled, log-uniformly.
+The published levels are five phones of SIDD (Abdelhamed et al. 2018; the numbers of Noise Flow, 2019), the line of
+PMRID for one phone (Wang et al. 2020), and the log-linear laws of ELD for five cameras (Wei et al. 2020). An ISO
+outside the measured range is refused; without an ISO the whole range is sampled log-uniformly.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def log_uniform(limits: tuple[float, float], batch: int, generator: torch.Genera
 
 
 class FixedLevels:
-    """The same levels for every picture: those of a camera at one ISO. ValueError if one is negative or not finite."""
+    """The same levels for every picture, as for a camera at one ISO. ValueError if one is negative or not finite."""
 
     def __init__(self, shot_var: float, read_var: float) -> None:
         if not (0 <= shot_var < math.inf and 0 <= read_var < math.inf):
@@ -76,7 +76,7 @@ class FixedLevels:
 
     @classmethod
     def of(cls, pair: Any) -> FixedLevels:
-        """The levels that ``(shot_var, read_var)`` gives; ValueError if it is not a pair of such numbers."""
+        """Make the levels from ``(shot_var, read_var)``; ValueError if it is not a pair of such numbers."""
         if not isinstance(pair, Sequence) or len(pair) != 2 or not all(isinstance(v, Real) for v in pair):
             raise ValueError(f"noise must be a name or a pair (shot_var, read_var) of variances, got {pair!r:.100}")
         return cls(*pair)
@@ -88,7 +88,7 @@ class FixedLevels:
 
 
 class MixedLevels:
-    """The levels of several laws, of which each picture draws one, all alike."""
+    """The levels of several laws; each picture draws one of the laws with equal probability."""
 
     def __init__(self, laws: Sequence[NoiseLevels]) -> None:
         if not laws:
@@ -123,7 +123,7 @@ class Preset:
         shot_var = log_uniform(self.shot_range, batch, generator)
         scatter = self.line["sigma"] * normal(generator, batch)
 
-        # The slope is the same in any base; intercept and scatter are exponents of the preset's own.
+        # The slope is the same in any base; intercept and scatter are exponents of the preset's own base.
         exponent = (self.line["intercept"] + scatter) * math.log(self.base)
         return shot_var, shot_var ** self.line["slope"] * torch.exp(exponent)
 
@@ -133,7 +133,7 @@ Iso = float | tuple[float, float] | None
 
 
 def iso_limits(camera: str, iso: Iso, measured: tuple[float, float]) -> tuple[float, float]:
-    """The limits of the draw that ``iso`` asks for; ValueError if they are outside the measured range."""
+    """The limits of the draw that ``iso`` requests; ValueError if they are outside the measured range."""
     if iso is None:
         return measured
 
@@ -167,7 +167,7 @@ class SiddLevels:
 
     Args:
         phone: ``iPhone 7``, ``Google Pixel``, ``Samsung Galaxy S6 Edge``, ``Motorola Nexus 6`` or ``LG G4``.
-        iso: one ISO, the limits of a log-uniform draw, or None for all that was tabulated.
+        iso: one ISO, the limits of a log-uniform draw, or None for the whole tabulated range.
     """
 
     def __init__(self, phone: str, iso: Iso = None) -> None:
@@ -207,7 +207,7 @@ class PmridLevels:
 class EldLevels:
     """One of ELD's cameras, where every scale s is log-linear in the gain: log s = slope log K + bias + N(0, sigma^2).
 
-    As levels they give the Gaussian law of read noise; :class:`rawaug.noise.EldNoise` is the full model.
+    Used as levels, they give the Gaussian law of read noise; :class:`rawaug.noise.EldNoise` is the full model.
     """
 
     def __init__(self, camera: str, iso: Iso = None) -> None:
@@ -218,7 +218,7 @@ class EldLevels:
         self.iso = iso_limits(camera, iso, tuple(law["iso"]))
 
     def sample_gain(self, batch: int, generator: torch.Generator) -> Tensor:
-        """Draw the gain K in DN an electron, ``(batch,)``."""
+        """Draw the gain K in DN per electron, ``(batch,)``."""
         return log_uniform(self.iso, batch, generator) * (self.camera["Kmin"] / self.lowest_iso)
 
     def sample_scale(self, law: str, gain: Tensor, generator: torch.Generator) -> Tensor:

@@ -1,7 +1,7 @@
-"""The noise of cameras that were measured, on their own files or by their data sheets, by ISO.
+"""The noise of measured cameras by ISO, from their own files or from their data sheets.
 
-Between the ISO values of a camera's levels, the logarithms of both variances are linear in that of the ISO. Outside the
-measured range an ISO is refused. Files without an ISO give one level for every picture.
+Between the ISO values of a camera's levels, the logarithms of both variances are linear in the logarithm of the ISO. An
+ISO outside the measured range is refused. Files without an ISO give one level for every picture.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from rawaug.noise.levels import FixedLevels, Iso, MixedLevels, NoiseLevels, inte
 from rawaug.noise.models import NOISE, Params, ShotReadNoise, per_picture
 
 _LEAST = 1e-12
-"""Stands for a variance of 0 in the logarithms."""
+"""Replaces a variance of 0 in logarithms."""
 
 
 class IsoLevel(NamedTuple):
     """The noise levels that were measured at one ISO.
 
     Args:
-        iso: None if the files have none.
+        iso: the ISO; None if the files have none.
         shot_var, read_var: variances, white = 1.
-        r2: of the line through the measured points; None if unknown.
-        frames: how many were measured; None if unknown.
+        r2: R^2 of the line through the measured points; None if unknown.
+        frames: number of frames that were measured; None if unknown.
     """
 
     iso: float | None
@@ -40,11 +40,11 @@ class MeasuredLevels:
     """The levels of one camera, at the measured ISO values and between them.
 
     Args:
-        levels: one for each ISO, or a single one without.
+        levels: one for each ISO, or a single one without an ISO.
         camera: make and model, for messages.
 
     Raises:
-        ValueError: if there is no level, two have the same ISO, or one of several has none.
+        ValueError: if there is no level, two have the same ISO, or one of several has no ISO.
 
     Example:
         >>> law = MeasuredLevels([IsoLevel(100, 1e-4, 1e-7), IsoLevel(400, 4e-4, 1.6e-6)], "Maker Model")
@@ -66,7 +66,7 @@ class MeasuredLevels:
 
     @property
     def limits(self) -> tuple[float, float] | None:
-        """The lowest and the highest ISO that was measured; None where the files have no ISO."""
+        """The lowest and the highest measured ISO; None if the files have no ISO."""
         low, high = self.levels[0].iso, self.levels[-1].iso
         if low is None or high is None:
             return None
@@ -95,7 +95,7 @@ class MeasuredLevels:
         return interpolate_levels(table, log_uniform(self.limits, batch, generator))
 
     def within(self, iso: float | tuple[float, float]) -> NoiseLevels:
-        """The law at one ISO, or between two; ValueError outside the measured range.
+        """Restrict the law to one ISO, or to the range between two; ValueError outside the measured range.
 
         Example:
             >>> law = MeasuredLevels([IsoLevel(100, 1e-4, 1e-7), IsoLevel(400, 4e-4, 1.6e-6)], "Maker Model")
@@ -118,7 +118,7 @@ class MeasuredLevels:
         return MeasuredLevels(levels, self.camera)
 
     def spec(self) -> dict[str, Any]:
-        """Write the law as a name with settings, which files of weights hold and :func:`noise_model` reads."""
+        """Write the law as a name with settings, the form that weight files store and :func:`noise_model` reads."""
         rows = []
         for level in self.levels:
             rows.append({key: value for key, value in level._asdict().items() if value is not None})
@@ -129,7 +129,7 @@ class RoundedNoise(ShotReadNoise):
     """Shot and read noise of RAW that is rounded to digital numbers.
 
     Args:
-        levels: whose ``read_var`` contains the rounding, as it does where it is measured on RAW files.
+        levels: levels whose ``read_var`` contains the rounding, as it does if it is measured on RAW files.
         quantum: step of the digital numbers, white = 1; None rounds nothing.
 
     Raises:
@@ -143,7 +143,7 @@ class RoundedNoise(ShotReadNoise):
         super().__init__(levels)
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        """Draw ``shot_var``, ``read_var`` (without the rounding), ``seed`` and, where RAW is rounded, ``quantum``."""
+        """Draw ``shot_var``, ``read_var`` (without the rounding), ``seed`` and, if RAW is rounded, ``quantum``."""
         params = super().sample(batch, generator)
         if self.quantum is not None:
             quantum = torch.full_like(params["read_var"], self.quantum)
@@ -152,7 +152,7 @@ class RoundedNoise(ShotReadNoise):
         return params
 
     def apply(self, clean: Tensor, params: Params) -> Tensor:
-        """Make noisy RAW ``(B, 4, h, w)``, rounded where the camera rounds; see :meth:`NoiseModel.apply`."""
+        """Make noisy RAW ``(B, 4, h, w)``, rounded if the camera rounds; see :meth:`NoiseModel.apply`."""
         noisy = super().apply(clean, params)
         return _round_to_quantum(noisy, params)
 
@@ -186,13 +186,13 @@ def _round_to_quantum(noisy: Tensor, params: Params) -> Tensor:
 
 @NOISE.register("MeasuredNoise")
 class MeasuredNoise(RoundedNoise):
-    """Shot and read noise of a camera measured at several ISO values; each picture draws an ISO.
+    """Shot and read noise of a camera that was measured at several ISO values; each picture draws an ISO.
 
     Args:
-        levels: for each ISO ``{iso, shot_var, read_var}``, besides ``r2`` and ``frames`` if known.
+        levels: ``{iso, shot_var, read_var}`` for each ISO, and ``r2`` and ``frames`` if known.
         camera: make and model.
         quantum: as for :class:`RoundedNoise`.
-        iso: one ISO, or (lowest, highest), from which the levels are drawn; by default all that was measured.
+        iso: one ISO, or (lowest, highest), from which the levels are drawn; by default the whole measured range.
 
     Raises:
         ValueError: if a level is incomplete, the step is not in (0, 1), or the ISO was not measured.
@@ -219,7 +219,7 @@ class MeasuredNoise(RoundedNoise):
 
 
 def camera_law(stored: Mapping[str, Any]) -> MeasuredLevels:
-    """Read the law in the entry ``noise`` of an ISP's file; ValueError if it is no law of a camera."""
+    """Read the law in the entry ``noise`` of an ISP's file; ValueError if it is not a camera's law."""
     if "shot_var" in stored:  # a single level, as in the shipped canon-powershot
         return MeasuredLevels([IsoLevel(None, stored["shot_var"], stored["read_var"], stored.get("r2"))])
     if stored.get("name") != "MeasuredNoise":
@@ -228,14 +228,14 @@ def camera_law(stored: Mapping[str, Any]) -> MeasuredLevels:
 
 
 def measured_noise(specs: Sequence[Mapping[str, Any]], iso: Iso = None) -> RoundedNoise:
-    """The noise of one or several cameras, of which each picture draws one.
+    """Make the noise of one or several cameras, of which each picture draws one.
 
     Args:
-        specs: laws as an ISP's file holds them.
-        iso: one ISO, limits, or None for what was measured.
+        specs: laws as an ISP's file stores them.
+        iso: one ISO, limits, or None for the whole measured range.
 
     Raises:
-        ValueError: if a law is none of a camera, or the cameras round to different digital numbers.
+        ValueError: if a law is not a camera's, or the cameras round to different digital numbers.
     """
     laws: list[NoiseLevels] = []
     quanta = set()

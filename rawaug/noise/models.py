@@ -4,12 +4,13 @@ r"""Shot and read noise, which every sensor has.
 
 on linear, black-subtracted RAW with white = 1 (Foi et al., "Practical Poissonian-Gaussian noise modeling and fitting
 for single-image raw-data", 2008). Shot noise is the Poisson statistics of photons, ``shot_var`` being the share of
-white that one electron makes; read noise is that of the electronics. Noisy RAW is clipped at white, as a sensor does,
+white that one electron makes; read noise comes from the electronics. Noisy RAW is clipped at white, as a sensor does,
 and never at black: zero-mean noise stays zero-mean in the shadows.
 
-Parameters hold one ``seed`` a picture, from which ``apply`` draws: the same parameters give the same bits, whatever
-else is in the batch and on any number of threads. On a GPU the default noise is that of the CPU within 1e-6 of its
-standard deviation; all other noise, and any without Triton, has a stream of its own for each kind of device.
+Each picture has one ``seed`` among its parameters, from which ``apply`` draws. The same parameters give the same bits,
+whatever else is in the batch and on any number of threads. On a GPU the default noise equals that of the CPU within
+1e-6 of its standard deviation. All other noise, and any noise without Triton, has its own stream for each kind of
+device.
 """
 
 from __future__ import annotations
@@ -33,17 +34,17 @@ from rawaug.registry import Registry
 from rawaug.seeding import derive_seed, keyed_generator
 
 NOISE = Registry("noise", "rawaug.noise", "rawaug.noise")
-"""The noise models by name: subclasses of :class:`NoiseModel`; presets and cameras: :mod:`rawaug.noise.cameras`."""
+"""The noise models by name, subclasses of :class:`NoiseModel`; :mod:`rawaug.noise.cameras` has presets and cameras."""
 
 Params = dict[str, Tensor]
-"""Parameters of a batch by name: tensors whose first dimension is B."""
+"""Parameters of a batch by name; they are tensors whose first dimension is B."""
 
 _NO_SHOT = 1e-30
 """Replaces a shot_var of 0 to avoid division by zero; too small to affect the picture."""
 _GROUP = 2**18
-"""Number of values whose photons are drawn at a time: many small pictures, or one large one."""
+"""Number of values whose photons are drawn at a time, from many small pictures or one large one."""
 INVERSION_LIMIT = 10.0
-"""The rate from which counts are drawn by the expansion, whose distribution function errs by 5e-5."""
+"""The rate above which counts are drawn by the expansion, whose distribution function errs by 5e-5."""
 _CPU_PIECE = 2**15
 """Number of counts that are drawn at a time on a CPU, to stay in its cache."""
 
@@ -53,16 +54,16 @@ class NoiseModel(ABC):
 
     It is used as ``noisy = model.apply(clean, model.sample(B, generator))``.
 
-    Models composed on one picture draw from its one seed without correlation, each from its own ``stream``.
+    Models that are combined on one picture draw from its one seed without correlation, each from its own ``stream``.
     """
 
     stream: ClassVar[str]
     by_plane = False
-    """Whether the four planes differ in more than their signal; such noise is for packed Bayer RAW alone."""
+    """Whether the four planes differ in more than their signal; such noise applies to packed Bayer RAW only."""
 
     @abstractmethod
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        """Draw the parameters of ``batch`` pictures: tensors of that leading dimension on the generator's device."""
+        """Draw the parameters of ``batch`` pictures, as tensors of that leading dimension on the generator's device."""
 
     @abstractmethod
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
@@ -80,7 +81,7 @@ class NoiseModel(ABC):
     def apply(self, clean: Tensor, params: Params) -> Tensor:
         """Make noisy RAW from clean packed RAW, both ``(B, 4, h, w)``; it is clipped at white and not at black.
 
-        The same parameters give the same bits. They may lie on another device than the picture. No gradient passes.
+        The same parameters give the same bits. They may be on another device than the picture. No gradient passes.
 
         Raises:
             ValueError: if ``clean`` is not packed RAW in float32 or float64, or ``params`` are for another batch size.
@@ -89,7 +90,7 @@ class NoiseModel(ABC):
         return self.disturb(clean, params).clamp_(max=1.0)
 
     def apply_with_variance(self, clean: Tensor, params: Params) -> tuple[Tensor, Tensor]:
-        """Make noisy RAW as :meth:`apply` does and its variance map from the noisy signal, both ``(B, 4, h, w)``."""
+        """Make noisy RAW as :meth:`apply` does, and its variance map from the noisy signal, both ``(B, 4, h, w)``."""
         noisy = self.apply(clean, params)
         return noisy, self.variance(noisy, params)
 
@@ -128,7 +129,7 @@ def draw_normals(like: Tensor, generators: Iterable[torch.Generator]) -> Tensor:
 
 
 class ShotReadModel(NoiseModel):
-    """Base of noise with var = shot_var y + read_var, whose levels are such as ``Preset("upi")``."""
+    """Base of noise with var = shot_var y + read_var, whose levels come from a law such as ``Preset("upi")``."""
 
     stream = "shot_read"
 
@@ -228,7 +229,7 @@ class PoissonGaussianNoise(ShotReadModel):
         return noisy
 
     def _noise(self, clean: Tensor, params: Params, group: slice, generators: Sequence[torch.Generator]) -> Tensor:
-        """Draw the noise of a group of pictures, for each first the photons, then the read noise."""
+        """Draw the noise of a group of pictures: for each picture first the photons, then the read noise."""
         shot_var = per_picture(params["shot_var"][group], clean)
         light = clean.clamp(min=0)
         photons = poisson(light / shot_var.clamp(min=_NO_SHOT), draw_normals(clean, generators)).mul_(shot_var)
@@ -247,8 +248,8 @@ def poisson(rate: Tensor, normals: Tensor) -> Tensor:
 
     ``normals`` must be contiguous; the counts are written over them.
 
-    A count is the quantile of its draw: ``torch.poisson`` has poor streams on CUDA and fails at high rates. Below
-    :data:`INVERSION_LIMIT` the distribution function is summed; from there on its inverse is Giles' expansion in
+    A count is the quantile of its draw, because ``torch.poisson`` has poor streams on CUDA and fails at high rates.
+    Below :data:`INVERSION_LIMIT` the distribution function is summed; from there on its inverse is Giles' expansion in
     ``rate**-0.5`` (Algorithm 955, ACM TOMS 2016), rounded down.
     """
     piece = max(rate.numel(), 1)
@@ -273,7 +274,7 @@ def _invert_expansion(rate: Tensor, w: Tensor) -> Tensor:
 
 
 def _invert_sum(rate: Tensor, w: Tensor) -> Tensor:
-    """Count the k with F(k) < Phi(w), in double precision: in single, the sum would stop short of the far tail."""
+    """Count the k with F(k) < Phi(w), in double precision; in single, the sum would stop short of the far tail."""
     rate = rate.double()
     u = torch.special.ndtr(w.double()).clamp_(max=1 - 1e-13)  # the sum reaches this limit
 

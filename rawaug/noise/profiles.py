@@ -1,12 +1,12 @@
-r"""Noise profiles of 374 cameras by ISO, var = a y + b, as darktable has measured them.
+r"""Noise profiles of 374 cameras by ISO, var = a y + b, as measured by darktable.
 
 Their red and blue figures contain a white balance, so the green ones serve all channels. darktable measures after
-demosaicing, where noise has been averaged: for four cameras that ELD measured on the mosaic its profiles are too low,
-by 7.2 to 11.4 in shot variance and 2.2 to 16 in read variance (:data:`SPREAD`). All are multiplied by the geometric
-means, :data:`SHOT_ON_MOSAIC` and :data:`READ_ON_MOSAIC`; the median shot_var at ISO 100 is then 2.8e-5, a full well of
-36,000 electrons. A fifth camera bears the first factor out: frames of a Nikon D5000 at ISO 200 measure 2.6 to 3.2e-5,
-and its profile gives 3.09e-5. ``any camera`` draws the factors, log-uniformly over the spread and each on its own. Rows
-whose green variance is not positive are left out.
+demosaicing, which averages noise. For four cameras that ELD measured on the mosaic, darktable's profiles are too low by
+7.2 to 11.4 in shot variance and 2.2 to 16 in read variance (:data:`SPREAD`). All profiles are multiplied by the
+geometric means, :data:`SHOT_ON_MOSAIC` and :data:`READ_ON_MOSAIC`; the median shot_var at ISO 100 is then 2.8e-5, a
+full well of 36,000 electrons. A fifth camera supports the first factor: frames of a Nikon D5000 at ISO 200 measure 2.6
+to 3.2e-5, and its profile gives 3.09e-5. ``any camera`` draws the two factors independently, log-uniformly over the
+spread. Rows whose green variance is not positive are left out.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rawaug.isp.camera_names import find_camera
 from rawaug.noise.levels import Iso, iso_limits, log_uniform
 
 ANY_CAMERA = "any camera"
-"""The name of all profiles together."""
+"""The name that stands for all profiles together."""
 
 SHOT_ON_MOSAIC = 8.6
 """Ratio of the shot variance on the mosaic to that of a profile."""
@@ -35,14 +35,14 @@ SPREAD = ((7.2 / SHOT_ON_MOSAIC, 11.4 / SHOT_ON_MOSAIC), (2.2 / READ_ON_MOSAIC, 
 """Limits of a camera's shot_var and read_var, relative to those of its profile."""
 
 _ROUNDING = 1e-9
-"""Largest difference between the logarithms of one ISO."""
+"""Largest difference between logarithms that count as one ISO."""
 
 
 class Profiles(NamedTuple):
     """The usable rows of darktable's N cameras.
 
     Args:
-        names: maker and model of each.
+        names: maker and model of each camera.
         table: float64 ``(3, N, R)``, logarithms of ISO, shot_var and read_var; ISO ascends, and is infinite after a
             camera's last row.
         rows: ``(N,)`` number of rows of each camera.
@@ -61,7 +61,7 @@ class Profiles(NamedTuple):
 
 @cache
 def load_profiles() -> Profiles:
-    """Load the package's ``profiles.tsv``; where a camera has an ISO twice, the geometric mean counts."""
+    """Load the package's ``profiles.tsv``; if a camera has an ISO twice, their geometric mean is used."""
     cameras: dict[str, dict[float, list[list[float]]]] = {}
     text = resources.files("rawaug.noise").joinpath("profiles.tsv").read_text("utf-8")
     for line in text.splitlines()[2:]:
@@ -83,7 +83,7 @@ def load_profiles() -> Profiles:
 
 
 def _table_of(levels_by_iso: dict[float, list[list[float]]]) -> Tensor:
-    """Rows of log ISO, log shot_var and log read_var, ``(R, 3)``, by ISO ascending."""
+    """Make rows of log ISO, log shot_var and log read_var, ``(R, 3)``, in ascending order of ISO."""
     rows = []
     for log_iso, levels in sorted(levels_by_iso.items()):
         mean = torch.tensor(levels, dtype=torch.float64).mean(dim=0)
@@ -92,17 +92,17 @@ def _table_of(levels_by_iso: dict[float, list[list[float]]]) -> Tensor:
 
 
 class ProfileLevels:
-    """The levels of one camera's profile, or of all profiles alike.
+    """The levels of one camera's profile, or of all profiles with equal probability.
 
-    Each picture draws an ISO, log-uniformly within the limits that its camera's profile has. The levels of any camera
-    are drawn within :data:`SPREAD` as well; those of one camera are the middle of it.
+    Each picture draws an ISO, log-uniformly within the range of its camera's profile. For ``any camera`` the levels are
+    drawn within :data:`SPREAD` as well; for one camera they are the middle of it.
 
     Args:
         camera: maker and model, or ``any camera``.
-        iso: one ISO, the limits of the draw, or None for all that was measured.
+        iso: one ISO, the limits of the draw, or None for the whole measured range.
 
     Raises:
-        ValueError: if the camera has no profile, or none reaches the ISO.
+        ValueError: if the camera has no profile, or no profile reaches the ISO.
     """
 
     def __init__(self, camera: str = ANY_CAMERA, iso: Iso = None) -> None:
@@ -148,13 +148,13 @@ class ProfileLevels:
 
 
 def _interpolate(log_levels: Tensor, right: Tensor, weight: Tensor) -> Tensor:
-    """Levels ``(B,)`` between the columns ``right - 1`` and ``right`` of rows ``(B, R)`` of logarithms."""
+    """Interpolate levels ``(B,)`` between the columns ``right - 1`` and ``right`` of rows ``(B, R)`` of logarithms."""
     log_level = torch.lerp(log_levels.gather(1, right - 1), log_levels.gather(1, right), weight)
     return torch.exp(log_level)[:, 0].float()
 
 
 class LevelEnds(NamedTuple):
-    """The least and the greatest levels that one camera is likely to have at an ISO, white = 1."""
+    """The lowest and the highest levels that one camera is likely to have at an ISO, white = 1."""
 
     iso: float
     shot_var: tuple[float, float]
@@ -162,7 +162,7 @@ class LevelEnds(NamedTuple):
 
 
 def profile_ends(camera: str) -> list[LevelEnds]:
-    """Say how far the levels of a camera's profile are known, at its lowest ISO and at each doubling of it.
+    """Say how well the levels of a camera's profile are known, at its lowest ISO and at each doubling of it.
 
     Raises:
         ValueError: if the camera has no profile.

@@ -1,16 +1,16 @@
-r"""Sensor noise beyond shot and read noise, each effect a model that composes with the others.
+r"""Sensor noise beyond shot and read noise; each effect is a model that can be combined with the others.
 
-Row and column noise (banding), heavy-tailed read noise, errors of the black level, greens that disagree, dead and hot
-pixels and rounding to digital numbers, after Wei et al., "A physics-based noise formation model for extreme low-light
-raw denoising", 2020. All of it is on black-subtracted RAW with white = 1. The heavy tails are those of the Tukey
-lambda,
+The effects are row and column noise (banding), heavy-tailed read noise, errors of the black level, greens that
+disagree, dead and hot pixels, and rounding to digital numbers, after Wei et al., "A physics-based noise formation model
+for extreme low-light raw denoising", 2020. All act on black-subtracted RAW with white = 1. The heavy tails follow the
+Tukey lambda distribution,
 
 .. math:: Q(u) = (u^\lambda - (1 - u)^\lambda) / \lambda, \qquad \lambda > -1/2,
 
-logistic at 0, near the normal at 0.14, heavier the lower the shape (Joiner and Rosenblatt 1971).
+which is logistic at 0, near the normal at 0.14, and heavier the lower the shape (Joiner and Rosenblatt 1971).
 
 Models in sequence, y -> model 1 -> model 2 -> ..., are clipped at white once, at the end; the variances of independent
-ones add up. Their parameters share one dictionary and one seed a picture, from which each draws its own stream.
+ones add up. Their parameters share one dictionary and one seed per picture, from which each model draws its own stream.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from rawaug.noise.models import (
 from rawaug.registry import require_between
 
 _NO_STEP = 1e-12
-"""Replaces a quantum of 0, where nothing is rounded."""
+"""Replaces a quantum of 0, which means that nothing is rounded."""
 
 Range = float | tuple[float, float]
 """One value for all pictures, or the limits between which each picture draws its own."""
@@ -64,7 +64,7 @@ def draw_between(value: Range, batch: int, generator: torch.Generator) -> Tensor
 
 @cache
 def _tukey_lambda_variance(shape: float) -> float:
-    """The variance of the Tukey lambda distribution of scale 1; up to a shape of -1/2 it is infinite: ValueError."""
+    """The variance of the Tukey lambda distribution of scale 1; ValueError for shapes up to -1/2: it is infinite."""
     from scipy.stats import tukeylambda
 
     if shape <= -0.5:
@@ -78,7 +78,7 @@ class TukeyLambdaNoise(PoissonGaussianNoise):
     def __init__(self, levels: NoiseLevels, shape: float | tuple[float, float]) -> None:
         super().__init__(levels)
         self.shape = shape if isinstance(shape, tuple) else (shape, shape)
-        _tukey_lambda_variance(min(self.shape))  # raises for an infinite variance
+        _tukey_lambda_variance(min(self.shape))  # raises ValueError for an infinite variance
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         """Draw levels, seeds and the shape ``tukey_lambda`` of the tails, each ``(batch,)``."""
@@ -132,7 +132,7 @@ class _Banding(NoiseModel):
         return torch.add(clean, lines[:, self.line_of_plane], out=out)
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
-        """The variance of the lines, the same at every site of a picture, ``(B, 4, h, w)``."""
+        """The variance of the lines, which is the same at every site of a picture, ``(B, 4, h, w)``."""
         return per_picture(params[self.key], clean).expand_as(clean).clone()
 
 
@@ -151,10 +151,10 @@ class ColumnNoise(_Banding):
 
 
 class _FixedPattern(NoiseModel):
-    """An error that is the same all over a picture: it moves the mean and adds no variance from pixel to pixel."""
+    """An error that is constant over a picture: it moves the mean and adds no variance from pixel to pixel."""
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
-        """No variance, ``(B, 4, h, w)``."""
+        """Return zeros ``(B, 4, h, w)``, as there is no variance."""
         return torch.zeros_like(clean)
 
 
@@ -188,12 +188,12 @@ class ColourBias(BlackOffset):
 
 
 class GreenImbalance(BlackOffset):
-    r"""Greens of the red and the blue rows that differ in gain, as red and blue neighbours leak into them unequally.
+    r"""A gain difference between the greens of red and blue rows, as red and blue neighbours leak in unequally.
 
     .. math:: y'_{Gr} = (1 + e/2) \, y_{Gr}, \qquad y'_{Gb} = (1 - e/2) \, y_{Gb}, \qquad e \sim N(0, sd^2)
 
-    with one e a picture; the mean of both greens and the clean target stay as they are. Where a developed picture is
-    smooth, such an imbalance shows as a maze.
+    with one e per picture. The mean of both greens and the clean target stay as they are. In smooth areas of a
+    developed picture, such an imbalance shows as a maze.
 
     Args:
         sd: standard deviation of the relative difference e, typically 0.01.
@@ -212,8 +212,8 @@ class DefectPixels(_FixedPattern):
     """Dead pixels, which read black, and hot ones, which add a dark current of U(0, 1); ``variance`` leaves them out.
 
     Args:
-        dead, hot: the share of pixels, typically 1e-5 to 1e-3, or a range of it.
-        clusters: the share of these, 0 to 1, whose whole 2 x 2 cell is defective.
+        dead, hot: the share of pixels, typically 1e-5 to 1e-3, or a range to draw it from.
+        clusters: the share of the defects, 0 to 1, whose whole 2 x 2 cell is defective.
     """
 
     stream = "defects"
@@ -235,7 +235,7 @@ class DefectPixels(_FixedPattern):
         return shares | {"seed": draw_seeds(batch, generator)}
 
     def generators(self, params: Params, device: torch.device) -> Iterator[torch.Generator]:
-        """Yield one generator for each picture; frames of a burst have the defects of one sensor."""
+        """Yield one generator for each picture; all frames of a burst have the defects of one sensor."""
         return super().generators({**params, "seed": params.get("sensor_seed", params["seed"])}, device)
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
@@ -259,11 +259,11 @@ def _largest(share: Range) -> float:
 
 
 class Quantisation(NoiseModel):
-    """Rounding to the sensor's digital numbers; its variance, a twelfth of a squared step, needs noise of half a step.
+    """Rounding to the sensor's digital numbers; a variance of a twelfth of a squared step needs noise of half a step.
 
     Args:
-        bits: the sensor's depth, 1 to 16, or several, of which each picture has one.
-        black_level: in digital numbers; the grid has 2^bits - 1 - black_level steps from black to white.
+        bits: the sensor's depth, 1 to 16, or several depths, of which each picture draws one.
+        black_level: the black level in digital numbers; 2^bits - 1 - black_level steps lead from black to white.
     """
 
     stream = "quantisation"
@@ -293,12 +293,12 @@ class Quantisation(NoiseModel):
         return torch.div(clean, quantum, out=out).round_().mul_(quantum)
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
-        """A twelfth of the squared step, ``(B, 4, h, w)``."""
+        """Return a twelfth of the squared step, ``(B, 4, h, w)``."""
         return (per_picture(params["quantum"], clean).square() / 12).expand_as(clean).clone()
 
 
 class Compose(NoiseModel):
-    """Several models of different streams, which are applied in order.
+    """Several models with different streams, applied in order.
 
     Example:
         >>> model = Compose([ShotReadNoise(FixedLevels(1e-3, 1e-5)), RowNoise(1e-6), Quantisation(bits=12)])
@@ -336,17 +336,17 @@ _ABSENT = {
     "row_var": 0.0, "column_var": 0.0, "black_offset": 0.0, "colour_bias": 0.0, "dead_share": 0.0, "hot_share": 0.0,
     "quantum": 0.0, "told": 1.0, "tukey_lambda": 0.14, "green_imbalance": 0.0,
 }  # fmt: skip
-"""The parameters of :class:`SensorNoise` where an effect is absent; a shape of 0.14 is near the normal."""
+"""The values of :class:`SensorNoise`'s parameters if an effect is absent; a shape of 0.14 is near the normal."""
 
 
 @NOISE.register("SensorNoise")
 class SensorNoise(Compose):
-    """Shot and read noise with a switch for everything else that a sensor does; effects set to 0 or None are off.
+    """Shot and read noise with a switch for every other effect of a sensor; effects set to 0 or None are off.
 
     Args:
         levels: a law of (shot_var, read_var), or a name or pair that :func:`noise_levels` knows.
-        poisson: exact photon statistics instead of the Gaussian.
-        tukey_lambda: shape of heavy-tailed read noise instead of Gaussian, or a range of it. Implies ``poisson``.
+        poisson: use exact photon statistics instead of the Gaussian.
+        tukey_lambda: shape of heavy-tailed read noise, or a range of it, instead of Gaussian. Implies ``poisson``.
         row_var, column_var: variance of banding along rows and columns, white = 1, or a range of it.
         black_offset_sd: standard deviation of the black level's error, white = 1.
         colour_bias_sd: standard deviation of the colours' offsets, white = 1.
@@ -354,9 +354,9 @@ class SensorNoise(Compose):
         dead, hot: shares of defective pixels, or ranges of them; see :class:`DefectPixels`.
         clusters: share of the defects, 0 to 1, whose whole 2 x 2 cell is defective.
         bits, black_level: the grid of digital numbers; see :class:`Quantisation`.
-        told: range of a factor that the variance map is off by, as the levels in a file's tags can be.
-        share: of the pictures that have an effect, 0 to 1, drawn for each effect on its own. All have shot and read
-            noise: below 1 a denoiser learns real sensors without forgetting ideal ones.
+        told: range of the factor by which the variance map is wrong, as the levels in a file's tags can be.
+        share: share of the pictures that have an effect, 0 to 1, drawn for each effect separately. All pictures have
+            shot and read noise. Below 1 a denoiser learns real sensors without forgetting ideal ones.
 
     Raises:
         ValueError: if a variance or share is out of its range, or the levels are unknown.
@@ -391,7 +391,7 @@ class SensorNoise(Compose):
         if isinstance(levels, (str, Sequence)):
             levels = noise_levels(levels)
 
-        # The greens differ in the light that they get, and photons are counted after that.
+        # The greens differ in the light that they receive, and photons are counted after that.
         models: list[NoiseModel] = []
         if green_imbalance:
             models.append(GreenImbalance(green_imbalance))
@@ -418,7 +418,7 @@ class SensorNoise(Compose):
         super().__init__(models)
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        """Draw the parameters of all effects; those that a picture lacks have their value of absence."""
+        """Draw the parameters of all effects; those that a picture lacks keep their value of absence."""
         params = super().sample(batch, generator)
         if self.told != (1.0, 1.0):
             params["told"] = log_uniform(self.told, batch, generator)
@@ -430,7 +430,7 @@ class SensorNoise(Compose):
         return params
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
-        """Add up the variances ``(B, 4, h, w)``, wrong by the factor ``told`` as a file's tag may be."""
+        """Add up the variances ``(B, 4, h, w)``, then multiply by the factor ``told``, as a file's tag may be wrong."""
         variance = super().variance(clean, params)
         if "told" not in params:
             return variance
@@ -441,11 +441,11 @@ class SensorNoise(Compose):
 class EldNoise(Compose):
     """ELD's full model of one of its five cameras: photons, Tukey-lambda read noise, banding, colour bias and rounding.
 
-    Each picture draws one gain K, which all scales follow, and one of the measured shapes of the tails.
+    Each picture draws one gain K, which determines all scales, and one of the measured shapes of the tails.
 
     Args:
         camera: ``CanonEOS5D4``, ``CanonEOS700D``, ``CanonEOS70D``, ``NikonD850`` or ``SonyA7S2``.
-        iso: one ISO, limits, or None for all of 100 to 6400.
+        iso: one ISO, limits, or None for the whole range of 100 to 6400.
     """
 
     def __init__(self, camera: str, iso: Iso = None) -> None:
@@ -459,7 +459,7 @@ class EldNoise(Compose):
         super().__init__([tails, RowNoise(0.0), bias, rounding])
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        """Draw the parameters of all effects, each ``(batch,)``, at one gain a picture."""
+        """Draw the parameters of all effects, each ``(batch,)``, at one gain per picture."""
         gain = self.law.sample_gain(batch, generator)
         index = torch.randint(len(self.shapes), (batch,), generator=generator, device=generator.device)
         shape = self.shapes.to(generator.device)[index]

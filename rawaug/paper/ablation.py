@@ -1,8 +1,8 @@
-r"""What the stages of an ISP are worth, on frames that no stage of a fit has seen.
+r"""Measures what the stages of an ISP are worth, on frames that no stage of a fit has seen.
 
-PSNR of every intermediate image ``x, x1, ..., x5`` of the reverse pass against the demosaiced RAW, in RGB, in luminance
-Y and in chrominance UV (ITU-R BT.601), as in the ablation figure of Conde et al., AAAI 2022; with each frame's as-shot
-gains and blind. And the other way round: fits that lack one stage.
+The PSNR of every intermediate image ``x, x1, ..., x5`` of the reverse pass is measured against the demosaiced RAW, in
+RGB, in luminance Y and in chrominance UV (ITU-R BT.601), as in the ablation figure of Conde et al., AAAI 2022, with
+each frame's as-shot gains and blind. Fits that lack one stage are measured as well.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.progress import progress
 
 YUV = ((0.299, 0.587, 0.114), (-0.14713, -0.28886, 0.436), (0.615, -0.51499, -0.10001))
-"""The matrix from RGB to YUV of ITU-R BT.601."""
+"""This is the matrix from RGB to YUV of ITU-R BT.601."""
 TITLES = ("x", "x1 tone", "x2 gamma", "x3 colour", "x4 gains", "x5 shading")
 SPACES = ("RGB", "Y", "UV")
 LEFT_OUT = ("tone", "colour", "gains", "shading")
 STRIDE = 4
-"""Step between the pixels of a registered frame that are compared, in both directions."""
+"""The pixels of a registered frame that are compared are this far apart in both directions."""
 CLIPPED = 0.98
 """Pixels of a registered frame with a value from here on are left out."""
 
@@ -67,7 +67,7 @@ class Ablation:
     out: str = "runs"
 
     def shortest(self) -> Ablation:
-        """A few steps on two frames."""
+        """Take a few steps on two frames."""
         return replace(self, count=2, fit=self.fit.shortest())
 
 
@@ -104,7 +104,7 @@ def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
 
 
 def _first_pairs(ablation: Ablation) -> list[Pair]:
-    """The pairs to use; ValueError if there are fewer than two."""
+    """Open the pairs to use; raise ValueError if there are fewer than two."""
     readable = skip_broken(open_pairs(ablation.data, split="train"), "data")
     pairs = list(islice(readable, ablation.count))
     if len(pairs) < 2:
@@ -113,7 +113,7 @@ def _first_pairs(ablation: Ablation) -> list[Pair]:
 
 
 class FrameFigures(NamedTuple):
-    """What is measured of a frame.
+    """The figures that are measured on a frame.
 
     Args:
         curves: by setting, ``blind`` or ``as-shot gains``, the PSNR in dB of 6 stages in 3 spaces.
@@ -141,7 +141,7 @@ def measure(others: Sequence[Pair], test_pair: Pair, config: FitConfig) -> Frame
 
 
 def mean_curves(frames: Sequence[FrameFigures]) -> dict[str, list[list[float]]]:
-    """The mean of the frames' curves, by setting."""
+    """Compute the mean of the frames' curves, by setting."""
     means = {}
     for setting in frames[0].curves:
         curves = torch.tensor([frame.curves[setting] for frame in frames])
@@ -150,7 +150,7 @@ def mean_curves(frames: Sequence[FrameFigures]) -> dict[str, list[list[float]]]:
 
 
 def mean_without(frames: Sequence[FrameFigures]) -> dict[str, float]:
-    """The mean PSNR_r in dB without a stage, by stage."""
+    """Compute the mean PSNR_r in dB without a stage, by stage."""
     means = {}
     for stage in frames[0].without:
         means[stage] = fmean(frame.without[stage] for frame in frames)
@@ -172,7 +172,7 @@ def _print(result: dict[str, Any]) -> None:
 
 @torch.no_grad()
 def stage_psnr(isp: DictionaryISP, pair: Pair, white_balance: bool) -> list[list[float]]:
-    """PSNR in dB of x, x1 ... x5 in RGB, Y and UV: 6 rows of 3; a stage that is left out repeats the one before."""
+    """Compute PSNR in dB of x, x1 ... x5 in RGB, Y and UV: 6 rows of 3; a missing stage repeats the one before."""
     srgb, raw, coordinates, unclipped = _comparable_pixels(pair)
     params = isp.choose(pair.srgb[None])
     if white_balance:
@@ -192,7 +192,7 @@ def stage_psnr(isp: DictionaryISP, pair: Pair, white_balance: bool) -> list[list
 
 
 def _comparable_pixels(pair: Pair) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """sRGB, RAW of three colours, coordinates and the mask of unclipped pixels, all ``(1, C, h, w)``."""
+    """Give sRGB, RAW of three colours, coordinates and the mask of unclipped pixels, all ``(1, C, h, w)``."""
     if not pair.registered:
         blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
         return blocks.srgb[None], blocks.raw[None], blocks.coordinates, (~blocks.clipped)[None, None]

@@ -3,8 +3,8 @@ r"""InvISP's own figure: the PSNR of demosaiced, white-balanced and gamma-compre
 .. math:: z(y) = \left(\frac{w}{\max w} \, \mathrm{demosaic}(y)\right)^{1/2.2}, \qquad
     \mathrm{PSNR} = -10 \log_{10} \mathrm{mean} (z(\hat y) - z(y))^2
 
-with the as-shot white balance w, bilinear interpolation and :math:`\hat y` within [0, 1]: the mean over a frame's 3 x 3
-equal pieces, which begin at even sites here. Source: Xing et al., CVPR 2021, and the authors' published scripts.
+with the as-shot white balance w, bilinear interpolation and :math:`\hat y` within [0, 1]. It is averaged over a frame's
+3 x 3 equal pieces, which begin at even sites here. Source: Xing et al., CVPR 2021, and the authors' published scripts.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from rawaug.metrics import psnr
 
 GAMMA = 2.2
 PARTS = 3
-"""Number of pieces along each side of a frame."""
+"""A frame has this many pieces along each side."""
 
 
 @torch.no_grad()
 def balanced_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair) -> float:
-    """InvISP's PSNR in dB, the mean over nine pieces; ValueError if the pair is not registered.
+    """Compute InvISP's PSNR in dB, the mean over nine pieces; raise ValueError if the pair is not registered.
 
     ``make`` maps sRGB ``(1, 3, h, w)`` and its coordinates in the frame ``(1, 2, h, w)`` to RAW ``(1, 1, h, w)``.
     """
@@ -47,13 +47,13 @@ def balanced_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair) -> float
 
 
 def even_edges(side: int) -> list[int]:
-    """Where the equal pieces of a side begin and end, at even places but for the last."""
+    """Find where the equal pieces of a side begin and end, at even places except for the last."""
     edges = [part * side // PARTS // 2 * 2 for part in range(PARTS)]
     return [*edges, side]
 
 
 def balanced(raw: Tensor, pair: Pair) -> Tensor:
-    """z of a mosaic ``(1, 1, h, w)``, of shape ``(1, 3, h, w)``."""
+    """Compute z of a mosaic ``(1, 1, h, w)``, of shape ``(1, 3, h, w)``."""
     gains = torch.tensor(pair.white_balance)
     gains = gains / gains.max()
     colour = bayer.demosaic(raw, pair.cfa) * gains.reshape(3, 1, 1)

@@ -1,7 +1,7 @@
-"""PSNR_d: the PSNR, on real RAW, of a denoiser that is trained on the RAW that a method makes of sRGB pictures.
+"""PSNR_d, the PSNR on real RAW of a denoiser that is trained on the RAW that a method makes of sRGB pictures.
 
 Pictures, network, steps and noise are the same for every method. The dictionary ISP draws camera settings from its
-hull, UPI from its published distributions; a network has one answer.
+hull, and UPI draws them from its published distributions; a network has only one answer.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ from rawaug.training.loop import train
 from rawaug.training.stream import TrainingStream
 
 SHORTEST_CROP = 256
-"""Side of the part of a test frame that a dry run scores, in pixels."""
+"""A dry run scores a part of a test frame with this side, in pixels."""
 
 
 @dataclass
 class DownstreamConfig:
-    """How PSNR_d is measured.
+    """The settings by which PSNR_d is measured.
 
     Args:
-        methods: the families of which it is measured.
+        methods: the families for which it is measured.
         test: RAW frames of unseen cameras; folders, or ``kind:path``.
         test_crop: side of the central crop scored of each test frame; null for the whole frame.
         test_count: number of frames of each of ``test``; null for all.
-        bin: K bins these frames K x K by colour site: clean references of real photographs.
+        bin: K bins these frames K x K by colour site, for clean references of real photographs.
         sampling: how the camera settings of a fitted ISP are drawn, see :class:`rawaug.plugin.draw.Draw`.
-        exposure: lowest and highest exposure in stops at which the RAW of a fitted ISP is drawn, for the test cameras'
-            headroom is not known; ISPs of published cameras and UPI's published distributions have their own.
-        noise: preset, in training and on the test frames.
+        exposure: lowest and highest exposure in stops at which the RAW of a fitted ISP is drawn, since the test
+            cameras' headroom is not known; ISPs of published cameras and UPI's published distributions have their own.
+        noise: preset of the noise, in training and on the test frames.
         denoiser: the network.
         train: the loop.
     """
@@ -70,7 +70,7 @@ class DownstreamConfig:
     train: TrainConfig = field(default_factory=TrainConfig)
 
     def shortest(self) -> DownstreamConfig:
-        """One step, one small test frame."""
+        """Take one step and one small test frame."""
         one = replace(self.train, steps=1, batch=2, warmup=1, validate_every=1, checkpoint_every=1)
         return replace(self, test_crop=SHORTEST_CROP, test_count=1, train=one)
 
@@ -82,14 +82,14 @@ def psnr_d(
     folder: Path,
     seed: int,
 ) -> float:
-    """Mean PSNR in dB, on the test frames, of a denoiser that is trained on a method's RAW.
+    """Measure the mean PSNR in dB, on the test frames, of a denoiser that is trained on a method's RAW.
 
     Args:
         model: makes the RAW.
         pictures: uint8 sRGB ``(3, H, W)``.
         config: network, loop, noise and test frames.
-        folder: of the training's files, one folder a seed in it, from which a stopped training goes on.
-        seed: of the training.
+        folder: folder of the training's files, with one folder for each seed, from which a stopped training resumes.
+        seed: seed of the training.
     """
     crops = crops_of(model, pictures, noise_model(config.noise), config)
     net = train_on(crops, config, folder, seed)
@@ -98,7 +98,7 @@ def psnr_d(
 
 
 def train_on(crops: Source, config: DownstreamConfig, folder: Path, seed: int) -> Denoiser:
-    """A denoiser trained on ``crops``; ``config``, ``folder`` and ``seed`` as in :func:`psnr_d`."""
+    """Train a denoiser on ``crops``; ``config``, ``folder`` and ``seed`` are as in :func:`psnr_d`."""
     stream = TrainingStream(None, crops, config.train.batch, 1.0, derive_seed(seed, "downstream"))
     samples = freeze_samples(crops, "watched")
     label = f"{folder.name} {seed}"
@@ -106,7 +106,7 @@ def train_on(crops: Source, config: DownstreamConfig, folder: Path, seed: int) -
 
 
 def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> list[Row]:
-    """The scores of a network on the test frames, whose noise is frozen with seed 0; ``cfa`` is the network's."""
+    """Score a network on the test frames, whose noise is frozen with seed 0; ``cfa`` is the network's."""
     noise = noise_model(config.noise)
     denoiser = RawDenoiser.of(net, cfa=cfa)
 
@@ -124,7 +124,7 @@ def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> list[Row]:
 def crops_of(
     model: BaselineISP | DictionaryISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig
 ) -> Source:
-    """The training samples that a method makes of pictures."""
+    """Make the training samples that a method gives for pictures."""
     if isinstance(model, BaselineISP):
         return MadeCrops(pictures, model.draw, model.cfa, noise, config.train.crop)
 
@@ -136,13 +136,13 @@ def crops_of(
 
 
 class MadeCrops:
-    """Crops of pictures, turned at random, made RAW by any function.
+    """Crops of pictures, turned at random and made into RAW by any function.
 
     Args:
         pictures: uint8 sRGB ``(3, H, W)``.
         make: maps float sRGB ``(1, 3, h, w)`` and a generator to a mosaic ``(1, 1, h, w)``.
         cfa: the pattern of these mosaics.
-        noise: drawn for each crop.
+        noise: the noise that is drawn for each crop.
         crop: side of the crops in pixels.
     """
 
@@ -163,7 +163,7 @@ class MadeCrops:
 
     @torch.no_grad()
     def draw(self, generator: torch.Generator) -> Sample:
-        """A sample of packed RAW ``(4, crop / 2, crop / 2)``."""
+        """Draw a sample of packed RAW ``(4, crop / 2, crop / 2)``."""
         index = int(torch.randint(len(self.pictures), (), generator=generator))
         patch = self.turn(self.crop(self.pictures[index], generator), generator)
         raw = self.make(as_float(patch[None]), generator).clamp(0.0, 1.0)

@@ -1,8 +1,8 @@
 """The methods of the reconstruction table, on equal terms: fitted to the same pairs, scored on the same patches.
 
-A family is fitted once and may fill several rows: the dictionary ISP blind, with the as-shot white balance, and with 64
-RAW samples. Networks that can hide RAW in a picture have a row for RAW that comes back from their own rendering. A
-shipped ISP, or the file of one, is not fitted; a frame that it was fitted to before is marked.
+A family is fitted once and may fill several rows: the dictionary ISP is scored blind, with the as-shot white balance,
+and with 64 RAW samples. Networks that can hide RAW in a picture have a row for RAW that comes back from their own
+rendering. A shipped ISP, or the file of one, is not fitted; a frame that it was fitted to before is marked.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
 ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples", "own": "own rendering"}
 SAMPLES = 64
 PIXELS = 8192
-"""Number of pixels of a frame on which the forward pass is scored."""
+"""The forward pass is scored on this many pixels of a frame."""
 Method = BaselineISP | DictionaryISP
 Maker = Callable[[Tensor, Tensor], Tensor]
-"""Maps an sRGB patch ``(1, 3, h, w)`` and its coordinates in the frame to a mosaic ``(1, 1, h, w)``."""
+"""It maps an sRGB patch ``(1, 3, h, w)`` and its coordinates in the frame to a mosaic ``(1, 1, h, w)``."""
 
 
 class Fitted(NamedTuple):
@@ -57,7 +57,7 @@ class Fitted(NamedTuple):
 
 
 def resume(path: Path, key: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """The figures in ``path`` if an earlier run wrote them under the same key; else they are measured and written."""
+    """Read the figures in ``path`` if an earlier run wrote them under the same key; else measure and write them."""
     if path.is_file():
         figures: dict[str, Any] = json.loads(path.read_text())
         if figures.get("key") == key:
@@ -69,7 +69,7 @@ def resume(path: Path, key: str, measure: Callable[[], dict[str, Any]]) -> dict[
 
 
 def is_method(family: str) -> bool:
-    """Whether this is a family to fit, the name of a shipped ISP, or the file of one."""
+    """Tell whether this is a family to fit, the name of a shipped ISP, or an ISP's file."""
     if family in FAMILIES:
         return True
     try:
@@ -80,7 +80,7 @@ def is_method(family: str) -> bool:
 
 
 def learns_by_descent(family: str) -> bool:
-    """Whether a family trains on crops: it has a budget, and needs pairs that are registered pixel by pixel."""
+    """Tell whether a family trains on crops: it then has a budget and needs pairs registered pixel by pixel."""
     return family in BASELINES and issubclass(BASELINES[family], CropTrainedISP)
 
 
@@ -96,7 +96,7 @@ def fit_family(
     Args:
         family: one of :data:`FAMILIES`, or an ISP to take as it is, by a shipped one's name or a file.
         pairs: the frames to fit.
-        config: of the dictionary ISP.
+        config: settings of the dictionary ISP's fit.
         training: budget and crops of the networks; its seed is used by every family.
         sizes: settings of the baseline's class, such as the width of a network; None for the published ones.
 
@@ -126,7 +126,7 @@ def fit_family(
 
 
 def end_to_end(info: Mapping[str, Any]) -> dict[str, Any]:
-    """The steps and the curve of an ISP's end-to-end training, from the record of its fit; empty without one.
+    """Give the steps and the curve of an ISP's end-to-end training from its fit's record; empty without one.
 
     The curve has the squared error on held-out frames, as the curves of networks have their losses.
     """
@@ -140,7 +140,7 @@ def end_to_end(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def reverse_parameters(model: Method) -> int:
-    """Number of parameters of the reverse pass."""
+    """Count the parameters of the reverse pass."""
     counted = getattr(model, "reverse_network", model)
     total = 0
     for name, parameter in counted.named_parameters():
@@ -158,9 +158,9 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None, balanced: bool =
 
     Args:
         fitted: the method.
-        pair: the frame. One that is not registered is compared as averages over blocks, and has PSNR_r alone.
+        pair: the frame. One that is not registered is compared as averages over blocks, and has only PSNR_r.
         patches: number of random patches; None scores all.
-        balanced: whether InvISP's figure (:mod:`rawaug.paper.balanced`) is measured as well, on the whole frame.
+        balanced: whether InvISP's figure (:mod:`rawaug.paper.balanced`) is also measured, on the whole frame.
 
     Returns:
         ``rows``, the PSNR_r in dB of every row that the family fills; ``balanced``, InvISP's figure of each, or empty;
@@ -208,14 +208,14 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None, balanced: bool =
 
 
 def maker_of(model: Method, setting: Any) -> Maker:
-    """The function that makes RAW of a patch under a setting."""
+    """Make the function that turns a patch into RAW under a setting."""
     if isinstance(model, DictionaryISP):
         return lambda patch, coordinates: model.reverse(patch, setting, coordinates=coordinates).raw
     return lambda patch, coordinates: model.reverse(patch, setting)
 
 
 def settings(model: Method, pair: Pair) -> dict[str, Any]:
-    """Make the camera setting of each row; a method that makes no use of gains has one row."""
+    """Make the camera setting of each row; a method that does not use gains has one row."""
     if isinstance(model, DictionaryISP):
         return dictionary_params(model, pair)
 
@@ -229,9 +229,9 @@ def settings(model: Method, pair: Pair) -> dict[str, Any]:
 
 @torch.no_grad()
 def own_rendering(model: Method, pair: Pair) -> Pair | None:
-    """The pair with the picture that the method itself renders of the RAW, stored as a JPEG of quality 90.
+    """Replace the picture of a pair by the method's own rendering of the RAW, stored as a JPEG of quality 90.
 
-    That is what InvISP's published figures are of. None for methods that are not made to hide RAW in their pictures.
+    InvISP's published figures are for this case. None is returned for methods that do not hide RAW in their pictures.
     """
     if not isinstance(model, CompressedISP):
         return None
@@ -255,7 +255,7 @@ def _block_rows(model: Method, pair: Pair) -> dict[str, float]:
 
 @torch.no_grad()
 def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
-    """The camera settings of the dictionary's rows for a frame."""
+    """Make the camera settings of the dictionary's rows for a frame."""
     blind = isp.choose(pair.srgb[None])
     rows = {"blind": blind}
     if pair.balance_known:
@@ -280,10 +280,10 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
 
 @torch.no_grad()
 def forward_psnr(model: Method, pair: Pair) -> float | None:
-    """PSNR in dB of the way from RAW to sRGB, pixel by pixel, under what the method finds in the RAW.
+    """Measure PSNR in dB from RAW to sRGB, pixel by pixel, under the setting that the method finds in the RAW.
 
-    CycleISP is given the picture itself for its colours, as published. None for methods that do not render, and where
-    the dictionary's frame does not state its colours.
+    CycleISP is given the picture itself for its colours, as published. None is returned for methods that do not render,
+    and if the dictionary's frame does not state its colours.
     """
     if isinstance(model, DictionaryISP):
         if not pair.color_known:
@@ -302,17 +302,17 @@ def forward_psnr(model: Method, pair: Pair) -> float | None:
 
 
 def can_render(model: BaselineISP) -> bool:
-    """Whether a baseline renders RAW, as it was trained."""
+    """Tell whether a baseline, as it was trained, renders RAW."""
     return model.renders and getattr(model, "both", True)
 
 
 @torch.no_grad()
 def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
-    """Mean PSNR in dB of a method from sRGB to RAW and back, over uint8 pictures ``(3, H, W)``.
+    """Measure the mean PSNR in dB of a method from sRGB to RAW and back, over uint8 pictures ``(3, H, W)``.
 
-    ``cycle`` is the paper's: the way back finds its own setting in the RAW, by encoders of its own. The dictionary ISP
-    has two more: ``cycle_same_setting`` hands the way back the setting of the way to RAW, and ``cycle_without_mosaic``
-    leaves out the mosaic as well. A method that does not render has none.
+    ``cycle`` is the paper's: the way back finds its own setting in the RAW, by its own encoders. The dictionary ISP has
+    two more: ``cycle_same_setting`` gives the way back the setting of the way to RAW, and ``cycle_without_mosaic`` also
+    leaves out the mosaic. A method that does not render has none.
     """
     model = fitted.model
     scores: dict[str, list[float]] = {}
@@ -326,7 +326,7 @@ def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
 
 
 def _cycles(model: Method, x: Tensor) -> dict[str, Tensor]:
-    """By way the pictures ``(B, 3, H, W)`` that come back of ``x``, of the same shape."""
+    """Compute, for each way, the pictures ``(B, 3, H, W)`` that come back from ``x``, of the same shape."""
     if not isinstance(model, DictionaryISP):
         if not can_render(model):
             return {}
@@ -342,13 +342,13 @@ def _cycles(model: Method, x: Tensor) -> dict[str, Tensor]:
 
 
 def cycle_without_mosaic(isp: DictionaryISP, srgb: Tensor) -> Tensor:
-    """sRGB ``(B, 3, H, W)`` to x5 and back to the same shape, under one setting: what the stages alone lose."""
+    """Convert sRGB ``(B, 3, H, W)`` to x5 and back under one setting, which shows what the stages alone lose."""
     params = isp.choose(srgb)
     return isp.forward_pixels(isp.reverse_pixels(srgb, params), params).clamp(0.0, 1.0)
 
 
 def mosaic_only_psnr(pictures: Sequence[Tensor], cfa: CFA | str = "RGGB") -> float:
-    """Mean PSNR in dB of pictures ``(3, H, W)`` after a mosaic and bilinear interpolation: the ceiling of a cycle."""
+    """Measure mean PSNR in dB of pictures ``(3, H, W)`` after mosaic and bilinear interpolation, a cycle's ceiling."""
     scores = []
     for picture in pictures:
         x = as_float(picture[None])

@@ -1,9 +1,9 @@
 """RAW reconstruction on equal terms: every method is fitted to the same pairs and scored on frames it has not seen.
 
-Without ``test`` the protocol is leave-one-out: a method is fitted on all frames but one, and scored on that one. With
-``test`` it is that of a published split: a method is fitted once to all frames, and scored on every frame of another
-set. PSNR_d is measured on frames of cameras that no method has seen. The figures of each fit go into a file of their
-own, so that a stopped run can resume.
+Without ``test``, the protocol is leave-one-out: a method is fitted on all frames but one, and scored on that one. With
+``test``, it is that of a published split: a method is fitted once to all frames, and scored on every frame of another
+set. PSNR_d is measured on frames of cameras that no method has seen. The figures of each fit go into a separate file,
+so that a stopped run can resume.
 """
 
 from __future__ import annotations
@@ -57,17 +57,17 @@ COLUMNS = {
     "psnr_r": "PSNR_r", "worst25": "worst 25%", "best25": "best 25%", "balanced": "balanced", "forward": "RAW to sRGB",
     "cycle": "cycle", "cycle_same_setting": "same setting", "cycle_without_mosaic": "no mosaic", "psnr_d": "PSNR_d",
 }  # fmt: skip
-"""Keys of a row and the headings of their columns."""
+"""This maps the keys of a row to the headings of their columns."""
 SHORTEST_SIDE = 128
-"""Side in pixels of the frames and pictures that a dry run scores."""
+"""A dry run scores frames and pictures of this side in pixels."""
 
 
 def print_methods(title: str, rows: Mapping[str, Mapping[str, Any]], ceiling: float) -> None:
     """Print the rows of a comparison.
 
     Args:
-        title: of the table.
-        rows: by name, as in ``table.json``.
+        title: title of the table.
+        rows: the rows by name, as in ``table.json``.
         ceiling: PSNR in dB that the mosaic alone leaves of a cycle.
     """
     columns = {}
@@ -86,7 +86,7 @@ def print_methods(title: str, rows: Mapping[str, Mapping[str, Any]], ceiling: fl
 
 
 def cells_of(row: Mapping[str, Any], columns: Sequence[str]) -> list[str]:
-    """A row of the table as text: the figures of ``columns``, parameters, seconds and speed."""
+    """Write a row of the table as text: the figures of ``columns``, parameters, seconds and speed."""
     cells = []
     for key in columns:
         value = row.get(key)
@@ -112,20 +112,20 @@ class Comparison:
         test: score on these pairs, of the split ``test``, instead of on frames left out of ``data``; frames of any
             pattern are brought to that of the first training frame.
         count: number of pairs of ``data`` to use; null for all.
-        select: which of them, as ``data.select`` of recipes that train.
+        select: which of them to use, as ``data.select`` of recipes that train.
         test_count: number of test pairs; null for all.
-        noise: preset added once to every frame; the dictionary ISP is then fitted to these noisy
+        noise: preset of the noise that is added once to every frame; the dictionary ISP is then fitted to these noisy
             frames and never sees a clean one, and the scores are against the clean frames. Null adds no noise.
         methods: families to fit: dictionary, dictionary-encoders and the baselines; or ISPs to take as they are, by
             a shipped one's name or a file.
         sizes: by baseline, settings in place of its published size, such as ``{unet: {width: 16}}``.
         seconds: training budget of methods trained by gradient descent, without file reading; null for none.
-        steps: their number of steps at most; null for no limit. With steps alone the same seed gives the same weights.
+        steps: largest number of their steps; null for no limit. With steps alone, the same seed gives the same weights.
         crop: side of the crops that these methods train on: small ones give more steps to a short budget.
-        batch: crops in a step of them.
+        batch: crops in a step of these methods.
         patches: random patches of each left-out frame that are scored; null scores all.
         test_crop: score only the middle of this side of each test frame; null for all of it. A lens shading is then
-            measured as if the middle were the frame, so this is for trying a recipe.
+            measured as if the middle were the frame, so this is only for trying a recipe.
         balanced: whether there is a column with InvISP's figure, on whole frames: PSNR of demosaiced, white-balanced
             and gamma-compressed RAW.
         pictures: sRGB pictures for the cycle and for PSNR_d.
@@ -188,7 +188,7 @@ class Comparison:
         return any(learns_by_descent(method) for method in self.methods)
 
     def shortest(self) -> Comparison:
-        """The comparison with one step of every method, on the middles of the first frames."""
+        """Shorten the comparison to one step of every method, on the middles of the first frames."""
         few: dict[str, Any] = {"count": 2, "test_count": 1, "patches": 1, "seeds": 1, "seconds": 0.1, "steps": 1}
         few |= {"picture_count": 2, "test_crop": SHORTEST_SIDE, "cycle_crop": SHORTEST_SIDE}
         downstream = self.downstream and self.downstream.shortest()
@@ -237,7 +237,7 @@ class ComparisonRun:
             self.cycle_pictures.append(picture)
 
     def all_rows(self) -> dict[str, dict[str, Any]]:
-        """All rows by name, which are printed, and written with every single figure."""
+        """Measure all rows by name, print them, and write them with every single figure."""
         settings = self.settings
         rows: dict[str, dict[str, Any]] = {}
         for family in settings.methods:
@@ -273,7 +273,7 @@ class ComparisonRun:
         return rows
 
     def _row(self, folds: Sequence[dict[str, Any]], row: str) -> dict[str, Any]:
-        """The figures of one row of a family."""
+        """Compute the figures of one row of a family."""
         names = names_of(self.scored)
         values = self._by_seed([fold["rows"][row] for fold in folds])
         worst, best = [], []
@@ -311,7 +311,7 @@ class ComparisonRun:
         return figures
 
     def _by_seed(self, values: Sequence[Any]) -> list[list[Any]]:
-        """The figures of all fits, a list of frames a seed."""
+        """Group the figures of all fits: a list of frames for each seed."""
         frames = len(self.scored)
         by_seed = []
         for first in range(0, len(values), frames):
@@ -319,7 +319,7 @@ class ComparisonRun:
         return by_seed
 
     def _fold(self, family: str, seed: int, frame: int) -> dict[str, Any]:
-        """The figures of a fit without one frame, scored on it; or of a fit to all, scored on a test frame."""
+        """Measure a fit without one frame, scored on it; or a fit to all frames, scored on a test frame."""
         settings = self.settings
         facts = [*self._fit_key(family, seed), settings.patches]
         if settings.test_crop is not None:
@@ -379,7 +379,7 @@ class ComparisonRun:
         return figures
 
     def _fit_to_all(self, family: str, seed: int) -> Fitted:
-        """The fit to all pairs, which serves the test frames, the cycle and PSNR_d."""
+        """Fit to all pairs, for the test frames, the cycle and PSNR_d."""
         key = fingerprint(*self._fit_key(family, seed))
         if key not in self._whole_fits:
             self._whole_fits[key] = self._fit(family, self.pairs, seed)
@@ -393,7 +393,7 @@ class ComparisonRun:
         return Training(settings.seconds, settings.steps, settings.crop, settings.batch, seed)
 
     def _fit_key(self, family: str, seed: int) -> tuple[Any, ...]:
-        """The settings and frames that a fit depends on."""
+        """List the settings and frames that a fit depends on."""
         settings = self.settings
         size = settings.sizes.get(family)
         frames = (settings.noise, settings.data, names_of(self.pairs), settings.test)
@@ -404,12 +404,12 @@ class ComparisonRun:
 
 
 def means_of(by_seed: Sequence[Sequence[float]]) -> list[float]:
-    """The mean over the frames of each seed."""
+    """Average over the frames of each seed."""
     return [fmean(values) for values in by_seed]
 
 
 def _training_frames(settings: Comparison, every: Sequence[Pair]) -> list[Pair]:
-    """The selected frames, all of one pattern, and registered where a method needs that."""
+    """Select the frames, all of one pattern, and registered if a method needs that."""
     selection = SomePairs(every, select_pairs(every, len(every), settings.count, settings.select))
     names = names_of(selection)
     for name in names:
@@ -433,7 +433,7 @@ def _training_frames(settings: Comparison, every: Sequence[Pair]) -> list[Pair]:
 
     if settings.noise is None:
         return pairs
-    noise = noise_model(settings.noise)  # frozen: keyed by the frame's name, as a noisy capture
+    noise = noise_model(settings.noise)  # frozen, keyed by the frame's name, as a noisy capture is
     captured = []
     for pair in pairs:
         noisy = trial_of(pair, noise).noisy
@@ -442,11 +442,11 @@ def _training_frames(settings: Comparison, every: Sequence[Pair]) -> list[Pair]:
 
 
 def _test_frames(settings: Comparison, every: Sequence[Pair]) -> Sequence[Pair]:
-    """The frames of ``test`` that can be read, none of which is in the data."""
+    """Find the frames of ``test`` that can be read, none of which is in the data."""
     test = open_pairs(str(settings.test), split="test")
     readable = Readable(SomePairs(test, range(len(test))[: settings.test_count]))
     for _ in skip_broken(readable, "test"):
-        pass  # each frame is read once, so that a damaged one is found before anything is fitted
+        pass  # each frame is read once, so a damaged one is found before anything is fitted
 
     scored = readable.kept()
     shared = shared_frame(scored, every)

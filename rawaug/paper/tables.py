@@ -1,7 +1,7 @@
-"""``rawaug run paper``: the paper's tables, its ablation and its cycle in one run, with its figures beside ours.
+"""``rawaug run paper``: the paper's tables, its ablation and its cycle in one run, with its figures next to ours.
 
-Each part is a recipe of its own, which runs in a folder below that of the whole and resumes by itself. Then one page,
-``report.html``, and one file, ``paper.json``, have all of them.
+Each part is a separate recipe, which runs in a subfolder of the whole run's folder and resumes by itself. In the end,
+one page, ``report.html``, and one file, ``paper.json``, have all of them.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ TITLES = {
     "ablation": "Ablation: PSNR against RAW after each stage",
 }
 SHORTEST_CROP = 64
-"""Side in pixels of what a dry run scores of a test frame."""
+"""A dry run scores a part of a test frame with this side in pixels."""
 Table = dict[str, dict[str, Any]]
-"""By row and column a figure, or None."""
+"""It has a figure, or None, by row and column."""
 
 
 @dataclass
@@ -49,14 +49,14 @@ class Paper:
         data: the pairs of all parts but table 2, in place of those that the parts name; null leaves them.
         test: the test pairs of these parts; null leaves those that they name.
         pictures: their sRGB pictures; null leaves those that they name.
-        parts: those to run now, in this order; the page has every part that was run before.
+        parts: the parts to run now, in this order; the page has every part that was run before.
         table1: RAW reconstruction, PSNR_d and the cycle.
         table2_nikon: RAW reconstruction of one DSLR.
-        table2_canon: of the other one.
+        table2_canon: RAW reconstruction of the other one.
         table3: denoising with all pairs; its arms are named tnrd, dncnn, dhdn, cycleisp and ours.
         few: the arm ours_f, with few pairs.
         unsupervised: the arm ours_u, from noisy frames alone.
-        ablation: after each stage.
+        ablation: the ablation, after each stage.
         out: folder of all runs.
     """
 
@@ -80,7 +80,7 @@ class Paper:
                 raise ValueError(f"parts: {part} is none; choose from {', '.join(PARTS)}")
 
     def shortest(self) -> Paper:
-        """All parts in their shortest form, on small test frames, since some filters take minutes for a whole one."""
+        """Shorten all parts, with small test frames, since some filters take minutes for a whole one."""
         parts: dict[str, Any] = {}
         for name in PARTS:
             settings = getattr(self, name)
@@ -93,7 +93,7 @@ class Paper:
         return replace(self, **parts)
 
     def part(self, name: str) -> Any:
-        """The settings of a part with the data of the whole, in a folder below that of the whole; None without it."""
+        """Give the settings of a part the data and a subfolder of the whole; return None without the part."""
         settings = getattr(self, name)
         if settings is None:
             return None
@@ -124,13 +124,13 @@ def run_paper(paper: Paper, overwrite: bool = False) -> dict[str, Any]:
     """Run the parts and write the page; ``overwrite`` replaces another run of its name.
 
     Returns:
-        By table (``table1``, ``table2``, ``table3``, ``ablation``) its rows, as ``paper.json`` has them.
+        The rows of each table (``table1``, ``table2``, ``table3``, ``ablation``), as ``paper.json`` has them.
     """
     require_free(paper, overwrite)
     for name in paper.parts:
         settings = paper.part(name)
         if isinstance(settings, Recipe):
-            find_classical(settings.classical, shown=False)  # a library that is missing is named before hours are spent
+            find_classical(settings.classical, shown=False)  # a missing library is named before hours are spent
 
     folder = claim(paper, overwrite)
     for name in paper.parts:
@@ -155,7 +155,7 @@ def run_paper(paper: Paper, overwrite: bool = False) -> dict[str, Any]:
 
 
 def read_tables(folder: Path) -> dict[str, Table]:
-    """The tables of the parts that were run in a folder, ours and the paper's figures side by side."""
+    """Read the tables of the parts that were run in a folder, with our and the paper's figures side by side."""
     tables = {}
 
     first = read_part(folder, "table1", "table")
@@ -184,7 +184,7 @@ def read_tables(folder: Path) -> dict[str, Table]:
 
 
 def read_part(folder: Path, part: str, stem: str) -> Any:
-    """The figures that a part left in its folder; None if it was not run to its end."""
+    """Read the figures that a part left in its folder; return None if it was not run to its end."""
     path = folder / part / f"{stem}.json"
     if not path.is_file():
         return None
@@ -192,14 +192,14 @@ def read_part(folder: Path, part: str, stem: str) -> Any:
 
 
 class Curve(NamedTuple):
-    """A training as its log has it: the last step, and the mean losses between validations."""
+    """A training as in its log: the last step, and the mean losses between validations."""
 
     steps: int
     losses: list[float]
 
 
 def read_curves(folder: Path, arms: Iterable[str]) -> dict[str, Curve]:
-    """The trainings of the arms of a recipe with their first seed; arms without a log are left out."""
+    """Read the trainings of a recipe's arms with their first seed; arms without a log are left out."""
     curves = {}
     for arm in arms:
         logs = sorted(folder.glob(f"seed*/{arm}/log.csv"))
@@ -216,7 +216,7 @@ def read_curves(folder: Path, arms: Iterable[str]) -> dict[str, Curve]:
 
 
 def reconstruction_table(rows: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Table 1 from the rows of a comparison."""
+    """Make table 1 from the rows of a comparison."""
     none = (None, None, None, None, None)
     cycles = {"dictionary-encoders": published.CYCLE}
     table: Table = {}
@@ -244,7 +244,7 @@ def reconstruction_table(rows: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def dslr_table(nikon: Mapping[str, Mapping[str, Any]], canon: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Table 2 from the rows of two comparisons, of which one may be empty."""
+    """Make table 2 from the rows of two comparisons, one of which may be empty."""
     table: Table = {}
     for name in {**nikon, **canon}:
         paper = published.TABLE_2.get(published.ISP_NAMES.get(name, ""), (None, None))
@@ -261,7 +261,7 @@ def dslr_table(nikon: Mapping[str, Mapping[str, Any]], canon: Mapping[str, Mappi
 
 
 def denoising_table(runs: Sequence[Mapping[str, Any]], curves: Mapping[str, Curve]) -> Table:
-    """Table 3 from the results of the recipes that train, with the self-ensemble where there is one.
+    """Make table 3 from the results of the recipes that train, with the self-ensemble if there is one.
 
     Args:
         runs: the results of the recipes.
@@ -311,7 +311,7 @@ def add_denoiser(
 
 
 def ablation_table(stages: Mapping[str, Sequence[Sequence[float]]]) -> Table:
-    """The ablation's curves by what is known of a frame and space, blind and with as-shot gains."""
+    """Make the ablation's table, by what is known of a frame and space, blind and with as-shot gains."""
     table: Table = {}
     for setting, rows in stages.items():
         for space, curve in zip(SPACES, zip(*rows, strict=True), strict=True):
@@ -323,14 +323,14 @@ def ablation_table(stages: Mapping[str, Sequence[Sequence[float]]]) -> Table:
 
 
 def row_name(name: str) -> str:
-    """A row's own name, with the paper's behind it."""
+    """Append the paper's name to a row's own name."""
     if name not in published.ISP_NAMES:
         return name
     return f"{name} ({published.ISP_NAMES[name]})"
 
 
 def still_falling(curve: Sequence[float] | None) -> float | None:
-    """By how many percent the loss of the last part of a training is below that of the part before."""
+    """Compute by how many percent the loss of a training's last part is below that of the part before."""
     if curve is None or len(curve) < 2:
         return None
     return 100.0 * (curve[-2] - curve[-1]) / curve[-2]
@@ -376,7 +376,7 @@ def compare_order(table: Table, column: str) -> Order:
 
 
 def mean_of(value: Any) -> float | None:
-    """The mean of a figure, which may be one a seed; None without it."""
+    """Average a figure, which may be one for each seed; return None without it."""
     if not isinstance(value, list):
         return value
 
@@ -387,7 +387,7 @@ def mean_of(value: Any) -> float | None:
 
 
 def cell(column: str, value: Any) -> str:
-    """A figure as text."""
+    """Write a figure as text."""
     if value is None or value == [None]:
         return ""
     if column == "steps":
@@ -402,7 +402,7 @@ def cell(column: str, value: Any) -> str:
 
 
 def columns_of(table: Table) -> list[str]:
-    """The columns that have a figure in any row."""
+    """List the columns that have a figure in any row."""
     columns: list[str] = []
     for cells in table.values():
         for column, value in cells.items():
@@ -412,7 +412,7 @@ def columns_of(table: Table) -> list[str]:
 
 
 def text_rows(table: Table) -> dict[str, list[str]]:
-    """The cells of a table as text, by row."""
+    """Write the cells of a table as text, by row."""
     columns = columns_of(table)
     rows = {}
     for name, cells in table.items():
@@ -441,7 +441,7 @@ ORDERED_BY = {"table1": ["PSNR_r", "PSNR_d"], "table2": ["Nikon PSNR_r", "Canon 
 
 
 def write_page(folder: Path, tables: Mapping[str, Table], settings: Mapping[str, Any]) -> Path:
-    """Write ``report.html``; its path."""
+    """Write ``report.html`` and return its path."""
     page = Page("The paper's tables", "The figures of Conde et al., AAAI 2022, beside those of this run.")
     if command_line():
         page.add(terms={"Command": command_line()})

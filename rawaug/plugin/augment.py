@@ -1,13 +1,13 @@
 r"""Online augmentation: sRGB pictures to noisy/clean RAW pairs.
 
-``y = isp^-1(x; C, g, T)`` with the camera setting (matrix, gains, tone curve) drawn from the hulls of the dictionaries'
-atoms, or of an ISP of published cameras as one camera in one light (:mod:`rawaug.isp.dictionary`), then
-``noisy ~ N(y, shot_var y + read_var)``, clipped at white, never at black (Conde et al., AAAI 2022, "Dictionary
-Augmentations").
+``y = isp^-1(x; C, g, T)`` inverts the camera's development. Its setting (matrix, gains, tone curve) is drawn from the
+hulls of the dictionaries' atoms or, for an ISP of published cameras, as one camera in one light
+(:mod:`rawaug.isp.dictionary`). Then noise is added, ``noisy ~ N(y, shot_var y + read_var)``. The result is clipped at
+white, never at black (Conde et al., AAAI 2022, "Dictionary Augmentations").
 
-:class:`RawAugment` works on batches, on the device of the batch. It draws its parameters first and applies them after,
-and the parameters replay the pair bit for bit. :mod:`rawaug.plugin.dataset` puts it behind a Dataset,
-:mod:`rawaug.plugin.loader` behind a DataLoader.
+:class:`RawAugment` works on batches, on the device of the batch. It first draws its parameters and then applies them;
+the same parameters reproduce the pair bit for bit. :mod:`rawaug.plugin.dataset` applies it to a Dataset,
+:mod:`rawaug.plugin.loader` to a DataLoader.
 """
 
 from __future__ import annotations
@@ -48,26 +48,27 @@ class RawAugment(PairMaker):
     that :mod:`rawaug.plugin.pictures` lists.
 
     Args:
-        isp: the camera; a frozen copy is taken, later changes do not reach it. A :class:`rawaug.Camera` stands for the
-            ISP ``universal`` with this camera.
+        isp: the camera. A frozen copy is taken, so later changes do not affect it. A :class:`rawaug.Camera` stands for
+            the ISP ``universal`` with this camera.
         noise: name of a preset or a measured camera, (shot_var, read_var), a law such as
             :class:`rawaug.noise.MeasuredLevels`, a :class:`rawaug.noise.NoiseModel`, or ``"camera"`` for the levels
             that were measured when the ISP was fitted, or that a :class:`rawaug.Camera` states.
-            By default those of the :class:`rawaug.Camera`, else ``"cycleisp_sidd"``.
+            The default is the noise of the :class:`rawaug.Camera`, else ``"cycleisp_sidd"``.
         draw: how cameras, lights, tone curves and exposures are drawn.
         target: what the pair holds. ``"raw"``: noisy and clean RAW. ``"rgb"``: noisy RAW, and clean linear camera RGB
             ``(B, 3, H, W)`` of the full size, for demosaicing. ``"srgb"`` or an :class:`Srgb`: both as sRGB
             ``(B, 3, H, W)`` in [0, 1], developed by the setting that made the RAW, and no variance map.
-        burst: number N of noisy frames of the scene that a pair holds, ``(B, N, ...)``, or a :class:`Burst`; clean is
-            that of the first. By default a single one, without the N.
+        burst: number N of noisy frames of the scene in a pair, ``(B, N, ...)``, or a :class:`Burst`. The clean frame
+            belongs to the first noisy one. By default there is a single frame, without the N.
         cfa: pattern of the RAW, by default the ISP's: another Bayer pattern, ``"XTRANS"``, or ``"QUAD-RGGB"`` and the
-            like. RAW of these last is a mosaic ``(B, 1, H, W)`` in place of packed RAW; see :mod:`rawaug.bayer`.
-        seed: of the module's own draws, where no generator is passed. They are counted from its construction: to
-            resume, pass a generator, or use RawPairs or wrap.
+            like. Patterns other than Bayer's give a mosaic ``(B, 1, H, W)`` instead of packed RAW; see
+            :mod:`rawaug.bayer`.
+        seed: seed of the module's own draws, used where no generator is passed. They are counted from its construction:
+            to resume, pass a generator, or use RawPairs or wrap.
 
     Raises:
-        ValueError: if a setting is unknown or out of range, or the noise is one of Bayer's planes and the pattern has
-            none.
+        ValueError: if a setting is unknown or out of range, or the noise distinguishes Bayer planes and the pattern
+            has none.
 
     Example:
         >>> augment = RawAugment(DictionaryISP(), noise="cycleisp_sidd")
@@ -97,7 +98,7 @@ class RawAugment(PairMaker):
         if noise is None:
             noise = usual_noise(isp)
 
-        # A Bayer pattern is a setting of the ISP; of others the colours are sampled after it.
+        # A Bayer pattern is a setting of the ISP; for other patterns the colours are sampled after it.
         if cfa is None:
             cfa = isp.info.get("pattern")
         self.pattern = None if cfa is None else pattern(cfa)
@@ -135,7 +136,7 @@ class RawAugment(PairMaker):
         self._calls = 0
 
     def with_draws(self, noise: AnyNoise, draw: Draw = Draw()) -> RawAugment:
-        """An augmentation with the same ISP, pattern and target but with other draws; nothing is baked again.
+        """Make an augmentation with the same ISP, pattern and target but other draws; nothing is baked again.
 
         Args:
             noise, draw: as in the constructor, whose errors they raise.
@@ -158,16 +159,16 @@ class RawAugment(PairMaker):
         cfa: str | None = None,
         seed: int = 0,
     ) -> RawAugment:
-        """Make an augmentation of a shipped ISP by its name, of an ISP's file, or of an ISP.
+        """Make an augmentation from the name of a shipped ISP, from an ISP's file, or from an ISP.
 
         Args:
             isp: the name, path or ISP; or a :class:`rawaug.Camera`, or the path of its YAML file.
-            noise: as in the constructor; with ``iso``, by default that of ``camera``.
+            noise: as in the constructor; with ``iso`` the default is the noise of ``camera``.
             camera: maker and model of a published camera, a :class:`rawaug.Camera` of your own or the path of its YAML
                 file, or several of these, in place of the ISP's colour atoms; for an ISP of published cameras, such as
                 ``universal``.
             iso: ISO of the noise of a measured camera, or (lowest, highest); ``rawaug info cameras`` lists the measured
-                ranges. All of them by default.
+                ranges. The default is the whole range.
             draw, target, burst, cfa, seed: as in the constructor.
 
         Raises:
@@ -201,7 +202,7 @@ class RawAugment(PairMaker):
     def draw_params(self, batch: Tensor, generator: torch.Generator, crop: Tensor | None) -> AugmentParams:
         """Draw the parameters of pictures ``(B, 3, H, W)``.
 
-        The samplings ``perturb`` and ``chosen`` look at the pictures, the others only count them.
+        The samplings ``perturb`` and ``chosen`` look at the pictures; the others only count them.
         """
         self._require_here(batch)
         if crop is None:
@@ -218,7 +219,7 @@ class RawAugment(PairMaker):
         return AugmentParams(setting, noise, crop, extras)
 
     def apply_params(self, batch: Tensor, params: AugmentParams) -> RawPair:
-        """Make the pairs that parameters describe of pictures ``(B, 3, H, W)``."""
+        """Make the pairs of pictures ``(B, 3, H, W)`` that the parameters describe."""
         self._require_here(batch)
         self._require_as_many(batch, params)
         with _float32(batch):
@@ -236,13 +237,13 @@ class RawAugment(PairMaker):
         return self._planes(self.baked.colours(srgb, params.isp, params.crop, white=1.0))
 
     def _planes(self, rgb: Tensor) -> Tensor:
-        """Sample RGB ``(B, 3, H, W)`` as four planes: packed RAW, or of other patterns the sites of 2 x 2 squares."""
+        """Sample RGB ``(B, 3, H, W)`` as four planes: packed RAW, or the sites of 2 x 2 squares for other patterns."""
         if self.pattern is None:
             return bayer.pack_rgb(rgb, self.isp.cfa)
         return bayer.pack(self.pattern.mosaic(rgb), CFA.RGGB)
 
     def _noisy(self, planes: Tensor, params: AugmentParams) -> tuple[Tensor, Tensor, Tensor]:
-        """Add noise to clean planes ``(B, 4, H/2, W/2)``; noisy, clean and variance, as RAW or developed."""
+        """Add noise to clean planes ``(B, 4, H/2, W/2)``; return noisy, clean and variance, as RAW or developed."""
         if self.srgb is not None:
             raw = self.noise.apply(planes, params.noise)
             _require_finite(raw)
@@ -257,7 +258,7 @@ class RawAugment(PairMaker):
         return bayer.unpack(noisy, CFA.RGGB), bayer.unpack(planes, CFA.RGGB), bayer.unpack(variance, CFA.RGGB)
 
     def _burst(self, srgb: Tensor, params: AugmentParams, burst: Burst) -> RawPair:
-        """Pairs of N noisy frames each; every frame has noise of its own, and the sensor's defects are one."""
+        """Make pairs of N noisy frames; each frame has its own noise, and all share the sensor's defects."""
         frame_params = params.map(lambda tensor: tensor.repeat_interleave(burst.frames, 0))
         if "seed" in frame_params.noise:
             frame_params.noise["sensor_seed"] = frame_params.noise["seed"]
@@ -280,11 +281,11 @@ class RawAugment(PairMaker):
     @eager
     @torch.no_grad()
     def develop(self, raw: Tensor, params: AugmentParams, demosaicing: str = "malvar") -> Tensor:
-        """Develop RAW of a pair, noisy, clean or denoised, by the camera setting that made it, to look at.
+        """Develop a pair's RAW (noisy, clean or denoised) for viewing, by the camera setting that made it.
 
         Args:
             raw: packed RAW ``(B, 4, h, w)``, or ``(4, h, w)`` of a sample of a Dataset; white = 1.
-            params: of the pair: ``pair.params``.
+            params: the pair's parameters, ``pair.params``.
             demosaicing: a name of :data:`rawaug.bayer.METHODS`.
 
         Returns:
@@ -361,12 +362,12 @@ class RawAugment(PairMaker):
 
     @torch.no_grad()
     def measure_signals(self, pictures: Iterable[Any], draws: int = 4, seed: int = 0) -> list[float]:
-        """Measure the mean signal of the clean RAW that pictures become, for noise of a stated PSNR of their pairs.
+        """Measure the mean signal of the clean RAW that pictures become, to set the noise by the PSNR of the pairs.
 
         Args:
-            pictures: some of those that are trained on, in any form that :mod:`rawaug.plugin.pictures` lists.
-            draws: camera settings that are drawn for each.
-            seed: of these draws.
+            pictures: some of the training pictures, in any form that :mod:`rawaug.plugin.pictures` lists.
+            draws: number of camera settings to draw for each picture.
+            seed: seed of these draws.
 
         Returns:
             Mean signals, white = 1, one for each picture and draw.
@@ -393,7 +394,7 @@ class RawAugment(PairMaker):
         return str(self.isp.cfa) if self.pattern is None else self.pattern.name
 
     def mosaic(self, raw: Tensor) -> Tensor:
-        """Unpack RAW of a pair ``(..., 4, H/2, W/2)`` to a mosaic ``(..., 1, H, W)``; RAW of other patterns is one."""
+        """Unpack RAW of a pair ``(..., 4, H/2, W/2)`` to a mosaic ``(..., 1, H, W)``; others already are one."""
         return bayer.unpack(raw, self.isp.cfa) if self.pattern is None else raw
 
     @property
@@ -443,12 +444,12 @@ def freeze(module: M) -> M:
 
 
 def _isp_of_camera(camera: Camera | str | Path) -> DictionaryISP:
-    """The ISP ``universal`` with a camera of one's own in place of the published ones."""
+    """The ISP ``universal`` with the user's own camera in place of the published ones."""
     return restrict_to_cameras(DictionaryISP.from_pretrained("universal"), camera)
 
 
 def _noise_of_cameras(camera: str | Path | Camera | Sequence[str | Path | Camera]) -> str | list[str]:
-    """The names of cameras as those of their noise."""
+    """Turn the names of cameras into the names of their noise."""
     if isinstance(camera, (str, Path, Camera)):
         return str(camera)
     names = [str(name) for name in camera]
@@ -456,11 +457,11 @@ def _noise_of_cameras(camera: str | Path | Camera | Sequence[str | Path | Camera
 
 
 def _require_finite(raw: Tensor) -> None:
-    """Refuse what damaged weights make; on the CPU only, elsewhere it would stall the device."""
+    """Refuse what damaged weights produce; this is checked on the CPU only, because it would stall other devices."""
     if raw.device.type == "cpu" and not math.isfinite(raw.numpy().min()):  # NumPy: PyTorch's threads die in a fork
         raise ValueError("the RAW has values that are not finite: the ISP's weights are damaged; fit or copy it again")
 
 
 def _float32(like: Tensor) -> torch.autocast:
-    """RAW is float32, inside mixed precision too."""
+    """Keep RAW in float32, inside mixed precision too."""
     return torch.autocast(like.device.type, enabled=False)

@@ -1,4 +1,4 @@
-"""The noise that belongs to an ISP: measured when it was fitted, or stated by cameras of one's own."""
+"""The noise that belongs to an ISP: measured when it was fitted, or stated by the user's own cameras."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from rawaug.noise.measured import measured_noise
 from rawaug.registry import Spec, check_settings, spec_label, split_spec
 
 AnyNoise = NoiseSpec | NoiseLevels | NoiseModel
-"""What stands for noise: a name, levels, a law of levels, or a model."""
+"""Anything that stands for noise: a name, levels, a law of levels, or a model."""
 
 USUAL = "cycleisp_sidd"
 """The default noise where no camera states its own."""
 
 
 def usual_noise(isp: DictionaryISP) -> str:
-    """The default noise of an ISP: ``"camera"`` if it is of cameras of one's own that all state theirs."""
+    """The default noise of an ISP: ``"camera"`` if all its cameras are the user's own and state theirs."""
     cameras = own_cameras(isp.info)
     if cameras and all(camera.levels for camera in cameras):
         return "camera"
@@ -31,7 +31,7 @@ def noise_for(isp: DictionaryISP, noise: AnyNoise) -> NoiseModel:
     """The noise model that ``noise`` means for this ISP.
 
     ``"camera"`` is the law in the ISP's file, at any ISO that was measured; ``{name: camera, settings: {iso: ...}}`` is
-    that law at an ISO. ValueError if there is none.
+    that law at an ISO. Raises ValueError if there is none.
     """
     if _has_name(noise):
         name, settings = split_spec(noise)
@@ -51,7 +51,7 @@ def with_iso(noise: AnyNoise, iso: Iso) -> AnyNoise:
 
 
 def noise_label(noise: AnyNoise) -> str:
-    """Name a noise in one line."""
+    """Describe a noise in one line."""
     if _has_name(noise):
         return spec_label(noise)
     if isinstance(noise, MeasuredLevels):

@@ -1,7 +1,7 @@
-r"""Pairs of clean RAW: the noise alone, ``noisy ~ N(y, shot_var y + read_var)``, with the face of an augmentation.
+r"""Pairs of clean RAW: the noise alone, ``noisy ~ N(y, shot_var y + read_var)``, with the interface of an augmentation.
 
-Who has clean RAW needs no camera model. A :class:`RawNoise` takes the place of a :class:`rawaug.RawAugment` in
-:class:`rawaug.RawPairs` and :func:`rawaug.wrap`: crops start at whole cells of the pattern, and turns keep it.
+If you have clean RAW, you need no camera model. A :class:`RawNoise` takes the place of a :class:`rawaug.RawAugment` in
+:class:`rawaug.RawPairs` and :func:`rawaug.wrap`. Crops start at whole cells of the pattern, and turns preserve it.
 """
 
 from __future__ import annotations
@@ -26,25 +26,26 @@ from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import Where, describe
 
 _ABOVE_WHITE = 1e-3
-"""How far beyond 1 clean RAW may go, as rounding leaves it."""
+"""How far clean RAW may exceed 1, to allow for rounding."""
 
 
 class RawNoise(PairMaker):
     """Make pairs of clean RAW by adding a sensor's noise.
 
-    It takes the place of a :class:`rawaug.RawAugment`, for RAW in place of pictures. A *frame* is
+    It takes the place of a :class:`rawaug.RawAugment` if you have RAW instead of pictures. A *frame* is
 
     - packed RAW ``(4, h, w)`` in the order R, Gr, Gb, B,
     - a mosaic ``(1, H, W)`` or ``(H, W)``, which needs ``cfa``,
-    - a :class:`rawaug.io.RawFrame` or a :class:`rawaug.data.Pair`, which know their pattern,
+    - a :class:`rawaug.io.RawFrame` or a :class:`rawaug.data.Pair`, which know their pattern.
 
-    in floating point, black-subtracted, white = 1. RAW of a Bayer pattern becomes packed RAW, of others a mosaic.
+    Values are floating point, black-subtracted, white = 1. RAW of a Bayer pattern becomes packed RAW, RAW of any other
+    pattern a mosaic.
 
     Args:
         noise: as for :class:`rawaug.RawAugment`.
-        cfa: pattern of mosaics that do not say it.
-        iso: of the noise of a measured camera: one ISO, or (lowest, highest); all of them by default.
-        seed: of the module's own draws, where no generator is passed, and of wrapped loaders.
+        cfa: pattern of mosaics that do not state their own.
+        iso: ISO of the noise of a measured camera, or (lowest, highest); all measured ISOs by default.
+        seed: seed of wrapped loaders, and of the module's own draws where no generator is passed.
 
     Raises:
         ValueError: if the noise or the pattern is unknown.
@@ -58,7 +59,7 @@ class RawNoise(PairMaker):
 
     stream = "raw noise"
     _nothing: Tensor
-    """An empty buffer, which is where the module is."""
+    """An empty buffer, which shows where the module is."""
 
     def __init__(
         self,
@@ -96,7 +97,7 @@ class RawNoise(PairMaker):
         return AugmentParams(setting, self.noise.sample(len(batch), generator), crop, {})
 
     def apply_params(self, batch: Tensor, params: AugmentParams) -> RawPair:
-        """Add the noise that parameters describe to frames ``(B, 4, h, w)`` or mosaics ``(B, 1, H, W)``."""
+        """Add the noise that the parameters describe to frames ``(B, 4, h, w)`` or mosaics ``(B, 1, H, W)``."""
         self._require_as_many(batch, params)
         if batch.shape[1] == 4:
             noisy, variance = self.noise.apply_with_variance(batch, params.noise)
@@ -109,7 +110,7 @@ class RawNoise(PairMaker):
         return RawPair(bayer.unpack(noisy, CFA.RGGB), batch, bayer.unpack(variance, CFA.RGGB), params)
 
     def find(self, sample: Any, key: str | int | None) -> Where:
-        """Where the frames are in a loader's batch; a list is a batch of frames."""
+        """Find the frames in a loader's batch; a list is a batch of frames."""
         if isinstance(sample, (Mapping, tuple)):
             return super().find(sample, key)
         return None
@@ -126,15 +127,15 @@ class RawNoise(PairMaker):
         return not isinstance(inputs, (list, tuple))
 
     def open_folder(self, path: str | Path, size: tuple[int, int] | None) -> Any:
-        """The RAW files of a folder, or the pairs of ``kind:path``; frames smaller than the crop are met on access."""
+        """Open the RAW files of a folder, or the pairs of ``kind:path``; frames that are too small fail on access."""
         return _open_clean_raw(path)
 
     def as_batch(self, inputs: Any, bgr: bool = False) -> Tensor:
-        """Frames of one size as ``(B, 4, h, w)``, or mosaics ``(B, 1, H, W)`` of other patterns than Bayer's.
+        """Turn frames of one size into ``(B, 4, h, w)``, or into mosaics ``(B, 1, H, W)`` if not of a Bayer pattern.
 
         Args:
             inputs: a batch ``(B, 4, h, w)`` or ``(B, 1, H, W)``, a single frame, or a list of frames.
-            bgr: RAW has no such order: ValueError.
+            bgr: must be false (ValueError), as RAW has no such order.
         """
         _require_no_bgr(bgr)
         if self.is_single(inputs):
@@ -160,12 +161,12 @@ class RawNoise(PairMaker):
         """Draw a crop of a frame, and cut it out.
 
         Args:
-            whole: a frame, as the class lists them.
+            whole: a frame, in any form that the class lists.
             size: height and width of the crop in pixels of the sensor; None for the whole frame.
-            turns: whether flips are drawn, and, of a square, quarter turns. A crop that fills its frame is not turned.
-            generator: on the CPU.
-            zoom: RAW cannot be enlarged: ValueError unless it is 1.
-            bgr: RAW has no such order: ValueError.
+            turns: whether to draw flips and, for a square, quarter turns. A crop that fills its frame is not turned.
+            generator: a generator on the CPU.
+            zoom: must be 1 (ValueError), as RAW cannot be enlarged.
+            bgr: must be false (ValueError), as RAW has no such order.
 
         Returns:
             The patch, packed ``(4, height / 2, width / 2)`` or a mosaic ``(1, height, width)``, and its place ``(5,)``:
@@ -189,17 +190,17 @@ class RawNoise(PairMaker):
         if not view:
             return bayer.pack_if_bayer(bayer.crop(mosaic, top, left, rows, columns), name).contiguous()
 
-        # Turns that keep the pattern move it: they need a cell more than the crop.
+        # Turns that keep the pattern shift it, so they need one cell more than the crop.
         whole_rows, whole_columns = _with_a_cell((rows, columns), pattern(name).period)
         region = mosaic[..., top : top + whole_rows, left : left + whole_columns]
         turned = pattern(name).turn_keeping(region, view)[..., :rows, :columns]
         return bayer.pack_if_bayer(turned, name).contiguous()
 
     def read(self, frame: Any) -> tuple[Tensor, str]:
-        """The mosaic ``(1, H, W)`` of a frame, float32, and the name of its pattern.
+        """Read the mosaic ``(1, H, W)`` of a frame, float32, and the name of its pattern.
 
         Raises:
-            ValueError: if it is no frame, is not scaled to white = 1, or does not say its pattern.
+            ValueError: if it is not a frame, is not scaled to white = 1, or does not state its pattern.
         """
         if hasattr(frame, "mosaic") and hasattr(frame, "cfa"):
             return _require_raw(frame.mosaic), canonical_cfa(frame.cfa)
@@ -261,7 +262,7 @@ def _require_no_bgr(bgr: bool) -> None:
 
 
 def _require_raw(raw: Tensor, packed: bool = False) -> Tensor:
-    """RAW as float32 with even sides; ValueError unless it is finite and at most 1."""
+    """Return RAW as float32; ValueError unless its sides are even and it is finite and at most 1."""
     raw = raw.float()
     height, width = raw.shape[-2:]
 
@@ -313,7 +314,7 @@ class RawFiles(Dataset[Any]):
 
 
 def _open_clean_raw(path: str | Path) -> Any:
-    """The RAW files of a folder, or the pairs of a known dataset, ``kind:path``, whose RAW is clean."""
+    """Open the RAW files of a folder, or the pairs of a known dataset, ``kind:path``, whose RAW is clean."""
     from rawaug.data import open_pairs
 
     if Path(path).exists():

@@ -1,4 +1,4 @@
-"""The settings of a :class:`rawaug.RawAugment` by names and numbers, as commands and files have them."""
+"""The settings of a :class:`rawaug.RawAugment` as names and numbers, as commands and files give them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _USUAL_NOISE = "auto"
 
 
 def pair_generator(seed: int, name: str, number: int) -> torch.Generator:
-    """The generator of a pair on the command line, keyed by the seed, the picture's name and the pair's number."""
+    """Make the generator of a pair on the command line, keyed by the seed, the picture's name and the pair's number."""
     return keyed_generator(seed, "synth", name, number)
 
 
@@ -54,7 +54,7 @@ class AugmentConfig:
         if self.noise is None:
             raise ValueError("noise must be a name or a pair (shot_var, read_var) of variances, got None")
 
-        # The figures of a camera count, not its file, which may change or lie elsewhere.
+        # The figures of a camera count, not its file: the file may change or be elsewhere later.
         if self.camera is not None and (isinstance(self.camera, Camera) or is_camera_file(self.camera)):
             camera = as_camera(self.camera)
             object.__setattr__(self, "camera", to_json(camera.to_json()))
@@ -66,7 +66,7 @@ class AugmentConfig:
 
     @property
     def own_camera(self) -> Camera | None:
-        """The camera of one's own; None where the cameras are published ones, or a fitted one."""
+        """The user's own camera; None where the cameras are published ones, or a fitted one."""
         if self.camera is not None and self.camera.startswith("{"):
             return Camera.from_json(parse_object(self.camera))
         if is_camera_file(self.isp):
@@ -74,7 +74,7 @@ class AugmentConfig:
         return None
 
     def make(self) -> RawAugment:
-        """The augmentation of these settings; it raises what :meth:`rawaug.RawAugment.from_pretrained` raises."""
+        """Make the augmentation of these settings, with the errors of :meth:`rawaug.RawAugment.from_pretrained`."""
         settings = dict(vars(self))
         if self.camera is not None and self.own_camera is not None:
             settings["camera"] = self.own_camera
@@ -83,7 +83,7 @@ class AugmentConfig:
 
     @property
     def target_name(self) -> Target:
-        """``"raw"``, ``"rgb"`` or ``"srgb"``, also where the target is an :class:`rawaug.Srgb`."""
+        """``"raw"``, ``"rgb"`` or ``"srgb"``, even where the target is an :class:`rawaug.Srgb`."""
         return "srgb" if isinstance(self.target, Srgb) else self.target
 
     def to_json(self) -> dict[str, Any]:
@@ -93,5 +93,5 @@ class AugmentConfig:
 
     @staticmethod
     def from_json(content: Mapping[str, Any]) -> "AugmentConfig":
-        """The settings that :meth:`to_json` has written; ValueError if they are none."""
+        """Read settings that :meth:`to_json` has written; ValueError if they are none."""
         return TypeAdapter(AugmentConfig).validate_python(content)

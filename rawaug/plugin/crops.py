@@ -1,4 +1,4 @@
-"""Crops and turns of pictures: drawn first, cut out after, as :class:`rawaug.AugmentParams` keeps them."""
+"""Crops and turns of pictures. They are drawn first, kept as :class:`rawaug.AugmentParams` does, and then cut out."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from rawaug.plugin.pictures import to_rgb_tensor, trim_to_even
 
 
 def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
-    """Height and width of a crop that is given as a side or as both; None means whole pictures.
+    """Turn a crop that is given as one side or as both into (height, width); None means whole pictures.
 
     Raises:
-        ValueError: if a side is odd, or it is neither.
+        ValueError: if a side is odd, or ``crop`` is neither.
     """
     if crop is None:
         return None
@@ -44,12 +44,12 @@ def draw_crop(
     Args:
         picture: ``(3, H, W)`` with even sides.
         size: height and width of the crop; None for the whole picture.
-        turns: whether flips are drawn, and, of a square, quarter turns.
-        generator: on the CPU.
+        turns: whether to draw flips and, for a square, quarter turns.
+        generator: a generator on the CPU.
         zoom: half of the crops are enlarged by up to this factor.
 
     Returns:
-        ``(5,)`` top, left, H, W, view; with a zoom ``(6,)``, where the last is the number of rows that are enlarged.
+        ``(5,)`` top, left, H, W, view; with a zoom ``(6,)``, where the last is the number of rows before enlarging.
     """
     height, width = picture.shape[-2:]
     region = size or (height, width)
@@ -94,7 +94,7 @@ def draw_patch(
 
 
 def cut_patch(picture: Tensor, crop: Tensor, size: tuple[int, int] | None) -> Tensor:
-    """Cut the patch ``(3, *size)`` that a drawn crop ``(5,)`` or ``(6,)`` means out of a whole picture ``(3, H, W)``.
+    """Cut the patch ``(3, *size)`` of a drawn crop ``(5,)`` or ``(6,)`` out of a whole picture ``(3, H, W)``.
 
     Raises:
         ValueError: if the crop was drawn for a picture of another size.
@@ -112,7 +112,7 @@ def cut_patch(picture: Tensor, crop: Tensor, size: tuple[int, int] | None) -> Te
 
 
 def _region(size: tuple[int, int], rows: int) -> tuple[int, int]:
-    """Even height and width of the ``rows`` that are enlarged to the crop; 0 rows for the crop itself."""
+    """Even height and width of the region of ``rows`` that is enlarged to the crop; 0 rows mean the crop itself."""
     if not rows:
         return size
     return rows, math.ceil(size[1] * rows / size[0] / 2) * 2

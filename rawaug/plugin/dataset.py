@@ -1,10 +1,10 @@
-"""A Dataset of sRGB pictures as a Dataset of RAW pairs, every draw keyed.
+"""A Dataset of sRGB pictures as a Dataset of RAW pairs, with every draw keyed.
 
-Sample i of epoch e comes from a generator seeded with BLAKE2b(seed, "pairs", e, i) alone: its crop, then one of eight
-flips and turns, then camera and noise. So the pairs do not depend on workers, start method or batch size.
+Sample i of epoch e comes from a generator seeded with BLAKE2b(seed, "pairs", e, i) alone. It draws the crop, then one
+of eight flips and turns, then camera and noise. So the pairs do not depend on workers, start method or batch size.
 
-The epoch advances by itself: it is the number of times that picture i was asked for before
-(:mod:`rawaug.plugin.epochs`). ``set_epoch`` pins it: from then on the same index is the same pair.
+The epoch advances by itself: it is the number of earlier requests for picture i (:mod:`rawaug.plugin.epochs`).
+``set_epoch`` pins it: from then on the same index is the same pair.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from rawaug.seeding import keyed_generator
 Sample = TypeVar("Sample", covariant=True)
 
 Maker = PairMaker | DictionaryISP | Camera | str | Path
-"""What makes pairs: an augmentation, or a camera for one with the default settings."""
+"""Anything that makes pairs: an augmentation, or a camera for one with the default settings."""
 
 Pictures = Dataset[Tensor] | Sequence[Tensor] | Sequence["np.ndarray[Any, Any]"] | str | Path
-"""Pictures alone, without labels: their samples are pairs."""
+"""Pictures alone, without labels. The samples made of them are pairs."""
 
 
 class _Pairs(Dataset[Sample], Generic[Sample]):
-    """What a Dataset of pairs and a stream of them share: the settings, the epochs, and how a sample becomes a pair."""
+    """The base of a Dataset and a stream of pairs: the settings, the epochs, and how a sample becomes a pair."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
         self._epochs = self._make_epochs(self.dataset)
 
     def _open(self, dataset: Any) -> Any:
-        """The pictures of a folder where its path is given."""
+        """Open the folder of pictures if a path is given."""
         if isinstance(dataset, (str, Path)):
             return open_dataset(dataset, self.augment, self.crop)
         return dataset
@@ -89,8 +89,8 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
     def state_dict(self) -> dict[str, Any]:
         """The state from which :meth:`load_state_dict` goes on with the draws that follow.
 
-        It is exact between passes, and in the middle of a pass without workers or with a pinned epoch. With workers
-        that have fetched pictures ahead it cannot be, and :meth:`load_state_dict` refuses it;
+        It is exact between passes, and in the middle of a pass without workers or with a pinned epoch. It cannot be
+        exact once workers have fetched pictures ahead, and then :meth:`load_state_dict` refuses it.
         :func:`rawaug.resumable` makes a loader whose state is exact anywhere.
         """
         return self._epochs.state_dict()
@@ -99,11 +99,11 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
         """Go on from ``state``; call this while no loader is in the middle of a pass.
 
         Args:
-            state: as :meth:`state_dict` gives it.
-            next_epoch: where the state is of the middle of a pass, begin the next epoch.
+            state: a state from :meth:`state_dict`.
+            next_epoch: begin the next epoch if the state is from the middle of a pass.
 
         Raises:
-            ValueError: if it is the state of other pictures, or of the middle of a pass that cannot go on exactly.
+            ValueError: if the state is of other pictures, or of the middle of a pass that cannot go on exactly.
         """
         self._epochs.load_state_dict(state, next_epoch)
         if self._epochs.pinned is not None:
@@ -115,7 +115,7 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
         return len(self.dataset)
 
     def __repr__(self) -> str:
-        """The pictures, the crop and the seed in a line, then what the augmentation draws."""
+        """Describe the pictures, the crop and the seed in a line, then what the augmentation draws."""
         pictures = type(self.dataset).__name__
         if isinstance(self.dataset, Sized):
             pictures = count_of(len(self.dataset), "picture")
@@ -142,7 +142,7 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
         return replace_picture(sample, where, self.form(pair, self._name_of(name)))
 
     def _name_of(self, number: int | str) -> str:
-        """The name of a picture: that of its file where the dataset knows it, else its number."""
+        """The name of a picture: the name of its file if the dataset knows it, else its number."""
         if not isinstance(number, int):
             return str(number)
         if hasattr(self.dataset, "file"):
@@ -154,7 +154,7 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
         return str(number)
 
     def __getattr__(self, name: str) -> Any:
-        """Attributes of the dataset, such as ``classes``."""
+        """Look up attributes of the dataset, such as ``classes``."""
         if name.startswith("_") or "dataset" not in self.__dict__:
             raise AttributeError(name)
         return getattr(self.dataset, name)
@@ -165,33 +165,34 @@ class RawPairs(_Pairs[Sample]):
 
     Args:
         dataset: has ``len`` and an index, and yields pictures in any form that :mod:`rawaug.plugin.pictures` lists, or
-            tuples or mappings that have one. All other fields pass through, and its attributes are those of the pairs.
-            Or the path of a folder of pictures, or ``kind:path`` (:func:`rawaug.data.open_pictures`).
-        augment: makes the pair, on the CPU where workers are to run it; or an ISP, its name or its path, or a
-            :class:`rawaug.Camera`, for a :class:`RawAugment` of it with the default settings. A
-            :class:`rawaug.RawNoise` makes pairs of clean RAW: the dataset has frames, or the path of a folder of RAW
-            files.
+            tuples or mappings that contain one. All other fields pass through, and the dataset's attributes can be read
+            from the pairs. It may also be the path of a folder of pictures, or ``kind:path``
+            (:func:`rawaug.data.open_pictures`).
+        augment: makes the pairs; it must be on the CPU if workers are to run it. An ISP, its name or its path, or a
+            :class:`rawaug.Camera` stands for a :class:`RawAugment` of it with the default settings. A
+            :class:`rawaug.RawNoise` makes pairs of clean RAW: ``dataset`` then yields frames, or is the path of a
+            folder of RAW files.
         crop: side of the square crop in pixels of the picture, or (height, width), even; None keeps whole pictures
-            (made even by dropping a line). Packed RAW has half as many rows and columns: what BasicSR calls a
-            ``gt_size`` of 128 packed pixels is a crop of 256.
+            (made even by dropping a line). Packed RAW has half as many rows and columns: a BasicSR ``gt_size`` of 128
+            packed pixels is a crop of 256.
         seed: decides all draws, together with the epoch and the index.
         key: name of the picture in samples that are mappings, its index in tuples (0 by default).
-        turns: whether to draw flips and quarter turns; what is not square is only flipped.
-        keys: names for the pair's noisy, clean, variance and params, in this order, as many as are wanted: the pair is
-            then a dict of these. In samples that are mappings they stand in place of the picture. Or a mapping of names
-            to these, to ``name``, that of the picture, or to ``level``, the strength of its noise, as
+        turns: whether to draw flips and quarter turns; a crop that is not square is only flipped.
+        keys: names for the pair's noisy, clean, variance and params, in this order, as many as are wanted. The pair is
+            then a dict of these; in samples that are mappings they replace the picture. Or a mapping from names to
+            these fields, to ``name`` (the picture's name) or to ``level`` (the strength of its noise), such as
             ``{"L": "noisy", "H": "clean", "L_path": "name"}``.
-        fields: of the same, as many as are wanted, as ``("clean", "noisy")``: the pair is then a tuple of these.
-        order: of the planes of packed RAW: a CFA, for the order that ``pixel_unshuffle`` of such a mosaic gives;
+        fields: as many of the same fields as are wanted, such as ``("clean", "noisy")``. The pair is then a tuple.
+        order: order of the planes of packed RAW: a CFA, for the order that ``pixel_unshuffle`` of such a mosaic gives;
             ``"RGBG"`` or the like, in which the first G is Gr; or four names of R, Gr, Gb, B. By default R, Gr, Gb, B.
         bgr: whether pictures have their channels in the order B, G, R, as ``cv2.imread`` gives them.
         zoom: half of the crops are enlarged by up to this factor (bicubic), drawn log-uniformly; 1 for none. Pictures
             scaled down for the screen are sharper, pixel by pixel, than RAW of a lens and an optical low-pass filter.
 
     Raises:
-        TypeError: if ``augment`` is none of these, or ``dataset`` has no index: a :class:`RawPairStream` takes it.
-        ValueError: if the crop is odd, the zoom less than 1 or without a crop, or, on access, if a picture is smaller
-            than the crop or none.
+        TypeError: if ``augment`` is none of these, or ``dataset`` has no index; for that, use a :class:`RawPairStream`.
+        ValueError: if the crop is odd, the zoom is less than 1 or has no crop, or, on access, if a sample is smaller
+            than the crop or is no picture.
 
     Example:
         >>> from rawaug.isp.model import DictionaryISP
@@ -206,7 +207,7 @@ class RawPairs(_Pairs[Sample]):
 
     _epochs: Visits
 
-    # What a sample is follows from the pictures and from how pairs are handed over.
+    # The type of a sample follows from the pictures and from how pairs are handed over.
     @overload
     def __init__(
         self: RawPairs[RawPair],
@@ -302,7 +303,7 @@ class RawPairs(_Pairs[Sample]):
         return self.draw(number, self._generator(*self._epochs.key(number)))
 
     def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
-        """The pairs of a batch, as a DataLoader asks for them."""
+        """Make the pairs of a batch, as a DataLoader asks for them."""
         self._epochs.fetch(len(indices))
         return [self[index] for index in indices]
 
@@ -310,17 +311,17 @@ class RawPairs(_Pairs[Sample]):
         """Draw the pair of picture ``index`` from a generator on the CPU; no epoch is counted.
 
         Returns:
-            The sample of the dataset with the pair, without B, in place of the picture.
+            The dataset's sample with the pair, without the leading B, in place of the picture.
         """
         sample: Sample = self._make_pair(self.dataset[index], index, generator)
         return sample
 
     def draw_batch(self, indices: Sequence[int], generators: Sequence[torch.Generator]) -> RawPair:
-        """Draw the pairs of :meth:`draw`, bit for bit, as one batch, which is faster for small crops.
+        """Draw the same pairs as :meth:`draw`, bit for bit, but as one batch, which is faster for small crops.
 
         Args:
             indices: B indices of a dataset whose samples are pictures alone; ``crop`` must be set.
-            generators: one for each.
+            generators: one generator for each index.
         """
         parameters, patches = [], []
         for index, generator in zip(indices, generators, strict=True):
@@ -333,10 +334,10 @@ class RawPairs(_Pairs[Sample]):
         return pair
 
     def replay(self, index: int, params: AugmentParams) -> RawPair:
-        """Make the pair of picture ``index`` again from the parameters of one pair, without B, whatever the seed is.
+        """Make the pair of picture ``index`` again from its parameters, without the leading B, whatever the seed is.
 
         Raises:
-            ValueError: if the picture is of another size than the one that they were drawn for.
+            ValueError: if the parameters were drawn for a picture of another size.
         """
         sample = self.dataset[index]
         picture = get_picture(sample, find_picture(sample, self.key))
@@ -346,19 +347,19 @@ class RawPairs(_Pairs[Sample]):
 
 
 class RawPairStream(_Pairs[Any], IterableDataset[Any]):
-    """An iterable Dataset of pictures as one of RAW pairs.
+    """An iterable Dataset of pictures as an iterable Dataset of RAW pairs.
 
-    A stream has no index. Without ``identity`` the n-th sample that worker w of W meets is number nW + w: no two share
-    a draw, and where sample i goes to worker i mod W, each keeps its draws whatever W is. A dataset that distributes
-    whole shards needs ``identity`` for that. Processes of a distributed run draw apart, by their rank, unless it is
-    given. Each pass is a new epoch, unless one is pinned.
+    A stream has no index. Without ``identity`` the n-th sample that worker w of W meets has the number nW + w. No two
+    samples share a draw, and if sample i goes to worker i mod W, each keeps its draws whatever W is. A dataset that
+    distributes whole shards needs ``identity`` for that. Without ``identity``, the processes of a distributed run draw
+    differently, by their rank. Each pass is a new epoch, unless one is pinned.
 
     Args:
-        dataset: an iterable of samples, which are as for :class:`RawPairs`. It divides itself between workers, as those
-            of WebDataset and Hugging Face do, or ``divide`` does. Or the path of a folder of pictures.
+        dataset: an iterable of samples, which are as for :class:`RawPairs`. It divides itself between workers, as
+            datasets of WebDataset and Hugging Face do, or ``divide`` does. Or the path of a folder of pictures.
         augment, crop, seed, key, turns, keys, fields, order, bgr, zoom: as for :class:`RawPairs`.
         identity: name or index of the field that identifies a sample, such as ``"__key__"``; it keys the draws.
-        divide: give sample i to worker i mod W, of a dataset that every worker would go through in full.
+        divide: give sample i to worker i mod W, for a dataset that every worker would otherwise go through in full.
 
     Example:
         >>> from rawaug.isp.model import DictionaryISP
@@ -464,7 +465,7 @@ class _InOrder(IterableDataset[Any]):
 
 
 def as_augment(augment: Maker) -> PairMaker:
-    """An augmentation as it is, or one of an ISP, its name or its path, or of a camera, with the default settings.
+    """Return an augmentation as it is, or make one with the default settings of an ISP, its name or path, or a camera.
 
     Raises:
         TypeError: if it is something else.
@@ -479,11 +480,11 @@ def as_augment(augment: Maker) -> PairMaker:
 
 
 def open_dataset(path: str | Path, augment: PairMaker, size: tuple[int, int] | None) -> Any:
-    """The pictures, or the clean RAW, of a folder or of ``kind:path``, with an index.
+    """Open the pictures, or the clean RAW, of a folder or of ``kind:path``, with an index.
 
     Args:
-        path: of a folder or a file, or ``kind:path``.
-        augment: says which.
-        size: of the crops; pictures that are smaller are left out, and reported by the folder.
+        path: path of a folder or a file, or ``kind:path``.
+        augment: decides whether these are pictures or RAW.
+        size: size of the crops; smaller pictures are left out, and the folder reports them.
     """
     return augment.open_folder(path, size)

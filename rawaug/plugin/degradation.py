@@ -14,10 +14,10 @@ class ISPModel:
     """Camera noise as a degradation of the pictures of KAIR and BSRGAN, which call it ``isp_model``.
 
     Args:
-        augment: with the target ``"srgb"``; each call draws anew, from its own seed.
+        augment: an augmentation with the target ``"srgb"``. Each call draws anew, from the augmentation's own seed.
 
     Raises:
-        ValueError: if its target is another.
+        ValueError: if it has another target.
 
     Example:
         >>> model = ISPModel(RawAugment.from_pretrained("universal", target="srgb"))
@@ -35,7 +35,7 @@ class ISPModel:
         """Add a camera's noise to a picture ``(H, W, 3)``, sRGB in [0, 1].
 
         Returns:
-            The noisy picture ``(H, W, 3)``, float32 in [0, 1], and ``hq`` as it is.
+            The noisy picture ``(H, W, 3)``, float32 in [0, 1], and ``hq`` unchanged.
         """
         height, width = img.shape[:2]
         even = np.pad(img, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

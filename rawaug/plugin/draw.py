@@ -1,7 +1,7 @@
-r"""Which camera settings pictures are given: cameras, lights, tone curves and exposures, drawn for each picture.
+r"""The camera settings that pictures are given: cameras, lights, tone curves and exposures, drawn for each picture.
 
-A setting is a colour matrix C, gains g and a tone curve T. It comes from the hulls of the dictionaries' atoms, or it is
-one camera in one light, for an ISP of published cameras (:mod:`rawaug.isp.dictionary`). An exposure of e stops divides
+A setting is a colour matrix C, gains g and a tone curve T. It comes from the hulls of the dictionaries' atoms or, for
+an ISP of published cameras, is one camera in one light (:mod:`rawaug.isp.dictionary`). An exposure of e stops divides
 the gains of the forward direction by :math:`2^e`.
 """
 
@@ -30,20 +30,20 @@ class Draw:
 
     Args:
         sampling: ``convex`` draws without looking at the picture: a camera in a light and a mixture of tone curves
-            where the ISP knows published cameras, as ``universal`` does, and mixtures of the atoms of a fitted ISP.
-            ``independent`` is the same with the gains of another camera in another light, to see what consistency is
-            worth. ``perturb`` adds Gaussian noise to the weights that the ISP chooses for the picture; ``chosen`` takes
-            these as they are.
+            if the ISP knows published cameras, as ``universal`` does, and mixtures of the atoms for a fitted ISP.
+            ``independent`` does the same with the gains of another camera in another light, to measure the value of
+            consistency. ``perturb`` adds Gaussian noise to the weights that the ISP chooses for the picture;
+            ``chosen`` takes them as they are.
         strength: standard deviation of the noise that ``perturb`` adds to the weights.
-        exposure: lowest and highest exposure of the RAW in stops, or a single one. By default that of the frames for a
-            fitted ISP, and -0.5 to 1 for published cameras, whose headroom above white is not known. To train for other
-            cameras than the fitted one, use -1.5 to 0.
+        exposure: lowest and highest exposure of the RAW in stops, or a single one. The default is the range of the
+            frames for a fitted ISP, and -0.5 to 1 for published cameras, whose headroom above white is not known. To
+            train for cameras other than the fitted one, use -1.5 to 0.
         light: colour temperature in kelvin of the light that published cameras are drawn in, or one of
             :data:`rawaug.isp.cameras.LAMPS` by name, such as ``LED-B3``. Any light by default.
-        tone: one tone curve of an ISP of published cameras, by name (``rawaug info`` lists them), in place of mixtures.
+        tone: one tone curve of an ISP of published cameras, by name (``rawaug info`` lists them), instead of mixtures.
 
     Raises:
-        ValueError: if the sampling is unknown, or the strength or the exposure out of range.
+        ValueError: if the sampling is unknown, or the strength or the exposure is out of range.
     """
 
     sampling: Sampling = "convex"
@@ -62,14 +62,14 @@ class Draw:
 
     @property
     def exposure_range(self) -> tuple[float, float] | None:
-        """The lowest and highest exposure in stops; None for that of the ISP."""
+        """The lowest and highest exposure in stops; None means the range of the ISP."""
         if isinstance(self.exposure, (int, float)):
             return self.exposure, self.exposure
         return self.exposure
 
 
 def _require_range(key: str, limits: Any) -> None:
-    """Refuse what is neither a finite number nor (lowest, highest)."""
+    """Refuse anything that is neither a finite number nor (lowest, highest)."""
     ends = limits if isinstance(limits, (list, tuple)) else (limits, limits)
 
     is_range = len(ends) == 2
@@ -83,12 +83,12 @@ class SettingSampler:
     """Draws camera settings of one ISP.
 
     Args:
-        draw: says how.
+        draw: how to draw.
         isp: the camera.
         baked: its tables, which choose settings for pictures.
 
     Raises:
-        ValueError: if light or tone are given for an ISP that was fitted to frames, or are unknown.
+        ValueError: if light or tone is given for an ISP that was fitted to frames, or is unknown.
     """
 
     def __init__(self, draw: Draw, isp: DictionaryISP, baked: BakedISP) -> None:
@@ -137,7 +137,7 @@ class SettingSampler:
         return self.isp.params_from_weights(*weights)
 
     def __repr__(self) -> str:
-        """The camera, the sampling, the light and the exposure in a line."""
+        """Describe the camera, the sampling, the light and the exposure in a line."""
         count = self.isp.config.cameras
         if count == 1:
             line = str(self.isp.info["cameras"][0])

@@ -2,12 +2,12 @@
 
 A DataLoader does not tell its Dataset that a new pass begins, so draws are counted where they are made:
 
-- of a picture with an index, the epoch is the number of earlier visits of this picture (:class:`Visits`): in a pass
-  that visits every picture once, visit k is epoch k, however many workers share the pass and in whatever order;
-- of a stream, it is the number of earlier passes, of which each worker counts its own (:class:`Passes`).
+- For a picture with an index, the epoch is the number of earlier visits of this picture (:class:`Visits`). In a pass
+  that visits every picture once, visit k is epoch k, however many workers share the pass and in whatever order.
+- For a stream, it is the number of earlier passes, which each worker counts for itself (:class:`Passes`).
 
 The counts lie in shared memory, where workers of every start method find them, persistent ones too. A cell is written
-by the one worker that has the picture, so no lock is needed. ``pin`` replaces the count by a fixed epoch: a draw is
+only by the worker that has the picture, so no lock is needed. ``pin`` replaces the count by a fixed epoch: a draw is
 then a pure function of (seed, epoch, index).
 """
 
@@ -26,7 +26,7 @@ from rawaug.plugin.order import world_size
 from rawaug.seeding import rank_key
 
 _COUNTED = -1
-"""Stands in place of a pinned epoch."""
+"""The value that stands for "not pinned"."""
 _MAX_WORKERS = 512
 
 _BROKEN_OFF = (
@@ -48,7 +48,7 @@ def require_epoch(epoch: SupportsIndex) -> int:
 
 
 class _Epochs:
-    """Counts in shared memory, and an epoch that may be pinned instead."""
+    """Counts in shared memory, with an epoch that may be pinned instead."""
 
     def __init__(self, *shape: int) -> None:
         self._pinned = torch.full((1,), _COUNTED).share_memory_()
@@ -57,7 +57,7 @@ class _Epochs:
 
     @property
     def pinned(self) -> int | None:
-        """The pinned epoch, None while epochs are counted."""
+        """The pinned epoch; None while epochs are counted."""
         epoch = int(self._pinned)
         if epoch == _COUNTED:
             return None
@@ -68,7 +68,7 @@ class _Epochs:
         self._pinned[0] = require_epoch(epoch)
 
     def rank(self) -> tuple[int, ...]:
-        """:func:`rawaug.seeding.rank_key`; in a spawned worker, which is no part of the process group, the parent's."""
+        """:func:`rawaug.seeding.rank_key`; the parent's in a spawned worker, which is not in the process group."""
         return rank_key() or self._rank
 
     def __getstate__(self) -> dict[str, Any]:
@@ -85,11 +85,11 @@ class _Epochs:
 
 
 class Visits(_Epochs):
-    """Counts of how often each of ``size`` pictures was asked for by its index.
+    """Counts how often each of ``size`` pictures was asked for by its index.
 
-    A pass that is broken off counts what its workers had fetched ahead. A picture that is drawn with replacement counts
-    each time, in the order in which workers come to it. Distributed processes take turns with a picture, so the key of
-    a counted draw also has the rank.
+    A pass that is broken off counts everything that its workers had fetched ahead. A picture that is drawn with
+    replacement counts each time, in the order in which workers come to it. Distributed processes share the pictures
+    between them, so the key of a counted draw also contains the rank.
     """
 
     def __init__(self, size: int) -> None:
@@ -97,7 +97,7 @@ class Visits(_Epochs):
         self._in_workers = torch.zeros(1, dtype=torch.bool).share_memory_()
         """Whether workers have counted visits."""
         self._batch = torch.ones(1, dtype=torch.int64).share_memory_()
-        """Pictures that are asked for at a time."""
+        """How many pictures are asked for at a time."""
 
     def key(self, index: int) -> tuple[int, ...]:
         """Count a visit of picture ``index``, and return the key of its draw: epoch, index and rank."""
@@ -120,7 +120,7 @@ class Visits(_Epochs):
     def state_dict(self) -> dict[str, Any]:
         """The pinned epoch, each picture's visits, and whether the state is exact.
 
-        The processes of a distributed run share one state: there each picture's visits are the passes so far.
+        The processes of a distributed run share one state, so there the visits of each picture are the passes so far.
         """
         visits = self._shared_by_ranks(self._counts.clone())
         exact = self.pinned is not None or not self._runs_ahead(visits)
@@ -130,11 +130,11 @@ class Visits(_Epochs):
         """Go on from ``state``.
 
         Args:
-            state: as :meth:`state_dict` gives it.
-            next_epoch: where the state is of the middle of a pass, begin the next epoch.
+            state: a state from :meth:`state_dict`.
+            next_epoch: begin the next epoch if the state is from the middle of a pass.
 
         Raises:
-            ValueError: if it belongs to another number of pictures, or is not exact.
+            ValueError: if the state is for another number of pictures, or is not exact.
         """
         visits = torch.as_tensor(state["visits"])
         if visits.shape != self._counts.shape:
@@ -153,16 +153,16 @@ class Visits(_Epochs):
     def _runs_ahead(self, visits: Tensor) -> bool:
         """Whether workers have counted visits of pictures that the training may not have seen yet.
 
-        It cannot be seen where they have fetched all the rest of a pass: such a state is that of the next pass.
+        This cannot be seen if they have fetched all the rest of a pass; such a state is that of the next pass.
         """
         worker = get_worker_info()
-        if worker is not None:  # one of torchdata's StatefulDataLoader, whose workers keep a state each
+        if worker is not None:  # a worker of torchdata's StatefulDataLoader, where each keeps its own state
             return worker.num_workers > 1
         if not bool(self._in_workers) or not len(visits):
             return False
 
         behind = int((visits < visits.max()).sum())
-        return behind >= int(self._batch)  # fewer are those that drop_last leaves out
+        return behind >= int(self._batch)  # drop_last leaves out fewer than that
 
     @staticmethod
     def _shared_by_ranks(visits: Tensor) -> Tensor:
@@ -170,7 +170,7 @@ class Visits(_Epochs):
         if world == 1 or not len(visits):
             return visits
 
-        share = math.ceil(len(visits) / world)  # a sampler fills the shares up where they do not divide
+        share = math.ceil(len(visits) / world)  # a sampler pads the shares if they do not divide evenly
         passes = math.ceil(int(visits.sum()) / share)
         return torch.full_like(visits, max(passes, int(visits.max())))
 
@@ -178,19 +178,19 @@ class Visits(_Epochs):
 class Passes(_Epochs):
     """Counts of the passes over a stream, and the sample at which a resumed pass goes on.
 
-    Workers of one pass begin it at different times, so each reads only what none of its siblings writes: worker w
-    counts the passes that it has begun, among however many, and the first of W workers those of W workers. The passes
-    before one of worker w are its own and those of at most w workers, which had no worker w.
+    Workers of one pass begin it at different times, so each reads only cells that none of its siblings writes. Worker w
+    counts the passes that it has begun, whatever the number of workers, and the first of W workers counts the passes of
+    W workers. The passes before a pass of worker w are its own and those of at most w workers, which had no worker w.
     """
 
     def __init__(self) -> None:
         super().__init__(_MAX_WORKERS)
         self._of_workers = torch.zeros(_MAX_WORKERS + 1, dtype=torch.int32).share_memory_()
-        """By W, the passes of W workers that the first of them has begun; 0 for the main process."""
+        """The passes of W workers that the first of them has begun, indexed by W; 0 is for the main process."""
         self._resumed = torch.tensor([-1, 0]).share_memory_()
         """A pass, and the number of its first sample."""
         self._running: tuple[int, int] | None = None
-        """In this process: the pass, and the number of the next sample."""
+        """The pass of this process, and the number of the next sample."""
 
     def begin(self, workers: int, worker: int) -> tuple[int, int]:
         """Count a pass of one of ``workers`` workers, and return its epoch and the number of its first sample."""
@@ -213,7 +213,7 @@ class Passes(_Epochs):
 
     @property
     def passes(self) -> int:
-        """The passes that have begun."""
+        """The number of passes that have begun."""
         return int(self._of_workers.sum())
 
     def at(self, number: int) -> None:
@@ -228,7 +228,7 @@ class Passes(_Epochs):
     def state_dict(self) -> dict[str, Any]:
         """The pinned epoch, the number of finished passes, and the number of the next sample.
 
-        The main process does not know how far its workers have come in a pass: with workers, the state is that of the
+        The main process does not know how far its workers have come in a pass, so with workers the state is that of the
         next pass.
         """
         started, position = self._running or (self.passes, 0)

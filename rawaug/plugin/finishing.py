@@ -1,23 +1,24 @@
-r"""What a camera does to a picture between demosaicing and the file: softness, noise reduction, sharpening, JPEG.
+r"""Finishing as cameras do it between demosaicing and the file: softness, noise reduction, sharpening, JPEG.
 
-With luma Y and chroma C (R - Y and B - Y, Y of BT.601) of the developed picture, a Gaussian blur :math:`G_s` of
-deviation s pixels, the mean :math:`M` within a square window, and shares m and n,
+Let Y be the luma and C the chroma (R - Y and B - Y, Y of BT.601) of the developed picture. With a Gaussian blur
+:math:`G_s` of deviation s pixels, the mean :math:`M` within a square window, and shares m and n,
 
 .. math:: x' = G_s x, \qquad C' = C + m (G_c C - C), \qquad Y' = Y + n (\bar a Y + M[(1 - a) M Y] - Y),
    \qquad Y'' = Y' + u (Y' - G_r Y')
 
-The lens, the low-pass filter and demosaicing soften, :math:`G_s`. The reduction of luma noise is the self-guided filter
-(He, Sun and Tang, PAMI 2013): weights :math:`a = \max(0, 1 - k \sigma^2 / v)` go from 0 in flat areas to 1 at edges, v
-being the variance of noisy luma in the window and :math:`\sigma^2` that of its noise, and :math:`\bar a = M a`. So
-noise is left at edges, as cameras leave it. The clean picture is finished with the weights that the noisy one chose:
-it is what the mean of many such shots would be. JPEG acts on the noisy picture alone.
+The lens, the low-pass filter and demosaicing soften the picture, :math:`G_s`. Luma noise is reduced by the self-guided
+filter (He, Sun and Tang, PAMI 2013). Its weights :math:`a = \max(0, 1 - k \sigma^2 / v)` go from 0 in flat areas to 1
+at edges. There v is the variance of noisy luma in the window, :math:`\sigma^2` the variance of its noise, and
+:math:`\bar a = M a`. So noise is left at edges, as cameras leave it. The clean picture is finished with the weights
+that the noisy one chose, so that it is what the mean of many such shots would be. JPEG acts on the noisy picture alone.
 
-Pictures that are shown smaller than they were taken need nothing here: what scales a picture comes before its crop, in
-the loader of pictures, and a pair could be scaled only by cutting a larger crop than was asked for. ``zoom`` of
-:class:`rawaug.RawPairs` makes the softer ones of those that come out of a camera at full size.
+Pictures that are shown smaller than they were taken need nothing here. A picture is scaled before its crop, in the
+loader of pictures; a pair could be scaled only by cutting a larger crop than was asked for. ``zoom`` of
+:class:`rawaug.RawPairs` makes softer pictures, like those that come out of a camera at full size.
 
 The ranges are fitted to the noise of developed pictures (``python -m benchmarks.picture_noise``): its autocorrelation
-by channel, the correlation between channels, its power by band, and its variance at edges over that in flat areas.
+by channel, the correlation between channels, its power by band, and the ratio of its variance at edges to that in flat
+areas.
 """
 
 from __future__ import annotations
@@ -39,18 +40,18 @@ _REACH = 2.5
 
 @dataclass(frozen=True)
 class Finish:
-    """How cameras finish pictures: ranges, lowest and highest, that are drawn from for each picture.
+    """How cameras finish pictures. Each picture draws its values from ranges, given as lowest and highest.
 
     Args:
         softness: deviation s of the blur of the whole picture, in pixels.
         window: half the side of the window in which luma noise is reduced, in pixels.
         luma: share n of the filtered luma.
-        edge: k, by which local variance must exceed that of the noise to be an edge; drawn by its logarithm.
-        chroma_blur: deviation c of the chroma blur, in pixels, drawn by its logarithm.
+        edge: k, the factor by which local variance must exceed the noise variance at an edge; drawn log-uniformly.
+        chroma_blur: deviation c of the chroma blur, in pixels, drawn log-uniformly.
         chroma: share m of the blurred chroma.
         sharpening: amount u of the unsharp mask.
         radius: deviation r of that mask, in pixels.
-        quality: of the JPEG; None leaves out JPEG.
+        quality: quality of the JPEG; None leaves out JPEG.
         unfinished: share of the pictures that are only compressed.
 
     Raises:
@@ -79,7 +80,8 @@ class Finish:
             raise ValueError(f"finish: unfinished must be a share in [0, 1], got {self.unfinished}")
 
     def sample(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """``finish`` ``(batch, 8)``: a column for each of the ranges before ``quality``, zeros if it is unfinished;
+        """Draw ``finish`` ``(batch, 8)``, a column for each range before ``quality``, zeros for unfinished pictures.
+
         ``chroma_420`` ``(batch,)`` says where JPEG halves the chroma.
         """
         *shares, unfinished, chroma = torch.rand(len(_RANGES) + 2, batch, generator=generator)
@@ -92,7 +94,7 @@ class Finish:
 
     @one_thread()  # the same bits everywhere
     def apply(self, noisy: Tensor, clean: Tensor, finish: Tensor) -> tuple[Tensor, Tensor]:
-        """Noisy and clean sRGB ``(B, 3, H, W)`` in [0, 1], finished alike; ``finish`` is as :meth:`sample` gives it."""
+        """Finish noisy and clean sRGB ``(B, 3, H, W)`` in [0, 1] alike; ``finish`` comes from :meth:`sample`."""
         pictures = torch.cat([noisy, clean], dim=1)
         is_finished = finish.any(dim=1)
         if is_finished.any():
@@ -116,7 +118,7 @@ def _between(limits: tuple[float, float], share: Tensor, by_logarithm: bool) -> 
 
 
 def _finish(pictures: Tensor, finish: Tensor) -> Tensor:
-    """Noisy and clean ``(B, 6, H, W)``, colour by colour, finished as ``(B, 8)`` says."""
+    """Finish noisy and clean pictures ``(B, 6, H, W)``, colour by colour, as ``finish`` ``(B, 8)`` says."""
     softness, window, share, edge, chroma_blur, mix, amount, radius = finish.cpu().unbind(1)
     pictures = blur(pictures, softness)
     red, green, blue = pictures[:, 0::3], pictures[:, 1::3], pictures[:, 2::3]
@@ -134,7 +136,7 @@ def _finish(pictures: Tensor, finish: Tensor) -> Tensor:
 
 
 def _reduce_noise(luma: Tensor, window: Tensor, share: Tensor, edge: Tensor) -> Tensor:
-    """Noisy and clean luma ``(B, 2, H, W)`` through the guided filter of the module."""
+    """Pass noisy and clean luma ``(B, 2, H, W)`` through the module's guided filter."""
     noise = torch.stack([(noisy - clean).square().mean() for noisy, clean in luma])[:, None, None, None]
     mean = box_mean(torch.cat([luma, luma[:, :1].square()], dim=1), window)
     variance = (mean[:, 2:] - mean[:, :1].square()).clamp_min(1e-9)
@@ -146,7 +148,7 @@ def _reduce_noise(luma: Tensor, window: Tensor, share: Tensor, edge: Tensor) -> 
 
 
 def blur(image: Tensor, deviation: Tensor) -> Tensor:
-    """``(B, N, H, W)`` through Gaussians of deviations ``(B,)`` in pixels; the edge is repeated beyond the edge."""
+    """Blur ``(B, N, H, W)`` with Gaussians of deviations ``(B,)`` in pixels; the edge is repeated outwards."""
     reach = _REACH * deviation[:, None].cpu()
     distance = torch.arange(math.ceil(float(reach.max())) + 1)
     taps = torch.exp(-0.5 * (distance * _REACH / reach.clamp_min(0.1)).square())

@@ -1,9 +1,9 @@
 """A DataLoader of sRGB pictures as a loader of RAW pairs: one line, on the device of the training.
 
 Batch n of epoch e is drawn from a generator seeded with BLAKE2b(seed, "wrap", e, n), where the seed is the
-augmentation's: whatever the loader's workers do, the same batches make the same pairs. Each pass is a new epoch. In a
-distributed run each process has its share of the pictures (:mod:`rawaug.plugin.order`), and the keys of processes but
-the first have their rank as well.
+augmentation's. So the same batches make the same pairs, whatever the loader's workers do. Each pass is a new epoch. In
+a distributed run each process has its share of the pictures (:mod:`rawaug.plugin.order`), and the keys of all processes
+but the first also contain their rank.
 
 :func:`resumable` does the same for the epochs and the order of a loader of any batches, such as those of RawPairs.
 """
@@ -33,7 +33,7 @@ Batch = TypeVar("Batch", covariant=True)
 
 
 class Position(NamedTuple):
-    """The next batch of a pass, and the number of batches before it that the wrapped loader gives once more."""
+    """The next batch of a pass, and how many batches before it the wrapped loader will give again."""
 
     epoch: int
     batch: int
@@ -41,11 +41,11 @@ class Position(NamedTuple):
 
 
 class ResumableLoader(Generic[Batch]):
-    """A loader that numbers its passes, and goes on in the middle of one; its other attributes are the loader's own.
+    """A loader that numbers its passes and can go on in the middle of one; other attributes are the loader's own.
 
     Args:
-        loader: a DataLoader, or what iterates like one.
-        seed: of the order of a distributed run, where each process has its share.
+        loader: a DataLoader, or anything that iterates like one.
+        seed: seed of the order of a distributed run, where each process has its share.
     """
 
     def __init__(self, loader: Iterable[Any], seed: int = 0) -> None:
@@ -60,7 +60,7 @@ class ResumableLoader(Generic[Batch]):
 
     @property
     def share(self) -> Any:
-        """The wrapped loader, or in a distributed run this process's part of it."""
+        """The wrapped loader, or this process's part of it in a distributed run."""
         if self._share is None:
             if world_size() == 1:
                 return self.loader
@@ -73,9 +73,9 @@ class ResumableLoader(Generic[Batch]):
     def set_epoch(self, epoch: int, start: int = 0) -> None:
         """Set the epoch of the next pass and the number of its first batch.
 
-        Without it every pass counts as the next epoch. Call it with a fixed number before each pass over validation
-        data, to repeat the same noise, and with ``start`` where the wrapped loader itself resumes in the middle of
-        an epoch. It is forwarded to the wrapped loader's own ``set_epoch``, if there is one.
+        Without a call every pass counts as the next epoch. Call it with a fixed number before each pass over validation
+        data to repeat the same noise, and with ``start`` if the wrapped loader itself resumes in the middle of an
+        epoch. The epoch is forwarded to the wrapped loader's own ``set_epoch``, if there is one.
         """
         self._next = self._at = Position(require_epoch(epoch), require_epoch(start))
         self._loaded = None
@@ -87,11 +87,11 @@ class ResumableLoader(Generic[Batch]):
     def state_dict(self) -> dict[str, Any]:
         """The state from which :meth:`load_state_dict` goes on with the next batch.
 
-        It holds the epoch and the number of that batch, and, where the loader has these, the state of its own
-        ``generator``, the order of the pass, or its own ``state_dict``.
+        It holds the epoch and the number of that batch. If the loader has these, it also holds the state of the
+        loader's ``generator``, the order of the pass, or the loader's own ``state_dict``.
 
-        In the middle of a pass that is shuffled each process of a distributed run has a state of its own, unless the
-        loader's order comes from ``shuffle`` alone.
+        In the middle of a shuffled pass, each process of a distributed run has a state of its own, unless the loader's
+        order comes from ``shuffle`` alone.
         """
         if self._loaded is not None:  # nothing has been asked for since
             return dict(self._loaded)
@@ -111,12 +111,12 @@ class ResumableLoader(Generic[Batch]):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with the batch after the last one that ``state`` knows of.
 
-        A wrapped loader with a ``load_state_dict`` of its own goes on by itself. A DataLoader goes on in the order of
-        the pass, and loads nothing twice. Of any other loader the first batches are loaded again and passed over: it
+        A wrapped loader with its own ``load_state_dict`` goes on by itself. A DataLoader goes on in the order of the
+        pass, and loads nothing twice. Any other loader loads its first batches again and they are passed over, so it
         must give the same ones.
 
         Raises:
-            ValueError: if the state is that of another process, or the loader's order cannot be had again.
+            ValueError: if the state is that of another process, or the loader's order cannot be restored.
         """
         epoch, batch = require_epoch(state["epoch"]), require_epoch(state["batch"])
         self._loaded = None
@@ -146,7 +146,7 @@ class ResumableLoader(Generic[Batch]):
         self._loaded = state
 
     def _load_loader(self, state: Mapping[str, Any], batch: int) -> None:
-        """Load the state of a loader that has one, and that of its generator."""
+        """Load the state of a loader that has one, and the state of its generator."""
         generator = self._generator
         if generator is None or "generator" not in state:
             self.loader.load_state_dict(state["loader"])  # type: ignore[attr-defined]
@@ -158,7 +158,7 @@ class ResumableLoader(Generic[Batch]):
             generator.set_state(state["generator"])
 
     def _restore_generator(self, state: Mapping[str, Any], batch: int) -> None:
-        """Let the loader's generator go on, of which a new pool of workers draws once more than one used again."""
+        """Restore the loader's generator, from which a new pool of workers draws once more than a reused one."""
         if self._generator is None or "generator" not in state:
             return
         if batch:
@@ -169,7 +169,7 @@ class ResumableLoader(Generic[Batch]):
             self._generator.set_state(state["generator"])
 
     def _require_repeatable(self, batch: int) -> None:
-        """Raise ValueError in the middle of a pass where the order is neither kept nor told by the epoch."""
+        """Raise ValueError in the middle of a pass whose order is neither kept nor given by the epoch."""
         has_order = isinstance(self.loader, DataLoader) and not isinstance(self.loader.dataset, IterableDataset)
         if batch and has_order:
             raise ValueError(
@@ -182,7 +182,7 @@ class ResumableLoader(Generic[Batch]):
         return getattr(self.loader, "generator", None)
 
     def _prepare(self) -> tuple[Any, Any]:
-        """The loader that is iterated, and its order where that is kept."""
+        """Return the loader to iterate, and its order if that is kept."""
         if self._kept is None:
             self._kept, self._order = keep_order(self.share)
         return self._kept, self._order
@@ -213,10 +213,10 @@ class ResumableLoader(Generic[Batch]):
 
         self._at = Position(epoch + 1, 0)
         if number < start and not start and hasattr(self.loader, "load_state_dict"):
-            yield from self._again(epoch)  # its state was that of the end of the pass before
+            yield from self._again(epoch)  # the state was that of the end of the previous pass
 
     def _again(self, epoch: int) -> Iterator[Batch]:
-        """The pass of a loader that resumes by itself, and has first ended the pass of its state."""
+        """Make the pass of a loader that resumes by itself and has just ended the pass of its state."""
         length = self._length()
         for number, batch in enumerate(self.share):
             converted = self._convert(batch, epoch, number)
@@ -227,24 +227,24 @@ class ResumableLoader(Generic[Batch]):
 
     @staticmethod
     def _after(epoch: int, number: int, is_last: bool) -> Position:
-        """Where a pass goes on after a batch; training loops stop at the last one, before the end of the iterator."""
+        """Say where a pass goes on after a batch; training loops stop at the last one, before the iterator ends."""
         if is_last:
             return Position(epoch + 1, 0)
         return Position(epoch, number + 1)
 
     def _begin(self, epoch: int) -> None:
-        """Called before each pass: a dataset that numbers its epochs is told this one."""
+        """Tell the epoch to a dataset that numbers its epochs; this is called before each pass."""
         dataset: Any = getattr(self.loader, "dataset", None)
         if hasattr(dataset, "set_epoch"):
             dataset.set_epoch(epoch)
 
     def _convert(self, batch: Any, epoch: int, number: int) -> Batch:
-        """What becomes of a batch of the loader."""
+        """Convert a batch of the loader to what this loader yields."""
         converted: Batch = batch
         return converted
 
     def _length(self) -> int | None:
-        """Batches of a pass, where they can be counted on."""
+        """The number of batches in a pass, if it is reliable."""
         if isinstance(getattr(self.loader, "dataset", None), IterableDataset):
             return None
         if not isinstance(self.loader, Sized):
@@ -252,11 +252,11 @@ class ResumableLoader(Generic[Batch]):
 
         try:
             return len(self)
-        except TypeError:  # of a sampler without a length
+        except TypeError:  # raised by a sampler without a length
             return None
 
     def __getattr__(self, name: str) -> Any:
-        if "_share" not in self.__dict__:  # asked for before anything is set, by copy and pickle
+        if "_share" not in self.__dict__:  # copy and pickle ask for attributes before any is set
             raise AttributeError(name)
         return getattr(self.share, name)
 
@@ -264,13 +264,13 @@ class ResumableLoader(Generic[Batch]):
 def resumable(loader: Iterable[Any], seed: int = 0) -> ResumableLoader[Any]:
     """Make a loader that goes on in the middle of an epoch, exactly.
 
-    It numbers its passes and tells the number to a dataset with ``set_epoch``, such as :class:`rawaug.RawPairs`, so
+    It numbers its passes and gives the number to a dataset with ``set_epoch``, such as :class:`rawaug.RawPairs`, so
     that a pair depends on (seed, epoch, index) alone. It keeps the order of a shuffled pass with its state.
 
     Args:
-        loader: a DataLoader, or what iterates like one.
-        seed: of the order of a distributed run, in which each process has its share of a loader that is sequential or
-            has ``shuffle=True``.
+        loader: a DataLoader, or anything that iterates like one.
+        seed: seed of the order of a distributed run, in which each process has its share of a loader that is sequential
+            or has ``shuffle=True``.
 
     Example:
         >>> from rawaug import DictionaryISP, RawAugment, RawPairs
@@ -315,7 +315,7 @@ class WrappedLoader(ResumableLoader[Batch]):
         self.augment = augment.to(device)
 
     def _begin(self, epoch: int) -> None:
-        """The pairs are drawn here, so that the dataset's epochs are its own."""
+        """Do nothing: the pairs are drawn here, so the dataset keeps its own epochs."""
 
     def _convert(self, batch: Any, epoch: int, number: int) -> Batch:
         where = find_picture(batch, self.key, batched=True)
@@ -327,7 +327,7 @@ class WrappedLoader(ResumableLoader[Batch]):
         return converted
 
     def _with_channel(self, batch: Any) -> Any:
-        """Batches of grey pictures ``(B, H, W)``, which a DataLoader collates, with an axis for their one channel."""
+        """Give batches of grey pictures ``(B, H, W)``, as a DataLoader collates them, an axis for their one channel."""
         if getattr(self.loader, "batch_size", None) is None:
             return batch
         if isinstance(batch, (Tensor, np.ndarray)) and batch.ndim == 3:
@@ -343,7 +343,7 @@ class WrappedLoader(ResumableLoader[Batch]):
         return self.augment.make_pair(patches.to(self.device, non_blocking=True), generator, places)
 
     def _draw_crops(self, pictures: Any, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """One crop of each picture ``(B, C, height, width)``, and their places ``(B, 5)``."""
+        """Draw one crop of each picture ``(B, C, height, width)``, and their places ``(B, 5)``."""
         if is_picture(pictures):
             pictures = [pictures]
 
@@ -415,24 +415,24 @@ def wrap(
     batch_size: int | None = None,
     shuffle: bool | None = None,
 ) -> WrappedLoader[Any]:
-    """Make a loader of RAW pairs of any loader of sRGB batches; the rest of the training script stays as it is.
+    """Make a loader of RAW pairs from any loader of sRGB batches; the rest of the training script stays as it is.
 
     Args:
-        loader: a DataLoader, or what iterates like one. Its batches are pictures ``(B, 3, H, W)`` in any form that
-            :mod:`rawaug.plugin.pictures` accepts, lists of pictures, or tuples or mappings that have these. The
-            :class:`RawPair` takes their place, all else passes through. Or the path of a folder of pictures, which
-            needs ``crop`` where they differ in size.
+        loader: a DataLoader, or anything that iterates like one. Its batches are pictures ``(B, 3, H, W)`` in any form
+            that :mod:`rawaug.plugin.pictures` accepts, lists of pictures, or tuples or mappings that contain these. The
+            :class:`RawPair` takes their place, and everything else passes through. Or the path of a folder of pictures,
+            which needs ``crop`` if they differ in size.
         augment: makes the pairs, and moves to ``device``; or an ISP, its name or its path, or a camera. A
-            :class:`rawaug.RawNoise` takes clean RAW in place of pictures.
-        crop: even side of a square crop, or (height, width), drawn for each picture: makes a batch of pictures of
-            different sizes. By default whole pictures, without their last row or column where a side is odd.
+            :class:`rawaug.RawNoise` takes clean RAW instead of pictures.
+        crop: even side of a square crop, or (height, width), drawn for each picture. With it, pictures of different
+            sizes form a batch. By default whole pictures, without their last row or column if a side is odd.
         key: name of the pictures in batches that are mappings, their index in tuples (0 by default).
         keys, fields, order: how pairs are handed over, as for :class:`rawaug.RawPairs`; a batch has no names.
         bgr: whether pictures have their channels in the order B, G, R, as ``cv2.imread`` gives them.
-        device: where the pairs are made, by default where ``augment`` is; a ``torch.device``, or a name that
-            :func:`rawaug.kernels.runtime.find_device` knows, ``auto`` among them. uint8 pictures travel
-            there as uint8.
-        batch_size, shuffle: of a folder, 1 and false by default; a loader has its own.
+        device: device on which the pairs are made, by default that of ``augment``; a ``torch.device``, or a name that
+            :func:`rawaug.kernels.runtime.find_device` knows, including ``auto``. uint8 pictures are moved there as
+            uint8.
+        batch_size, shuffle: for a folder, 1 and false by default; a loader has its own.
 
     Raises:
         TypeError: if ``augment`` is none of these.

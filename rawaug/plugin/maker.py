@@ -1,9 +1,8 @@
-"""The base of what makes pairs: parameters are drawn first and applied after.
+"""The base of everything that makes pairs: parameters are drawn first and applied afterwards.
 
-:class:`rawaug.RawAugment` makes pairs of pictures, :class:`rawaug.RawNoise` of clean RAW. Each says what its inputs
-are, how their parameters are drawn (:meth:`PairMaker.draw_params`) and what parameters make of them
-(:meth:`PairMaker.apply_params`). What is around these two is written here once: single inputs and batches, tuples and
-mappings, generators and devices.
+:class:`rawaug.RawAugment` makes pairs from pictures, :class:`rawaug.RawNoise` from clean RAW. Each defines its inputs,
+how their parameters are drawn (:meth:`PairMaker.draw_params`), and how the parameters make a pair
+(:meth:`PairMaker.apply_params`). What surrounds these two is written here once: single inputs and batches, tuples and
 """
 
 from __future__ import annotations
@@ -24,15 +23,15 @@ from rawaug.seeding import keyed_generator, rank_key
 
 
 class PairMaker(nn.Module, ABC):
-    """Base of what makes pairs of batches.
+    """Base of the modules that make pairs from batches.
 
     Args:
-        seed: of the module's own draws, where no generator is passed. They are counted from its construction: to
-            resume, pass a generator, or use RawPairs or wrap.
+        seed: seed of the module's own draws, used where no generator is passed. They are counted from its construction:
+            to resume, pass a generator, or use RawPairs or wrap.
     """
 
     stream: ClassVar[str]
-    """Key of the module's own draws, beside the seed."""
+    """Key of the module's own draws, in addition to the seed."""
 
     def __init__(self, seed: int) -> None:
         super().__init__()
@@ -49,15 +48,15 @@ class PairMaker(nn.Module, ABC):
 
     @abstractmethod
     def open_folder(self, path: str | Path, size: tuple[int, int] | None) -> Any:
-        """The inputs of a folder, or of ``kind:path``, as a Dataset; ``size`` is that of the crops."""
+        """Open the inputs of a folder, or of ``kind:path``, as a Dataset; ``size`` is the size of the crops."""
 
     @abstractmethod
     def is_single(self, inputs: Any) -> bool:
-        """Whether these are one input, and not a batch of them."""
+        """Whether this is one input, and not a batch."""
 
     @abstractmethod
     def as_batch(self, inputs: Any, bgr: bool = False) -> Tensor:
-        """Inputs of one size, in any form, as a batch ``(B, C, H, W)``."""
+        """Convert inputs of one size, in any form, to a batch ``(B, C, H, W)``."""
 
     @abstractmethod
     def stack(self, patches: Sequence[Tensor]) -> Tensor:
@@ -73,7 +72,7 @@ class PairMaker(nn.Module, ABC):
         zoom: float = 1.0,
         bgr: bool = False,
     ) -> tuple[Tensor, Tensor]:
-        """Draw a crop of an input and cut it out: the patch, and its place as :class:`AugmentParams` keeps it."""
+        """Draw a crop of an input and cut it out; return the patch and its place as :class:`AugmentParams` keeps it."""
 
     @abstractmethod
     def cut_patch(self, whole: Any, place: Tensor, size: tuple[int, int] | None, bgr: bool = False) -> Tensor:
@@ -85,10 +84,10 @@ class PairMaker(nn.Module, ABC):
 
     @abstractmethod
     def apply_params(self, batch: Tensor, params: AugmentParams) -> RawPair:
-        """Make the pairs that parameters describe of a batch ``(B, C, H, W)``."""
+        """Make the pairs of a batch ``(B, C, H, W)`` that the parameters describe."""
 
     def find(self, sample: Any, key: str | int | None) -> Where:
-        """Where the inputs are in a loader's batch; None if it is nothing else."""
+        """Find the inputs in a loader's batch; None if the batch is nothing else."""
         return find_picture(sample, key, batched=True)
 
     # -- draw, apply --------------------------------------------------------------------------------------------------
@@ -98,13 +97,13 @@ class PairMaker(nn.Module, ABC):
     def sample(
         self, inputs: Any, generator: torch.Generator | None = None, crop: Tensor | None = None
     ) -> AugmentParams:
-        """Draw the parameters of a batch; those of a single input have no leading B.
+        """Draw the parameters of a batch; the parameters of a single input have no leading B.
 
         Args:
             inputs: a batch or a single input, in any form that the class lists.
-            generator: on the CPU; the module's own by default.
-            crop: ``(B, 5)`` where the inputs lie in larger frames, as :class:`AugmentParams` has it; by default they
-                are full frames.
+            generator: a generator on the CPU; the module's own by default.
+            crop: ``(B, 5)`` if the inputs lie in larger frames, as in :class:`AugmentParams`; by default they are full
+                frames.
         """
         params = self.draw_params(self._batch(inputs), generator or self._own_generator(), crop)
         if self.is_single(inputs):
@@ -114,12 +113,12 @@ class PairMaker(nn.Module, ABC):
     @eager
     @torch.no_grad()
     def apply(self, inputs: Any, params: AugmentParams | None = None) -> Any:
-        """Make the :class:`RawPair` that parameters describe, bit for bit the same at every call.
+        """Make the :class:`RawPair` that the parameters describe, bit for bit the same at every call.
 
         Args:
             inputs: as for :meth:`sample`. A function alone, as a surrounding module may pass it, goes to
                 ``nn.Module.apply``.
-            params: those of as many inputs; for a single one they and the pair have no leading B.
+            params: parameters of as many inputs; for a single one they and the pair have no leading B.
 
         Raises:
             ValueError: if there is no batch, or ``params`` are for another number of inputs.
@@ -141,7 +140,7 @@ class PairMaker(nn.Module, ABC):
 
         Args:
             batch: ``(B, C, H, W)`` as :meth:`as_batch` gives it, on the module's device.
-            generator: on the CPU.
+            generator: a generator on the CPU.
             crop: ``(B, 5)``, as for :meth:`sample`.
         """
         return self.apply_params(batch, self.draw_params(batch, generator, crop))
@@ -156,13 +155,13 @@ class PairMaker(nn.Module, ABC):
         """Draw parameters for a batch and apply them.
 
         Args:
-            batch: inputs as for :meth:`sample`, or a tuple or mapping that has them. A single input makes a single
+            batch: inputs as for :meth:`sample`, or a tuple or mapping that contains them. A single input makes a single
                 pair, without the leading B.
-            generator: of all that is drawn, on the CPU; the module's own by default.
+            generator: a generator on the CPU for all draws; the module's own by default.
             key: name or index of the inputs in a mapping or tuple.
 
         Returns:
-            A :class:`RawPair`; of a tuple or mapping, this with the pair in place of the inputs.
+            A :class:`RawPair`; for a tuple or mapping, the same with the pair in place of the inputs.
 
         Raises:
             ValueError: if there are no inputs.
@@ -175,7 +174,7 @@ class PairMaker(nn.Module, ABC):
             pair = pair.map(_first)
         return replace_picture(batch, where, pair)
 
-    if TYPE_CHECKING:  # nn.Module's own call is of any kind
+    if TYPE_CHECKING:  # nn.Module's own call has no types
 
         @overload
         def __call__(self, batch: Tensor, generator: torch.Generator | None = None, key: None = None) -> RawPair: ...
@@ -188,7 +187,7 @@ class PairMaker(nn.Module, ABC):
         ) -> Any: ...
 
     def _batch(self, inputs: Any) -> Tensor:
-        """Inputs as a batch; what is no tensor yet is moved to the module's device."""
+        """Turn inputs into a batch; anything that is not yet a tensor is moved to the module's device."""
         batch = self.as_batch(inputs)
         if isinstance(inputs, Tensor):
             return batch
@@ -199,7 +198,7 @@ class PairMaker(nn.Module, ABC):
             raise ValueError(f"the parameters describe a batch of {len(params.crop)}, this one has {len(batch)}")
 
     def _own_generator(self) -> torch.Generator:
-        """A new generator for each call, worker and process."""
+        """Make a new generator for each call, worker and process."""
         self._calls += 1
         worker = get_worker_info()
         worker_seed = worker.seed if worker else 0

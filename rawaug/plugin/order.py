@@ -1,8 +1,8 @@
 """The order in which a DataLoader visits its pictures: a process's share of it, and the rest of a pass.
 
 A DataLoader draws its order when a pass begins, from its own generator or from the global state, and a pool of workers
-that is used again draws a number less from it than a new one. So a pass that goes on after a break has its order by
-heart: it is kept with the state, and the batches that were seen are not loaded again.
+that is used again draws one number less from it than a new one. So the order of a pass is kept with the state: a pass
+that goes on after a break follows it, and the batches that were seen are not loaded again.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from torch.utils.data import (
 
 
 def world_size() -> int:
-    """The number of processes of a distributed run, 1 without one."""
+    """The number of processes of a distributed run; 1 without one."""
     if not torch.distributed.is_available() or not torch.distributed.is_initialized():
         return 1
     return torch.distributed.get_world_size()
 
 
 class KeptOrder:
-    """Stands in place of the sampler of a loader's indices, and keeps what it yields.
+    """A sampler in place of a loader's own, which keeps the indices that it yields.
 
     Args:
-        sampler: of indices, or of batches of them.
+        sampler: a sampler of indices, or of batches of them.
     """
 
     def __init__(self, sampler: Any) -> None:
         self.sampler = sampler
         self.current: list[Any] | None = None
-        """What the pass that is going on visits, in order; None before the first one."""
+        """What the current pass visits, in order; None before the first pass."""
         self._next: list[Any] | None = None
         self._first = 0
         self._generator: tuple[torch.Generator, Tensor] | None = None
@@ -74,8 +74,8 @@ def keep_order(loader: Any) -> tuple[Any, KeptOrder | None]:
         loader: any loader.
 
     Returns:
-        The copy, and its order; the loader itself and None where it resumes by itself, is no DataLoader, goes through
-        an iterable dataset, or has a sampler without a length.
+        The copy and its order. Or the loader itself and None if it resumes by itself, is no DataLoader, goes through an
+        iterable dataset, or has a sampler without a length.
     """
     if not isinstance(loader, DataLoader) or hasattr(loader, "load_state_dict"):
         return loader, None
@@ -92,18 +92,18 @@ def keep_order(loader: Any) -> tuple[Any, KeptOrder | None]:
 def _has_length(sampler: Any) -> bool:
     try:
         return isinstance(sampler, Sized) and len(sampler) >= 0
-    except TypeError:  # that of a batch sampler over one without a length
+    except TypeError:  # raised by a batch sampler over one without a length
         return False
 
 
 def is_drawn(sampler: Any) -> bool:
-    """Whether a sampler's order is drawn when a pass begins, and not told by the epoch."""
+    """Whether a sampler draws its order when a pass begins, instead of taking it from the epoch."""
     inner = sampler.sampler if isinstance(sampler, BatchSampler) else sampler
     return not isinstance(inner, (SequentialSampler, DistributedSampler, range, list, tuple, Tensor))
 
 
 def pack_order(order: Sequence[Any]) -> dict[str, Any]:
-    """An order as tensors where it is of whole numbers or batches of them, to be kept with a state."""
+    """Pack an order into tensors, if it consists of whole numbers or batches of them, to be kept with a state."""
     indices: list[Any] = []
     sizes = []
     for entry in order:
@@ -123,7 +123,7 @@ def pack_order(order: Sequence[Any]) -> dict[str, Any]:
 
 
 def unpack_order(packed: dict[str, Any]) -> list[Any]:
-    """The order that :func:`pack_order` has packed."""
+    """Read the order that :func:`pack_order` has packed."""
     if "order" in packed:
         return list(packed["order"])
 
@@ -136,15 +136,15 @@ def unpack_order(packed: dict[str, Any]) -> list[Any]:
 def own_share(loader: Any, seed: int) -> Any:
     """Divide a DataLoader between the processes of a distributed run.
 
-    Lightning and Fabric divide only a DataLoader, which a wrapped one is not.
+    Lightning and Fabric divide only a DataLoader, and a wrapped one is not a DataLoader.
 
     Args:
         loader: a DataLoader whose order comes from its ``shuffle``.
-        seed: of the order, the same in all processes.
+        seed: seed of the order, the same in all processes.
 
     Returns:
-        A loader over this process's pictures; ``loader`` itself in a single process, where its sampler was chosen by
-        the user, and where it is no DataLoader.
+        A loader over this process's pictures. Or ``loader`` itself in a single process, if the user chose its sampler,
+        or if it is no DataLoader.
     """
     if world_size() == 1 or not isinstance(loader, DataLoader) or not _has_own_order(loader):
         return loader
@@ -160,10 +160,10 @@ def own_share(loader: Any, seed: int) -> Any:
 
 
 def _with_samplers(loader: DataLoader[Any], **samplers: Any) -> DataLoader[Any]:
-    """A copy of a DataLoader with other samplers, and workers of its own."""
+    """Copy a DataLoader with other samplers, and with its own workers."""
     other = copy.copy(loader)
     for name, sampler in samplers.items():
-        object.__setattr__(other, name, sampler)  # a DataLoader itself refuses it after its construction
+        object.__setattr__(other, name, sampler)  # a DataLoader forbids this after its construction
     object.__setattr__(other, "_iterator", None)
     return other
 

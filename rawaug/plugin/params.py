@@ -1,4 +1,4 @@
-"""A training pair, and the parameters that were drawn for it: they go to a file and back, and replay the pair."""
+"""A training pair, and the parameters that were drawn for it. They can be saved and loaded, and reproduce the pair."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class AugmentParams(NamedTuple):
         isp: camera settings.
         noise: levels and seeds of the noise.
         crop: ``(B, 5)`` top and left of the picture in its full frame, height and width of the frame, and the view,
-            which is how the picture was turned after the crop (see :func:`rawaug.bayer.turn`). With a zoom it is
+            which says how the picture was turned after the crop (see :func:`rawaug.bayer.turn`). With a zoom it is
             ``(B, 6)``, and the last is the number of rows that were enlarged to the crop.
-        extras: with the target ``"srgb"`` ``demosaicing`` (its number), with JPEG ``quality``, with finishing
-            ``chroma_420``, each ``(B,)``, and ``finish`` ``(B, 8)``; with bursts ``motion`` ``(B, N, 3)`` and
-            ``frame_seed`` ``(B, N)``. Else it is empty.
+        extras: for the target ``"srgb"``, ``demosaicing`` (its number), ``quality`` with JPEG, and with finishing
+            ``chroma_420``, each ``(B,)``, and ``finish`` ``(B, 8)``; for bursts, ``motion`` ``(B, N, 3)`` and
+            ``frame_seed`` ``(B, N)``. Otherwise it is empty.
     """
 
     isp: ISPParams
@@ -38,7 +38,7 @@ class AugmentParams(NamedTuple):
     def map(self, change: Callable[[Tensor], Tensor]) -> AugmentParams:
         """Apply a function to every tensor.
 
-        Of a batch, ``params.map(lambda t: t[0])`` gives the parameters of the first picture, from ``(B, ...)`` to
+        For a batch, ``params.map(lambda t: t[0])`` gives the parameters of the first picture, from ``(B, ...)`` to
         ``(...)``.
         """
         isp = self.isp.map(change)
@@ -47,7 +47,7 @@ class AugmentParams(NamedTuple):
         return AugmentParams(isp, noise, change(self.crop), extras)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The parameters as a flat dict, to store with a batch; :meth:`from_tensors` reads it back."""
+        """Return the parameters as a flat dict, to store with a batch; :meth:`from_tensors` reads it back."""
         flat = {}
         for group, tensors in (("isp", self.isp._asdict()), ("noise", self.noise), ("extras", self.extras)):
             for name, tensor in tensors.items():
@@ -85,16 +85,16 @@ class AugmentParams(NamedTuple):
 
 
 class RawPair(NamedTuple):
-    """A training pair, packed R, Gr, Gb, B; without the leading B where it comes from a Dataset.
+    """A training pair, packed R, Gr, Gb, B; it has no leading B if it comes from a Dataset.
 
     RAW of other patterns than Bayer's (:mod:`rawaug.bayer`) is ``(B, 1, H, W)`` in all three. Other targets and bursts
     have the shapes that :class:`rawaug.RawAugment` states.
 
     Args:
         noisy: ``(B, 4, H/2, W/2)``, at most 1, not clipped at 0.
-        clean: ``(B, 4, H/2, W/2)``, at most 1: the sensor saturates there.
+        clean: ``(B, 4, H/2, W/2)``, at most 1, where the sensor saturates.
         variance: ``(B, 4, H/2, W/2)`` noise variance computed from the noisy signal, as a network sees it.
-        params: replays the pair.
+        params: parameters that reproduce the pair.
     """
 
     noisy: Tensor
@@ -108,9 +108,9 @@ class RawPair(NamedTuple):
 
     @property
     def level(self) -> Tensor:
-        """The strength of the noise, the root of the mean square of noisy less clean: ``(B,)``, or a scalar.
+        """The strength of the noise, the root mean square of noisy minus clean: ``(B,)``, or a scalar.
 
-        It is what networks for developed pictures are told, on the scale white = 1.
+        Networks for developed pictures take it as an input, on the scale white = 1.
         """
         if self.noisy.shape != self.clean.shape or self.noisy.numel() == 0:
             raise ValueError("level: noisy and clean differ in shape; a level is one of pairs of one kind")
@@ -122,12 +122,12 @@ class RawPair(NamedTuple):
 
 
 FIELDS = ("noisy", "clean", "variance", "params", "name", "level")
-"""What a sample of a Dataset can hold: a pair's parts, the name of its picture, and the strength of its noise."""
+"""The fields of a sample of a Dataset: a pair's parts, the name of its picture, and the strength of its noise."""
 
 RAW_PLANES = ("R", "Gr", "Gb", "B")
 """The planes of packed RAW, in order."""
 _ORDERS = {"RGGB": (0, 1, 2, 3), "BGGR": (3, 2, 1, 0), "GRBG": (1, 0, 3, 2), "GBRG": (2, 3, 0, 1)}
-"""What ``pixel_unshuffle`` of a mosaic of each CFA gives, as numbers of :data:`RAW_PLANES`."""
+"""The planes that ``pixel_unshuffle`` of a mosaic of each CFA gives, as indices into :data:`RAW_PLANES`."""
 
 
 @dataclass(frozen=True)
@@ -135,9 +135,9 @@ class PairForm:
     """How a pair is handed over: whole, as a tuple or as a dict, and in which order its planes are.
 
     Args:
-        fields: of :data:`FIELDS`, in the order of the tuple or dict; None for a :class:`RawPair`.
+        fields: names from :data:`FIELDS`, in the order of the tuple or dict; None for a :class:`RawPair`.
         keys: a key for each field, for a dict.
-        planes: numbers of R, Gr, Gb and B in the order of the planes; None for this very order.
+        planes: indices of R, Gr, Gb and B in the order of the planes; None for this very order.
     """
 
     fields: tuple[str, ...] | None = None
@@ -149,7 +149,7 @@ class PairForm:
 
         Args:
             pair: packed RAW ``(..., 4, h, w)`` in the order R, Gr, Gb, B, or any other target.
-            name: of its picture.
+            name: name of its picture.
 
         Raises:
             ValueError: if the name is asked for and there is none.
@@ -177,7 +177,7 @@ class PairForm:
         return RawPair(self._reorder(noisy), self._reorder(clean), self._reorder(variance), params)
 
     def _reorder(self, part: Tensor) -> Tensor:
-        """Packed RAW ``(..., 4, h, w)`` in the order of the planes; all else as it is."""
+        """Reorder packed RAW ``(..., 4, h, w)`` to the order of the planes; leave everything else as it is."""
         is_packed = part.ndim >= 3 and part.shape[-3] == len(RAW_PLANES)
         if not is_packed or self.planes is None:
             return part
@@ -196,12 +196,12 @@ def pair_form(
     Args:
         keys: names for noisy, clean, variance and params, in this order, as many as are wanted; or a mapping of names
             to :data:`FIELDS`. The pair is then a dict.
-        fields: of :data:`FIELDS`, as many as are wanted; the pair is then a tuple of these.
-        order: of the planes of packed RAW: a CFA, for the order that ``pixel_unshuffle`` of such a mosaic gives;
+        fields: names from :data:`FIELDS`, as many as are wanted; the pair is then a tuple of these.
+        order: order of the planes of packed RAW: a CFA, for the order that ``pixel_unshuffle`` of such a mosaic gives;
             ``"RGBG"`` or the like, in which the first G is Gr; or four names of R, Gr, Gb, B.
 
     Raises:
-        ValueError: if a name, a field or a plane is unknown or there twice.
+        ValueError: if a name, a field or a plane is unknown or appears twice.
     """
     planes = None if order is None else _planes_of(order)
     if keys is not None and fields is not None:
@@ -244,7 +244,7 @@ def _planes_of(order: str | Sequence[str]) -> tuple[int, ...]:
 
 
 def save_params(params: AugmentParams, path: str | Path) -> None:
-    """Write parameters to a safetensors file, which is replaced as a whole."""
+    """Write parameters to a safetensors file; an existing file is replaced as a whole."""
     tensors = {name: value.detach().cpu() for name, value in params.tensors().items()}
     write_tensors(tensors, {"format": "rawaug", "kind": _KIND}, path)
 

@@ -1,8 +1,8 @@
-"""Pictures in any common form, converted to one: RGB, channels first, 8 bits or float32 in [0, 1].
+"""Pictures in any common form, converted to a single one: RGB, channels first, 8 bits or float32 in [0, 1].
 
 A *picture* is a tensor, a NumPy array or a PIL image, HWC or CHW: uint8, uint16 (divided by 65535) or floating point
-in [0, 1]. Grey is repeated to three channels. Of RGBA the colours are kept as they are stored and alpha is left out;
-a float tensor of four channels, and an array that has them first, is refused: it is more likely packed RAW. A *batch*
+in [0, 1]. Grey is repeated to three channels. The colours of RGBA are kept as they are stored and alpha is left out. A
+float tensor of four channels, or an array that has them first, is refused, as it is more likely packed RAW. A *batch*
 is ``(B, 3, H, W)`` or ``(B, H, W, 3)``, or a list of pictures. A *sample*, or a loader's batch, is one of these, or a
 tuple or mapping with one among its fields.
 """
@@ -38,12 +38,12 @@ Where = str | int | None
 def to_rgb_tensor(picture: Any, bgr: bool = False) -> Tensor:
     """Convert a picture to ``(3, H, W)``, uint8 or float32.
 
-    The axis of length 1, 3 or 4 holds the channels; where both ends could, it is the first of a tensor and the last of
-    an array. 8 bits and floats keep their values. Floats may pass half an 8-bit level beyond [0, 1], as resizing leaves
-    them; they are checked on the CPU only, because elsewhere that would stall the device.
+    The axis of length 1, 3 or 4 holds the channels; if both ends qualify, it is the first axis of a tensor and the last
+    of an array. 8 bits and floats keep their values. Floats may exceed [0, 1] by half an 8-bit level, as resizing
+    leaves them. They are checked on the CPU only, because a check would stall other devices.
 
     Args:
-        picture: as the module lists them.
+        picture: a picture in any form that the module lists.
         bgr: whether its channels are in the order B, G, R, as ``cv2.imread`` gives them.
 
     Raises:
@@ -72,7 +72,7 @@ def to_rgb_batch(pictures: Any, bgr: bool = False) -> Tensor:
 
 
 def stack_pictures(images: Sequence[Tensor]) -> Tensor:
-    """Stack pictures ``(3, H, W)`` of one size to ``(B, 3, H, W)``; where only some are 8 bits, all become float32."""
+    """Stack pictures ``(3, H, W)`` of one size to ``(B, 3, H, W)``; if only some are 8 bits, all become float32."""
     sizes = sorted({tuple(image.shape[-2:]) for image in images})
     if len(sizes) != 1:
         listed = ", ".join(f"{height} x {width}" for height, width in sizes) or "no pictures"
@@ -86,7 +86,7 @@ def stack_pictures(images: Sequence[Tensor]) -> Tensor:
 
 
 def trim_to_even(image: Tensor) -> Tensor:
-    """Drop the last row or column of ``(..., H, W)`` where a side is odd: a Bayer cell is 2 x 2."""
+    """Drop the last row or column of ``(..., H, W)`` if a side is odd: a Bayer cell is 2 x 2."""
     height, width = image.shape[-2:]
     if min(image.shape[0], height // 2, width // 2) < 1:
         raise ValueError(f"a picture must be at least 2 x 2 and a batch must not be empty, got {tuple(image.shape)}")
@@ -104,10 +104,10 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
     """Find the picture of a sample.
 
     Args:
-        sample: a picture, or a tuple, list or mapping that has one.
-        key: its key in a mapping, or its index in a tuple or list. By default it is the first of a tuple, with a
+        sample: a picture, or a tuple, list or mapping that contains one.
+        key: its key in a mapping, or its index in a tuple or list. The default is the first element of a tuple, with a
             warning if the second is a picture of the same shape.
-        batched: whether ``sample`` is a loader's batch, in which a list of pictures is a batch of them.
+        batched: whether ``sample`` is a loader's batch, in which a list of pictures is a batch of pictures.
 
     Returns:
         The key or index, for :func:`get_picture`; None if the sample itself is the picture.
@@ -136,12 +136,12 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
 
 @cache
 def warn_of_pairs() -> None:
-    """Warn once a process: a filter of warnings that is set anew would let it through at every sample."""
+    """Warn once per process: a warnings filter that is set anew would let the warning through at every sample."""
     warnings.warn(_PAIR, stacklevel=3)
 
 
 def _likely_pair(first: Any, second: Any) -> bool:
-    """Whether both are pictures in colour, or batches of them, of one shape."""
+    """Whether both are colour pictures, or batches of them, of one shape."""
     if isinstance(first, (Tensor, np.ndarray)) and isinstance(second, (Tensor, np.ndarray)):
         if first.ndim not in (3, 4) or 3 not in (first.shape[-3], first.shape[-1]):
             return False
@@ -153,14 +153,14 @@ def _likely_pair(first: Any, second: Any) -> bool:
 
 
 def get_picture(sample: Any, where: Where) -> Any:
-    """The picture of a sample, at the place that :func:`find_picture` has found."""
+    """Get the picture of a sample, at the place that :func:`find_picture` has found."""
     return sample if where is None else sample[where]
 
 
 def replace_picture(sample: Any, where: Where, value: Any) -> Any:
     """Put ``value`` into a sample in place of its picture; the other fields stay, and a mapping becomes a dict.
 
-    A dict in place of the picture of a mapping is merged with it; ValueError if that would overwrite another field.
+    A dict that replaces the picture of a mapping is merged with it; ValueError if that would overwrite another field.
     """
     if where is None:
         return value
@@ -188,7 +188,7 @@ def _replace_in_mapping(sample: Mapping[Any, Any], where: str | int, value: Any)
 
 
 def _as_tensor(picture: Any) -> Tensor:
-    """Values as they are, in the type that PyTorch has for them."""
+    """Convert a picture to a tensor: the values as they are, in the type that PyTorch has for them."""
     if isinstance(picture, Tensor):
         if picture.layout != torch.strided:
             raise ValueError(f"a picture must be a dense tensor, got {picture.layout}; call to_dense()")
@@ -211,7 +211,7 @@ def _as_tensor(picture: Any) -> Tensor:
 
 
 def _rgb(image: Tensor, original: Any) -> Tensor:
-    """``(..., C, H, W)`` or ``(..., H, W, C)`` to ``(..., 3, H, W)``, uint8 or float32."""
+    """Convert ``(..., C, H, W)`` or ``(..., H, W, C)`` to ``(..., 3, H, W)``, uint8 or float32."""
     is_first = image.shape[-3] in _CHANNELS
     is_last = image.shape[-1] in _CHANNELS
     if not is_first and not is_last:
@@ -243,7 +243,7 @@ def _rgb(image: Tensor, original: Any) -> Tensor:
 
 
 def describe(value: Any) -> str:
-    """Say what a value is, for messages: its type, and the shape of a tensor or array."""
+    """Describe a value for messages: its type, and the shape of a tensor or array."""
     if isinstance(value, (Tensor, np.ndarray)):
         return f"{type(value).__name__} of shape {tuple(value.shape)}, {value.dtype}"
     return type(value).__name__

@@ -1,17 +1,18 @@
-r"""Targets besides RAW of one shot: linear camera RGB, developed sRGB, and bursts.
+r"""Targets other than RAW of one shot: linear camera RGB, developed sRGB, and bursts.
 
 *sRGB* is developed by the camera setting that made the RAW,
 
 .. math:: x = t(C^{-1} (g \cdot \mathrm{demosaic}(y)))
 
 with the gains g, matrix C and tone curve t of the draw (:class:`rawaug.isp.fast.FastForward`). Noisy and clean RAW are
-developed alike, by a demosaicing drawn from those at hand, so that the two differ by the sensor's noise alone: the
-developed clean RAW is the target, not the picture, which demosaicing alone would leave at 29 to 31 dB.
+developed alike, by a demosaicing method drawn from those available, so that the two differ by the sensor's noise alone.
+The target is the developed clean RAW, not the picture: demosaicing alone would leave the picture at 29 to 31 dB.
 
 *Bursts* are several noisy frames of one scene, moved by the hand that holds the camera. Frame k shows the scene of the
-first frame at ``R(angle) (p - c) + c + (dy, dx)`` for pixel p and centre c, in sensor pixels: light is interpolated
-(bicubic, and clipped at black) before the mosaic, so that each frame samples the scene at other places, and has noise
-of its own. Lens shading and defects of the sensor stay where they are. What comes into view at the edges is reflected.
+first frame at ``R(angle) (p - c) + c + (dy, dx)`` for pixel p and centre c, in sensor pixels. Light is interpolated
+(bicubic, and clipped at black) before the mosaic, so that each frame samples the scene at other places, and each has
+its own noise. Lens shading and defects of the sensor stay where they are. Whatever comes into view at the edges is
+filled by reflection.
 """
 
 from __future__ import annotations
@@ -42,15 +43,15 @@ class Srgb:
     """The target ``"srgb"``: noisy and clean developed pictures, and how they are developed.
 
     Args:
-        demosaicing: a name of :data:`rawaug.bayer.METHODS`, or several, of which one is drawn for each picture. All by
-            default.
-        jpeg: lowest and highest quality of the JPEG that the noisy picture goes through. By default that of ``finish``,
-            or no JPEG without it.
+        demosaicing: a name from :data:`rawaug.bayer.METHODS`, or several, of which one is drawn for each picture. The
+            default is all of them.
+        jpeg: lowest and highest quality of the JPEG that the noisy picture goes through. The default is that of
+            ``finish``, or no JPEG without it.
         finish: finish both pictures as cameras do, by noise reduction and sharpening, and the noisy one by JPEG: a
             :class:`rawaug.Finish`, or true for its defaults.
 
     Raises:
-        ValueError: if a demosaicing is unknown, or the quality out of range.
+        ValueError: if a demosaicing method is unknown, or the quality is out of range.
     """
 
     demosaicing: tuple[str, ...] | str | None = None
@@ -65,7 +66,7 @@ class Srgb:
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """The names of the demosaicings that are drawn from."""
+        """The names of the demosaicing methods to draw from."""
         if self.demosaicing is None:
             return tuple(bayer.METHODS)
         if isinstance(self.demosaicing, str):
@@ -74,14 +75,14 @@ class Srgb:
 
     @property
     def finishing(self) -> Finish | None:
-        """The ranges of the finishing, None without it."""
+        """The ranges of the finishing; None without it."""
         if self.finish is True:
             return Finish()
         return self.finish or None
 
     @property
     def quality(self) -> tuple[int, int] | None:
-        """The range of the JPEG's quality, None without it."""
+        """The range of the JPEG's quality; None without it."""
         if self.jpeg or self.finishing is None:
             return self.jpeg
         return self.finishing.quality
@@ -103,9 +104,9 @@ class Srgb:
 
         Args:
             forward: the ISP's forward pass.
-            noisy: mosaics ``(B, 1, H, W)`` from 4 x 4 on; a saturated sensor becomes white.
+            noisy: mosaics ``(B, 1, H, W)`` of at least 4 x 4; a saturated sensor becomes white.
             clean: mosaics of the same shape.
-            params: what was drawn for them.
+            params: the parameters that were drawn for them.
 
         Returns:
             Noisy and clean sRGB ``(B, 3, H, W)`` in [0, 1], the noisy one after its JPEG.
@@ -125,15 +126,15 @@ class Srgb:
 def keep_white(setting: ISPParams) -> ISPParams:
     """Raise the gains ``(B, 3)`` of a setting to at least 1, so that a saturated sensor is developed to white.
 
-    Below 1, where the RAW was drawn brighter than its picture, the sensor's white would become grey.
+    With gains below 1, for RAW drawn brighter than its picture, the sensor's white would become grey.
     """
     return setting._replace(gains=setting.gains / setting.gains.amin(dim=-1, keepdim=True).clamp_max(1.0))
 
 
 def compress_jpeg(srgb: Tensor, quality: Tensor, chroma_420: Tensor | None = None) -> Tensor:
-    """Compress sRGB ``(B, 3, H, W)`` in [0, 1] as JPEGs of the qualities ``(B,)``, and decode it again.
+    """Compress sRGB ``(B, 3, H, W)`` in [0, 1] as JPEGs of the qualities ``(B,)``, and decode them again.
 
-    Chroma is 4:2:2, or, where ``chroma_420`` ``(B,)`` is given, 4:2:0 where it is true and 4:4:4 elsewhere.
+    Chroma is 4:2:2. If ``chroma_420`` ``(B,)`` is given, it is 4:2:0 where that is true and 4:4:4 elsewhere.
     """
     from rawaug.io.pictures import recode_jpeg  # OpenImageIO
 
@@ -148,15 +149,15 @@ def compress_jpeg(srgb: Tensor, quality: Tensor, chroma_420: Tensor | None = Non
 
 @dataclass(frozen=True)
 class Burst:
-    """Several noisy frames of a scene from a hand that moves.
+    """Several noisy frames of a scene, taken by a moving hand.
 
     Args:
         frames: number N of frames.
         motion: largest shift in pixels and largest rotation in degrees.
-        stops: exposure of each frame in stops, for brackets; all alike by default.
+        stops: exposure of each frame in stops, for brackets; all are equal by default.
 
     Raises:
-        ValueError: if there is no frame, a motion is negative, or the exposures are not one for each frame.
+        ValueError: if there is no frame, a motion is negative, or there is not one exposure for each frame.
     """
 
     frames: int
@@ -188,16 +189,16 @@ class Burst:
         return {"motion": motion, "frame_seed": seeds.reshape(batch, self.frames)}
 
     def move(self, scene: Tensor, motion: Tensor) -> Tensor:
-        """The frames ``(B * N, 3, H, W)`` that see linear light ``(B, 3, H, W)`` after their motions ``(B, N, 3)``."""
+        """Make the frames ``(B * N, 3, H, W)`` that show light ``(B, 3, H, W)`` after their motions ``(B, N, 3)``."""
         moving = move(scene.repeat_interleave(self.frames, 0), motion.flatten(0, 1))
-        moving.clamp_(min=0.0)  # beside edges a bicubic curve undershoots
+        moving.clamp_(min=0.0)  # a bicubic curve undershoots beside edges
 
         first = (motion == 0.0).all(-1).flatten().nonzero()[:, 0].to(scene.device)
-        moving[first] = scene[first // self.frames]  # which nothing interpolates
+        moving[first] = scene[first // self.frames]  # the first frame is not interpolated
         return moving
 
     def expose(self, frames: Tensor) -> Tensor:
-        """Frames ``(B * N, 3, H, W)`` at their exposures, clipped at 1, the sensor's white."""
+        """Expose frames ``(B * N, 3, H, W)`` as their stops say, clipped at 1, the sensor's white."""
         stops = torch.tensor(self.stops or (0.0,) * self.frames, device=frames.device)
         stops = stops.repeat(len(frames) // self.frames)
         return (frames * torch.exp2(stops)[:, None, None, None]).clamp_max(1.0)
@@ -208,7 +209,7 @@ def _is_finite(value: object) -> bool:
 
 
 def move(image: Tensor, motion: Tensor) -> Tensor:
-    """Images ``(B, C, H, W)`` as they are seen after motions ``(B, 3)``: dy and dx in pixels, angle in radians.
+    """Move images ``(B, C, H, W)`` by motions ``(B, 3)``: dy and dx in pixels, angle in radians.
 
     Example:
         >>> image, motion = torch.rand(1, 3, 16, 16), torch.tensor([[1.0, 2.0, 0.0]])

@@ -1,9 +1,9 @@
 r"""A pair on disk: ``NAME.npz``, or ``NAME_clean`` and ``NAME_noisy`` as ``.dng``, ``.tif`` or ``.png``.
 
-:mod:`rawaug.data.formats` says what these hold; the frames of a burst are ``NAME_noisy_0`` and so on, in NPZ one array.
-``NAME.safetensors``, the parameters that replay the pair, is written last: a pair is there when its parameters are. A
-DNG's black level is as high as the darkest noisy value needs, so that nothing is clipped at black; all files of a pair
-have the same levels.
+:mod:`rawaug.data.formats` describes their contents. The noisy frames of a burst are ``NAME_noisy_0`` and so on, or one
+array in NPZ. ``NAME.safetensors``, the parameters that replay the pair, is written last: a pair exists once its
+parameters do. A DNG's black level is as high as the darkest noisy value needs, so that nothing is clipped at black; all
+files of a pair have the same levels.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ from rawaug.plugin.targets import Target
 from rawaug.version import __version__
 
 _LONGEST_STEM = 200
-"""Largest number of bytes of a picture's name in the names of its pairs, which have at most 255."""
+"""Maximum number of bytes of a picture's name in the names of its pairs, which have at most 255."""
 
 _WHITE = 65535
 """White level of DNGs."""
 
 _BLACK_STEP = 256
-"""Black levels of DNGs are multiples of it."""
+"""The step of the black levels of DNGs, which are its multiples."""
 
 _SHADING_NODES = (25, 33)
-"""Rows and columns of a gain map."""
+"""Number of rows and columns of a gain map."""
 
 Format = Literal["dng", "npz", "tiff", "png", "webdataset"]
 TARGETS: dict[Format, tuple[Target, ...]] = {"dng": ("raw",), "png": ("srgb",)}
-"""The targets that a format can hold; the others hold any."""
+"""The targets that a format can hold; formats that are not listed hold any target."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings that the files of a run depend on besides the pictures; ``synth.json`` beside them holds these."""
+    """The settings, besides the pictures, that a run's files depend on; ``synth.json`` beside the files holds them."""
 
     format: Format
     config: AugmentConfig
@@ -88,7 +88,7 @@ class PairMaker:
         Args:
             picture: an sRGB file.
             key: the picture's name in its folder, which keys the draws.
-            numbers: those of the pairs that are wanted.
+            numbers: the numbers of the pairs to make.
 
         Returns:
             The origin of the pairs, and an iterator over (number, pair), where the pair has no leading B.
@@ -124,7 +124,7 @@ def replay_pair(
     """Make a pair again from its parameters.
 
     Args:
-        params: those of one pair, without B.
+        params: parameters of one pair, without the leading B.
         origin: what the pair was made from.
         label: names the pair in messages.
         picture: the sRGB picture, if it has moved since.
@@ -154,7 +154,7 @@ class PictureTask:
         picture: an sRGB file.
         key: its name in the folder, which keys the draws.
         stem: the beginning of its pairs' files.
-        per_image: number of pairs that there are to be.
+        per_image: number of pairs that the picture is to have.
     """
 
     def __init__(self, picture: Path, key: str, stem: Path, per_image: int) -> None:
@@ -184,13 +184,13 @@ class PictureTask:
 
 
 def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: int) -> Iterator[PictureTask]:
-    """Make one task for each picture; pictures that differ only in their extension keep it in the names of their pairs.
+    """Make one task for each picture; pictures that differ only in their extension keep it in their pairs' names.
 
     Args:
         pictures: sRGB files below ``source``.
         source: the folder of the pictures.
         out: the folder of the pairs, whose subfolders are those of ``source``.
-        per_image: pairs of each picture.
+        per_image: number of pairs of each picture.
 
     Raises:
         ValueError: if the pairs of two pictures would have the same names.
@@ -222,9 +222,9 @@ def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, o
 
     Args:
         stem: the beginning of the files' names.
-        pair: one pair, without B.
-        augment: the augmentation that has made it.
-        format: one of files, not of shards.
+        pair: one pair, without the leading B.
+        augment: the augmentation that made it.
+        format: a format of files, not of shards.
         origin: what the pair was made from.
     """
     _WRITERS[format](stem, pair, augment)
@@ -234,7 +234,7 @@ def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, o
 
 
 def _images(pair: RawPair, augment: RawAugment) -> dict[str, Tensor]:
-    """The images of a pair, ``(C, H, W)`` each, by the end of their files' names."""
+    """Get the images of a pair, ``(C, H, W)`` each, by the end of their files' names."""
     images = {"_clean": pair.clean}
     if augment.burst is None:
         images["_noisy"] = pair.noisy
@@ -299,7 +299,7 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
 
 
 def _metadata(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
-    """The metadata of a pair in NPZ and TIFF; colour that cannot be inverted is left out."""
+    """Get the metadata of a pair in NPZ and TIFF; colour that cannot be inverted is left out."""
     if augment.target == "srgb":
         return pair_levels(pair)
 
@@ -312,10 +312,10 @@ def _metadata(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
 
 
 def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[dict[str, RawFrame], float]:
-    """Describe the mosaics of a RAW pair, without B, as frames of a camera.
+    """Describe the mosaics of a RAW pair, without the leading B, as frames of a camera.
 
     Returns:
-        The frames by the ends of their files' names, and by how many stops they are underexposed.
+        The frames by the ends of their files' names, and the number of stops by which they are underexposed.
 
     Raises:
         ValueError: if a DNG cannot store the white balance of the pair.
@@ -346,8 +346,8 @@ def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[dict[str, RawFram
 
 
 def _color(pair: RawPair, augment: RawAugment) -> tuple[tuple[float, float, float], Tensor, float]:
-    """White balance, the matrix from white-balanced camera colour to linear sRGB, and the stops of underexposure."""
-    # With raw = C x / gains for linear sRGB x, grey is s / gains in the camera, where s are the sums of C's rows: the
+    """Get white balance, the matrix from white-balanced camera colour to linear sRGB, and stops of underexposure."""
+    # With raw = C x / gains for linear sRGB x, grey is s / gains in the camera, where s are the sums of C's rows. So
     # white balance is gains / s, whose green is the exposure, and C with its rows over s is the matrix's inverse.
     setting = pair.params.isp
     matrix = setting.matrix if augment.isp.find(ColorCorrection) else torch.eye(3)
@@ -362,14 +362,14 @@ def _color(pair: RawPair, augment: RawAugment) -> tuple[tuple[float, float, floa
 
 
 def _black(darkest: float) -> float:
-    """The lowest multiple of 256 at which ``darkest`` is a digital number: d = y (white - black) + black >= 0."""
+    """Find the lowest multiple of 256 at which ``darkest`` is a digital number: d = y (white - black) + black >= 0."""
     depth = max(0.0, -darkest)
     black = depth / (1 + depth) * _WHITE
     return float(_BLACK_STEP * max(1, math.ceil(black / _BLACK_STEP)))
 
 
 def _shading_maps(augment: RawAugment, pair: RawPair) -> tuple[GainMap, ...]:
-    """Gain maps that correct the Gaussian part of the shading, if the ISP has any."""
+    """Make gain maps that correct the Gaussian part of the shading, if the ISP has any."""
     lens = augment.isp.find(LensShading)
     if lens is None:
         return ()

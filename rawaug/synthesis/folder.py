@@ -1,8 +1,8 @@
 """Make RAW pairs on disk from a folder of sRGB pictures, in parallel, on one machine or on many.
 
 The draws of a pair depend on (seed, picture's name, number) alone, and files are written whole. So a run may be stopped
-and started again, and may have any number of workers on any number of machines: the same files come out, and each is
-made once.
+and restarted, and may have any number of workers on any number of machines: the same files come out, and each is made
+once.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _Outcome = tuple[int, dict[str, str]]
 class Synthesis:
     """The result of a run: the pairs that it made or found, and the reason for each picture that cannot be read.
 
-    ``left_out`` has a line for each kind of file in the folder that is no picture.
+    ``left_out`` has a line for each kind of file in the folder that is not a picture.
     """
 
     out: Path
@@ -68,20 +68,20 @@ def synth(
 ) -> Synthesis:
     """Make ``per_image`` pairs of every picture of a folder and its subfolders, or of one; existing pairs are kept.
 
-    :mod:`rawaug.synthesis.files` and :mod:`rawaug.synthesis.shards` say what is written.
+    :mod:`rawaug.synthesis.files` and :mod:`rawaug.synthesis.shards` describe the output.
 
     Args:
         source: a folder of sRGB pictures, or one picture.
         out: the output folder.
         format: ``"dng"`` (16 bits, target raw only), ``"npz"``, ``"tiff"``, ``"png"`` (target srgb only) or
             ``"webdataset"``, tar shards.
-        per_image: pairs of each picture; may grow from run to run, but not in shards.
-        seed: with a picture's name and a pair's number it decides what is drawn.
-        workers: 0 for this process only. Others start by forkserver or spawn, so a script needs
+        per_image: number of pairs of each picture; may grow from run to run, but not in shards.
+        seed: decides the draws, together with a picture's name and a pair's number.
+        workers: 0 for this process only. Other workers start by forkserver or spawn, so a script needs
             ``if __name__ == "__main__":`` around its main part.
         max_pixels: larger pictures are refused before they are decoded.
         shard: ``"K/N"`` makes part K of N, for job arrays; all N write to the same folder.
-        per_shard: pictures in a tar file.
+        per_shard: number of pictures in a tar file.
         settings: ``isp``, ``camera``, ``noise``, ``iso``, ``draw``, ``target``, ``burst`` and ``cfa``, as in
             :meth:`rawaug.RawAugment.from_pretrained`.
 
@@ -106,7 +106,7 @@ def synth(
         raise ValueError(f"workers must be at least 0, got {workers}")
     part, parts = parse_shard(shard)
     run_settings = _settings(format, per_image, seed, AugmentConfig(**settings))
-    PairMaker(run_settings, max_pixels)  # raises for a wrong name here, not in a worker
+    PairMaker(run_settings, max_pixels)  # raises an error for a wrong name here, not in a worker
 
     lock = LOCK
     if parts != 1:

@@ -1,12 +1,12 @@
 """RAW pairs in tar shards, as WebDataset and Hugging Face read them.
 
-``shard-000012.tar`` has the pairs of pictures 12 n to 12 n + n - 1 of the sorted folder. A sample is three files of one
-key, ``PICTURE_NUMBER``: ``KEY.clean.npy`` and ``KEY.noisy.npy``, float32 as :class:`rawaug.RawPair` has them, and
-``KEY.json``: picture and ISP with their SHA-256, CFA, mosaic's height and width, noise levels, parameters.
+``shard-000012.tar`` has the pairs of pictures 12 n to 12 n + n - 1 of the sorted folder. A sample is three files with
+one key, ``PICTURE_NUMBER``: ``KEY.clean.npy`` and ``KEY.noisy.npy``, float32 as in :class:`rawaug.RawPair`, and
+``KEY.json`` with picture and ISP and their SHA-256, CFA, the mosaic's height and width, noise levels and parameters.
 
-The bytes of a shard depend on its pictures and the settings alone. A shard is there when ``.shards/shard-000012.json``
-is, which is written last. Once all are, ``index.json`` (sizes, as WebDataset's ``wids`` reads them) and the dataset
-card ``README.md`` are written.
+The bytes of a shard depend only on its pictures and the settings. A shard is complete once
+``.shards/shard-000012.json`` exists, which is written last. Once all shards are complete, ``index.json`` (sizes, as
+WebDataset's ``wids`` reads them) and the dataset card ``README.md`` are written.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ class ShardTask:
     """One shard.
 
     Args:
-        path: its tar file.
+        path: path of its tar file.
         first: index of its first picture in the sorted folder.
         source: the folder of the pictures.
-        names: its pictures within this folder.
-        per_image: pairs of each picture.
+        names: names of its pictures within this folder.
+        per_image: number of pairs of each picture.
     """
 
     def __init__(self, path: Path, first: int, source: Path, names: Sequence[str], per_image: int) -> None:
@@ -91,7 +91,7 @@ def _record_path(shard: Path) -> Path:
 
 
 def _read_record(shard: Path) -> dict[str, Any]:
-    """The record that marks a shard as complete, empty if there is none."""
+    """Read the record that marks a shard as complete; it is empty if there is none."""
     record = _record_path(shard)
     if not record.is_file():
         return {}
@@ -107,8 +107,8 @@ def shard_tasks(
         pictures: sRGB files below ``source``, sorted.
         source: the folder of the pictures.
         out: the folder of the shards.
-        per_image: pairs of each picture.
-        per_shard: pictures of each shard but the last.
+        per_image: number of pairs of each picture.
+        per_shard: number of pictures in each shard but the last.
     """
     if per_shard < 1:
         raise ValueError(f"per_shard must be at least 1, got {per_shard}")
@@ -124,14 +124,14 @@ def shard_tasks(
 def shard_settings(
     pictures: Sequence[Path], source: Path, per_image: int, per_shard: int, max_pixels: int
 ) -> dict[str, object]:
-    """The settings that must not change between runs: adding a picture would shift all later shards.
+    """Get the settings that must not change between runs: adding a picture would shift all later shards.
 
     Args:
         pictures: sRGB files below ``source``, sorted.
         source: the folder of the pictures.
-        per_image: pairs of each picture.
-        per_shard: pictures of each shard.
-        max_pixels: of the largest picture that is read.
+        per_image: number of pairs of each picture.
+        per_shard: number of pictures in each shard.
+        max_pixels: number of pixels of the largest picture that is read.
     """
     return {
         "pictures": len(pictures),
@@ -147,7 +147,7 @@ def _names(pictures: Sequence[Path], source: Path) -> tuple[str, ...]:
 
 
 def _describe(pair: RawPair, maker: PairMaker, origin: Origin, name: str, number: int) -> dict[str, Any]:
-    """The JSON of a sample; paths are relative, so that machines with other folders write the same bytes."""
+    """Describe a sample as JSON; paths are relative, so that machines with other folders write the same bytes."""
     sample = asdict(origin) | {"picture": name, "number": number, "cfa": maker.augment.cfa}
     sample["settings"]["isp"] = Path(sample["settings"]["isp"]).name
 
@@ -166,7 +166,7 @@ def _add_sample(tar: tarfile.TarFile, key: str, pair: RawPair, sample: Mapping[s
         "noisy.npy": _npy(pair.noisy),
     }
     for ending, content in contents.items():
-        entry = tarfile.TarInfo(f"{key}.{ending}")  # of nobody, at the epoch
+        entry = tarfile.TarInfo(f"{key}.{ending}")  # it has no owner, and its time is the epoch
         entry.size = len(content)
         tar.addfile(entry, io.BytesIO(content))
 

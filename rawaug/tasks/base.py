@@ -1,4 +1,4 @@
-"""A task: what goes in and comes out, how truth and noise are made, how results are compared and shown."""
+"""A task: its input and output, how truth and noise are made, and how results are compared and shown."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from rawaug.training.state import Start
 from rawaug.training.stream import TrainingStream
 
 TASKS = Registry("task", "rawaug.tasks", "rawaug.tasks")
-"""Subclasses of :class:`Task`, by the name in a recipe's key ``experiment``."""
+"""This maps the name in a recipe's key ``experiment`` to a subclass of :class:`Task`."""
 
 _MOST_ROWS = 3
-"""Maximum number of test frames in ``picture.png``."""
+"""``picture.png`` has at most this many test frames."""
 
 
 def task_of(data: str) -> type[Task]:
-    """The task whose images a test set, ``kind:path``, holds: RAW, unless another task reads it."""
+    """Find the task whose images a test set, ``kind:path``, holds: RAW, unless another task reads it."""
     for name in TASKS:
         task: type[Task] = TASKS[name]
         if task.reads(data):
@@ -47,32 +47,32 @@ def task_of(data: str) -> type[Task]:
 
 
 class Task(ABC):
-    """One kind of image with all that is special about it; everything else is the same for all tasks.
+    """One kind of image with everything special about it; all else is the same for all tasks.
 
     Args:
         recipe: the settings of the experiment.
     """
 
     settings: ClassVar[type[Recipe]] = Recipe
-    """The dataclass with the keys of its recipes."""
+    """This dataclass has the keys of the task's recipes."""
 
     upscale: ClassVar[int] = 1
-    """The factor by which results have longer sides than packed RAW has; 2 if networks demosaic."""
+    """The sides of results are this many times those of packed RAW; 2 if networks demosaic."""
 
     together: ClassVar[bool] = False
-    """Whether frames are binned so that the four sites of a cell make a pixel of full colour."""
+    """This says whether frames are binned so that the four sites of a cell make a pixel of full colour."""
 
     compared_in: ClassVar[str] = ""
-    """The end of the titles of tables: the domain of the scores, if it is not RAW."""
+    """Titles of tables end with this: the domain of the scores, if it is not RAW."""
 
     developed: ClassVar[bool] = False
-    """Whether frames may be pairs of developed pictures."""
+    """This says whether frames may be pairs of developed pictures."""
 
     input: ClassVar[Any] = NOISY
-    """The denoiser that stands for the noisy input in tables."""
+    """This denoiser stands for the noisy input in tables."""
 
     ensembles: ClassVar[bool] = True
-    """Whether the self-ensemble is scored, too."""
+    """This says whether the self-ensemble is also scored."""
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe: Any = recipe
@@ -81,7 +81,7 @@ class Task(ABC):
 
     @classmethod
     def reads(cls, data: str) -> bool:
-        """Whether a name of a test set is one of this kind of image alone."""
+        """Tell whether the name of a test set is only for this kind of image."""
         return False
 
     def open(self, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Any]:
@@ -89,7 +89,7 @@ class Task(ABC):
 
         Args:
             spec: a path, ``kind:path``, a sequence of pairs, or None for none.
-            split: of a dataset that has several.
+            split: split of a dataset that has several.
             clean: whether the frames of a bare folder are taken for clean ones.
 
         Raises:
@@ -104,9 +104,9 @@ class Task(ABC):
         return open_pairs(spec, split, clean, data.max_pixels, developed=self.developed, **settings)
 
     def prepare(self, frames: Sequence[Any], part: str) -> Sequence[Any]:
-        """Frames of a part, "validation" or "test", counted, binned and cropped as the recipe says; each is read once.
+        """Count, bin and crop the frames of a part, "validation" or "test", as the recipe says; each is read once.
 
-        The own noise of test frames is measured on whole frames, of which binning takes most.
+        The test frames' own noise is measured on whole frames; binning removes most of it.
         """
         data = self.recipe.data
         count = getattr(data, f"{part}_count")
@@ -125,10 +125,10 @@ class Task(ABC):
     # -- one denoiser on a test set, and several
 
     evaluate = staticmethod(evaluate_raw)
-    """Scores a denoiser on a test set, see :mod:`rawaug.evaluation.evaluate`."""
+    """This scores a denoiser on a test set, see :mod:`rawaug.evaluation.evaluate`."""
 
     benchmark = staticmethod(compare_raw)
-    """Compares denoisers on a test set, see :mod:`rawaug.evaluation.comparison`."""
+    """This compares denoisers on a test set, see :mod:`rawaug.evaluation.comparison`."""
 
     # -- networks
 
@@ -143,7 +143,7 @@ class Task(ABC):
         raise ValueError(f"denoiser: {name} gives {gives}; take another network")
 
     def pattern(self, start: Start | None, isp: DictionaryISP) -> CFA:
-        """The CFA that an arm is trained for: that of the weights that it starts from, else the ISP's."""
+        """Find the CFA that an arm is trained for: that of the weights that it starts from, else the ISP's."""
         if start is not None:
             return start.cfa
 
@@ -155,56 +155,56 @@ class Task(ABC):
     def stream(
         self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
     ) -> TrainingStream:
-        """The training samples of an arm.
+        """Make the training samples of an arm.
 
         Args:
-            arm: its name in the recipe.
+            arm: the arm's name in the recipe.
             frames: the real frames, as :meth:`training_frames` gives them.
             pictures: the sRGB pictures.
-            isp: makes RAW of them, in the CFA of the arm's network.
-            noise: is added to clean RAW.
-            seed: of the run.
+            isp: makes RAW of the pictures, in the CFA of the arm's network.
+            noise: the noise that is added to clean RAW.
+            seed: seed of the run.
         """
 
     def training_frames(self, pairs: Sequence[Pair], isp: DictionaryISP) -> Sequence[Any]:
-        """The real frames as :meth:`stream` and :meth:`validation_trials` take them."""
+        """Prepare the real frames as :meth:`stream` and :meth:`validation_trials` take them."""
         return pairs
 
     @abstractmethod
     def validation_trials(
         self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
     ) -> Sequence[Trial]:
-        """The frozen samples by which the weights of every arm are chosen; arguments as of :meth:`stream`."""
+        """Make the frozen samples that choose every arm's weights; the arguments are as in :meth:`stream`."""
 
     @abstractmethod
     def test_trials(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
-        """The test frames with their frozen noise, each made when it is first asked for."""
+        """Give the test frames their frozen noise; each is made when it is first asked for."""
 
     def samples_key(self) -> Sequence[Any]:
-        """What the weights depend on besides the settings that all tasks have."""
+        """Return what the weights depend on besides the settings that all tasks have."""
         return ()
 
     def validation_key(self) -> Any:
-        """What the validation depends on besides its frames."""
+        """Return what the validation depends on besides its frames."""
         return None
 
     def trials_key(self) -> Sequence[Any]:
-        """What the scores depend on besides weights, frames and views."""
+        """Return what the scores depend on besides weights, frames and views."""
         return ()
 
     def test_noise(self) -> Any:
-        """The noise of test frames without a capture, as the recipe says it."""
+        """Return the noise of test frames without a capture, as the recipe states it."""
         return self.recipe.noise
 
     # -- methods and scores
 
     @abstractmethod
     def denoiser(self, name: str, network: nn.Module, pattern: CFA, views: int = 1) -> Any:
-        """The network of an arm as it is tested; one whose training diverged is scored as it is."""
+        """Make the denoiser of an arm for the test; a network whose training diverged is scored as it is."""
 
     @abstractmethod
     def open_methods(self, classical: Sequence[Spec], untouched: Sequence[Path]) -> list[Any]:
-        """The denoisers that arms are compared with.
+        """Open the denoisers that arms are compared with.
 
         Args:
             classical: filters.
@@ -215,21 +215,21 @@ class Task(ABC):
         """
 
     def group(self, trial: Any) -> str:
-        """The table that a trial, or a row of its scores, belongs to; "" where there is one table."""
+        """Name the table that a trial, or a row of its scores, belongs to; it is "" if there is only one."""
         return ""
 
     def methods_for(self, group: str, methods: Sequence[Any], validation: Sequence[Any]) -> list[Any]:
-        """The methods of a table; ``validation`` are the frames by which settings of filters are chosen."""
+        """Choose the methods of a table; ``validation`` are the frames by which settings of filters are chosen."""
         return list(methods)
 
     def can_denoise(self, denoiser: Any, trial: Trial) -> bool:
-        """Whether a denoiser takes the image of a trial."""
+        """Tell whether a denoiser takes the image of a trial."""
         return True
 
     # -- what is shown
 
     def panels(self, methods: Mapping[str, Sequence[Any]], trials: Sequence[Trial]) -> list[Panels]:
-        """The frames of the page: test frames, denoised by the methods of their table."""
+        """Make the frames of the page: test frames, denoised by the methods of their table."""
         panels = []
         for trial in select_for_page(trials):
             denoisers = [one for one in methods[self.group(trial)] if self.can_denoise(one, trial)]
@@ -242,11 +242,11 @@ class Task(ABC):
         return save_picture(panels[:_MOST_ROWS], path)
 
     def command_of_weights(self, path: Path) -> str:
-        """The command that uses the weights of an arm."""
+        """Write the command that uses the weights of an arm."""
         return f"rawaug denoise IN.dng OUT.dng --denoiser {path}"
 
     def command_of_method(self, name: str) -> str:
-        """The command that uses another method, by the name of its row; empty if it is the noisy input."""
+        """Write the command that uses another method, by the name of its row; it is empty for the noisy input."""
         for trained in self.recipe.untouched:
             if name.partition(", ")[0] == Path(trained).stem:
                 return f"rawaug denoise IN.dng OUT.dng --denoiser {trained}"
@@ -261,5 +261,5 @@ class Task(ABC):
         return ""
 
     def notes(self, test: Sequence[Any]) -> dict[str, Any]:
-        """What ``results.json`` says besides scores."""
+        """Return what ``results.json`` says besides scores."""
         return {}

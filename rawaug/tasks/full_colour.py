@@ -1,10 +1,11 @@
-r"""A truth of full colour that no demosaicing has made, its mosaics, and what LibRaw makes of them.
+r"""Ground truth of full colour that no demosaicing has made, its mosaics, and LibRaw's demosaicing of them.
 
 .. math:: x = (R, (G_r + G_b) / 2, B), \qquad y \sim N(M x, \mathrm{shot\_var}\, M x + \mathrm{read\_var})
 
 The truth x takes each pixel from one 2 x 2 cell of a finer frame, whose four sites are means around the cell's centre
-(:func:`rawaug.bayer.bin_mosaic`, ``together``), so that it has real optics, colours in register and little noise of its
-own; M keeps one colour a site. PSNR and SSIM are those of linear camera RGB, and of one fixed development of it.
+(:func:`rawaug.bayer.bin_mosaic`, ``together``). It therefore has real optics, colours in register and little noise of
+its own. M keeps one colour for each site. PSNR and SSIM are those of linear camera RGB, and of one fixed development of
+it.
 """
 
 from __future__ import annotations
@@ -34,17 +35,17 @@ from rawaug.tasks.settings import NoiseSetting, Recipe
 from rawaug.training.state import Start
 
 LIBRAW = ("VNG", "PPG", "AHD", "DCB", "DHT", "AAHD")
-"""LibRaw's demosaicings by its names."""
+"""These are LibRaw's demosaicings by its names."""
 
 _LEAST = 512
-"""Minimum side of a frame for LibRaw's interpolation of X-Trans."""
+"""LibRaw's interpolation of X-Trans needs a frame of at least this side."""
 
 _BLACK, _WHITE = 1024, 65535
-"""Black and white level of the DNGs that LibRaw demosaics."""
+"""The DNGs that LibRaw demosaics have these black and white levels."""
 
 
 def full_colour(pair: Pair) -> Tensor:
-    """The truth of a frame: linear camera RGB ``(1, 3, H/2, W/2)`` cut to even sides, each pixel from one cell."""
+    """Make the truth of a frame: linear camera RGB ``(1, 3, H/2, W/2)`` with even sides, each pixel from one cell."""
     red, green, other_green, blue = bayer.pack(pair.raw[None], pair.cfa).unbind(1)
     rgb = torch.stack([red, (green + other_green) / 2, blue], dim=1)
     height, width = rgb.shape[-2:]
@@ -54,11 +55,11 @@ def full_colour(pair: Pair) -> Tensor:
 def rgb_trial(
     pair: Pair, noise: NoiseModel, ways: Mapping[str, str] | None = None, cfa: str = CFA.RGGB, **about: Any
 ) -> Trial:
-    """A frame as a test case in the domain ``rgb``: noisy RAW of a pattern against its truth of full colour.
+    """Make a frame a test case in the domain ``rgb``: noisy RAW of a pattern against its truth of full colour.
 
     Args:
         pair: the frame, of which each cell becomes a pixel.
-        noise: drawn on the mosaic of the truth; of every 2 x 2 square the same in all patterns.
+        noise: the noise drawn on the mosaic of the truth; every 2 x 2 square has the same noise in all patterns.
         ways: the demosaicings, by the names of rows, that follow a denoiser of RAW.
         cfa: the pattern.
         about: other attributes of the trial, such as ``condition``.
@@ -87,7 +88,7 @@ def rgb_trial(
 
 
 def _in_pattern(squares: Tensor, cfa: str) -> Tensor:
-    """Squares of 2 x 2 as a denoiser takes their pattern: packed RAW if it is Bayer's, else the mosaic."""
+    """Arrange squares of 2 x 2 as a denoiser takes their pattern: packed RAW if it is Bayer's, else the mosaic."""
     if cfa == CFA.RGGB:
         return squares
 
@@ -95,7 +96,7 @@ def _in_pattern(squares: Tensor, cfa: str) -> Tensor:
 
 
 def develop(image: Tensor, pair: Pair, exposure: float) -> Tensor:
-    """Linear RGB ``(1, 3, H, W)``, or packed RAW at its own size, to sRGB ``(3, H, W)`` in the frame's colours."""
+    """Develop linear RGB ``(1, 3, H, W)``, or packed RAW at its size, to sRGB ``(3, H, W)`` in the frame's colours."""
     rgb = image[0]
     if image.shape[1] == PACKED:
         rgb = image[0, [0, 1, 3]]
@@ -104,7 +105,7 @@ def develop(image: Tensor, pair: Pair, exposure: float) -> Tensor:
 
 
 def demosaic(image: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB) -> Tensor:
-    """RAW as a denoiser gives it to linear camera RGB ``(1, 3, H, W)``.
+    """Demosaic RAW, as a denoiser gives it, to linear camera RGB ``(1, 3, H, W)``.
 
     Args:
         image: packed RAW ``(1, 4, H/2, W/2)``, or a mosaic ``(1, 1, H, W)``.
@@ -122,17 +123,17 @@ def demosaic(image: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB) -> Ten
 
 
 def libraw_demosaic(mosaic: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB, **more: Any) -> Tensor:
-    """A mosaic ``(1, 1, H, W)`` to linear camera RGB ``(1, 3, H, W)`` by LibRaw.
+    """Demosaic a mosaic ``(1, 1, H, W)`` to linear camera RGB ``(1, 3, H, W)`` by LibRaw.
 
-    LibRaw works on white-balanced RAW, as in its own pictures, and clips at white what the gains lift beyond it, so
-    that the mosaic is scaled down before and the result up again.
+    LibRaw works on white-balanced RAW, as in its own pictures, and clips at white what the gains lift beyond it. The
+    mosaic is therefore scaled down before, and the result is scaled up again.
 
     Args:
-        mosaic: a small one is continued by its whole cells.
+        mosaic: the mosaic; a small one is extended by its whole cells.
         pair: the frame that it is of, whose colours LibRaw is given.
         method: one of :data:`LIBRAW`; X-Trans has Markesteijn's interpolation, whatever is given.
         cfa: the pattern of the mosaic.
-        more: arguments of rawpy's ``postprocess``.
+        more: further arguments of rawpy's ``postprocess``.
     """
     with extra("raw"):
         import rawpy
@@ -169,7 +170,7 @@ def libraw_demosaic(mosaic: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB
 
 
 def _repeat_cells(side: int, period: int) -> Tensor:
-    """Numbers of the lines of a side, which go on with its whole cells if LibRaw would find it too small."""
+    """Number the lines of a side, which go on with its whole cells if LibRaw would find it too small."""
     count = side
     if period != 2:
         count = max(side, _LEAST)
@@ -183,7 +184,7 @@ class FullColourRecipe(Recipe):
     """A recipe whose validation and test frames are truths of full colour.
 
     Args:
-        test_noise: of these frames, in place of ``noise``.
+        test_noise: noise of these frames, in place of ``noise``.
     """
 
     from_pictures: ClassVar[bool] = True
@@ -191,7 +192,7 @@ class FullColourRecipe(Recipe):
 
 
 class FullColourTask(RawTask):
-    """Denoisers that are compared in full colour: their truth is a frame whose cells become pixels."""
+    """Denoisers that are compared in full colour; their truth is a frame whose cells become pixels."""
 
     together = True
     compared_in = "linear camera RGB"
@@ -201,13 +202,13 @@ class FullColourTask(RawTask):
         self.noise = noise_model(recipe.test_noise)
 
     def pattern(self, start: Start | None, isp: DictionaryISP) -> CFA:
-        """RGGB, whatever the ISP's is."""
+        """Return RGGB, whatever the ISP's CFA is."""
         return CFA.RGGB
 
     def validation_key(self) -> Any:
-        """The noise of the frames."""
+        """Return the noise of the frames."""
         return self.recipe.test_noise
 
     def test_noise(self) -> Any:
-        """``test_noise``."""
+        """Return ``test_noise``."""
         return self.recipe.test_noise

@@ -1,7 +1,7 @@
-"""Mosaics of every pattern: a mosaic and the planes of its colours in, the mosaic out, one network for all.
+"""Mosaics of every pattern: one network takes a mosaic and the planes of its colours, and returns the mosaic.
 
-The truth is mosaicked anew in each pattern. Results are demosaiced by LibRaw, X-Trans by Markesteijn's interpolation;
-Quad-Bayer, which LibRaw does not know, by :meth:`rawaug.bayer.Pattern.demosaic`.
+The truth is mosaicked anew in each pattern. Results are demosaiced by LibRaw, with Markesteijn's interpolation for
+X-Trans; Quad-Bayer, which LibRaw does not know, is demosaiced by :meth:`rawaug.bayer.Pattern.demosaic`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class MosaicRecipe(FullColourRecipe):
 
     Args:
         patterns: shares of the patterns in training, by name.
-        test_patterns: those of validation and test frames.
+        test_patterns: patterns of validation and test frames.
     """
 
     kind: ClassVar[str] = "mosaic"
@@ -49,7 +49,7 @@ class MosaicRecipe(FullColourRecipe):
 
 
 def mosaic_trial(pair: Pair, cfa: str, noise: NoiseModel) -> Trial:
-    """A frame as a test case of a pattern, in the domain ``rgb``: packed RAW if it is Bayer's, else a mosaic."""
+    """Make a frame a test case of a pattern, in the domain ``rgb``: packed RAW if it is Bayer's, else a mosaic."""
     method = "AHD"
     if cfa.startswith("QUAD"):
         method = "bilinear"
@@ -58,9 +58,9 @@ def mosaic_trial(pair: Pair, cfa: str, noise: NoiseModel) -> Trial:
 
 
 def planes_trial(pair: Pair, cfa: str, noise: NoiseModel) -> Trial:
-    """A frame as a network of mosaics takes it, with the planes of its colours: ``(1, 4, H, W)``, domain ``raw``.
+    """Make a frame what a network of mosaics takes, with its colours' planes: ``(1, 4, H, W)``, domain ``raw``.
 
-    It begins at the line from which the network is trained to meet the pattern.
+    The frame begins at the line from which the network is trained to meet the pattern.
     """
     trial = mosaic_trial(pair, cfa, noise)
     assert trial.variance is not None
@@ -87,7 +87,7 @@ class MosaicTask(FullColourTask):
     def stream(
         self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
     ) -> TrainingStream:
-        """Crops of pictures as RAW of all patterns."""
+        """Make crops of pictures as RAW of all patterns."""
         settings, train = self.recipe.arms[arm], self.recipe.train
         augment = RawAugment(isp, noise, draw=settings.draw)
         crops = MosaicCrops(pictures, augment, train.crop, settings.zoom, self.recipe.patterns)
@@ -96,7 +96,7 @@ class MosaicTask(FullColourTask):
     def validation_trials(
         self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
     ) -> Sequence[Trial]:
-        """The frames in every pattern."""
+        """Take the frames in every pattern."""
         trials = []
         for cfa in self.recipe.test_patterns:
             for pair in frames:
@@ -105,7 +105,7 @@ class MosaicTask(FullColourTask):
         return trials
 
     def test_trials(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
-        """The frames in every pattern."""
+        """Take the frames in every pattern."""
 
         def make(case: tuple[str, int]) -> Trial:
             cfa, index = case
@@ -115,17 +115,17 @@ class MosaicTask(FullColourTask):
         return make_trials(cases, make)
 
     def samples_key(self) -> Sequence[Any]:
-        """The patterns."""
+        """Return the patterns."""
         return self.recipe.patterns, self.recipe.test_patterns
 
     def trials_key(self) -> Sequence[Any]:
-        """The noise and the patterns of the test."""
+        """Return the noise and the patterns of the test."""
         return self.recipe.test_noise, self.recipe.test_patterns
 
     def group(self, trial: Any) -> str:
-        """The pattern."""
+        """Return the pattern."""
         return str(trial.condition)
 
     def can_denoise(self, denoiser: Any, trial: Trial) -> bool:
-        """Networks of mosaics take any pattern, other denoisers Bayer's."""
+        """Tell whether a denoiser takes the pattern: networks of mosaics take any, other denoisers take Bayer's."""
         return bool(denoiser.takes_pattern(trial.condition))

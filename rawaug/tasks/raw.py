@@ -1,4 +1,4 @@
-"""RAW: packed noisy RAW in, packed RAW out, trained on real frames, on pictures, or on both."""
+"""RAW: networks take packed noisy RAW and return packed RAW, trained on real frames, on pictures, or on both."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from rawaug.training.stream import TrainingStream
 
 @TASKS.register("raw")
 class RawTask(Task):
-    """Denoisers of RAW in one of Bayer's patterns, with clean targets or from noisy frames alone."""
+    """Denoisers of RAW in one of Bayer's patterns, trained with clean targets or on noisy frames alone."""
 
     def training_frames(self, pairs: Sequence[Pair], isp: DictionaryISP) -> Sequence[Any]:
-        """The pairs, or a :class:`NoisyFrame` of each if no arm sees clean ones."""
+        """Return the pairs, or a :class:`NoisyFrame` of each if no arm sees clean ones."""
         if not self.recipe.self_supervised:
             return pairs
 
@@ -39,7 +39,7 @@ class RawTask(Task):
     def stream(
         self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
     ) -> TrainingStream:
-        """Crops of the frames, and of pictures as RAW, in the arm's shares."""
+        """Make crops of the frames, and of pictures as RAW, in the arm's shares."""
         settings = self.recipe.arms[arm]
         train = self.recipe.train
         seed = derive_seed(seed, "stream")
@@ -68,7 +68,7 @@ class RawTask(Task):
     def validation_trials(
         self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
     ) -> Sequence[Trial]:
-        """The frames with frozen noise, or as r2r pairs if no arm sees clean ones; without any, pictures as RAW."""
+        """Take frames with frozen noise, or as r2r pairs if no arm sees clean ones; without any, pictures as RAW."""
         if frames and not self.recipe.self_supervised:
             return [trial_of(pair, noise, isp.cfa) for pair in frames]
 
@@ -80,15 +80,15 @@ class RawTask(Task):
         return freeze_samples(PictureCrops(RawPairs(pictures, augment, self.recipe.train.crop)), "validation")
 
     def test_trials(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
-        """The frames with captured or frozen noise, in the pattern of the ISP."""
+        """Take the frames with captured or frozen noise, in the pattern of the ISP."""
         return make_trials(frames, lambda pair: trial_of(pair, noise, isp.cfa))
 
     def denoiser(self, name: str, network: nn.Module, pattern: CFA, views: int = 1) -> RawDenoiser:
-        """The network in tiles, for its own pattern."""
+        """Make a denoiser of the network, in tiles, for its own pattern."""
         return RawDenoiser.of(network, self.recipe.device, name=name, cfa=pattern, views=views, checked=False)
 
     def open_methods(self, classical: Sequence[Spec], untouched: Sequence[Path]) -> list[RawDenoiser]:
-        """Filters and trained denoisers of mosaics."""
+        """Open filters and trained denoisers of mosaics."""
         denoisers = []
         for spec in classical:
             denoisers.append(RawDenoiser.of(spec).require_mosaic())

@@ -1,4 +1,4 @@
-"""Linear camera RGB: packed noisy RAW in, full colour out, beside denoisers of RAW followed by each demosaicing.
+"""Linear camera RGB: networks turn noisy packed RAW into full colour; rivals are RAW denoisers and a demosaicing.
 
 The demosaicings are those of :func:`rawaug.bayer.demosaic`, and LibRaw's.
 """
@@ -28,8 +28,8 @@ class RgbRecipe(FullColourRecipe):
     """Networks that demosaic and denoise at once.
 
     Args:
-        demosaicing: what each denoiser of RAW, of ``classical`` and ``untouched``, is followed by: bilinear, malvar, or
-            LibRaw's VNG, PPG, AHD, DCB, DHT or AAHD.
+        demosaicing: the demosaicings that follow each denoiser of RAW in ``classical`` and ``untouched``: bilinear,
+            malvar, or LibRaw's VNG, PPG, AHD, DCB, DHT or AAHD.
     """
 
     kind: ClassVar[str] = "rgb"
@@ -57,7 +57,7 @@ class _MalvarInput:
 
 @TASKS.register("rgb")
 class RgbTask(FullColourTask):
-    """Networks that demosaic, too."""
+    """Networks that also demosaic."""
 
     settings = RgbRecipe
     upscale = 2
@@ -66,17 +66,17 @@ class RgbTask(FullColourTask):
     def validation_trials(
         self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
     ) -> Sequence[Trial]:
-        """The frames with the noise of the test; without any, pictures as RAW."""
+        """Take the frames with the noise of the test; without any frames, take pictures as RAW."""
         if not frames:
             return super().validation_trials(frames, pictures, isp, noise)
 
         return [rgb_trial(pair, self.noise) for pair in frames]
 
     def test_trials(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
-        """The frames in RGGB, with every demosaicing."""
+        """Take the frames in RGGB, with every demosaicing."""
         ways = {method: method for method in self.recipe.demosaicing}
         return make_trials(frames, lambda pair: rgb_trial(pair, self.noise, ways))
 
     def trials_key(self) -> Sequence[Any]:
-        """The noise of the test."""
+        """Return the noise of the test."""
         return (self.recipe.test_noise,)

@@ -1,4 +1,4 @@
-"""The settings of a recipe: a dataclass for each part, which explains every key and has its type."""
+"""The settings of a recipe: a dataclass for each part, which explains every key and gives its type."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from rawaug.training.srgb_noise import noise_on_srgb
 from rawaug.training.srgb_samples import Told
 
 _SHORT_CROP = 256
-"""Side in pixels of the middles of frames that a dry run uses."""
+"""A dry run uses the middles of frames, of this side in pixels."""
 
 HELD_OUT = "auto"
-"""The value of ``data.validation`` for a part of ``data.pairs``."""
+"""``data.validation`` has this value for a part of ``data.pairs``."""
 
 _USUAL = "usual"
-"""The value of ``data.validation`` that :class:`DataConfig` replaces by the one that suits ``data.pairs``."""
+""":class:`DataConfig` replaces this value of ``data.validation`` by the one that suits ``data.pairs``."""
 
 _DEMO = "demo:"
-"""The beginning of the names of the built-in, simulated frames."""
+"""The names of the built-in, simulated frames begin with this."""
 
 _PAIRS = "pairs:"
 _BOUNDS: dict[str, tuple[float, float]] = {
@@ -43,39 +43,39 @@ _BOUNDS: dict[str, tuple[float, float]] = {
 
 
 def _require_noise_form(value: Any) -> Any:
-    """Refuse what is neither a name, a list nor a mapping, in the words of :func:`rawaug.noise.noise_model`."""
+    """Refuse anything but a name, a list or a mapping, in the words of :func:`rawaug.noise.noise_model`."""
     if not isinstance(value, (str, list, tuple, Mapping)):
         noise_model(value)
     return value
 
 
 NoiseSetting = Annotated[tuple[float, float] | str | list[str] | dict[str, Any], BeforeValidator(_require_noise_form)]
-"""The noise of a recipe, as :func:`rawaug.noise.noise_model` takes it."""
+"""This is the noise of a recipe, as :func:`rawaug.noise.noise_model` takes it."""
 
 
 @dataclass
 class DataConfig(PairSettings):
-    """Where pictures come from.
+    """The settings of the data: where pictures come from.
 
     Args:
         pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``, such as ``pairs:PATH`` for
             noisy/clean pairs; null for none.
         count: number of pairs to use; null for all.
-        select: which: first; scenes, whole ones; phones, as many of each; or a list of names of frames or their
-            folders.
+        select: which pairs to use: first; scenes, whole ones; phones, as many of each; or a list of names of frames or
+            their folders.
         pictures: the sRGB pictures to augment with: a folder, ``demo:``, ``shapes:COUNT``, a list of these, or
             ``pairs``, those of the chosen pairs.
         memory_mb: size in megabytes of the cache of decoded pictures.
-        max_pixels: larger pictures, those of pairs and PNG mosaics too, are refused; null for 2^26.
+        max_pixels: larger pictures, including those of pairs and PNG mosaics, are refused; null for 2^26.
         validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
             fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
-            and keeps the final weights; usual is demo:validation where ``pairs`` is the demo's or null, else auto.
+            and keeps the final weights; usual is demo:validation if ``pairs`` is the demo's or null, else auto.
         validation_count: number of pairs to use; null for all.
         validation_crop: side of the central crop used of each validation frame; null for the whole frame.
         test: test pairs; no earlier stage sees them.
         test_count: number of pairs to use; null for all.
         test_crop: side of the central crop used of each test frame; null for the whole frame.
-        bin: K bins validation and test frames K x K by colour site before noise is added: clean references of real
+        bin: K bins validation and test frames K x K by colour site before noise is added, for clean references of real
             photographs, which then have about 1 / K^2 of their own noise.
     """
 
@@ -116,7 +116,7 @@ class DataConfig(PairSettings):
                 raise ValueError(f"data.{key}: applies to {_PAIRS}PATH, which neither pairs, validation nor test is")
 
     def settings_of(self, spec: str | Sequence[Pair]) -> dict[str, Any]:
-        """The settings of ``pairs:PATH`` that are for this spec; none if it is another kind of data."""
+        """Give the settings of ``pairs:PATH`` for this spec; there are none for another kind of data."""
         if not _is_pair_folder(spec):
             return {}
 
@@ -127,7 +127,7 @@ class DataConfig(PairSettings):
 
 
 def _is_pair_folder(spec: str | Sequence[Pair] | None) -> bool:
-    """Whether frames are named as ``pairs:PATH``."""
+    """Tell whether frames are named as ``pairs:PATH``."""
     return isinstance(spec, str) and spec.startswith(_PAIRS)
 
 
@@ -138,20 +138,21 @@ class ArmConfig:
     Args:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
         draw: how the camera settings of pictures are drawn.
-        srgb: of sRGB targets: how pictures are developed; null draws every demosaicing, without JPEG.
-        zoom: of supervised arms: half of the crops of pictures are enlarged by up to this factor, see
+        srgb: for sRGB targets, how pictures are developed; null draws every demosaicing, without JPEG.
+        zoom: for supervised arms, half of the crops of pictures are enlarged by up to this factor, see
             :class:`rawaug.RawPairs`; 1 for none.
-        srgb_noise: of sRGB targets: noise drawn on the pictures themselves, in place of the camera's: Gaussian, BSRGAN,
-            Coloured, or {name, settings}, see :mod:`rawaug.training.srgb_noise`.
+        srgb_noise: for sRGB targets, noise drawn on the pictures themselves, in place of the camera's: Gaussian,
+            BSRGAN, Coloured, or {name, settings}, see :mod:`rawaug.training.srgb_noise`.
         srgb_share: share of the samples that have ``srgb_noise``; the rest have the camera's.
-        told: of sRGB targets: what a network that reads a level of noise is told of it; null for nothing.
+        told: for sRGB targets, the level of noise that is given to a network that reads one; null for none.
         estimator: training target, a name or {name, settings}: supervised uses clean frames; distilled uses
             what another denoiser makes of the noisy ones; noisier, noise2noise, r2r and neighbor2neighbor use noisy
             frames only, see :mod:`rawaug.training.estimators`.
         denoiser: this arm's network, in place of the recipe's; ``{start: rawaug-small}`` fine-tunes a shipped one.
-        learning_rate: in place of ``train.learning_rate``; null takes that one.
-        weigh: in place of ``train.weigh``; null takes that one.
-        steps: at most, where fewer than ``train.steps`` are enough, as for fine-tuning; null takes them all.
+        learning_rate: learning rate in place of ``train.learning_rate``; null takes that one.
+        weigh: weighting in place of ``train.weigh``; null takes that one.
+        steps: largest number of steps, if fewer than ``train.steps`` are enough, as for fine-tuning; null takes them
+            all.
     """
 
     augmented: float = 0.0
@@ -179,7 +180,7 @@ class ArmConfig:
 
     @property
     def sees_clean(self) -> bool:
-        """Whether the estimator needs clean frames."""
+        """This says whether the estimator needs clean frames."""
         name, _ = split_spec(self.estimator)
         return bool(ESTIMATORS[name].sees_clean)
 
@@ -193,8 +194,8 @@ class Recipe:
         data: where pictures come from.
         isp: how the dictionary ISP is fitted.
         camera: an ISP to use unchanged, by a shipped one's name or a file; null fits one to ``data.pairs``.
-        noise: added to clean RAW in training, and to test frames without a noisy capture: the name of a preset
-            or of a camera, a list of names of which each picture draws one, [shot_var, read_var], {name, settings} of a
+        noise: noise added to clean RAW in training, and to test frames without a noisy capture: the name of a preset or
+            of a camera, a list of names from which each picture draws one, [shot_var, read_var], {name, settings} of a
             camera or a model, or "camera", the levels measured on the frames that the ISP is fitted to.
         denoiser: the network.
         train: the training loop.
@@ -213,13 +214,13 @@ class Recipe:
     """
 
     kind: ClassVar[str] = "raw"
-    """The name of the task that reads these settings."""
+    """The task that reads these settings has this name."""
 
     target: ClassVar[Target] = "raw"
-    """The target of the augmentation."""
+    """This is the target of the augmentation."""
 
     from_pictures: ClassVar[bool] = False
-    """Whether arms can train on nothing but pictures, with clean targets."""
+    """This says whether arms can train on nothing but pictures, with clean targets."""
 
     name: str = "experiment"
     data: DataConfig = field(default_factory=DataConfig)
@@ -288,11 +289,11 @@ class Recipe:
             raise ValueError(f"weigh: {weigh} is not for noisy targets of {name}; use {' or '.join(weighings)}")
 
     def network_of(self, arm: str) -> DenoiserConfig:
-        """The network of an arm: its own, or else the recipe's."""
+        """Return the network of an arm: its own, or else the recipe's."""
         return self.arms[arm].denoiser or self.denoiser
 
     def loop_of(self, arm: str) -> TrainConfig:
-        """The training loop of an arm: the recipe's, with the arm's own learning rate, weighting and steps."""
+        """Return the training loop of an arm: the recipe's, with the arm's own learning rate, weighting and steps."""
         own = self.arms[arm]
         loop = self.train
         if own.learning_rate is not None:
@@ -305,7 +306,7 @@ class Recipe:
         return loop
 
     def shortest(self) -> Recipe:
-        """The recipe with one step an arm, on the middles of a few of its frames; networks and precision stay."""
+        """Shorten the recipe to one step for each arm, on the middles of a few frames; networks and precision stay."""
         data = replace(self.data, count=2, select="first", validation_count=1, test_count=1)
         data = replace(data, validation_crop=_SHORT_CROP, test_crop=_SHORT_CROP)
         train = replace(self.train, steps=1, validate_every=1, checkpoint_every=1, workers=min(self.train.workers, 1))
@@ -315,5 +316,5 @@ class Recipe:
 
     @property
     def self_supervised(self) -> bool:
-        """Whether the arms may see noisy frames alone."""
+        """This says whether the arms may see only noisy frames."""
         return not any(arm.sees_clean for arm in self.arms.values())

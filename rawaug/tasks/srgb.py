@@ -2,11 +2,11 @@ r"""Developed pictures: sRGB in and out, tested on real pairs, or on frames with
 
 .. math:: x = L(y + n), \qquad \operatorname{var}(n) = \mathrm{shot\_var} \cdot y + \mathrm{read\_var}
 
-L is LibRaw's own way from a DNG to sRGB: its demosaicing (AHD), its colours and its tone curve, not the forward pass
-that a training with camera noise has seen, though ``ahd`` is a relative. The truth is L(y). Noise is keyed by (frame,
-levels), the same for every method. Beside the arms stand classical filters on sRGB, whose strength validation chooses
-for each level, and trained RAW denoisers, which are given the levels and developed after. Real pairs are those of
-:mod:`rawaug.data.picture_pairs`, as ``cc15:DIR``.
+L is LibRaw's own way from a DNG to sRGB: its demosaicing (AHD), its colours and its tone curve. It is not the forward
+pass that a training with camera noise has seen, though ``ahd`` is a relative. The truth is L(y). Noise is keyed by
+(frame, levels), so it is the same for every method. The arms are compared with classical filters on sRGB, whose
+strength validation chooses for each level, and with trained RAW denoisers, which are given the levels and whose results
+are developed afterwards. Real pairs are those of :mod:`rawaug.data.picture_pairs`, as ``cc15:DIR``.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ from rawaug.training.srgb_samples import NoisyPictures, SrgbSamples
 from rawaug.training.stream import TrainingStream
 
 BLACK, WHITE = 8192.0, 65535.0
-"""Black and white level of the DNG: room for noise below black."""
+"""The DNG has these black and white levels, which leave room for noise below black."""
 
 _DEVIATIONS = (0.01, 0.015, 0.022, 0.033, 0.05, 0.075, 0.11, 0.16)
-"""Standard deviations of white noise from which validation chooses a filter's strength."""
+"""Validation chooses a filter's strength from these standard deviations of white noise."""
 
 REAL = "real"
-"""The name of the table of real pairs, whose level is not known."""
+"""The table of real pairs, whose level is not known, has this name."""
 
 _WITHOUT_PLANES = ("NonLocalMeans", "TotalVariation", "Wavelet")
 
@@ -67,12 +67,12 @@ _WITHOUT_PLANES = ("NonLocalMeans", "TotalVariation", "Wavelet")
 class SrgbRecipe(Recipe):
     """A comparison of blind denoisers of sRGB by what they are trained on.
 
-    ``noise`` is that of training. ``data.validation`` and ``data.test`` may be real pairs of developed pictures, too;
-    networks are told no level.
+    ``noise`` is the noise of training. ``data.validation`` and ``data.test`` may also be real pairs of developed
+    pictures. Networks are given no level.
 
     Args:
         rivals: denoisers of RAW to compare with, by name or file, in place of ``untouched``.
-        levels: (shot_var, read_var) of the RAW noise of validation and test frames, a table each.
+        levels: (shot_var, read_var) of the RAW noise of validation and test frames, with a table for each.
     """
 
     kind: ClassVar[str] = "srgb"
@@ -117,13 +117,13 @@ class SrgbTask(Task):
 
     @classmethod
     def reads(cls, data: str) -> bool:
-        """Whether the test set is of developed pictures."""
+        """Tell whether the test set is of developed pictures."""
         return is_picture_pairs(data)
 
     def stream(
         self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
     ) -> TrainingStream:
-        """Crops of pictures with the camera's noise, with noise drawn on them, or with both in the arm's shares."""
+        """Make crops of pictures with the camera's noise, noise drawn on them, or both in the arm's shares."""
         settings, train = self.recipe.arms[arm], self.recipe.train
 
         camera = None
@@ -141,39 +141,39 @@ class SrgbTask(Task):
     def validation_trials(
         self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
     ) -> Sequence[Trial]:
-        """The frames at every level, developed."""
+        """Take the frames at every level, developed."""
         return srgb_trials(frames, self.recipe.levels, "develop validation")
 
     def test_trials(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
-        """The frames at every level, developed."""
+        """Take the frames at every level, developed."""
         return srgb_trials(frames, self.recipe.levels, "develop test")
 
     def validation_key(self) -> Any:
-        """The levels."""
+        """Return the levels."""
         return self.recipe.levels
 
     def trials_key(self) -> Sequence[Any]:
-        """The levels."""
+        """Return the levels."""
         return (self.recipe.levels,)
 
     def test_noise(self) -> Any:
-        """Noise is that of each table's level."""
+        """Return None, since noise is that of each table's level."""
         return None
 
     def denoiser(self, name: str, network: nn.Module, pattern: CFA, views: int = 1) -> PictureDenoiser:
-        """The network in tiles; one that reads a level estimates it."""
+        """Make a denoiser of the network, in tiles; one that reads a level estimates it."""
         return PictureDenoiser.of(network, self.recipe.device, name=name, views=1, checked=False)
 
     def open_methods(self, classical: Sequence[Spec], untouched: Sequence[Path]) -> list[Any]:
-        """The rivals, denoisers of RAW; filters are made for each level, see :meth:`methods_for`."""
+        """Open the rivals, which are denoisers of RAW; filters are made for each level, see :meth:`methods_for`."""
         return [RawDenoiser.of(name, self.recipe.device).require_mosaic() for name in self.recipe.rivals]
 
     def group(self, trial: Any) -> str:
-        """The level."""
+        """Return the level."""
         return str(trial.strength)
 
     def methods_for(self, group: str, methods: Sequence[Any], validation: Sequence[Any]) -> list[Any]:
-        """Filters, each at the strength that is best on validation frames of this level, and the rivals."""
+        """Choose the filters, each at its best strength on validation frames of this level, and the rivals."""
         same_level = [trial for trial in validation if trial.strength == group]
         denoisers: list[Any] = []
         for spec in self.recipe.classical:
@@ -184,7 +184,7 @@ class SrgbTask(Task):
         return denoisers
 
     def panels(self, methods: Any, trials: Sequence[Trial]) -> list[Panels]:
-        """The first frame of each level."""
+        """Show the first frame of each level."""
         panels = []
         for group, of_group in methods.items():
             first = next(trial for trial in trials if trial.strength == group)
@@ -198,11 +198,11 @@ class SrgbTask(Task):
         return path
 
     def command_of_weights(self, path: Path) -> str:
-        """The command that denoises pictures with the weights of an arm."""
+        """Write the command that denoises pictures with the weights of an arm."""
         return f"rawaug denoise IN.jpg OUT.jpg --denoiser {path}"
 
     def command_of_method(self, name: str) -> str:
-        """The command that denoises pictures with a filter, or RAW with a rival."""
+        """Write the command that denoises pictures with a filter, or RAW with a rival."""
         method = name.partition(", ")[0]
         for rival in self.recipe.rivals:
             if method == Path(rival).stem:
@@ -215,7 +215,7 @@ class SrgbTask(Task):
         return ""
 
     def notes(self, test: Sequence[Any]) -> dict[str, Any]:
-        """The mean variance of the own noise of the test frames, in RAW, where it is known."""
+        """Return the mean variance of the test frames' own noise in RAW, if it is known."""
         own = {}
         for pair in test:
             if pair.own_noise is not None:
@@ -225,12 +225,12 @@ class SrgbTask(Task):
 
 
 def _level_name(levels: Levels) -> str:
-    """A level's name in tables and files."""
+    """Write a level's name in tables and files."""
     return f"{levels[0]:g}, {levels[1]:g}"
 
 
 def srgb_trials(pairs: Sequence[Any], levels: Sequence[Levels], label: str) -> list[Trial]:
-    """The trials of frames in the domain ``srgb``: RAW at every level, pairs of pictures as they are."""
+    """Make trials of frames in the domain ``srgb``: RAW at every level, pairs of pictures as they are."""
     trials: list[Trial] = []
     for pair in progress(pairs, label=label, unit="frame"):
         if isinstance(pair, PicturePair):
@@ -242,13 +242,13 @@ def srgb_trials(pairs: Sequence[Any], levels: Sequence[Levels], label: str) -> l
 
 
 def _real_trial(pair: PicturePair) -> Trial:
-    """A pair of pictures as it is published."""
+    """Make a trial of a pair of pictures as it is published."""
     (trial,) = picture_trials([pair])
     return replace(trial, condition="", strength=REAL)
 
 
 def _drawn_trials(pair: Pair, levels: Sequence[Levels]) -> list[Trial]:
-    """A RAW frame at every level as LibRaw develops it, with the RAW before."""
+    """Make trials of a RAW frame at every level, as LibRaw develops it, with the RAW before."""
     clean = developed(pair.raw, pair)
     packed = bayer.pack(pair.raw[None], pair.cfa)
     ways = {"then LibRaw": partial(_unpacked_and_developed, pair=pair)}
@@ -272,7 +272,7 @@ def _unpacked_and_developed(packed: Tensor, pair: Pair) -> Tensor:
 
 
 def developed(mosaic: Tensor, pair: Pair) -> Tensor:
-    """What LibRaw makes of a mosaic ``(1, H, W)`` in the colours of its pair: sRGB ``(1, 3, H, W)`` of 8 bits."""
+    """Develop a mosaic ``(1, H, W)`` by LibRaw in the colours of its pair: sRGB ``(1, 3, H, W)`` of 8 bits."""
     mosaic = mosaic.clamp(-BLACK / (WHITE - BLACK), 1.0)
     colour = pair.white_balance, pair.white_balance, pair.color_matrix
     frame = RawFrame(mosaic, pair.cfa, (BLACK,) * 4, WHITE, *colour, "rawaug", name=pair.name)
@@ -284,7 +284,7 @@ def developed(mosaic: Tensor, pair: Pair) -> Tensor:
 
 
 def best_filter(spec: Spec, trials: Sequence[Trial]) -> PictureDenoiser:
-    """The filter of the deviation with the highest mean PSNR on these trials."""
+    """Choose the filter of the deviation with the highest mean PSNR on these trials."""
     best, best_psnr = None, float("-inf")
     for deviation in _DEVIATIONS:
         denoiser = PictureDenoiser.of(spec, name=spec_label(spec), level=deviation)

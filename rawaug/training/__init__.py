@@ -1,1 +1,1 @@
-"""Fitting a camera's ISP, and training a RAW denoiser, with clean targets or from noisy frames alone."""
+"""Fitting of a camera's ISP, and training of a RAW denoiser with clean targets or on noisy frames alone."""

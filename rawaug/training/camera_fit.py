@@ -1,7 +1,7 @@
-"""``rawaug.fit``: files, folders or pairs in, a camera with its noise law out.
+"""``rawaug.fit``: makes a camera with its noise law from files, folders or pairs.
 
-The noise is measured on the frames that are fitted, those of each ISO together, by photon transfer, and on dark frames
-if they are given: on the captured noisy mosaic of a pair where it has one, else on the RAW file itself.
+The noise is measured by photon transfer on the fitted frames, those of each ISO together, and on dark frames if they
+are given. It is measured on a pair's captured noisy mosaic if there is one, else on the RAW file itself.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rawaug.isp.own_cameras import Camera, as_camera
 from rawaug.training.camera_noise import CameraNoise, measure_camera_noise
 
 WATCHED_PATCHES = 4
-"""Number of patches of a held-out frame that are scored during the fit."""
+"""This many patches of a held-out frame are scored during the fit."""
 
 
 def fit(
@@ -46,21 +46,21 @@ def fit(
     Args:
         source: a RAW file, a folder of them, a list of files and folders, ``kind:path`` of a known dataset, or pairs.
         progress: show progress bars.
-        noise: "on" also measures the camera's noise levels, for ``RawAugment(isp, noise="camera")``; "auto"
-            continues without them where they cannot be measured; the reason is in ``isp.info["noise_not_measured"]``.
+        noise: "on" also measures the camera's noise levels, for ``RawAugment(isp, noise="camera")``; "auto" continues
+            without them if they cannot be measured; the reason is in ``isp.info["noise_not_measured"]``.
         dark: folder of dark frames to measure the read variance.
         noise_figure: where to draw the measured points and the line.
         camera_jpeg: use the camera's JPEG of the same stem as the sRGB; False always uses LibRaw's rendering.
         held_out: frames to leave out of the fit; their PSNR_r is shown in the progress bar and stored in
             ``isp.info["held_out"]``.
         state: file with the state of the fit, to resume it; removed at the end.
-        cfa, black, white: of the files of ``pairs:PATH`` that do not state them, see :class:`rawaug.data.PairFolder`.
+        cfa, black, white: values for the files of ``pairs:PATH`` that do not state them, see
+            :class:`rawaug.data.PairFolder`.
         camera: figures of the camera to start from, a :class:`rawaug.Camera` or its YAML file, or a published camera by
-            its name. They decide where the colours of the frames do not.
-        settings: of :class:`rawaug.isp.fit.FitConfig`.
+            its name. They decide what the colours of the frames leave open.
+        settings: settings of :class:`rawaug.isp.fit.FitConfig`.
 
-    Frames that cannot be read, of those fitted and those held out, are left out; ``isp.info["unreadable"]`` has a line
-    for each.
+    Fitted and held-out frames that cannot be read are left out; ``isp.info["unreadable"]`` has a line for each.
 
     Raises:
         FileNotFoundError, ValueError: if a file is missing, none can be read as a Bayer RAW file, or a held-out frame
@@ -88,7 +88,7 @@ def fit(
     if held_out is not None:
         watch = _Watch(_held_out_pairs(held_out, pairs, camera_jpeg, mosaics))
 
-    estimate = _measure_noise(frames, noise, dark)  # before the fit: what fails here fails early
+    estimate = _measure_noise(frames, noise, dark)  # before the fit, so that failures come early
 
     figures = None
     if camera is not None:
@@ -120,7 +120,7 @@ def fit(
 def _held_out_pairs(
     held_out: str | Path | Sequence[Pair], pairs: Sequence[Pair], camera_jpeg: bool, mosaics: Mapping[str, Any]
 ) -> Sequence[Pair]:
-    """Open the held-out frames; ValueError if one of them is among those fitted, ``pairs``."""
+    """Open the held-out frames; raise ValueError if one of them is among the fitted ones, ``pairs``."""
     if not str(held_out).startswith("pairs:"):
         mosaics = {}
     others = _open_pairs(held_out, camera_jpeg, mosaics)
@@ -132,7 +132,7 @@ def _held_out_pairs(
 
 
 def _measure_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> CameraNoise | str | None:
-    """Measure the levels; return the reason where they cannot be measured."""
+    """Measure the levels; return the reason if they cannot be measured."""
     if noise == "off":
         return None
     try:
@@ -144,9 +144,9 @@ def _measure_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -
 
 
 def rendering_of(pairs: LazyPairs, frames: int, registered: int) -> str:
-    """Name the renderings that the fit was to, whose tone curve and colours the ISP undoes.
+    """Name the renderings that were fitted, whose tone curve and colours the ISP undoes.
 
-    Registered pairs are no JPEGs of the camera.
+    Registered pairs are not JPEGs of the camera.
     """
     counts = {pairs.rendering: registered, "JPEG of the camera": frames - registered}
 
@@ -154,7 +154,7 @@ def rendering_of(pairs: LazyPairs, frames: int, registered: int) -> str:
 
 
 class _Watch:
-    """PSNR_r of held-out frames, which are decoded once, on a few patches of each."""
+    """Measures PSNR_r of held-out frames, which are decoded once, on a few patches of each."""
 
     def __init__(self, pairs: Sequence[Pair]) -> None:
         self.pairs = Readable(Kept(pairs))

@@ -20,16 +20,16 @@ from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_dark_
 from rawaug.noise.estimate import WORST_FIT
 
 MOST_FRAMES = 32
-"""Maximum number of frames that are measured, as all of them are in memory."""
+"""At most this many frames are measured, as all of them are in memory."""
 _UNKNOWN = "unknown"
-"""The camera of files that do not name one."""
+"""Files that do not name a camera have this one."""
 
 
 class CameraNoise(NamedTuple):
     """The noise of a camera.
 
     Attributes:
-        law: its levels by ISO.
+        law: the camera's levels by ISO.
         estimates: the measured points by ISO.
     """
 
@@ -37,7 +37,7 @@ class CameraNoise(NamedTuple):
     estimates: dict[float | None, NoiseEstimate]
 
     def plot(self, path: str | Path) -> None:
-        """Draw the measured points and the line of each ISO, one file each, see :func:`noise_figures`."""
+        """Draw the measured points and the line of each ISO, one file for each, see :func:`noise_figures`."""
         for file, (iso, estimate) in zip(noise_figures(path, self.law), self.estimates.items(), strict=True):
             title = self.law.camera
             if iso is not None:
@@ -99,7 +99,7 @@ def _measure(
 
 
 def _group_by_iso(frames: Sequence[RawFrame]) -> dict[float | None, list[RawFrame]]:
-    """Group frames by ISO, ascending; ValueError if they are of two cameras, which do not share a law."""
+    """Group frames by ISO, ascending; raise ValueError if they are of two cameras, which share no law."""
     cameras: Counter[str] = Counter()
     by_iso: dict[float | None, list[RawFrame]] = defaultdict(list)
     for frame in frames:
@@ -117,7 +117,7 @@ def _group_by_iso(frames: Sequence[RawFrame]) -> dict[float | None, list[RawFram
 
 
 def _read_frames(pairs: Sequence[Pair]) -> list[RawFrame]:
-    """Read frames spread over ``pairs``; of :class:`Readable` ones those that can be read. None is developed."""
+    """Read frames spread over ``pairs``, and of :class:`Readable` ones only sound ones. None is developed."""
     last = len(pairs) - 1
     indices = list(range(len(pairs)))
     if last >= MOST_FRAMES:
@@ -156,7 +156,7 @@ def _align(frames: Sequence[RawFrame]) -> tuple[list[Tensor], str]:
 
 
 def noise_figures(path: str | Path, law: MeasuredLevels) -> list[Path]:
-    """List the files of the drawn points: ``path``, with the ISO in its name where there are several."""
+    """List the files of the drawn points: ``path``, with the ISO in its name if there are several."""
     path = Path(path)
     if len(law.levels) == 1:
         return [path]

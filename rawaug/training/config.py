@@ -1,4 +1,4 @@
-"""The settings of a training: its network and its loop, and what of them its weights depend on."""
+"""The settings of a training, its network and its loop, and those of them that the weights depend on."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from rawaug.registry import require_between
 from rawaug.training.losses import LOSSES
 
 MOST = 2**31
-"""Maximum of the settings that are numbers of steps, samples or processes."""
+"""Settings that are numbers of steps, samples or processes are at most this."""
 
 VALIDATIONS = 5
-"""Number of validations of a short training, which are the points of its curves."""
+"""A short training has this many validations, which are the points of its curves."""
 
 Weighing = Literal["linear", "normalised", "stabilised", "mixed", "relative"]
-"""How the loss weighs light and shade; :mod:`rawaug.training.weighing` has the formulas."""
+"""The loss weighs light and shade in one of these ways; :mod:`rawaug.training.weighing` has the formulas."""
 
 
 @dataclass
@@ -25,10 +25,10 @@ class DenoiserConfig:
     """The network.
 
     Args:
-        name: of the network; another one than the recipe's has its own settings.
-        settings: its constructor's keys.
+        name: name of the network; one other than the recipe's has its own settings.
+        settings: keys of its constructor.
         start: weights that training continues from: the name of a shipped denoiser or a file. Name and settings are
-            then the file's; where they are given, they must agree with it. Null starts from random weights.
+            then the file's; if they are given, they must agree with it. Null starts from random weights.
     """
 
     name: str = field(default="UNet", metadata={"registry": DENOISERS})
@@ -49,21 +49,22 @@ class TrainConfig:
         crop: side of the mosaic crops in pixels.
         learning_rate: peak learning rate of Adam.
         warmup: steps of linear warm-up.
-        schedule: of the learning rate after warm-up: cosine, down to 1%, or step, halved every ``halve_every`` steps.
+        schedule: schedule of the learning rate after warm-up: cosine, down to 1%, or step, halved every ``halve_every``
+            steps.
         halve_every: steps between halvings.
         loss: l1, l2, rms or log_mse, or {name, settings}.
         weigh: loss weighting of light and shade: linear, normalised, stabilised, mixed or relative,
             see :mod:`rawaug.training.weighing`.
         ema: decay of the running average of the weights, which are validated and saved; 0 disables it.
         start_share: share of the weights that the training started from in those that are validated and saved, from 0
-            up to 1. A fine-tuned network forgets part of what its start knew of other pictures; between both lie
+            up to 1. A fine-tuned network forgets part of what its start knew about other pictures; between the two lie
             networks that know both (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
         clip_norm: gradient norm limit; 0 disables it.
-        validate_every: steps between validations; the best weights are kept. A training of no more steps than that is
+        validate_every: steps between validations; the best weights are kept. A training with no more steps than that is
             validated five times.
         checkpoint_every: steps between checkpoints, from which a killed run resumes.
         workers: processes that prepare samples; 0 prepares them in the training process.
-        precision: Fabric's, such as 32-true or bf16-mixed.
+        precision: Fabric's precision, such as 32-true or bf16-mixed.
         channels_last: memory format of the network.
         compile: torch.compile the network.
         logger: where loss and validation are logged besides ``log.csv``: tensorboard, wandb or csv; null for nowhere.
@@ -119,19 +120,19 @@ class TrainConfig:
 
 
 SAME_WEIGHTS = frozenset({"workers", "compile", "checkpoint_every", "logger"})
-"""Keys of :class:`TrainConfig` that change the speed of a training, and not its weights."""
+"""These keys of :class:`TrainConfig` change the speed of a training, but not its weights."""
 
 
 def weights_key(network: DenoiserConfig, config: TrainConfig, samples: Any, validation: Any) -> str:
-    """Compute a short hash of what the weights of a training depend on: weights with the same key need no new training.
+    """Compute a short hash of what the weights depend on; weights with the same key need no new training.
 
     It leaves out the device, the number of processes, and what is used after the training.
 
     Args:
-        network: what is trained.
-        config: how it is trained.
-        samples: what the training samples depend on, as JSON.
-        validation: what the validation samples depend on; None if the weights of the last step are kept.
+        network: the network to train.
+        config: the settings of the loop.
+        samples: everything that the training samples depend on, as JSON.
+        validation: everything that the validation samples depend on; None if the weights of the last step are kept.
     """
     irrelevant = SAME_WEIGHTS
     if validation is None:

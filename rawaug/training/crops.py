@@ -20,14 +20,14 @@ from rawaug.plugin.dataset import RawPairs
 from rawaug.seeding import keyed_generator
 
 WATCHED = 16
-"""Number of samples made from pictures for watching a training without validation pairs."""
+"""This many samples are made from pictures to watch a training without validation pairs."""
 
 
 class Source(Protocol):
-    """A source of samples; one with a ``draw_batch(generators)`` makes those of a step together."""
+    """A source of samples; one with a ``draw_batch(generators)`` makes all samples of a step together."""
 
     def draw(self, generator: torch.Generator) -> Any:
-        """Draw a training sample, a named tuple of tensors ``(C, h, w)``, that depends on ``generator`` alone."""
+        """Draw a training sample, a named tuple of tensors ``(C, h, w)``, which depends only on ``generator``."""
         ...
 
 
@@ -41,7 +41,7 @@ def freeze_samples(source: Source, key: str) -> list[Trial]:
 
 
 def add_noise(clean: Tensor, noise: NoiseModel, generator: torch.Generator) -> Sample:
-    """Draw noise for clean packed RAW ``(1, 4, h, w)``: a sample of ``(4, h, w)``."""
+    """Draw noise for clean packed RAW ``(1, 4, h, w)``, which makes a sample of ``(4, h, w)``."""
     params = noise.sample(1, generator)
     noisy = noise.apply(clean, params)
     return Sample(noisy[0], clean[0], noise.variance(noisy, params)[0])
@@ -51,8 +51,8 @@ class RealCrops:
     """Crops of real RAW pairs, in eight turns that keep the CFA.
 
     Args:
-        pairs: clean frames, with a noisy capture or without.
-        noise: drawn for frames without a capture.
+        pairs: clean frames, with or without a noisy capture.
+        noise: the noise drawn for frames without a capture.
         crop: side of the crops in pixels.
         cfa: the pattern in which all crops are packed.
     """
@@ -76,7 +76,7 @@ class RealCrops:
 
 
 class PictureCrops:
-    """Samples of :class:`rawaug.RawPairs` in any target; zeros stand for the noise map where there is none."""
+    """Samples of :class:`rawaug.RawPairs` in any target; zeros stand for the noise map if there is none."""
 
     def __init__(self, pairs: RawPairs) -> None:
         self.pairs = pairs
@@ -101,7 +101,8 @@ class MosaicCrops:
 
     Args:
         pictures: a Dataset of pictures.
-        augment: of a Bayer pattern; noise of planes is then of the four sites of every 2 x 2 square.
+        augment: an augmentation of a Bayer pattern; noise of planes is then that of the four sites of every 2 x 2
+            square.
         crop: side in pixels.
         zoom: see :class:`rawaug.RawPairs`.
         patterns: shares of patterns by name.
@@ -142,8 +143,8 @@ def packed_crop(
     """Cut one random part out of all mosaics of a frame, in one of eight turns, and pack it.
 
     Args:
-        name: of the frame.
-        mosaics: each ``(C, H, W)``, of the pattern ``own``.
+        name: name of the frame.
+        mosaics: the mosaics, each ``(C, H, W)``, of the pattern ``own``.
         own: their pattern.
         crop: side in pixels.
         cfa: the pattern in which the result is packed.
@@ -162,7 +163,7 @@ def packed_crop(
     mosaics = [bayer.crop_to_cfa(mosaic, own, cfa) for mosaic in mosaics]
     height, width = mosaics[0].shape[-2:]
 
-    side = crop + 4  # turned, then cut to size, so that lines lost to the CFA do not show
+    side = crop + 4  # turned, then cut to size, so that lines lost to the CFA do not matter
     row = 2 * int(torch.randint((height - side) // 2 + 1, (), generator=generator))
     column = 2 * int(torch.randint((width - side) // 2 + 1, (), generator=generator))
     view = int(torch.randint(bayer.N_VIEWS, (), generator=generator))

@@ -2,8 +2,8 @@ r"""Distillation: a denoiser learns what a stronger one makes of the same noisy 
 
 .. math:: \theta \leftarrow \arg\min_\theta \; \mathbb{E}\, \ell(f_\theta(y),\ (1 - a)\, x + a\, g(y))
 
-A clean picture x differs from E[x | y], the best that any denoiser can give, by all that the noise has hidden. A
-trained teacher g is near that mean, so its results tell what f is to learn with far less scatter: fewer samples are
+A clean picture x differs from E[x | y], the best that any denoiser can give, by everything that the noise has hidden. A
+trained teacher g is near that mean, so its results show with far less scatter what f is to learn, and fewer samples are
 enough.
 
 Source: Hinton, Vinyals and Dean, "Distilling the Knowledge in a Neural Network", 2015.
@@ -32,8 +32,9 @@ class Distilled(Supervised):
     """Training with the results of another denoiser as targets.
 
     Args:
-        teacher: the name of a shipped denoiser, or a file, that takes and gives what the trained network does.
-        share: of the teacher in the target, from 0 to 1; the rest is the clean picture.
+        teacher: the name of a shipped denoiser, or a file, with the same kind of input and output as the trained
+            network.
+        share: share of the teacher in the target, from 0 to 1; the rest is the clean picture.
     """
 
     def __init__(self, teacher: str = "rawaug-best", share: float = 1.0) -> None:
@@ -61,7 +62,7 @@ class Distilled(Supervised):
 
     @torch.no_grad()
     def teach(self, noisy: Tensor, variance: Tensor) -> Tensor:
-        """Denoise a batch ``(B, C, h, w)`` of noise of this ``variance`` with the teacher."""
+        """Denoise a batch ``(B, C, h, w)`` with noise of this ``variance`` by the teacher."""
         device = noisy.device
         network = self.network.to(device)
         mixed = network.mixed and has_fast_bfloat16(device)

@@ -1,4 +1,4 @@
-r"""What a denoiser learns from noisy frames alone: pairs of input and target made of one noisy RAW ``y = x + n``.
+r"""Estimators, which train on noisy frames alone: input and target are both made of one noisy RAW ``y = x + n``.
 
 =================  ========================  ====================  =====================================================
 estimator          input                     target                what ``l2`` training converges to
@@ -12,13 +12,14 @@ neighbor2neighbor  one pixel of each cell    its neighbour         E[neighbour |
 
 ``m`` is drawn with the noise's own variance at x, ``shot_var x + read_var``. For pictures x is known; for real frames
 it is estimated (:func:`rawaug.training.noisy_frames.signal_estimate`), and the error of that estimate remains as a
-bias, mostly at edges. What the sensor clipped at black (as in SIDD's published frames) or at white is lost to every
-estimator. Targets are noisy, so the loss has to be l2: its minimum is the mean of the targets, that of l1 their median.
+bias, mostly at edges. Whatever the sensor clipped at black (as in SIDD's published frames) or at white is lost to every
+estimator. Targets are noisy, so the loss has to be l2: its minimum is the mean of the targets, whereas that of l1 is
+their median.
 
-Domain: packed RAW, black 0, white 1. Inputs are clipped at white as frames are, targets are not.
-Sources: Conde et al., AAAI 2022, "Unsupervised experiments" (noisier); Moran et al., "Noisier2Noise", CVPR 2020 (its
-correction); Lehtinen et al., ICML 2018 (noise2noise); Pang et al., "Recorrupted-to-Recorrupted", CVPR 2021 (r2r);
-Huang et al., "Neighbor2Neighbor", CVPR 2021.
+Domain: packed RAW, black 0, white 1. Inputs are clipped at white as frames are; targets are not. Sources: Conde et al.,
+AAAI 2022, "Unsupervised experiments" (noisier); Moran et al., "Noisier2Noise", CVPR 2020 (its correction); Lehtinen et
+al., ICML 2018 (noise2noise); Pang et al., "Recorrupted-to-Recorrupted", CVPR 2021 (r2r); Huang et al.,
+"Neighbor2Neighbor", CVPR 2021.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from rawaug.training.losses import Criterion
 from rawaug.training.weighing import WEIGHINGS
 
 ESTIMATORS = Registry("estimator", "rawaug.estimators", "rawaug.training")
-"""The estimators by name: subclasses of :class:`Supervised`, which say what a training step learns from."""
+"""This maps names to estimators, subclasses of :class:`Supervised` that say what a training step learns from."""
 
 
 @ESTIMATORS.register("supervised")
@@ -49,7 +50,7 @@ class Supervised:
     Attributes:
         sees_clean: whether it needs clean frames; a recipe cannot mix estimators that do with others.
         revision: a number that grows whenever the same frames give other samples, so that weights are trained anew.
-        weighings: those of :data:`WEIGHINGS` that it can be trained with.
+        weighings: the entries of :data:`WEIGHINGS` that it can be trained with.
     """
 
     sees_clean: ClassVar[bool] = True
@@ -104,13 +105,13 @@ class NoisyCrop(NamedTuple):
 class SelfSupervised(Supervised, ABC):
     """Training with noisy targets: ``apply(crop, sample(shape, generator))`` makes a sample of noisy frames.
 
-    Only weighings whose factors do not depend on the noisy target remain: the others would move its mean.
+    Only weighings whose factors do not depend on the noisy target remain, since the others would move its mean.
     """
 
     shots: ClassVar[int] = 1
     adds_noise: ClassVar[bool] = False
     sees_clean = False
-    revision = 1  # since weights are chosen on r2r pairs
+    revision = 1  # since weights began to be chosen on r2r pairs
     weighings: ClassVar[Collection[str]] = ("linear", "normalised")
 
     def sample(self, shape: torch.Size, generator: torch.Generator) -> Tensor:
@@ -119,7 +120,7 @@ class SelfSupervised(Supervised, ABC):
 
     @abstractmethod
     def apply(self, crop: NoisyCrop, drawn: Tensor) -> Any:
-        """Make the training sample of a crop, of images ``(4, h, w)``, by nothing but its arguments.
+        """Make the training sample of a crop, of images ``(4, h, w)``, from nothing but the arguments.
 
         Args:
             crop: a crop of ``shots`` shots or more.
@@ -151,9 +152,9 @@ class Noisier(_AddsNoise):
     """The input is made noisier; the noisy frame is the target.
 
     Args:
-        alpha: standard deviation of the extra noise in units of that of the noise.
+        alpha: standard deviation of the extra noise in units of the noise's own.
         correct: whether the trained network is extrapolated to the clean signal. As the network is ``z + R(z)``, the
-            corrected one is ``z + (1 + 1/alpha^2) R(z)``: its last convolution times a constant.
+            corrected one is ``z + (1 + 1/alpha^2) R(z)``, which is its last convolution times a constant.
     """
 
     def __init__(self, alpha: float = 1.0, correct: bool = False) -> None:
@@ -191,8 +192,8 @@ class R2R(_AddsNoise):
     """Input and target are made of the frame with the same noise, whose covariance cancels: ``(y + a m, y - m / a)``.
 
     Args:
-        alpha: a above. If it is small, the input is little noisier than the frame, but the target much; if it is 1,
-            both have twice the variance.
+        alpha: a above. If it is small, the input is only a little noisier than the frame, but the target is much
+            noisier; if it is 1, both have twice the variance.
     """
 
     def apply(self, crop: NoisyCrop, drawn: Tensor) -> Sample:

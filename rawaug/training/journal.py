@@ -11,11 +11,11 @@ from rawaug.files import replacing
 class Journal:
     """The log of a training, ``log.csv``.
 
-    A row has the mean loss since the row before, the validation PSNR, the learning rate of the step and the speed.
+    A row has the mean loss since the previous row, the validation PSNR, the learning rate of the step and the speed.
 
     Args:
-        folder: of this file. A training from its first step clears what another one has left there.
-        start: the step from which the training goes on; rows that a killed one wrote beyond it are dropped.
+        folder: folder of this file. A training that begins at its first step clears what another one has left there.
+        start: the step from which the training goes on; rows that a killed training wrote beyond it are dropped.
     """
 
     def __init__(self, folder: Path, start: int) -> None:

@@ -15,7 +15,7 @@ from rawaug.kernels.runtime import find_device
 
 
 def require_trainable(device: str, devices: int, precision: str, logger: str | None = None) -> None:
-    """Raise ValueError or ImportError if a training's libraries, device, precision or logger are not there."""
+    """Raise ValueError or ImportError if a training's libraries, device, precision or logger are unavailable."""
     with extra("train"):
         for name in ("matplotlib", "skimage", "PIL"):
             import_module(name)
@@ -75,6 +75,6 @@ def launch(device: str, devices: int, precision: str, loggers: Sequence[Any] = (
         devices = int(os.environ["LOCAL_WORLD_SIZE"])
         nodes = int(os.environ["WORLD_SIZE"]) // devices
     fabric: Any = Fabric(accelerator=device, devices=devices, num_nodes=nodes, precision=precision, loggers=loggers)
-    if os.environ.get("LT_CLI_USED") != "1":  # ``fabric run`` has launched it
+    if os.environ.get("LT_CLI_USED") != "1":  # otherwise ``fabric run`` has launched it
         fabric.launch()
     return fabric

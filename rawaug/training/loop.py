@@ -1,8 +1,8 @@
 """The training loop: one denoiser, one stream of samples, and its validation.
 
 ``theta <- Adam(grad loss(net(noisy, variance; theta), target))`` with a warm-up, a cosine and a running average of the
-weights. Lightning Fabric places model and data: the same code on a CPU, one GPU, or the processes of several nodes, as
-``torchrun`` or ``fabric run`` start them.
+weights. Lightning Fabric places model and data, so the same code runs on a CPU, on one GPU, or in the processes of
+several nodes, as ``torchrun`` or ``fabric run`` start them.
 
 The validation is the PSNR on frozen frames, in RAW and developed to sRGB.
 """
@@ -49,21 +49,21 @@ def train(
     choose: bool = True,
     key: str = "",
 ) -> Denoiser:
-    """Train a denoiser; if there is a checkpoint in ``folder``, from there on.
+    """Train a denoiser, or continue its training from the checkpoint in ``folder`` if there is one.
 
     Args:
         stream: the training samples.
         validation: frozen images ``(1, 4, h, w)``, scored every ``validate_every`` steps.
-        network: what is trained.
-        config: how it is trained.
+        network: the network to train.
+        config: the settings of the loop.
         folder: gets ``last.pt`` (all that a resume needs) and ``log.csv``.
-        seed: of the initial weights.
+        seed: seed of the initial weights.
         device: Fabric's accelerator.
-        devices: number of devices; where torchrun runs, its processes count instead.
-        label: heads the progress bar.
+        devices: number of devices; under torchrun, its processes count instead.
+        label: heading of the progress bar.
         estimator: makes the loss of a batch, and the denoiser of the trained network; by default supervised.
-        choose: whether the averaged weights of the best validation are kept, or else those of the last step.
-        key: what the weights depend on; a checkpoint that was saved with another key is written over.
+        choose: whether the averaged weights of the best validation are kept; otherwise those of the last step are.
+        key: hash of what the weights depend on; a checkpoint that was saved with another key is overwritten.
 
     Returns:
         The network with the weights that are kept, in eval mode, on the CPU.
@@ -142,7 +142,7 @@ def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> d
     """Compute the mean PSNR in dB of a network, which denoises large frames in tiles.
 
     Returns:
-        ``psnr`` over all frames; ``psnr_srgb`` where every frame can be developed; and ``psnr_CONDITION`` by condition.
+        ``psnr`` over all frames; ``psnr_srgb`` if every frame can be developed; and ``psnr_CONDITION`` by condition.
     """
     raw_scores = []
     srgb_scores = []
@@ -152,7 +152,7 @@ def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> d
     for frame in frames:
         variance = frame.variance
         if variance is None:
-            variance = torch.zeros_like(frame.noisy)  # which stands for an unknown one
+            variance = torch.zeros_like(frame.noisy)  # zero stands for an unknown variance
         denoised = denoisers.denoise_tiles(net, frame.noisy.to(device), variance.to(device)).cpu()
 
         score = psnr(denoised, frame.clean).mean().item()

@@ -9,10 +9,10 @@ from torch import Tensor, nn
 from rawaug.registry import Registry
 
 LOSSES = Registry("loss", "rawaug.losses", "rawaug.training")
-"""The losses by name: classes whose instances are called as ``loss(denoised, target) -> scalar``."""
+"""This maps names to losses, classes whose instances are called as ``loss(denoised, target) -> scalar``."""
 
 Criterion = Callable[[Tensor, Tensor], Tensor]
-"""``criterion(denoised, target)``: two batches ``(B, 4, h, w)`` to a scalar."""
+"""``criterion(denoised, target)`` maps two batches ``(B, 4, h, w)`` to a scalar."""
 
 LOSSES.register("l1")(nn.L1Loss)
 LOSSES.register("l2")(nn.MSELoss)
@@ -22,8 +22,8 @@ LOSSES.register("l2")(nn.MSELoss)
 class RootMeanSquare(nn.Module):
     """The mean over pictures of ``sqrt(mean (a - b)^2 + epsilon^2)``.
 
-    Hard pictures do not outweigh the rest, as they do in l2. With ``weigh: relative`` it is the share of the noise that
-    is left.
+    Hard pictures do not outweigh the rest, as they do in l2. With ``weigh: relative``, the loss is the share of the
+    noise that is left.
     """
 
     def __init__(self, epsilon: float = 1e-2) -> None:
@@ -38,7 +38,7 @@ class RootMeanSquare(nn.Module):
 
 @LOSSES.register("log_mse")
 class LogMeanSquare(nn.Module):
-    """The mean over pictures of ``log(mean (a - b)^2 + epsilon) / 2``: their PSNR, but for its sign and unit.
+    """The mean over pictures of ``log(mean (a - b)^2 + epsilon) / 2``: their PSNR, except for its sign and unit.
 
     A flat picture, whose error is small, then counts as much as a picture full of texture, as it does in a table of
     PSNR. Source: the PSNR loss of Chen et al., "HINet", CVPR Workshops 2021.

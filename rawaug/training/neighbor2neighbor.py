@@ -1,7 +1,7 @@
 """Neighbor2Neighbor: two neighbours of every 2 x 2 cell of one noisy RAW are input and target.
 
 ``loss = c(f(g1 y), g2 y) + gamma c(f(g1 y) - g2 y, g1 f(y) - g2 f(y))``, where g1 y and g2 y are pictures of half the
-sides that take one pixel of each cell, and its neighbour.
+sides: one takes a pixel of each cell, and the other takes its neighbour.
 
 Source: Huang et al., "Neighbor2Neighbor", CVPR 2021.
 """
@@ -17,7 +17,7 @@ from rawaug.training.estimators import ESTIMATORS, NoisyCrop, SelfSupervised
 from rawaug.training.losses import Criterion
 
 NEIGHBOURS = ((0, 1), (1, 0), (2, 3), (3, 2), (0, 2), (2, 0), (1, 3), (3, 1))
-"""Ordered pairs of horizontal or vertical neighbours among the pixels 0 1 / 2 3 of a cell."""
+"""These are the ordered pairs of horizontal or vertical neighbours among the pixels 0 1 / 2 3 of a cell."""
 
 
 class NeighborSample(NamedTuple):
@@ -25,7 +25,7 @@ class NeighborSample(NamedTuple):
 
     Attributes:
         noisy: packed RAW ``(4, h, w)``.
-        variance: of its noise, ``(4, h, w)``.
+        variance: variance of its noise, ``(4, h, w)``.
         choice: for each 2 x 2 cell of a plane an index of :data:`NEIGHBOURS`, ``(1, h/2, w/2)``.
     """
 
@@ -39,15 +39,15 @@ class Neighbor2Neighbor(SelfSupervised):
     """Two neighbours of every 2 x 2 cell of each packed plane are input and target.
 
     ``loss = c(f(g1 y), g2 y) + gamma c(f(g1 y) - g2 y, g1 f(y) - g2 f(y))``: the second term takes off what the
-    neighbours' own difference, as the network sees it, adds to the first; gradients do not pass through f(y). An
-    untrained network takes noise for that difference, so the term comes in as training goes on.
+    neighbours' own difference, as the network sees it, adds to the first. Gradients do not pass through f(y). An
+    untrained network takes noise for that difference, so the term is phased in during training.
 
     Args:
         gamma: weight of the second term at the end; it grows in proportion to the steps. Published: 2 for synthetic
             noise, 16 for the RAW of SIDD; the larger it is, the smoother the result.
     """
 
-    weighings = ("linear",)  # two pixels of different noise are compared
+    weighings = ("linear",)  # two pixels with different noise are compared
 
     def __init__(self, gamma: float = 2.0) -> None:
         if gamma < 0:

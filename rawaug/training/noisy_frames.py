@@ -1,12 +1,12 @@
-r"""Frames without a clean RAW: real noisy ones, and those made once and for all from sRGB pictures.
+r"""Frames without a clean RAW: real noisy ones, and those that are made once and for all from sRGB pictures.
 
-Noise that is drawn anew whenever a picture comes up is averaged out over the epochs: the network would in effect be
-shown clean RAW. So the camera setting and the noise of a picture are keyed by (seed, index) for good; only crops, turns
-and what an estimator adds change from step to step.
+Noise that is drawn anew whenever a picture comes up is averaged out over the epochs, and in effect the network would be
+shown clean RAW. The camera setting and the noise of a picture are therefore keyed by (seed, index) for good; only
+crops, turns and what an estimator adds change from step to step.
 
-Estimators put noise of the noise's own variance, ``shot_var x + read_var``, on top of a frame. Taken at the noisy
-signal y in place of x, that variance is right on average, but large where the noise happens to be positive: what is
-added then depends on the noise, which their derivation excludes. So the signal of a real frame is estimated first, by
+Estimators add noise of the noise's own variance, ``shot_var x + read_var``, to a frame. Taken at the noisy signal y in
+place of x, that variance is right on average, but large where the noise happens to be positive. The added noise then
+depends on the noise, which their derivation excludes. The signal of a real frame is therefore estimated first, by
 non-local means. (At ``shot_var`` 0.008 and ``read_var`` 3e-4 on the demo camera's frames, the noise of r2r's input
 explains 0.3 standard deviations of its target with y, 0.06 in flat areas and 0.11 at edges with the estimate.)
 """
@@ -41,13 +41,13 @@ from rawaug.training.estimators import R2R, NoisyCrop, SelfSupervised
 def signal_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) -> Tensor:
     """Estimate the signal of a noisy mosaic, ``(1, H, W)``, by non-local means.
 
-    Without shot noise the signal does not matter, and the mosaic comes back as it is.
+    Without shot noise the signal does not matter, and the mosaic is returned as it is.
 
     Args:
         noisy: ``(1, H, W)``.
         shot_var: slope of the noise's variance over the signal.
         read_var: its variance at black.
-        cfa: of the mosaic.
+        cfa: pattern of the mosaic.
     """
     if not shot_var > 0:
         return noisy
@@ -58,7 +58,7 @@ def signal_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) -
 
 
 CACHED = 64
-"""Maximum number of frames made of pictures that stay in memory."""
+"""At most this many frames made of pictures stay in memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +66,11 @@ class NoisyFrame:
     """Noisy RAW of one scene.
 
     Attributes:
-        name: of the frame.
+        name: name of the frame.
         shots: mosaics ``(N, H, W)`` of the scene.
         shot_var: slope of the noise's variance over the signal.
         read_var: its variance at black.
-        cfa: of the mosaics.
+        cfa: pattern of the mosaics.
         clean: the scene without noise ``(1, H, W)``, if it was made from a picture.
     """
 
@@ -83,7 +83,7 @@ class NoisyFrame:
 
     @cached_property
     def signal(self) -> Tensor:
-        """The scene without noise ``(1, H, W)``: for a real frame an estimate, which takes 0.5 s a megapixel."""
+        """The scene without noise ``(1, H, W)``; for a real frame it is an estimate, which takes 0.5 s a megapixel."""
         if self.clean is not None:
             return self.clean
 
@@ -93,9 +93,9 @@ class NoisyFrame:
 def drop_clean(pair: Pair) -> Pair:
     """Return the pair without anything that was derived from a clean frame.
 
-    If there is a noisy capture, it takes the place of ``raw``, and the camera's picture of it that of ``srgb``; without
-    such a picture the capture is developed (bilinear demosaic, the camera's white balance and matrix, the sRGB curve).
-    A pair without a capture is a RAW file as shot: it is noisy itself.
+    A noisy capture, if there is one, replaces ``raw``, and the camera's picture of it replaces ``srgb``; without such a
+    picture, the capture is developed (bilinear demosaic, the camera's white balance and matrix, the sRGB curve). A pair
+    without a capture is a RAW file as shot, which is noisy itself.
     """
     if pair.noisy is None:
         return pair
@@ -136,11 +136,11 @@ def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
 
 
 FAINT = 45.0
-"""PSNR of noisy frames, in dB, above which there is hardly any noise to remove."""
+"""Noisy frames above this PSNR, in dB, have hardly any noise to remove."""
 
 
 def faintness_note(frames: Sequence[NoisyFrame]) -> str:
-    """Write a line that warns of frames with next to no noise, by their levels; empty if there is enough."""
+    """Write a line that warns of frames with hardly any noise, by their levels; it is empty if there is enough."""
     if not frames:
         return ""
 
@@ -160,12 +160,12 @@ def faintness_note(frames: Sequence[NoisyFrame]) -> str:
 
 
 class FrozenPictures(Lazy[NoisyFrame]):
-    """sRGB pictures as noisy RAW frames that never change; up to :data:`CACHED` of them stay in memory.
+    """Noisy RAW frames of sRGB pictures, which never change; up to :data:`CACHED` of them stay in memory.
 
     Args:
         pictures: a Dataset of pictures.
         augment: makes RAW of them; its noise must be shot and read noise.
-        seed: of the camera settings and the noise.
+        seed: seed of the camera settings and the noise.
         shots: number of noisy shots of each scene.
     """
 
@@ -214,7 +214,7 @@ class NoisyCrops:
     """Crops of noisy frames, in eight turns that keep the CFA, as an estimator's training samples.
 
     Args:
-        frames: of any patterns.
+        frames: frames of any patterns.
         estimator: makes a sample of a crop.
         crop: side in pixels.
         cfa: the pattern in which all crops are packed.
@@ -231,7 +231,7 @@ class NoisyCrops:
                 _ = frame.signal
 
     def draw(self, generator: torch.Generator) -> Any:
-        """Draw a sample of packed RAW ``(4, crop / 2, crop / 2)``; ValueError if the frame has too few shots."""
+        """Draw a sample of packed RAW ``(4, crop / 2, crop / 2)``; raise ValueError if the frame has too few shots."""
         frame = self.frames[int(torch.randint(len(self.frames), (), generator=generator))]
         if len(frame.shots) < self.estimator.shots:
             name = type(self.estimator).__name__
@@ -251,9 +251,9 @@ class NoisyCrops:
 def r2r_trials(frames: Sequence[NoisyFrame], cfa: CFA) -> list[Trial]:
     """Make r2r pairs ``(1, 4, h, w)`` of whole noisy frames, whose score needs no clean frame.
 
-    The error against a target of independent noise is the error against the clean frame plus that noise's variance, a
-    constant: the weights that score best are the best, as far as the estimate of the signal is right, though the
-    decibels are lower than against a clean frame.
+    The error against a target of independent noise is the error against the clean frame plus that noise's variance,
+    which is constant. The weights that score best are therefore the best, as far as the estimate of the signal is
+    right, though the decibels are lower than against a clean frame.
     """
     estimator = R2R()
     trials = []

@@ -45,14 +45,14 @@ class NoisyPictures:
 
 @dataclass
 class Told:
-    """The level of noise that a network which reads one is given in training.
+    """The level of noise that is given in training to a network that reads one.
 
-    It is none for a share of the pairs, the pair's own for another share, and a wrong one for the rest.
+    A share of the pairs has no level, another share has the pair's own, and the rest have a wrong one.
 
     Args:
         unknown: share of the pairs with the level 0, which stands for unknown.
         exact: share with the deviation of the pair, the root mean square of noisy less clean.
-        factor: how far the wrong level is off at most, up or down, drawn by its logarithm.
+        factor: largest factor by which the wrong level is off, up or down, drawn by its logarithm.
     """
 
     unknown: float = 0.35
@@ -80,12 +80,12 @@ class Told:
 
 
 class SrgbSamples:
-    """Training samples of developed pictures, of which a share has noise drawn on sRGB in place of the camera's.
+    """Training samples of developed pictures; a share of them has noise drawn on sRGB in place of the camera's.
 
     Args:
-        camera: pairs of target ``"srgb"``; None where all noise is drawn on sRGB.
-        drawn: the others; None where there are none.
-        share: of the others.
+        camera: pairs of target ``"srgb"``; None if all noise is drawn on sRGB.
+        drawn: the other samples; None if there are none.
+        share: share of the other samples.
         told: the level of noise that the network is given; None for none.
     """
 

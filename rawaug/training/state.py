@@ -1,4 +1,4 @@
-"""The state of a training: the network it starts from, the running average, and the checkpoint that it resumes from.
+"""The state of a training: its first network, the running average, and the checkpoint that it resumes from.
 
 ``theta <- Adam(gradient of the loss)``, then ``average <- d average + (1 - d) theta``; the learning rate warms up and
 falls.
@@ -33,7 +33,7 @@ class Start(NamedTuple):
 
 
 def start_of(config: DenoiserConfig) -> Start | None:
-    """Look up the weights that ``config.start`` names; None if the training starts from random ones.
+    """Look up the weights that ``config.start`` names; return None if the training starts from random ones.
 
     Raises:
         FileNotFoundError: if there are no such weights.
@@ -138,12 +138,12 @@ class TrainingState:
             self.step = int(state["step"])
             self.best = state["best"]
             self.losses = state["losses"]
-        except Exception as error:  # the unpickler raises nearly anything
+        except Exception as error:  # the unpickler may raise nearly anything
             reason = " ".join(str(error).split())[:120]
             raise ValueError(f"{path}: damaged ({reason}); delete it to train this arm from its first step") from error
 
     def save(self, path: Path, key: str) -> None:
-        """Write a checkpoint, whole or not at all: a kill or a full disk leaves the one before."""
+        """Write a checkpoint, completely or not at all; after a kill or on a full disk, the previous one stays."""
         state: dict[str, Any] = {name: part.state_dict() for name, part in self._parts.items()}
         state["key"] = key
         state["step"] = self.step
@@ -196,13 +196,13 @@ class TrainingState:
         return mean
 
     def keep_average(self, score: float, choose: bool) -> None:
-        """Keep the network as it is now if its ``score`` is the highest so far, or ``choose`` is off."""
+        """Keep the current network if its ``score`` is the highest so far, or ``choose`` is off."""
         if score > self.best["psnr"] or not choose:
             weights = copy.deepcopy(self.network_to_keep().state_dict())
             self.best = {"psnr": score, "step": self.step, "net": weights}
 
     def best_network(self, label: str) -> Any:
-        """Return the network with the best weights, on the CPU; ValueError if no score was a number."""
+        """Return the network with the best weights, on the CPU; raise ValueError if no score was a number."""
         if not math.isfinite(self.best["psnr"]):
             raise ValueError(f"{label}: diverged, every validation score is NaN; lower train.learning_rate")
 
@@ -211,7 +211,7 @@ class TrainingState:
 
 
 def running_average(decay: float) -> Any:
-    """``average <- d average + (1 - d) weights`` with d = ``decay``, at first (1 + n) / (10 + n) after n steps."""
+    """Update ``average <- d average + (1 - d) weights``; d is ``decay``, at first (1 + n) / (10 + n) after n steps."""
 
     @torch.no_grad()
     def update(averages: Sequence[Tensor], weights: Sequence[Tensor], steps: Tensor | int) -> None:

@@ -1,7 +1,7 @@
-"""The stream of training samples: sample i depends on (seed, i) alone, so any step can be repeated.
+"""The stream of training samples: sample i depends only on (seed, i), so any step can be repeated.
 
-A batch is part real crops (clean RAW of the few pairs with its captured noise, or with drawn noise where none was
-captured; or of frames without a clean RAW), part RAW made from sRGB pictures.
+One part of a batch is real crops (clean RAW of the few pairs with its captured noise, or with drawn noise if none was
+captured; or crops of frames without a clean RAW). The other part is RAW made from sRGB pictures.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class TrainingStream(Dataset[Any]):
         pictures: samples made from sRGB pictures; needed if ``augmented`` is above 0.
         batch: samples in a step.
         augmented: share of every batch, from 0 to 1, that is made from pictures; these come first.
-        seed: of all samples.
+        seed: seed of all samples.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class TrainingStream(Dataset[Any]):
         return source.draw(self._generator(index))
 
     def __getitems__(self, indices: Sequence[int]) -> list[Any]:
-        """Draw the samples of a step; those of pictures together where their source can."""
+        """Draw the samples of a step; those of pictures are drawn together if their source can do so."""
         of_pictures = list(filter(self._is_of_picture, indices))
         draw_batch = getattr(self.pictures, "draw_batch", None)
 
@@ -74,7 +74,7 @@ class TrainingStream(Dataset[Any]):
 
 
 class StepSampler(Sampler[list[int]]):
-    """The numbers of the samples of each step; of several processes each takes every ``world``-th.
+    """The numbers of the samples of each step; each of several processes takes every ``world``-th.
 
     Args:
         start: the first step.

@@ -1,4 +1,4 @@
-r"""How a loss weighs light and shade: what of denoised RAW and of its target a norm compares.
+r"""Weighing of light and shade in a loss: the form in which a norm compares denoised RAW and its target.
 
 ==============  ====================================================================================================
 ``weigh``       what is compared
@@ -10,10 +10,10 @@ mixed           the mean of both, the linear one divided by the noise's mean dev
 relative        the picture in units of its own error before denoising; needs no variance: for developed pictures
 ==============  ====================================================================================================
 
-with s = ``shot_var`` and r = ``read_var`` of the picture. An sRGB curve weighs errors much like ``stabilised``, both
-being near a square root. The minimum of l1 is the median, which a curve does not move; that of l2 is the mean, and in
-the stabilised domain it is not the mean of the RAW. So where targets are noisy, with l2, only ``linear`` and
-``normalised`` are unbiased: their factors do not depend on the target.
+with s = ``shot_var`` and r = ``read_var`` of the picture. An sRGB curve weighs errors much like ``stabilised``, as both
+are near a square root. The minimum of l1 is the median, which a curve does not move. That of l2 is the mean, which in
+the stabilised domain is not the mean of the RAW. With noisy targets and l2, only ``linear`` and ``normalised`` are
+therefore unbiased: their factors do not depend on the target.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from rawaug.data.pairs import Sample
 from rawaug.training.losses import Criterion
 
 LEAST_ERROR = 1.0 / 255.0
-"""The unit of ``relative`` for pictures with hardly any noise: one step of an 8-bit file."""
+"""This is the unit of ``relative`` for pictures with hardly any noise: one step of an 8-bit file."""
 
 _PICTURE = (1, 2, 3)
-"""The axes of a picture in a batch ``(B, C, h, w)``."""
+"""These are the axes of a picture in a batch ``(B, C, h, w)``."""
 
 
 def weigh_loss(loss: Criterion, weigh: str, sample: Sample) -> Criterion:
@@ -90,4 +90,4 @@ WEIGHINGS: dict[str, Callable[[Criterion, Sample], Criterion]] = {
     "mixed": _mixed,
     "relative": _relative,
 }
-"""The weighings by name: functions of a loss and a batch that return the weighed loss."""
+"""This maps names to weighings: functions of a loss and a batch that return the weighed loss."""

@@ -1,4 +1,4 @@
-"""How an ISP is fitted."""
+"""The settings of the fit of an ISP."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rawaug.isp.stages import STAGES
 from rawaug.registry import require_between
 
 _PUBLISHED_STEPS = 3000
-"""Steps end to end of the published fit."""
+"""Number of end-to-end steps of the published fit."""
 MOST = 2**31
 """Upper limit of settings that count steps or pixels."""
 
@@ -22,44 +22,46 @@ class FitConfig:
     """How an ISP is fitted.
 
     Args:
-        method: "staged" fits stage by stage and keeps encoders and masks where held-out frames gain, for a handful of
-            frames. "published" is the fit of the paper: encoders and both masks, learned end to end after a short
-            start, by l2 losses on RAW and on every image between the stages of both passes and by the consistency of
-            the weights (``joint_steps``, 3,000 by default). It sets ``shading`` and ``attention`` to on, ``tone`` to
-            learned, and ``encoders`` to on unless they are off. It needs two frames or more; the paper has 5 to 320.
-        start: an ISP, by the name of a shipped one or its file, from whose tone the fit starts wherever that makes the
+        method: "staged" fits stage by stage and keeps encoders and masks only if held-out frames gain; it is meant for
+            a handful of frames. "published" is the fit of the paper. It learns encoders and both masks end to end after
+            a short start, with l2 losses on RAW and on every image between the stages of both passes, and with the
+            consistency of the weights (``joint_steps``, 3,000 by default). It sets ``shading`` and ``attention`` to on,
+            ``tone`` to learned, and ``encoders`` to on unless they are off. It needs two frames or more; the paper has
+            5 to 320.
+        start: an ISP, given by the name of a shipped one or by its file. The fit starts from its tone if that suits the
             frames better than the curves of the standards.
-        size: "small" has at most 8 atoms a dictionary and narrow encoders: with encoders 0.12 M parameters instead
-            of 0.52 M, without them about 5,000 in either case.
-        atoms: largest number of atoms in each dictionary; more frames than that are clustered.
+        size: "small" has at most 8 atoms a dictionary and narrow encoders: with encoders it has 0.12 M parameters
+            instead of 0.52 M, without them about 5,000 in either case.
+        atoms: largest number of atoms in each dictionary; if there are more frames, they are clustered.
         reach: gain atoms that no frame had are added, up to ``atoms`` in all: the frames' mean with red and blue gains
-            multiplied and divided by this factor (the digital gain by its fourth root), so that the hull holds other
+            multiplied and divided by this factor (the digital gain by its fourth root), so that the hull covers other
             light as well; 1 adds none.
-        steps: refinement steps of each direction.
-        pixels: random pixels kept of each frame.
-        batch: pixels of each frame in a step.
+        steps: number of refinement steps in each direction.
+        pixels: number of random pixels kept of each frame.
+        batch: number of pixels of each frame in a step.
         learning_rate: initial learning rate of Adam, with cosine decay to 0.
         shading: "on" fits the lens shading mask, "off" omits the stage, "auto" keeps a mask that removes
             at least half of the squared error.
         tone: "learned" is the tone network and gamma of the paper, "curve" a monotone curve as a table, the same for R,
             G and B. "auto" fits both with some of the frames held out and keeps the one that is better on those, given
-            their as-shot gains; with one frame, "learned".
+            their as-shot gains; with one frame it is "learned".
         attention: fit the attention mask as well.
-        encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them with a dozen frames or more
-            and keeps them if they beat the constants on held-out frames.
-        raw_loss: of end-to-end training on RAW: "l2" as published, or "log", the logarithm of each frame's mean squared
-            error, which weighs frames as the mean of decibels does.
-        encoder_steps: steps of the encoders' training.
-        joint_steps: steps of a last end-to-end training of everything at once; by default 1000 with 50 frames or more,
-            else 0. Kept only if held-out frames improve.
-        curve_steps: steps of the first stage, which fits the tone curve; 150 by default.
-        prior_steps: steps of the descent on the constant weights.
-        mse_floor: added to a frame's mean squared error under the logarithm: frames beyond 50 dB count no more.
-        intermediate: weight of the loss on the images between the stages, beside 1 of that on sRGB; 0 leaves it out.
+        encoders: "on" trains the encoders, "off" uses constant weights. "auto" trains them if there are a dozen frames
+            or more, and keeps them if they beat the constants on held-out frames.
+        raw_loss: loss of end-to-end training on RAW: "l2" as published, or "log", the logarithm of each frame's mean
+            squared error, which weights frames as the mean of decibels does.
+        encoder_steps: number of steps of the encoders' training.
+        joint_steps: number of steps of a last end-to-end training of everything at once; by default 1000 with 50 frames
+            or more, else 0. Its result is kept only if held-out frames improve.
+        curve_steps: number of steps of the first stage, which fits the tone curve; 150 by default.
+        prior_steps: number of steps of the descent on the constant weights.
+        mse_floor: added to a frame's mean squared error under the logarithm, so that frames beyond 50 dB count no more.
+        intermediate: weight of the loss on the images between the stages, where that on sRGB has weight 1; 0 leaves it
+            out.
         consistency: factor of the losses between the weights that reverse and forward encoders choose; 0 leaves them
             out.
         noisy: fit on the captured noisy RAW of the pairs.
-        seed: random seed of the drawn pixels and initial networks.
+        seed: random seed of the pixels to draw and of the initial networks.
         isp: further keys of :class:`rawaug.isp.config.ISPConfig`, such as ``encoder_widths``.
     """
 
@@ -94,7 +96,7 @@ class FitConfig:
         return min(self.atoms, SMALL.colour_atoms) if self.size == "small" else self.atoms
 
     def settled(self) -> FitConfig:
-        """The same configuration, with what its method sets."""
+        """The same configuration, with the settings that its method implies."""
         if self.method == "staged":
             return self
 
@@ -107,7 +109,7 @@ class FitConfig:
         )
 
     def shortest(self) -> FitConfig:
-        """The same configuration, reduced to a fit of a second."""
+        """The same configuration, reduced to a fit that takes a second."""
         short = replace(self, steps=2, curve_steps=10, pixels=512, batch=128, prior_steps=20, encoder_steps=4)
         return replace(short, joint_steps=4) if self.method == "published" else short
 

@@ -1,18 +1,18 @@
 r"""The losses of a fit, and gradient descent in stages, between which it can be stopped and resumed.
 
-The loss on RAW is ``(y_hat - y)^2 / (4 (y_hat + 0.01))``, with the denominator taken as a constant: shot noise makes
+The loss on RAW is ``(y_hat - y)^2 / (4 (y_hat + 0.01))``, with the denominator taken as a constant. Shot noise makes
 the error of a reading proportional to its square root, and weights that do not depend on ``y`` keep noise unbiased.
-The loss on sRGB takes in the images between the stages (Conde et al., AAAI 2022, "Training").
+The loss on sRGB includes the images between the stages (Conde et al., AAAI 2022, "Training").
 
 *Encoders* are trained last, with tone and dictionaries frozen, on the RAW that either direction's weights make:
 ``L = sum_f log(MSE_f(w_r) + eps) + log(MSE_f(w_f) + eps) + c |w_r - w_f|^2``. For every fold, curve, tone and atoms are
-fitted anew without its frames, then constants and encoders compared on these. *End-to-end training* refines an ISP that
-is already fitted: ``L = |y_hat - y|^2 + |x_hat - x|^2 + 0.1 sum_k |x_k^f - x_k^r|^2 + 0.01 |w_r - w_f|^2`` on random
-pixels of random frames, by the weights that both encoders choose. A tenth of the frames is watched: the best parameters
-come back.
+fitted anew without its frames, then constants and encoders are compared on these. *End-to-end training* refines an ISP
+that is already fitted: ``L = |y_hat - y|^2 + |x_hat - x|^2 + 0.1 sum_k |x_k^f - x_k^r|^2 + 0.01 |w_r - w_f|^2`` on
+random pixels of random frames, with the weights that both encoders choose. A tenth of the frames is watched, and the
+best parameters are restored.
 
-A fit has stages; one is a loss and its tensors. What a step draws is keyed by (seed, stage, step), so that a resumed
-fit ends with the same bits as one that was not stopped.
+A fit has stages; a stage is a loss and its tensors. The draws of a step are keyed by (seed, stage, step), so that a
+resumed fit ends with the same bits as one that was not stopped.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def cycle_error(
 ) -> Tensor:
     """Compute the squared error of the forward pass on sRGB and on every image between the stages.
 
-    From noisy readings the pass would learn to denoise, so there it starts where the reverse pass ended.
+    On noisy readings the pass would learn to denoise, so there it starts where the reverse pass ended.
 
     Args:
         isp: the ISP being fitted.
@@ -104,13 +104,13 @@ def adam(
     spent: Callable[[int], float],
     clip_norm: float | None = None,
 ) -> Iterator[Tensor]:
-    """Descend on a loss by Adam under a cosine, and yield the loss of each step, a scalar.
+    """Descend on a loss by Adam with cosine decay, and yield the loss of each step, a scalar.
 
     Args:
-        tensors: what is changed, in place, tensors of any shape.
-        learning_rate: at the start; it falls to 0.
+        tensors: the tensors to change in place, of any shape.
+        learning_rate: learning rate at the start; it falls to 0.
         loss: ``loss(step)`` gives the scalar to minimise.
-        spent: ``spent(step)`` says which share of the budget is used up; the descent ends at 1.
+        spent: ``spent(step)`` gives the share of the budget that is used up; the descent ends at 1.
         clip_norm: gradients are scaled down to this norm.
     """
     optimiser = torch.optim.Adam(tensors, lr=learning_rate)
@@ -129,7 +129,7 @@ def adam(
 
 
 class BestScore(NamedTuple):
-    """The score of a watched stage at its start, the best one with its step, and every score so far."""
+    """The score of a watched stage at its start, the best score with its step, and every score so far."""
 
     start: float
     step: int
@@ -137,7 +137,7 @@ class BestScore(NamedTuple):
     scores: Sequence[float] = ()
 
     def curve(self) -> list[float]:
-        """At most :data:`CURVE_POINTS` of the scores, the first and the last among them, to two decimals."""
+        """At most :data:`CURVE_POINTS` of the scores, including the first and the last, to two decimals."""
         last = len(self.scores) - 1
         count = min(CURVE_POINTS, last + 1)
         places = [round(k * last / max(1, count - 1)) for k in range(count)]
@@ -145,11 +145,11 @@ class BestScore(NamedTuple):
 
 
 class Descent:
-    """Runs the stages of a fit, and writes the end of each, so that a stopped fit goes on with the next one.
+    """Runs the stages of a fit, and saves the end of each, so that a stopped fit goes on with the next one.
 
     Args:
         path: file of the state; None keeps none.
-        key: what the state belongs to; a file of another fit is ignored.
+        key: identifies the fit that the state belongs to; a file of another fit is ignored.
         seed: keys the draws of every step.
         progress: whether to show progress bars.
     """
@@ -177,16 +177,16 @@ class Descent:
         report: Callable[[], str] | None = None,
         watch: Callable[[], float] | None = None,
     ) -> None:
-        """Minimise a loss by Adam; a stage that ran already takes its end from the state.
+        """Minimise a loss by Adam; a stage that has already run takes its end from the state.
 
         Args:
             stage: name of the stage.
             loss: ``loss(generator)`` draws a batch and gives a scalar.
-            tensors: what is changed in place, tensors of any shape by name.
+            tensors: the tensors to change in place, of any shape, by name.
             steps: number of steps.
-            learning_rate: at the start.
+            learning_rate: learning rate at the start.
             report: gives a text for the progress bar, every :attr:`report_steps` steps.
-            watch: gives a score of frames held out; the stage then ends with the tensors that scored best.
+            watch: gives a score on held-out frames; the stage then ends with the tensors that scored best.
         """
 
         def scores(step: int) -> str:
@@ -226,7 +226,7 @@ class Descent:
             tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
 
     def finish(self) -> None:
-        """Remove the state, as the fit is done."""
+        """Remove the state, because the fit is done."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 
@@ -256,24 +256,24 @@ FEWEST_FRAMES, FOLDS = 12, 4
 _MANY_FRAMES = 50
 """Minimum number of frames for end-to-end training by default."""
 STEPS, LEARNING_RATE = 1000, 2e-4
-"""Steps and rate of end-to-end training."""
+"""Number of steps, and learning rate, of end-to-end training."""
 _CONSISTENCY = 0.01
 """Weight of the distance between the weights of both directions."""
 PUBLISHED_RATE, PUBLISHED_FRAMES, _PUBLISHED_PIXELS = 2e-3, 8, 256
-"""Rate of the published fit, which learns nearly all of it end to end, and frames and pixels of a step."""
+"""Rate of the published fit, which learns nearly everything end to end, and frames and pixels in a step."""
 _LOG_WEIGHT = 0.02
 """Weight of the logarithm of an error beside the squared errors of the other pass."""
 CURVE_POINTS = 13
-"""Number of scores of a watched training that an ISP's record has."""
+"""Number of scores of a watched training in an ISP's record."""
 _LOSS_SCALE = 1e4
-"""Squared errors are near 1e-4, and what encoders get of them would vanish beside the epsilon of Adam, 1e-8."""
+"""Factor on squared errors: they are near 1e-4, and the encoders' share would vanish beside Adam's epsilon of 1e-8."""
 
 Refit = Callable[[FitFrames, str, FitConfig], DictionaryISP]
 """A function that fits an ISP without encoders to some frames; the text names the fit in its progress."""
 
 
 def _gain_left_out(frames: FitFrames, folds: int, gain: Callable[[FitFrames, FitFrames, str], float]) -> float:
-    """Mean over the frames of ``gain(left out, kept, name of the fold)``, every frame being left out once."""
+    """Average ``gain(left out, kept, name of the fold)`` over the frames, each of which is left out once."""
     count = len(frames.shots)
     total = 0.0
     for fold in range(folds):
@@ -284,7 +284,7 @@ def _gain_left_out(frames: FitFrames, folds: int, gain: Callable[[FitFrames, Fit
 
 
 def with_better_tone(frames: FitFrames, config: FitConfig, refit: Refit) -> tuple[FitConfig, float | None]:
-    """Decide the setting ``tone``; the gain of the curve in dB comes with it if both were compared."""
+    """Decide the setting ``tone``; also return the gain of the curve in dB if both were compared."""
     if config.tone != "auto":
         return config, None
     if len(frames.shots) < 2:
@@ -311,7 +311,7 @@ def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, des
     """
 
     def better(out: FitFrames, kept: FitFrames, part: str) -> float:
-        """dB by which encoders beat constants on frames that no stage of the fit has seen."""
+        """Compute by how many dB encoders beat constants on frames that no stage of the fit has seen."""
         other = refit(kept, part, config)
         other.use_encoders(False)
         constants = mean_psnr(other, out)
@@ -370,7 +370,7 @@ def _frame_loss(
 
 
 def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Cut the same random piece from both thumbnails, flipped or not, so that the encoders cannot learn the frames."""
+    """Cut the same random piece from both thumbnails, maybe flipped, so that the encoders cannot learn the frames."""
     share = 0.5 + 0.5 * torch.rand(2, generator=generator)
     start = torch.rand(2, generator=generator) * (1.0 - share)
     flip = bool(torch.rand((), generator=generator) < 0.5)
@@ -386,7 +386,7 @@ def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[
 
 
 def joint_steps(config: FitConfig, frames: int) -> int:
-    """The steps of end-to-end training on this number of frames."""
+    """The number of steps of end-to-end training on this number of frames."""
     if config.joint_steps is not None:
         return config.joint_steps
     return STEPS if frames >= _MANY_FRAMES else 0
@@ -395,9 +395,9 @@ def joint_steps(config: FitConfig, frames: int) -> int:
 def train_jointly(
     isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent, watched: FitFrames | None = None
 ) -> None:
-    """Refine everything at once, if ``config.joint_steps`` says so; the gain goes to ``isp.info``.
+    """Refine everything at once, if ``config.joint_steps`` asks for it; the gain is noted in ``isp.info``.
 
-    What as-shot gains need to know of the atoms is measured anew afterwards.
+    The properties of the atoms that as-shot gains depend on are measured anew afterwards.
 
     Args:
         isp: the fitted ISP.

@@ -1,15 +1,16 @@
 """The stages of a fit, in order.
 
-1. Curve. ``x2 = (x + a (1 - x))^gamma`` (sRGB, BT.709 and plain gamma are of this form), each frame's matrix ``M_f``
-   and, where there is fall-off, the Gaussian mask: least squares first, then gradient descent on these few numbers.
+1. Curve. ``x2 = (x + a (1 - x))^gamma`` (sRGB, BT.709 and plain gamma have this form), each frame's matrix ``M_f`` and,
+   if there is fall-off, the Gaussian mask: first least squares, then gradient descent on these few numbers.
 2. Tone. The tone network starts as that curve and is refined together with all of stage 1; or the curve itself is
    bent (:mod:`rawaug.isp.tone`). With ``tone="auto"`` both are compared on frames left out, given their as-shot gains.
 3. Atoms. The frames' matrices and gains become the dictionaries, with the constant weights that serve best.
-4. Encoders, where frames that were left out of stages 1 to 3 as well say that they help.
+4. Encoders, if frames that were left out of stages 1 to 3 as well show that they help.
 5. Forward. The forward networks, given the reverse pass: l2 on sRGB and on every intermediate image.
 6. Joint. With many frames, everything at once, kept as far as frames left out of it gain.
 
-Model and losses: Conde et al., AAAI 2022; a global and a per-frame part make it hold up with a handful of frames.
+Model and losses are those of Conde et al., AAAI 2022; a global and a per-frame part make the fit work with a handful of
+frames.
 """
 
 from __future__ import annotations
@@ -55,19 +56,19 @@ from rawaug.seeding import derive_seed
 from rawaug.version import __version__
 
 _STANDARD_CURVES = ((2.2, 0.0), (2.4, 0.055 / 1.055), (1.0 / 0.45, 0.099 / 1.099))
-"""gamma and toe a of a plain gamma camera, of sRGB (IEC 61966-2-1) and of ITU-R BT.709."""
+"""The gamma and toe a of a plain gamma camera, of sRGB (IEC 61966-2-1) and of ITU-R BT.709."""
 CURVE_STEPS, _CURVE_RATE = 150, 2e-2
-"""Default steps and rate of stage 1."""
+"""Default number of steps, and rate, of stage 1."""
 _DIMMEST = 0.01
-"""Minimum share of a corner's light that a mask takes for being tried."""
+"""Minimum share of a corner's light that a mask must take to be tried."""
 _SHADING_PAYS = 0.5
 """Maximum ratio of the squared errors with and without a mask for keeping the mask."""
 FRAMES_A_STEP = 16
 """Maximum number of frames in a step."""
 _START_STEPS, _START_RATE = 1000, 3e-3
-"""Steps and rate of the descent that brings the tone near that of the ISP that a fit starts from."""
+"""Number of steps, and rate, of the descent that brings the tone near that of the ISP that a fit starts from."""
 _MOST_LEFT_OUT = 0.1
-"""Share of the frames that may be left out because too few of their pixels are not clipped."""
+"""Share of the frames that may be left out because they have too few unclipped pixels."""
 
 
 def fit_isp(
@@ -82,12 +83,13 @@ def fit_isp(
     """Fit a dictionary ISP to pairs of RAW and sRGB.
 
     Args:
-        pairs: one or more frames, of one or several cameras; read once.
+        pairs: one or more frames, from one or several cameras; they are read once.
         config: settings; see :class:`FitConfig`.
         progress: show progress bars.
         state: file with the state of the fit, to resume it; removed at the end.
-        report: called with the ISP as it would be now, every 50 steps of stage 2; its text goes to the progress bar.
-        camera: figures of the camera, from which the frames' matrices start.
+        report: function that gets the ISP in its current state, every 50 steps of stage 2; its text goes to the
+            progress bar.
+        camera: the camera's figures, from which the frames' matrices start.
         watched: frames on which end-to-end training is watched; by default a tenth of the pairs, which is held out.
 
     Raises:
@@ -153,7 +155,7 @@ def _with_enough_pixels(frames: FitFrames) -> FitFrames:
 
 
 def _key(config: FitConfig, frames: FitFrames, camera: Camera | None) -> str:
-    """Hash the settings and pixels that a kept state belongs to."""
+    """Hash the settings and pixels that identify a kept state."""
     facts: list[Any] = [__version__, config]
     facts.append([(shot.name, shot.camera, shot.white_balance) for shot in frames.shots])
     if camera is not None:
@@ -206,7 +208,7 @@ class _Fit:
 
     @torch.no_grad()
     def _start(self) -> FrameColour:
-        """Least squares under the curve of the standard that fits best."""
+        """Solve by least squares under the curve of the standard that fits best."""
         tried = []
         for curve in _STANDARD_CURVES:
             self._start_coarse(*curve)
@@ -234,7 +236,7 @@ class _Fit:
     # -- stage 1 ----------------------------------------------------------------------------------------------------
 
     def curve(self) -> None:
-        """Run stage 1 without the mask and, where the readings fall off towards the corners, with it as well."""
+        """Run stage 1 without the mask and, if the readings fall off towards the corners, with it as well."""
         shading = self.isp.find(LensShading)
         mode = self.config.shading if shading else "off"
         if mode != "on":
@@ -271,7 +273,7 @@ class _Fit:
         return float(reading_error(predicted, self.samples))
 
     def _apply_curve(self, part: PixelSamples) -> Tensor:
-        """Compute x2 by the curve, times the mask: a frame's matrix takes it to RAW."""
+        """Compute x2 by the curve, times the mask, which a frame's matrix takes to RAW."""
         x = part.srgb
         for stage in self.isp.ordered_stages:
             x = stage.coarse(x, part.coordinates)
@@ -291,7 +293,7 @@ class _Fit:
     # -- stage 2 ----------------------------------------------------------------------------------------------------
 
     def tone(self, report: Callable[[DictionaryISP], str] | None) -> None:
-        """Run stage 2, the tone and each frame's colour; ``report`` is called with the ISP as it would be."""
+        """Run stage 2, the tone and each frame's colour; ``report`` gets the ISP as it would be now."""
         for stage in self.isp.ordered_stages:
             stage.start_fine()
 
@@ -319,7 +321,7 @@ class _Fit:
         self.descent.run(name, loss, tensors, self.config.steps, self.config.learning_rate, status)
 
     def _start_from(self, other: DictionaryISP) -> None:
-        """Start the tone from that of another ISP, or the best of its curves, if it makes the frames better."""
+        """Start the tone from that of another ISP, or the best of its curves, if that improves the frames."""
         greys = torch.linspace(0.0, 1.0, 256).expand(1, 3, 1, -1)
         colours = torch.cat([greys, stages.node_colours(9).flatten(2)[:, :, None]], dim=3)
         tensors: list[Tensor] = []
@@ -357,7 +359,7 @@ class _Fit:
 
     @torch.no_grad()
     def _best_tone(self, other: DictionaryISP, colours: Tensor) -> tuple[float, Tensor]:
-        """Compute the least error under the tone of another ISP, or one of its curves, and x2 of ``colours`` by it."""
+        """Compute the least error under another ISP's tone, or one of its curves, and x2 of ``colours`` by it."""
         curves: list[Callable[[Tensor], Tensor]] = [other.linear]
         if other.tone is not None:
             curves = [_curve_of(table) for table in other.tone.curves]
@@ -390,7 +392,7 @@ class _Fit:
         return {"log_scale": self.colour.log_scale, "matrix": self.colour.matrix}
 
     def _draw(self, generator: torch.Generator) -> tuple[Tensor | slice, PixelSamples]:
-        """Draw the frames of a step (all, if they are few) and their pixels."""
+        """Draw the frames of a step (all, if there are few) and their pixels."""
         count, pixels = self.samples.srgb.shape[0], self.samples.srgb.shape[-1]
         frames: Tensor | slice = slice(None)
         if count > FRAMES_A_STEP:
@@ -428,7 +430,7 @@ class _Fit:
 
 
 def _curve_of(table: Tensor) -> Callable[[Tensor], Tensor]:
-    """Make the function of pictures ``(B, 3, H, W)`` that a table ``(1021,)`` stands for."""
+    """Make the function of pictures ``(B, 3, H, W)`` that a table ``(1021,)`` describes."""
     return lambda x: to_linear(x, table.expand(len(x), -1))
 
 

@@ -1,6 +1,6 @@
 """Random pixels of RAW-sRGB pairs, on which an ISP is fitted.
 
-Given its parameters the ISP is pointwise up to the mosaic, so a random subset of pixels stands for a frame. A mosaic
+Given its parameters the ISP is pointwise up to the mosaic, so a random subset of pixels represents a frame. A mosaic
 site has one colour: ``target`` holds its reading and ``known`` says in which channel. The 2 x 2 cell around it,
 averaged, gives the forward pass all three colours. Pairs that are not registered pixel by pixel (a camera's own JPEG)
 are compared as averages over blocks instead, where every channel is known.
@@ -23,9 +23,9 @@ from rawaug.isp.staged import thumbnail
 from rawaug.seeding import keyed_generator
 
 _CLIPPED_SRGB = 0.98
-"""The value from which on a picture counts as clipped."""
+"""The value from which a picture counts as clipped."""
 CLIPPED_RAW = 0.98
-"""The value from which on a reading counts as clipped."""
+"""The value from which a reading counts as clipped."""
 LEAST_LIKENESS = 0.8
 """Minimum correlation of the greens of an unregistered pair, after the shift is removed."""
 BLOCK = 16
@@ -33,7 +33,7 @@ BLOCK = 16
 
 
 class FramePair(Protocol):
-    """A frame that a fit takes; :class:`rawaug.data.Pair` is one."""
+    """A frame that a fit accepts; :class:`rawaug.data.Pair` is one."""
 
     @property
     def name(self) -> str:
@@ -73,10 +73,10 @@ class FramePair(Protocol):
 
 
 class FrameSummary(NamedTuple):
-    """The facts that a fit keeps of a frame besides its pixels.
+    """What a fit keeps of a frame besides its pixels.
 
     Args:
-        name: of the frame.
+        name: name of the frame.
         camera: maker and model.
         cfa: pattern of its mosaic.
         white_balance: as-shot multipliers of R, G and B.
@@ -102,10 +102,10 @@ class PixelSamples(NamedTuple):
         target: the reading in the channel of the site, 0 in the others, ``(F, 3, 1, P)``.
         site: 1 in the channel of the site, ``(F, 3, 1, P)``.
         known: the same, but 0 where the reading or the picture is clipped.
-        coordinates: of the pixels in the full frame, ``(F, 2, 1, P)``.
+        coordinates: coordinates of the pixels in the full frame, ``(F, 2, 1, P)``.
         cell_srgb: the picture averaged over the 2 x 2 cell, ``(F, 3, 1, P)``.
         cell_raw: the three colours of the cell, ``(F, 3, 1, P)``.
-        cell_weight: how much the cell counts, less on edges and 0 where it is clipped, ``(F, 1, 1, P)``.
+        cell_weight: weight of the cell, less on edges and 0 if it is clipped, ``(F, 1, 1, P)``.
     """
 
     srgb: Tensor
@@ -162,7 +162,7 @@ def sample_pixels(pairs: Iterable[FramePair], pixels: int, seed: int, noisy: boo
 
     Args:
         pairs: the frames.
-        pixels: how many are drawn from each.
+        pixels: number of pixels to draw from each frame.
         seed: keys the draws, with the name of the frame.
         noisy: take the captured noisy RAW in place of the clean one.
 
@@ -258,7 +258,7 @@ class Blocks(NamedTuple):
     Args:
         srgb: ``(3, h, w)``, averaged in linear light.
         raw: ``(3, h, w)``.
-        clipped: ``(h, w)``, whether any site of the block is.
+        clipped: ``(h, w)``, whether any site of the block is clipped.
         coordinates: ``(1, 2, h, w)``, in the full frame.
     """
 
@@ -269,7 +269,7 @@ class Blocks(NamedTuple):
 
 
 def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA) -> Blocks:
-    """Average sRGB ``(3, H, W)`` and RAW ``(1, H, W)`` over corresponding blocks, their shift removed."""
+    """Average sRGB ``(3, H, W)`` and RAW ``(1, H, W)`` over corresponding blocks, with their shift removed."""
     height, width = raw.shape[-2:]
     dy, dx = find_shift(srgb, raw, cfa)
     top, left = -(min(dy, 0) // 2) * 2, -(min(dx, 0) // 2) * 2
@@ -287,7 +287,7 @@ def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA) -> Blocks:
 
 
 def find_shift(srgb: Tensor, raw: Tensor, cfa: CFA) -> tuple[int, int]:
-    """Find how many pixels down and right a picture ``(3, H, W)`` lies against its mosaic ``(1, H, W)``."""
+    """Find how many pixels a picture ``(3, H, W)`` is shifted down and right from its mosaic ``(1, H, W)``."""
     with extra("raw"):
         from skimage.registration import phase_cross_correlation
 

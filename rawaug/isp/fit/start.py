@@ -1,12 +1,13 @@
 """The start of a fit: every frame's own colour, the atoms of the dictionaries, and the constant weights.
 
-A frame's colour is ``M_f = diag(1 / g_f) C_f`` (sRGB to RAW), rows of ``C_f`` l1-normalised. Frames of one camera share
-``M_f`` divided by its row sums ``s_f``, and ``k_f = s_f wb_f``, which is 1 where the metadata are exact. Both are drawn
-together by ``rho(d) = tau^2 d^2 / (tau^2 + d^2)`` (Geman and McClure): metadata that lie cost a constant.
+A frame's colour is ``M_f = diag(1 / g_f) C_f`` (sRGB to RAW), with the rows of ``C_f`` l1-normalised. Frames of one
+camera share ``M_f`` divided by its row sums ``s_f``, and ``k_f = s_f wb_f``, which is 1 if the metadata are exact. Both
+are drawn together by ``rho(d) = tau^2 d^2 / (tau^2 + d^2)`` (Geman and McClure), under which wrong metadata cost a
+constant.
 
 The constant weights minimise ``sum_f log(E_f(w) + eps)``, because the score averages decibels. ``E_f`` is the squared
-error beyond that of the frame's best gains. It is quadratic in the inverse gains ``u``: with second moments
-``a = <x^2>``, ``b = <x y>`` of a channel it is ``(u a - b)^2 / a``. Clipped readings enter none of this.
+error in excess of that of the frame's best gains. It is quadratic in the inverse gains ``u``: with second moments
+``a = <x^2>``, ``b = <x y>`` of a channel it is ``(u a - b)^2 / a``. Clipped readings are not used.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from rawaug.seeding import derive_seed
 TIE = 1e-1
 """Weight of the deviations; the squared errors of a good fit are about 1e-6."""
 TIE_RANGE = 0.05
-"""tau: deviations of frames that belong together are a few hundredths at most."""
+"""The scale tau; deviations of frames that belong together are a few hundredths at most."""
 FEWEST_PIXELS = 32
 
 
@@ -52,11 +53,11 @@ class FrameColour:
         return cls(product.abs().sum(2).log(), l1_normalise(product))
 
     def product(self) -> Tensor:
-        """``M`` ``(F, 3, 3)``."""
+        """Compute ``M`` ``(F, 3, 3)``."""
         return self.log_scale.exp()[:, :, None] * l1_normalise(self.matrix)
 
     def params(self) -> ISPParams:
-        """The settings of the frames as the ISP takes them, without weights."""
+        """The settings of the frames in the ISP's form, without weights."""
         none = self.log_scale.new_empty(len(self.log_scale), 0)
         return ISPParams(none, none, l1_normalise(self.matrix), torch.exp(-self.log_scale), none)
 
@@ -102,8 +103,8 @@ _CAMERA_RIDGE = 1e-3
 def least_squares(linear: Tensor, samples: PixelSamples, known_matrix: Tensor | None = None) -> Tensor:
     """Solve for ``M_f`` ``(F, 3, 3)``, which takes ``linear`` ``(F, 3, 1, P)`` to the readings, by least squares.
 
-    Where the colours of a frame do not say, ``known_matrix`` ``(F, 3, 3)`` does, from linear sRGB to white-balanced
-    camera RGB: the ridge draws ``M_f`` to its rows, each times the gain that fits the readings best.
+    If the colours of a frame do not determine it, ``known_matrix`` ``(F, 3, 3)`` does, from linear sRGB to
+    white-balanced camera RGB: the ridge draws ``M_f`` to its rows, each times the gain that fits the readings best.
     """
     x = linear[:, :, 0].double()
     y, known = samples.target[:, :, 0].double(), samples.known[:, :, 0].double()
@@ -130,7 +131,7 @@ def fit_fall_off(linear: Tensor, samples: PixelSamples, product: Tensor) -> tupl
 
     ``product`` ``(F, 3, 3)`` takes ``linear`` ``(F, 3, 1, P)`` to the prediction.
     """
-    # A quadratic in the coordinates; an offset for each frame and channel takes up what the mask does to the matrices.
+    # A quadratic in the coordinates; an offset per frame and channel absorbs the effect of the mask on the matrices.
     predicted = functional.correct_colour(linear, product)
     bright = (samples.known * (samples.target > 0.02) * (predicted > 0.02))[:, :, 0].double()
     ratio = (samples.target.clamp_min(1e-3) / predicted.clamp_min(1e-3)).log()[:, :, 0].double()
@@ -152,10 +153,10 @@ _SPREAD_EPS = 1e-6
 """Constant under the logarithm, so that a frame that nothing predicts does not decide alone."""
 _KNEES = (0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
 _FRAMES_AT_ONCE = 16
-"""Frames whose pixels pass the stages at a time, so that memory does not grow with their number."""
+"""Number of frames whose pixels pass the stages at a time, so that memory does not grow with the number of frames."""
 REACH_ATOMS = 8
 _LEAST_DETERMINANT = 0.05
-"""Of a matrix with rows of l1 norm 1; published cameras have 0.1 and more."""
+"""Minimum determinant of a matrix with rows of l1 norm 1; published cameras have 0.1 and more."""
 
 
 def set_dictionaries(
@@ -164,7 +165,7 @@ def set_dictionaries(
     """Set the knee, the atoms and the constant weights of an ISP from the frames.
 
     Args:
-        isp: whose dictionaries are set.
+        isp: the ISP whose dictionaries are set.
         colour: the colour of each frame.
         samples: the pixels of the frames.
         shots: the summaries of the frames.
@@ -177,12 +178,12 @@ def set_dictionaries(
 
 @torch.no_grad()
 def _set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSummary], config: FitConfig) -> None:
-    """Make the frames' matrices and gains the atoms, or clusters of them where there are more frames than atoms.
+    """Make the frames' matrices and gains the atoms, or their clusters if there are more frames than atoms.
 
     Args:
-        isp: whose dictionaries are set.
+        isp: the ISP whose dictionaries are set.
         colour: the colour of each frame.
-        shots: their summaries.
+        shots: the summaries of the frames.
         config: gives the reach of further gain atoms, and the seed of the clusters.
     """
     balance = as_shot(shots)
@@ -211,8 +212,8 @@ def _set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSum
 def plausible_matrices(matrices: Tensor) -> Tensor:
     """Say which matrices ``(F, 3, 3)`` from sRGB may be a camera's: booleans ``(F,)``.
 
-    Each channel sees its own primary most, and the matrix is far from singular. Frames of few colours leave their
-    matrices open, and must not become atoms.
+    In a camera's matrix each channel sees its own primary most, and the matrix is far from singular. Frames of few
+    colours leave their matrices undetermined, and must not become atoms.
     """
     own = matrices.diagonal(dim1=1, dim2=2)
     others = matrices.abs() - torch.diag_embed(matrices.diagonal(dim1=1, dim2=2).abs())
@@ -222,7 +223,7 @@ def plausible_matrices(matrices: Tensor) -> Tensor:
 def reach_atoms(count: int, reach: float) -> Tensor:
     """Make gain atoms that no frame had, as log offsets (digital, red, blue) from the frames' mean, ``(count, 3)``.
 
-    They are the corners of a box, those of a tetrahedron first.
+    They are the corners of a box, starting with those of a tetrahedron.
     """
     corners = sorted(product((-1.0, 1.0), repeat=3), key=lambda corner: corner[0] * corner[1] * corner[2])
     size = torch.tensor([0.25, 1.0, 1.0]) * torch.tensor(reach).log()
@@ -230,14 +231,14 @@ def reach_atoms(count: int, reach: float) -> Tensor:
 
 
 def _groups(points: Tensor, count: int, seed: int) -> Tensor:
-    """``(count, F)`` averaging matrix: the identity if there are as many points, else of k-means clusters."""
+    """Make an averaging matrix ``(count, F)``: the identity for as many points, else that of k-means clusters."""
     if len(points) == count:
         return torch.eye(count)
 
     from scipy.cluster.vq import kmeans2
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of an empty cluster, which frames that are all alike leave
+        warnings.simplefilter("ignore")  # k-means warns of an empty cluster, which occurs if all frames are alike
         _, labels = kmeans2(points.double().numpy(), count, minit="++", rng=derive_seed(seed, "atoms") % 2**32)
 
     member = torch.nn.functional.one_hot(torch.from_numpy(labels).long(), count).T.float()
@@ -268,7 +269,7 @@ def _spread(colour: FrameColour, balance: Tensor) -> float:
 
 @torch.no_grad()
 def _set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) -> None:
-    """Set where highlights begin to be spared: the knee under which all pixels, clipped ones too, come out best."""
+    """Set the knee, above which highlights are spared, to the one that suits all pixels best, clipped ones included."""
     errors: dict[float, float] = {}
     for knee in _KNEES:
         isp.configure(knee=knee)
@@ -280,10 +281,10 @@ def _set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) ->
 
 
 def _reverse_in_parts(isp: DictionaryISP, samples: PixelSamples, params: ISPParams) -> Tensor:
-    """Compute x5 ``(F, 3, 1, P)`` of all frames, some at a time: the networks need far more memory than x5.
+    """Compute x5 ``(F, 3, 1, P)`` of all frames, a few at a time, as the networks need far more memory than x5.
 
     Args:
-        isp: whose reverse pass is taken.
+        isp: the ISP whose reverse pass is run.
         samples: the pixels of F frames.
         params: a setting for each frame, or one for all.
     """
@@ -300,17 +301,17 @@ def _reverse_in_parts(isp: DictionaryISP, samples: PixelSamples, params: ISPPara
 
 
 _LIGHT_PIXELS = 1024
-"""Pixels of a frame by which the lights of trained atoms are measured."""
+"""Number of pixels of a frame that serve to measure the lights of trained atoms."""
 _LIGHT_RIDGE = 1e-2
 """Ridge that pulls the neutrals of rarely used atoms to the mean."""
 
 
 @torch.no_grad()
 def measure_lights(isp: DictionaryISP, frames: FitFrames) -> None:
-    """Measure the light, the neutral and the spread of colour atoms anew, which training has moved.
+    """Measure the light, the neutral and the spread of colour atoms anew, since training has moved them.
 
-    An atom's light is the mean of those frames that choose it, where encoders choose. The neutrals are those under
-    which as-shot gains come nearest to each frame's best gains, and the spread is the one under which they do so best.
+    An atom's light is the mean light of the frames that choose it, if encoders choose. The neutrals are those under
+    which as-shot gains come nearest to each frame's best gains, and the spread is the one that works best with them.
     """
     balance = frames.as_shot
     if isp.config.encoders:
@@ -362,7 +363,7 @@ def _solve_mixture(weights: Tensor, wanted: Tensor) -> Tensor:
 
 
 def set_priors(isp: DictionaryISP, samples: PixelSamples, config: FitConfig) -> None:
-    """Set the constant weights: all colour atoms alike, and the gain atoms as serves the frames best."""
+    """Set the constant weights: equal ones for the colour atoms, and those that serve the frames best for the gains."""
     colour_weights = torch.full((isp.config.colour_atoms,), 1.0 / isp.config.colour_atoms)
     with torch.no_grad():
         plain = isp.params_from_weights(colour_weights[None], torch.ones(1, isp.config.gain_atoms))
@@ -379,12 +380,12 @@ def set_priors(isp: DictionaryISP, samples: PixelSamples, config: FitConfig) -> 
 
 
 def best_constants(a: Tensor, b: Tensor, inverse_atoms: Tensor, steps: int = 400, mse_floor: float = 1e-5) -> Tensor:
-    """Descend on the weights of the gain atoms that serve the frames best; see the module.
+    """Find the weights of the gain atoms that serve the frames best by gradient descent; see the module.
 
     Args:
         a, b: second moments of the frames, ``(F, 3)``.
         inverse_atoms: one over the gains of the atoms, ``(M, 3)``.
-        steps: of the descent.
+        steps: number of steps of the descent.
         mse_floor: added to a frame's squared error under the logarithm.
 
     Returns:

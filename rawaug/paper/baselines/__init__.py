@@ -1,4 +1,4 @@
-r"""The methods that the dictionary ISP is compared with, written from their papers, on one interface.
+r"""The methods that the dictionary ISP is compared with, written from their papers, with one interface.
 
 =========== ============================================ ============ ========= =================================
 name        source                                       parameters   fitted    RAW to sRGB

@@ -1,13 +1,12 @@
-r"""What the methods that the dictionary ISP is compared with have in common, and how they are fitted.
+r"""The common base of the methods that the dictionary ISP is compared with, and their fit.
 
-``y = mosaic(u(x))``, u being the method: sRGB ``x`` ``(B, 3, H, W)`` becomes linear camera colour of the same size, of
-which the mosaic keeps one channel a site. Whatever a method predicts, RAW leaves it within [0, 1]; training sees the
-values as they are. Some methods also render, ``x = f(y)``.
+``y = mosaic(u(x))``, where u is the method: sRGB ``x`` ``(B, 3, H, W)`` becomes linear camera colour of the same size,
+of which the mosaic keeps one channel for each site. Whatever a method predicts, its RAW is held within [0, 1]; training
+sees the values as they are. Some methods also render, ``x = f(y)``.
 
-Networks are trained by Adam, each with its own loss, on random crops of the pairs, which start where the frame's CFA is
+Networks are trained by Adam, each with its own loss, on random crops of the pairs. Crops start where the frame's CFA is
 that of the model, so frames of any pattern train one model. The learning rate falls to 0 by half a cosine over the
-budget, whichever of the two, seconds or steps, is further spent. Given steps alone, the same seed gives the same
-weights.
+budget of seconds or steps, whichever is further spent. Given only steps, the same seed gives the same weights.
 """
 
 from __future__ import annotations
@@ -34,12 +33,12 @@ from rawaug.registry import Registry
 from rawaug.seeding import keyed_generator
 
 BASELINES = Registry("baseline", "rawaug.baselines", "rawaug.paper.baselines")
-"""The baselines by name: subclasses of :class:`BaselineISP`."""
+"""This maps names to baselines, which are subclasses of :class:`BaselineISP`."""
 
 CLIP_NORM = 1.0
-"""The gradient's largest norm. Short fits need high rates, at which the U-Net diverges without this limit."""
+"""The gradient's norm is limited to this. Short fits need high rates, at which the U-Net otherwise diverges."""
 CURVE_POINTS = 10
-"""Number of equal parts of a training whose mean losses are recorded, so that one can see whether it had ended."""
+"""Mean losses are recorded for this many equal parts of a training, which shows whether it had ended."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class Training:
             raise ValueError(f"give seconds or steps above 0, got {self.seconds} and {self.steps}")
 
     def share_done(self, seconds: float, steps: int) -> float:
-        """How far the training has come, from 0 to 1: the share of the time or of the steps, whichever is larger."""
+        """Compute how far training has come, from 0 to 1: its share of the time or of the steps, if that is larger."""
         if steps == 0:  # one step is done in any case
             return 0.0
 
@@ -84,7 +83,7 @@ class Training:
 class BaselineISP(nn.Module, ABC):
     """A method that the dictionary ISP is compared with.
 
-    The ``setting`` of a pass is what the method may know of a shot, such as its gains; None leaves it to its own.
+    The ``setting`` of a pass is what the method may know about a shot, such as its gains; with None it uses its own.
 
     Args:
         cfa: the pattern of the RAW that it makes and takes.
@@ -92,7 +91,7 @@ class BaselineISP(nn.Module, ABC):
 
     name: ClassVar[str]
     renders: ClassVar[bool] = False
-    """Whether the method also has a pass from RAW to sRGB."""
+    """This says whether the method also has a pass from RAW to sRGB."""
 
     def __init__(self, cfa: CFA | str = "RGGB") -> None:
         super().__init__()
@@ -100,11 +99,11 @@ class BaselineISP(nn.Module, ABC):
         self.info: dict[str, Any] = {}
 
     def setting_of(self, white_balance: tuple[float, float, float]) -> Any:
-        """The setting for as-shot multipliers R, G, B; None if the method makes no use of them."""
+        """Make the setting for as-shot multipliers R, G, B; return None if the method does not use them."""
         return None
 
     def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to a mosaic ``(B, 1, H, W)`` under a random setting, if the method has any to draw."""
+        """Convert sRGB ``(B, 3, H, W)`` to a mosaic ``(B, 1, H, W)``, under a random setting if there are any."""
         return self.reverse(srgb)
 
     def learn(self, pairs: Sequence[FramePair], training: Training) -> list[float]:
@@ -116,20 +115,20 @@ class BaselineISP(nn.Module, ABC):
         """Float sRGB ``(B, 3, H, W)`` to linear camera colour ``(B, 3, H, W)``, not clipped."""
 
     def reverse(self, srgb: Tensor, setting: Any = None) -> Tensor:
-        """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides, to the mosaic ``(B, 1, H, W)`` in [0, 1]."""
+        """Turn even-sided sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], into mosaics ``(B, 1, H, W)`` in [0, 1]."""
         camera_colour = self.unprocess(as_float(srgb), setting)
         return bayer.mosaic(camera_colour.clamp(0.0, 1.0), self.cfa)
 
     def render(self, raw: Tensor, setting: Any = None) -> Tensor:
-        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``, not clipped; ValueError if the method cannot."""
+        """Render a mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``, not clipped; raise ValueError if it cannot."""
         raise ValueError(f"{self.name} only converts sRGB to RAW")
 
     def forward(self, raw: Tensor, setting: Any = None) -> Tensor:
-        """RAW mosaic ``(B, 1, H, W)`` in :attr:`cfa` to sRGB ``(B, 3, H, W)`` in [0, 1]."""
+        """Render a RAW mosaic ``(B, 1, H, W)`` in :attr:`cfa` to sRGB ``(B, 3, H, W)`` in [0, 1]."""
         return self.render(raw, setting).clamp(0.0, 1.0)
 
     def cycle(self, srgb: Tensor) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to RAW and back to sRGB of the same shape."""
+        """Convert sRGB ``(B, 3, H, W)`` to RAW and back to sRGB of the same shape."""
         return self.forward(self.reverse(srgb))
 
 
@@ -149,18 +148,18 @@ class CropTrainedISP(BaselineISP):
 
     reverse_network: nn.Module
     learning_rate: ClassVar[float]
-    """Adam's learning rate at the start."""
+    """Adam starts with this learning rate."""
 
     def unprocess(self, srgb: Tensor, setting: Any = None) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape, by ``reverse_network``."""
+        """Convert sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape, by ``reverse_network``."""
         camera_colour: Tensor = self.reverse_network(srgb)
         return camera_colour
 
     def prepare(self, pairs: Sequence[FramePair]) -> None:
-        """Set from the pairs what descent does not learn; called once, before training."""
+        """Set from the pairs what descent does not learn. This is called once, before training."""
 
     def loss(self, crops: Crops, share_done: float = 1.0) -> Tensor:
-        """The scalar that training lowers: by default :meth:`raw_error`.
+        """Compute the scalar that training minimises, by default :meth:`raw_error`.
 
         Args:
             crops: the batch.
@@ -170,11 +169,11 @@ class CropTrainedISP(BaselineISP):
         return self.raw_error(predicted, crops.raw)
 
     def raw_error(self, predicted: Tensor, raw: Tensor) -> Tensor:
-        """The error of predicted mosaics ``(B, 1, H, W)``, a scalar: by default l1."""
+        """Compute the error of predicted mosaics ``(B, 1, H, W)``, a scalar, by default l1."""
         return F.l1_loss(predicted, raw)
 
     def learn(self, pairs: Sequence[FramePair], training: Training) -> list[float]:
-        """Train on crops; ValueError if there is no budget, or a pair is too small or not registered."""
+        """Train on crops; raise ValueError if there is no budget, or a pair is too small or not registered."""
         training.require_budget()
         require_crops(pairs, training.crop)
         self.prepare(pairs)
@@ -218,12 +217,12 @@ def require_crops(pairs: Sequence[FramePair], side: int) -> None:
 def random_crops(
     pairs: Sequence[FramePair], cfa: CFA, training: Training, step: int, device: torch.device | str = "cpu"
 ) -> Crops:
-    """The batch of a step, the same for the same seed and step.
+    """Make the batch of a step, which is the same for the same seed and step.
 
     Args:
         pairs: registered frames of any pattern.
         cfa: the pattern in which all crops arrive.
-        training: says the crops' number, side and seed.
+        training: sets the crops' number, side and seed.
         step: counts from 0.
         device: where the batch is put.
     """
@@ -252,7 +251,7 @@ Model = TypeVar("Model", bound=BaselineISP)
 def fit_baseline(model: Model, pairs: Sequence[FramePair], training: Training) -> Model:
     """Fit a method in place and return it in eval mode.
 
-    ``model.info`` records the frames, the seed, the number of steps, the seconds and, of a network, ``loss``, the last
+    ``model.info`` records the frames, the seed, the number of steps, the seconds and, for a network, ``loss``, the last
     one, and ``curve``, the mean losses of ten equal parts of the training. UPI as published has nothing to fit; tuned
     UPI is solved in closed form, whatever the budget.
     """
@@ -276,7 +275,7 @@ def fit_baseline(model: Model, pairs: Sequence[FramePair], training: Training) -
 
 
 def mean_curve(losses: Sequence[float], points: int = CURVE_POINTS) -> list[float]:
-    """Mean losses of equal parts of a training; of one shorter than ``points`` steps, the losses themselves.
+    """Average losses over equal parts of a training; one shorter than ``points`` steps keeps the losses themselves.
 
     Example:
         >>> mean_curve([4.0, 2.0, 1.0, 1.0], points=2)

@@ -1,10 +1,10 @@
-r"""CycleISP: a network a direction, ``y = mosaic(N_rgb2raw(x))`` and ``x = N_raw2rgb(pack(y), a(x'))``.
+r"""CycleISP: a network for each direction, ``y = mosaic(N_rgb2raw(x))`` and ``x = N_raw2rgb(pack(y), a(x'))``.
 
 Either network has three groups of five dual-attention blocks (:mod:`denoisers.cycleisp`) of 96 features. RAW has no
-trace of how its picture was coloured, so a colour branch a guides the way to sRGB: a blurred sRGB picture x' becomes a
-map in (0, 1) that re-weights the features.
+trace of how its picture was coloured, so a colour branch a guides the way to sRGB: it turns a blurred sRGB picture x'
+into a map in (0, 1) that re-weights the features.
 
-The two networks are trained apart at first, by ``|y - y^|_1 + |log y - log y^|_1`` and ``|x - x^|_1``, and then
+The two networks are first trained separately, by ``|y - y^|_1 + |log y - log y^|_1`` and ``|x - x^|_1``, and then
 together on the cycle: ``b L_raw + (1 - b) |x - N_raw2rgb(mosaic(N_rgb2raw(x)), a(x))|_1`` with b = 0.5 here.
 
 Source: Zamir et al., "CycleISP: Real Image Restoration via Improved Data Synthesis", CVPR 2020. What its text leaves
@@ -26,13 +26,13 @@ from rawaug.paper.baselines.base import BASELINES, Crops, CropTrainedISP
 from rawaug.seeding import derive_seed, initialise_from
 
 LOG_FLOOR = 1e-3
-"""The value below which the log loss is flat: at 12 bits it is four levels above black."""
+"""The log loss is flat below this value, which is four levels above black at 12 bits."""
 BLUR_SIZE, BLUR_SIGMA = 21, 12.0
-"""Side in pixels and standard deviation of the blur of the picture that gives the colours."""
+"""The picture that gives the colours is blurred with this side in pixels and standard deviation."""
 APART = 0.75
-"""Share of the training in which the two networks are trained apart, before they are trained on the cycle."""
+"""The two networks are trained separately for this share of the training, and then on the cycle."""
 RAW_SHARE = 0.5
-"""Weight of the error of the RAW in the loss on the cycle; the rest is the weight of the picture that comes back."""
+"""In the loss on the cycle, the error of the RAW has this weight; the picture that comes back has the rest."""
 
 
 class RGB2RAW(Trunk):
@@ -50,7 +50,7 @@ class RGB2RAW(Trunk):
         self.tail = nn.Sequential(nn.Conv2d(features, 3, 3, padding=1))
 
     def forward(self, srgb: Tensor) -> Tensor:
-        """``(B, 3, H, W)`` to ``(B, 3, H, W)``."""
+        """Map ``(B, 3, H, W)`` to ``(B, 3, H, W)``."""
         return self.tail(self.body(self.head(srgb)))
 
 
@@ -64,7 +64,7 @@ class RAW2RGB(Trunk):
         self.tail_rgb = nn.Sequential(nn.Conv2d(features, 12, 1))
 
     def forward(self, packed: Tensor, colour: Tensor) -> Tensor:
-        """RAW ``(B, 4, H/2, W/2)`` and the map ``(B, features, H/2, W/2)`` to sRGB ``(B, 3, H, W)``."""
+        """Render RAW ``(B, 4, H/2, W/2)`` and the map ``(B, features, H/2, W/2)`` to sRGB ``(B, 3, H, W)``."""
         features = self.body[:-1](self.head(packed))
         guided = self.body[-1](features + features * colour)
         return F.pixel_shuffle(self.tail_rgb(self.tail(guided)), 2)
@@ -78,7 +78,7 @@ class ColourBranch(Trunk):
         self.tail = nn.Sequential(nn.Conv2d(features, features, 3, padding=1), nn.Sigmoid())
 
     def forward(self, srgb: Tensor) -> Tensor:
-        """A picture ``(B, 3, H, W)`` to weights of features in (0, 1), ``(B, features, H/2, W/2)``."""
+        """Turn a picture ``(B, 3, H, W)`` to weights of features in (0, 1), ``(B, features, H/2, W/2)``."""
         from kornia.filters import gaussian_blur2d
 
         height, width = srgb.shape[-2:]
@@ -94,7 +94,7 @@ class ColourBranch(Trunk):
 
 @BASELINES.register("cycleisp")
 class CycleISP(CropTrainedISP):
-    """CycleISP. To render RAW it needs a picture of the same scene whose colours it takes: ``model(raw, srgb)``.
+    """CycleISP. To render RAW, it takes the colours of a picture of the same scene: ``model(raw, srgb)``.
 
     Args:
         cfa: the pattern of the RAW that it makes and takes.
@@ -102,7 +102,7 @@ class CycleISP(CropTrainedISP):
         groups: of dual-attention blocks, in each network.
         blocks: in each group.
         reduction: of the features in channel attention.
-        both: whether the way to sRGB and the cycle are trained as well; without, the way to RAW alone, in a third of
+        both: whether the way to sRGB and the cycle are also trained; otherwise only the way to RAW is, in a third of
             the time.
         seed: decides the initial weights.
     """
@@ -141,7 +141,7 @@ class CycleISP(CropTrainedISP):
         self.colour_branch.requires_grad_(both)
 
     def render(self, raw: Tensor, setting: Tensor | None = None) -> Tensor:
-        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``; the setting is an sRGB picture of the same scene."""
+        """Render a mosaic ``(B, 1, H, W)`` as sRGB ``(B, 3, H, W)``; the setting is an sRGB picture of the scene."""
         if setting is None:
             raise ValueError("cycleisp renders RAW in the colours of a picture: pass the sRGB of the same scene")
         if not self.both:
@@ -151,11 +151,11 @@ class CycleISP(CropTrainedISP):
         return self.raw2rgb(bayer.pack(raw, self.cfa), colour)
 
     def cycle(self, srgb: Tensor) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to RAW and back, in its own colours."""
+        """Convert sRGB ``(B, 3, H, W)`` to RAW and back, in its own colours."""
         return self.forward(self.reverse(srgb), srgb)
 
     def loss(self, crops: Crops, share_done: float = 1.0) -> Tensor:
-        """The error of the RAW and of the picture, first each network by itself and then over the cycle; a scalar."""
+        """Compute the error of RAW and picture, first of each network alone and then over the cycle, a scalar."""
         predicted = bayer.mosaic(self.unprocess(crops.srgb), self.cfa)
         raw_error = self.raw_error(predicted, crops.raw)
         if not self.both:
@@ -168,7 +168,7 @@ class CycleISP(CropTrainedISP):
         return RAW_SHARE * raw_error + (1.0 - RAW_SHARE) * F.l1_loss(returned, crops.srgb)
 
     def raw_error(self, predicted: Tensor, raw: Tensor) -> Tensor:
-        """l1 of mosaics ``(B, 1, H, W)`` and of their logarithms, a scalar."""
+        """Compute the l1 error of mosaics ``(B, 1, H, W)`` and of their logarithms, a scalar."""
         log_predicted = predicted.clamp_min(LOG_FLOOR).log()
         log_raw = raw.clamp_min(LOG_FLOOR).log()
         return F.l1_loss(predicted, raw) + F.l1_loss(log_predicted, log_raw)
@@ -179,8 +179,8 @@ class CycleISP(CropTrainedISP):
         Nothing in the file is run as code; errors are those of :func:`denoisers.cycleisp.load_published`.
 
         Args:
-            path: of the checkpoint.
-            part: whose weights these are: "rgb2raw", "raw2rgb" or "ccm", which is the colour branch.
+            path: path of the checkpoint.
+            part: the part whose weights these are: "rgb2raw", "raw2rgb" or "ccm", which is the colour branch.
         """
         networks = {"rgb2raw": self.reverse_network, "raw2rgb": self.raw2rgb, "ccm": self.colour_branch}
         if part not in networks:

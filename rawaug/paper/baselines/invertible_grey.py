@@ -1,14 +1,14 @@
 r"""Invertible greyscale, with RAW hidden in the picture: ``x = E(r)``, ``r = D(x)``.
 
 Xia et al. hide a colour picture in a grey one by an encoder E, from which a decoder D restores it. In InvISP's
-comparison the hidden picture is the RAW and the visible one the sRGB; r is RAW as InvISP prepares it
+comparison, the hidden picture is the RAW and the visible one is the sRGB; r is RAW as InvISP prepares it
 (:mod:`rawaug.paper.baselines.invisp`). E is a residual encoder-decoder of 64, 128 and 256 features with 2, 4 and 2
 residual blocks, strides of 2 down, nearest neighbours up, and the finer features added; D has 64 features and 8
 residual blocks, then 256 features and a 1 x 1 convolution.
 
 Loss: ``|E(r) - x|_1`` for the picture, ``|D(E(r)) - r|_1`` for what is hidden in it, and ``|D(x) - r|_1``, since here
 RAW is also made of a camera's own picture. Two things differ from the source and are assumptions: outputs are linear,
-for the published tanh is flat where most of RAW is, and errors are l1, as for the other methods.
+since the published tanh is flat where most of RAW is, and errors are l1, as for the other methods.
 
 Source: Xia et al., "Invertible Grayscale", ACM TOG 37(6), 2018; Xing et al., CVPR 2021.
 """
@@ -26,7 +26,7 @@ from rawaug.seeding import derive_seed, initialise_from
 
 
 def conv(inputs: int, outputs: int, stride: int = 1) -> nn.Conv2d:
-    """A 3 x 3 convolution that keeps the size at a stride of 1."""
+    """Make a 3 x 3 convolution that keeps the size at a stride of 1."""
     return nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1)
 
 
@@ -38,22 +38,22 @@ class ResidualBlock(nn.Module):
         self.layers = nn.Sequential(conv(features, features), nn.ReLU(), conv(features, features))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features ``(B, C, H, W)`` to features of the same shape."""
+        """Map features ``(B, C, H, W)`` to features of the same shape."""
         return x + self.layers(x)
 
 
 def residual_blocks(features: int, count: int) -> nn.Sequential:
-    """``count`` residual blocks in a row."""
+    """Make ``count`` residual blocks in a row."""
     return nn.Sequential(*[ResidualBlock(features) for _ in range(count)])
 
 
 def scale_change(inputs: int, outputs: int, stride: int) -> nn.Sequential:
-    """A change of size and of the number of features."""
+    """Make layers that change the size and the number of features."""
     return nn.Sequential(conv(inputs, outputs, stride), conv(outputs, outputs), nn.ReLU())
 
 
 class Encoder(nn.Module):
-    """E, with ``features``, twice and four times as many in its three scales."""
+    """E, with ``features``, twice as many and four times as many in its three scales."""
 
     def __init__(self, features: int) -> None:
         super().__init__()
@@ -67,7 +67,7 @@ class Encoder(nn.Module):
         self.last = nn.Sequential(residual_blocks(fine, 2), conv(fine, 3))
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(B, 3, H, W)`` to ``(B, 3, H, W)``; sides are padded to multiples of 4 inside."""
+        """Map ``(B, 3, H, W)`` to ``(B, 3, H, W)``; sides are padded to multiples of 4 inside."""
         height, width = x.shape[-2:]
         fine = self.first(pad_to_multiple(x, 4))
         middle = self.to_middle(fine)
@@ -82,7 +82,7 @@ class Encoder(nn.Module):
 
 @BASELINES.register("invgrey")
 class InvertibleGrey(CompressedISP):
-    """The invertible-greyscale network, one network a direction.
+    """The invertible-greyscale networks, one for each direction.
 
     Args:
         cfa: the pattern of the RAW that it makes and takes.
@@ -107,7 +107,7 @@ class InvertibleGrey(CompressedISP):
             )
 
     def from_picture(self, srgb: Tensor) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to balanced, compressed colour of the same shape, by the decoder."""
+        """Convert sRGB ``(B, 3, H, W)`` to balanced, compressed colour of the same shape, by the decoder."""
         compressed: Tensor = self.reverse_network(srgb)
         return compressed
 
@@ -117,7 +117,7 @@ class InvertibleGrey(CompressedISP):
         return picture
 
     def loss(self, crops: Crops, share_done: float = 1.0) -> Tensor:
-        """l1 of the picture, of what is hidden in it and of RAW from the camera's picture, a scalar."""
+        """Compute l1 of the picture, of what is hidden in it and of RAW from the camera's picture, a scalar."""
         compressed = self.compress(crops.raw, crops.white_balance)
         rendered = self.to_picture(compressed)
         hidden = self.from_picture(rendered)

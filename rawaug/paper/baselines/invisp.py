@@ -4,11 +4,11 @@ RAW enters as InvISP prepares it: demosaiced, balanced by the white balance w of
 compressed, ``r = (w demosaic(y))^(1/2.2)``. f is eight blocks ``u = W v``, ``p = u_1 + F(u_23)``,
 ``q = u_23 exp(s(p)) + G(p)`` with the log-scale ``s = 0.8 (2 sigmoid(H(p)) - 1)``, each of which is undone exactly.
 
-Loss: ``|f(r) - x|_1 + |f^-1(x) - r|_1``; with JPEG between, the second term is ``|f^-1(jpeg(f(r))) - r|_1``, for which
-the codec (:mod:`rawaug.paper.baselines.jpeg`) must be differentiable.
+Loss: ``|f(r) - x|_1 + |f^-1(x) - r|_1``. With JPEG in between, the second term is ``|f^-1(jpeg(f(r))) - r|_1``, for
+which the codec (:mod:`rawaug.paper.baselines.jpeg`) must be differentiable.
 
-InvISP's own figures are of RAW recovered from the network's *own rendering*, stored as JPEG, which may hide in the
-picture what the way back needs. RAW recovered from the picture of a camera is another task, and the harder one.
+InvISP's own figures are for RAW recovered from the network's *own rendering*, stored as JPEG. That rendering may hide
+in the picture what the way back needs. RAW recovered from a camera's picture is another task, and the harder one.
 
 Source: Xing et al., "Invertible Image Signal Processing", CVPR 2021; couplings of Dinh et al. (Real NVP), 1 x 1
 convolutions of Kingma and Dhariwal (Glow), dense blocks of growth 32.
@@ -31,20 +31,20 @@ from rawaug.paper.baselines.jpeg import jpeg
 from rawaug.seeding import derive_seed, initialise_from
 
 SCALE_CLAMP = 0.8
-"""The largest absolute log-scale of a coupling."""
+"""A coupling has at most this absolute log-scale."""
 GAMMA = 2.2
-"""The power by which RAW is compressed before the network."""
+"""RAW is compressed by this power before the network."""
 SLOPE = 0.2
-"""Slope of the leaky ReLUs for negative values."""
+"""The leaky ReLUs have this slope for negative values."""
 JPEG_QUALITY = 90
-"""The quality at which pictures are stored between the two passes, as published."""
+"""Pictures are stored at this quality between the two passes, as published."""
 Balance = Tensor | tuple[float, ...] | None
 
 
 class CompressedISP(CropTrainedISP):
     """A network that sees RAW as InvISP prepares it; the setting is the as-shot multipliers R, G, B.
 
-    They are ``(3,)`` or ``(B, 3)``. Without a setting both passes take the geometric mean of the training pairs'.
+    The multipliers are ``(3,)`` or ``(B, 3)``. Without a setting, both passes take the training pairs' geometric mean.
 
     Args:
         cfa: the pattern of the RAW that it makes and takes.
@@ -58,16 +58,16 @@ class CompressedISP(CropTrainedISP):
         self.register_buffer("balance", torch.ones(1, 3))
 
     def prepare(self, pairs: Sequence[FramePair]) -> None:
-        """Take the pairs' mean multipliers as those of shots that state none."""
+        """Take the pairs' mean multipliers for shots that state none."""
         multipliers = torch.tensor([pair.white_balance for pair in pairs])
         self.balance.copy_(multipliers.log().mean(0, keepdim=True).exp())
 
     def setting_of(self, white_balance: tuple[float, float, float]) -> Balance:
-        """The multipliers themselves."""
+        """Return the multipliers themselves."""
         return white_balance
 
     def from_picture(self, srgb: Tensor) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to balanced, compressed colour of the same shape."""
+        """Convert sRGB ``(B, 3, H, W)`` to balanced, compressed colour of the same shape."""
         raise NotImplementedError
 
     def to_picture(self, compressed: Tensor) -> Tensor:
@@ -75,21 +75,21 @@ class CompressedISP(CropTrainedISP):
         raise NotImplementedError
 
     def unprocess(self, srgb: Tensor, setting: Balance = None) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape."""
+        """Convert sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape."""
         balanced = functional.gamma_expand(self.from_picture(srgb), GAMMA)
         return functional.apply_gains(balanced, 1.0 / self.gains(setting, len(srgb)))
 
     def render(self, raw: Tensor, setting: Balance = None) -> Tensor:
-        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``."""
+        """Render a mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``."""
         return self.to_picture(self.compress(raw, setting))
 
     def compress(self, raw: Tensor, setting: Balance = None) -> Tensor:
-        """Mosaic ``(B, 1, H, W)`` to balanced, gamma-compressed colour ``(B, 3, H, W)``, what the network sees."""
+        """Convert a mosaic ``(B, 1, H, W)`` to balanced, gamma-compressed colour ``(B, 3, H, W)`` for the network."""
         balanced = functional.apply_gains(bayer.demosaic(raw, self.cfa), self.gains(setting, len(raw)))
         return functional.gamma_compress(balanced, GAMMA)
 
     def gains(self, setting: Balance, batch: int) -> Tensor:
-        """The multipliers ``(B, 3)`` of a setting, of largest entry 1."""
+        """Give the multipliers ``(B, 3)`` of a setting, scaled to a largest entry of 1."""
         multipliers = self.balance if setting is None else setting
         gains = torch.as_tensor(multipliers, dtype=self.balance.dtype, device=self.balance.device).expand(batch, 3)
         return gains / gains.amax(dim=1, keepdim=True)
@@ -109,7 +109,7 @@ class DenseBlock(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(B, inputs, H, W)`` to ``(B, outputs, H, W)``."""
+        """Map ``(B, inputs, H, W)`` to ``(B, outputs, H, W)``."""
         for layer in self.hidden:
             x = torch.cat([x, F.leaky_relu(layer(x), SLOPE)], dim=1)
         return self.last(x)
@@ -126,7 +126,7 @@ class InvertibleBlock(nn.Module):
         self.add_two = DenseBlock(1, 2, growth)
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(B, 3, H, W)`` to ``(B, 3, H, W)``."""
+        """Map ``(B, 3, H, W)`` to ``(B, 3, H, W)``."""
         mixed = F.conv2d(x, self.weight[:, :, None, None])
         one, two = mixed.split([1, 2], dim=1)
 
@@ -135,7 +135,7 @@ class InvertibleBlock(nn.Module):
         return torch.cat([one, two], dim=1)
 
     def inverse(self, x: Tensor) -> Tensor:
-        """The input ``(B, 3, H, W)`` that :meth:`forward` makes ``x`` of, which has the same shape."""
+        """Compute the input ``(B, 3, H, W)`` from which :meth:`forward` makes ``x``, which has the same shape."""
         one, two = x.split([1, 2], dim=1)
         two = (two - self.add_two(one)) * (-self.log_scale(one)).exp()
         one = one - self.add_one(two)
@@ -144,12 +144,12 @@ class InvertibleBlock(nn.Module):
         return F.conv2d(torch.cat([one, two], dim=1), unmix[:, :, None, None])
 
     def log_scale(self, one: Tensor) -> Tensor:
-        """The logarithm ``(B, 2, H, W)`` of the factor of two channels, of the other one ``(B, 1, H, W)``."""
+        """Compute the logarithm ``(B, 2, H, W)`` of two channels' factor from the other one, ``(B, 1, H, W)``."""
         return SCALE_CLAMP * (2.0 * torch.sigmoid(self.scale_two(one)) - 1.0)
 
 
 class Flow(nn.Module):
-    """The blocks in a row. Before training their exchanges of channels undo each other, so that it is the identity."""
+    """The blocks in a row. Before training, their exchanges of channels undo each other, so it is the identity."""
 
     def __init__(self, blocks: int, growth: int) -> None:
         super().__init__()
@@ -165,7 +165,7 @@ class Flow(nn.Module):
         return x
 
     def inverse(self, x: Tensor) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to compressed, balanced RAW of the same shape."""
+        """Convert sRGB ``(B, 3, H, W)`` to compressed, balanced RAW of the same shape."""
         for block in reversed(self.blocks):
             x = block.inverse(x)  # type: ignore[operator]
         return x
@@ -196,7 +196,7 @@ class InvISP(CompressedISP):
         return self.flow
 
     def from_picture(self, srgb: Tensor) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to balanced, compressed colour of the same shape."""
+        """Convert sRGB ``(B, 3, H, W)`` to balanced, compressed colour of the same shape."""
         compressed: Tensor = self.flow.inverse(srgb)
         return compressed
 
@@ -206,14 +206,14 @@ class InvISP(CompressedISP):
         return picture
 
     def loss(self, crops: Crops, share_done: float = 1.0) -> Tensor:
-        """l1 of both passes, a scalar."""
+        """Compute the l1 error of both passes, a scalar."""
         compressed = self.compress(crops.raw, crops.white_balance)
         rendered = self.to_picture(compressed)
         recovered = self.from_picture(self.stored(rendered, crops.srgb))
         return F.l1_loss(rendered, crops.srgb) + F.l1_loss(recovered, compressed)
 
     def stored(self, rendered: Tensor, srgb: Tensor) -> Tensor:
-        """The picture ``(B, 3, H, W)`` from which the way back starts: here the camera's."""
+        """Return the picture ``(B, 3, H, W)`` from which the way back starts: here the camera's."""
         return srgb
 
 
@@ -223,7 +223,7 @@ class JpegInvISP(InvISP):
 
     Args:
         cfa, blocks, growth, seed: as for :class:`InvISP`.
-        quality: of the JPEG, from 1 to 100.
+        quality: quality of the JPEG, from 1 to 100.
     """
 
     name = "invisp-jpeg"
@@ -235,5 +235,5 @@ class JpegInvISP(InvISP):
         self.quality = quality
 
     def stored(self, rendered: Tensor, srgb: Tensor) -> Tensor:
-        """The network's own rendering ``(B, 3, H, W)``, compressed."""
+        """Compress the network's own rendering ``(B, 3, H, W)``."""
         return jpeg(rendered.clamp(0.0, 1.0), self.quality)

@@ -1,13 +1,13 @@
-r"""A JPEG codec through which gradients pass, as InvISP trains with it.
+r"""A JPEG codec through which gradients pass, as in InvISP's training.
 
-Colour goes to YCbCr, chrominance to half the size, each plane to the discrete cosine transform of its 8 x 8 blocks,
-and the coefficients to whole multiples of the tables of ITU-T T.81, Annex K, scaled to the quality as libjpeg does.
-The rounding is the Fourier series of the sawtooth,
+Colour is converted to YCbCr, chrominance is halved in size, and each plane goes through the discrete cosine transform
+of its 8 x 8 blocks. The coefficients become whole multiples of the tables of ITU-T T.81, Annex K, scaled to the quality
+as in libjpeg. The rounding is the Fourier series of the sawtooth,
 
 .. math:: Q(c) = c - \frac{1}{\pi} \sum_{k=1}^{K} \frac{(-1)^{k+1}}{k} \sin(2 \pi k c), \qquad K = 10
 
-with which gradients pass. Entropy coding loses nothing and is left out. Source: Xing et al., "Invertible Image Signal
-Processing", CVPR 2021; ITU-T T.81.
+through which gradients pass. Entropy coding loses nothing and is left out. Source: Xing et al., "Invertible Image
+Signal Processing", CVPR 2021; ITU-T T.81.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch import Tensor
 
 BLOCK = 8
 TERMS = 10
-"""K, the number of terms of the Fourier series."""
+"""This is K, the number of terms of the Fourier series."""
 LUMINANCE = (
     (16, 11, 10, 16, 24, 40, 51, 61),
     (12, 12, 14, 19, 26, 58, 60, 55),
@@ -38,7 +38,7 @@ CHROMINANCE = (
     (47, 66, 99, 99, 99, 99, 99, 99),
     *((99,) * 8,) * 4,
 )
-"""The quantisation tables of Annex K."""
+"""These are the quantisation tables of Annex K."""
 
 
 def fourier_round(x: Tensor) -> Tensor:
@@ -51,14 +51,14 @@ def fourier_round(x: Tensor) -> Tensor:
 
 
 def quantisation_table(base: tuple[tuple[int, ...], ...], quality: int) -> Tensor:
-    """The table ``(8, 8)`` of a quality from 1 to 100, in units of 1 / 255."""
+    """Compute the table ``(8, 8)`` of a quality from 1 to 100, in units of 1 / 255."""
     percent = 5000.0 / quality if quality < 50 else 200.0 - 2.0 * quality
     table = ((torch.tensor(base) * percent + 50.0) / 100.0).floor()
     return table.clamp(1.0, 255.0) / 255.0
 
 
 def cosines() -> Tensor:
-    """The orthonormal matrix ``(8, 8)`` of the discrete cosine transform, a frequency a row."""
+    """Compute the orthonormal matrix ``(8, 8)`` of the discrete cosine transform, with a frequency in each row."""
     place = torch.arange(BLOCK).double()
     frequency = place[:, None]
     matrix = torch.cos(math.pi * (2.0 * place + 1.0) * frequency / (2 * BLOCK)) / 2.0
@@ -67,7 +67,7 @@ def cosines() -> Tensor:
 
 
 def quantise(plane: Tensor, table: Tensor) -> Tensor:
-    """A plane ``(B, C, H, W)``, zero at mid-grey, as it comes back from coding; sides are multiples of 8."""
+    """Code and decode a plane ``(B, C, H, W)``, zero at mid-grey, whose sides are multiples of 8."""
     transform = cosines().to(plane)
     table = table.to(plane)
 
@@ -80,9 +80,9 @@ def quantise(plane: Tensor, table: Tensor) -> Tensor:
 
 
 def jpeg(srgb: Tensor, quality: int) -> Tensor:
-    """sRGB ``(B, 3, H, W)`` in [0, 1], after JPEG of a ``quality`` from 1 to 100; the result is within [0, 1].
+    """Put sRGB ``(B, 3, H, W)`` in [0, 1] through JPEG of a ``quality`` from 1 to 100; the result is in [0, 1].
 
-    Sides of any length are padded by their last values to multiples of 16, and cut again.
+    Sides of any length are padded with their last values to multiples of 16, and cropped again.
     """
     from kornia.color import rgb_to_ycbcr, ycbcr_to_rgb
 

@@ -1,9 +1,9 @@
 r"""The plain U-Net, ``y = mosaic(x + U(x))``, trained end to end with l1.
 
-The published size is 11.77 M parameters. That is UPI's U-Net with three channels in and out (five scales of three
-convolutions, 32 to 512 features, bilinear interpolation up: 11,774,979 parameters), so the one in
-:mod:`denoisers.unet` is used. That the paper's U-Net is this one is concluded from the number of parameters.
-Source: Ronneberger et al., MICCAI 2015; Conde et al., AAAI 2022.
+The published size is 11.77 M parameters. UPI's U-Net has this size with three channels in and out (five scales of three
+convolutions, 32 to 512 features, bilinear interpolation up: 11,774,979 parameters), so the one in :mod:`denoisers.unet`
+is used. It is taken for the paper's U-Net because of the number of parameters. Source: Ronneberger et al., MICCAI 2015;
+Conde et al., AAAI 2022.
 """
 
 from __future__ import annotations

@@ -6,9 +6,9 @@ rows divided by their sum. The gains ``g`` are a digital one, 1 / N(0.8, 0.1), t
 one, U(1.5, 1.9); ``h`` divides by them and spares highlights. Nothing is learned.
 
 Tuned, as in the paper of the dictionary ISP, it has one matrix and one set of gains fitted to pairs: below the
-highlights ``y = M s^-1(x)^2.2``, ``M = diag(1 / g) C``, rows of ``C`` summing to 1. All of a frame's mean squared error
-is in second moments, ``MSE_f(M) = sum_c m_c A_fc m_c - 2 m_c b_fc + e_fc``. What is minimised is
-``sum_f log(MSE_f + eps)``, by weighted least squares with weights ``1 / (MSE_f + eps)``, of which no round rises.
+highlights ``y = M s^-1(x)^2.2`` with ``M = diag(1 / g) C``, where the rows of ``C`` sum to 1. Second moments hold all
+of a frame's mean squared error, ``MSE_f(M) = sum_c m_c A_fc m_c - 2 m_c b_fc + e_fc``. The fit minimises ``sum_f
+log(MSE_f + eps)`` by weighted least squares with weights ``1 / (MSE_f + eps)``; it rises in no round.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ XYZ_TO_CAMERA = (
     ((0.8380, -0.2630, -0.0639), (-0.2887, 1.0725, 0.2496), (-0.0627, 0.1427, 0.5438)),
     ((0.6596, -0.2079, -0.0562), (-0.4782, 1.3016, 0.1933), (-0.0970, 0.1581, 0.5181)),
 )
-"""Matrices of the four cameras of the Darmstadt Noise Dataset, as published with UPI."""
+"""These are the matrices of the four cameras of the Darmstadt Noise Dataset, as published with UPI."""
 INVERSE_DIGITAL = (0.8, 0.1)
-"""Mean and standard deviation of 1 / digital gain."""
+"""1 / digital gain has this mean and standard deviation."""
 RED, BLUE = (1.9, 2.4), (1.5, 1.9)
-"""Lowest and highest gain of a colour in units of that of green."""
+"""These are the lowest and the highest gain of a colour in units of green's."""
 
 
 class UPIParams(NamedTuple):
-    """One camera setting a picture: matrices ``(B, 3, 3)`` from linear sRGB to the camera, and gains ``(B, 3)``."""
+    """Camera settings, one for each picture: matrices ``(B, 3, 3)`` from sRGB to the camera, and gains ``(B, 3)``."""
 
     matrix: Tensor
     gains: Tensor
@@ -55,7 +55,7 @@ def inverse_smoothstep(x: Tensor) -> Tensor:
 
 
 def camera_matrix(weights: Tensor) -> Tensor:
-    """Weights ``(B, 4)`` of the cameras, of any positive sum, to linear sRGB-to-camera ``(B, 3, 3)``, rows of sum 1."""
+    """Turn weights ``(B, 4)`` of the cameras, of any positive sum, into sRGB-to-camera ``(B, 3, 3)``, row sums 1."""
     cameras = torch.tensor(XYZ_TO_CAMERA).to(weights) @ SRGB_TO_XYZ.to(weights)
     matrix = torch.einsum("bn,nij->bij", weights, cameras)
     return matrix / matrix.sum(dim=2, keepdim=True)
@@ -66,37 +66,37 @@ class SmoothstepISP(BaselineISP):
 
     @abstractmethod
     def default_params(self, batch: int) -> UPIParams:
-        """The setting of ``batch`` pictures of which nothing is known."""
+        """Make the setting of ``batch`` pictures about which nothing is known."""
 
     def setting_of(self, white_balance: tuple[float, float, float]) -> UPIParams:
-        """The defaults with as-shot multipliers R, G, B in place of their own; the digital gain stays."""
+        """Put as-shot multipliers R, G, B in place of the default ones; the digital gain stays."""
         params = self.default_params(1)
         balance = torch.tensor(white_balance) / white_balance[1]
         return params._replace(gains=params.gains[:, 1:2].cpu() * balance)
 
     def unprocess(self, srgb: Tensor, setting: UPIParams | None = None) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape."""
+        """Convert sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape."""
         return unprocess_pixels(srgb, setting or self.default_params(len(srgb)))
 
 
 def unprocess_pixels(x: Tensor, params: UPIParams) -> Tensor:
-    """sRGB to linear camera colour, both ``(B, 3, H, W)``; not clipped yet."""
+    """Convert sRGB to linear camera colour, both ``(B, 3, H, W)``; not clipped yet."""
     linear = functional.gamma_expand(inverse_smoothstep(x), GAMMA)
     return functional.inverse_gains(functional.correct_colour(linear, params.matrix.to(x)), params.gains.to(x))
 
 
 @BASELINES.register("upi")
 class UPI(SmoothstepISP):
-    """UPI as published: a random camera a picture, or the mean one."""
+    """UPI as published, with a random camera for each picture, or the mean one."""
 
     name = "upi"
 
     def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
-        """sRGB ``(B, 3, H, W)`` to mosaics ``(B, 1, H, W)``, each by a camera of its own."""
+        """Convert sRGB ``(B, 3, H, W)`` to mosaics ``(B, 1, H, W)``, each by its own camera."""
         return self.reverse(srgb, self.sample(len(srgb), generator))
 
     def default_params(self, batch: int) -> UPIParams:
-        """The published distributions' means: the four cameras alike, digital gain 1 / 0.8, red 2.15, blue 1.7."""
+        """Take the published means: the four cameras alike, digital gain 1 / 0.8, red 2.15, blue 1.7."""
         digital = 1.0 / INVERSE_DIGITAL[0]
         gains = torch.tensor([digital * sum(RED) / 2, digital, digital * sum(BLUE) / 2])
         return UPIParams(camera_matrix(torch.ones(1, 4)).expand(batch, 3, 3), gains.expand(batch, 3))
@@ -113,10 +113,10 @@ class UPI(SmoothstepISP):
 
 
 LOG_MSE_EPS = 1e-5
-"""Constant added to a frame's MSE under the logarithm, so that frames beyond 50 dB do not count."""
+"""This is added to a frame's MSE under the logarithm, so that frames beyond 50 dB do not count."""
 ROUNDS = 100
 PIXELS = 32768
-"""Number of pixels drawn from each frame."""
+"""This many pixels are drawn from each frame."""
 
 
 @BASELINES.register("upi-tuned")
@@ -131,11 +131,11 @@ class TunedUPI(SmoothstepISP):
         self.gains = nn.Parameter(torch.ones(3), requires_grad=False)
 
     def default_params(self, batch: int) -> UPIParams:
-        """The fitted matrix and gains for each of ``batch`` pictures."""
+        """Return the fitted matrix and gains for each of ``batch`` pictures."""
         return UPIParams(self.matrix.expand(batch, 3, 3), self.gains.expand(batch, 3))
 
     def learn(self, pairs: Sequence[FramePair], training: Training) -> list[float]:
-        """Fit to pairs of any CFA, registered or not; ValueError if the best matrix turns white black."""
+        """Fit to pairs of any CFA, registered or not; raise ValueError if the best matrix turns white black."""
         moments = Moments.of(sample_pixels(pairs, PIXELS, training.seed).pixels)
         product = moments.solve(torch.ones(len(moments.energy)).double())
         for _ in range(ROUNDS):
@@ -157,7 +157,7 @@ class Moments(NamedTuple):
 
     @classmethod
     def of(cls, samples: PixelSamples) -> Moments:
-        """Moments of the pixels below the highlights, where the inverse gains are plain divisions."""
+        """Compute the moments of the pixels below the highlights, where the inverse gains are plain divisions."""
         linear = functional.gamma_expand(inverse_smoothstep(samples.srgb), GAMMA)
         below = samples.known * (linear.mean(1, keepdim=True) < HIGHLIGHT_KNEE)
         x = linear[:, :, 0].double()
@@ -171,12 +171,12 @@ class Moments(NamedTuple):
         return cls(a, torch.einsum("fip,fcp,fcp->fci", x, y, weight), (weight * y * y).sum((1, 2)))
 
     def solve(self, weights: Tensor) -> Tensor:
-        """The matrix ``(3, 3)`` of least weighted error; ``weights`` of the frames are ``(F,)``."""
+        """Compute the matrix ``(3, 3)`` of least weighted error; ``weights`` of the frames are ``(F,)``."""
         a, b = torch.einsum("f,fcij->cij", weights, self.a), torch.einsum("f,fci->ci", weights, self.b)
         ridge = 1e-9 * a.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(3).to(a)
         return torch.linalg.solve(a + ridge, b)
 
     def error(self, product: Tensor) -> Tensor:
-        """The frames' mean squared errors ``(F,)`` under a matrix ``product`` of shape ``(3, 3)``."""
+        """Compute the frames' mean squared errors ``(F,)`` under a matrix ``product`` of shape ``(3, 3)``."""
         square = torch.einsum("ci,fcij,cj->f", product, self.a, product)
         return (square - 2.0 * (product * self.b).sum((1, 2)) + self.energy).clamp_min(0.0)
