@@ -3,7 +3,7 @@
 A file is safetensors whose string metadata says how to build the network again: ``{"format": "rawaug", "kind":
 "denoiser", "model": "UNet", "config": <JSON: the constructor's arguments>, "info": <JSON: anything else>}``. Nothing in
 it is code; a file can only name the classes in :data:`denoisers.network.DENOISERS`. Shipped weights have a model card
-next to them, and ``recipes/base.yaml`` trained them.
+next to them, which says how they were trained.
 """
 
 from __future__ import annotations

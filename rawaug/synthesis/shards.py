@@ -1,8 +1,9 @@
 """RAW pairs in tar shards, as WebDataset and Hugging Face read them.
 
-``shard-000012.tar`` has the pairs of pictures 12 n to 12 n + n - 1 of the sorted folder. A sample is three files with
-one key, ``PICTURE_NUMBER``: ``KEY.clean.npy`` and ``KEY.noisy.npy``, float32 as in :class:`rawaug.RawPair`, and
-``KEY.json`` with picture and ISP and their SHA-256, CFA, the mosaic's height and width, noise levels and parameters.
+With n pictures in a shard, ``shard-000012.tar`` has the pairs of pictures 12 n to 12 n + n - 1 of the sorted folder. A
+sample is three files with one key, ``PICTURE_NUMBER``: ``KEY.clean.npy`` and ``KEY.noisy.npy``, float32 as in
+:class:`rawaug.RawPair`, and ``KEY.json`` with picture and ISP and their SHA-256, CFA, the mosaic's height and width,
+noise levels and parameters.
 
 The bytes of a shard depend only on its pictures and the settings. A shard is complete once
 ``.shards/shard-000012.json`` exists, which is written last. Once all shards are complete, ``index.json`` (sizes, as
