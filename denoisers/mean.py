@@ -1,10 +1,10 @@
-r"""The mean of two DRUNets: their errors are partly different ones, and the mean has less of each.
+r"""The mean of two DRUNets: their errors differ in part, and the mean has less of each.
 
 .. math:: d = (1 - w) f(y) + w g(y)
 
-f and g are told the same level. As the squared error is convex, that of the mean is never above the mean of theirs, and
-below both where they are nearly as good as each other. On noise that one of them was not trained on, the mean lies
-between them.
+f and g are told the same level. Since the squared error is convex, that of the mean is never above the mean of the two
+errors, and it is below both where the networks are nearly as good as each other. On noise that one of them was not
+trained on, the mean lies between them.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class MeanDRUNet(Denoiser):
     """The mean of two DRUNets of developed pictures; a variance of 0 stands for a level that is not known.
 
     Args:
-        width, patch: of both networks, see :class:`denoisers.DRUNet`.
-        blocks: of each scale of the first network, one number or one for each scale.
-        second_blocks: of the second one, likewise.
-        share: of the second network in the mean, 0 to 1.
+        width, patch: those of both networks, see :class:`denoisers.DRUNet`.
+        blocks: blocks of the first network, one number for all scales or one for each.
+        second_blocks: blocks of the second network, likewise.
+        share: share of the second network in the mean, 0 to 1.
         channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
     Example:

@@ -5,10 +5,10 @@ r"""How strong the noise of a developed picture is, how sure it is that there is
    u = S(e\, (\rho_1 - t_1))\, S(e\, (t_2 - \rho_2 - \rho_{RGB})), \qquad S(z) = \frac{1}{1 + e^{-z}}
 
 A network f that is told the level of the noise, its standard deviation, also works where the level is unknown. What it
-then takes away, :math:`x - f(x, 0)`, tells the level: :math:`r_q` is the q-th percentile of its deviation over squares
-of 16 x 16 pixels. Texture raises the upper percentiles, so the lower quartile follows the noise. Noise and fine detail
-are alike, though, and the network does best when it is told the geometric mean of that quartile and a usual level K,
-half of K where u is 1.
+then removes, :math:`x - f(x, 0)`, tells the level: :math:`r_q` is the q-th percentile of its deviation over squares of
+16 x 16 pixels. Texture raises the upper percentiles, so the lower quartile follows the noise. Noise and fine detail are
+alike, though, and the network does best when it is told the geometric mean of that quartile and a usual level K (half
+of K where u is 1).
 
 Noise lies evenly over a picture and texture does not, so the ratio of two percentiles tells them apart: w is the share
 of the network's correction that is applied, near 1 for a noisy picture and smaller for a clean one. A low level would
@@ -17,8 +17,8 @@ not do instead, since a network that is told next to nothing takes the level for
 u says how sure it is that nobody has finished the picture since it was developed from RAW. Demosaicing makes the noise
 of neighbours alike, but hardly that of pixels two apart, and the colour correction matrix makes that of different
 colours unlike; the denoising, the sharpening and the conversion to luma and chroma in a camera make both alike again.
-:math:`\rho_1` and :math:`\rho_2` are the correlations at a distance of one and of two pixels, :math:`\rho_{RGB}` the
-mean one of two colours, all of what is removed, in the half of the squares with the least of it.
+All correlations are those of what is removed, in the half of the squares that have the least of it: :math:`\rho_1` and
+:math:`\rho_2` between pixels one and two apart, :math:`\rho_{RGB}` between two colours, the mean of the pairs.
 
 The constants are chosen on noisy pictures (CC15, developed frames, drawn noise) and on clean photographs.
 """
@@ -101,10 +101,10 @@ class _Squares(NamedTuple):
     """Means over small squares, each ``(N,)``, of products of what a network removes.
 
     Attributes:
-        power: its square, the mean of the colours.
+        power: the square of what is removed, the mean of the colours.
         of_colours: the product of two colours, the mean of the three pairs.
         one_apart: the product of neighbours, the mean of rows and columns and of the colours.
-        two_apart: the same of pixels that are two apart.
+        two_apart: the same for pixels that are two apart.
     """
 
     power: Tensor

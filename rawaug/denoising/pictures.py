@@ -1,12 +1,13 @@
-r"""What denoises developed pictures, sRGB ``(1, 3, H, W)`` in [0, 1], beside :class:`rawaug.RawDenoiser` for RAW.
+r"""Denoisers of developed pictures, sRGB ``(1, 3, H, W)`` in [0, 1], beside :class:`rawaug.RawDenoiser` for RAW.
 
 .. math:: d = x + w\, (f(x, s \sigma) - x)
 
-A network f is told the level of the noise, its standard deviation :math:`\sigma`, and the share w of its correction is
-applied; both are estimated from the picture, see :mod:`rawaug.denoising.picture_levels`, as is the share of the second
-network in a mean of two. The strength s is 1 unless the user says otherwise. A single network that estimates the level
-sees the picture twice, upright and turned by a quarter, and the mean is taken: half of what the self-ensemble gains,
-the mean of eight turns as for RAW.
+A network f is told the level of the noise, its standard deviation :math:`\sigma`, and a share w of its correction is
+applied. Both are estimated from the picture, see :mod:`rawaug.denoising.picture_levels`; so is the share of the second
+network in a mean of two. The strength s is 1 unless the user says otherwise.
+
+A single network that estimates the level sees the picture twice, upright and turned by a quarter, and the two results
+are averaged. This gains half of what the self-ensemble does, which is the mean of eight turns, as for RAW.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from rawaug.denoising.weights import Image
 from rawaug.registry import Spec, spec_label
 
 _TILE = 1280
-"""Side of a tile; the default denoiser needs more than 2 GB for 12 megapixels at once."""
+"""Side of a tile; without tiles, the default denoiser needs more than 2 GB for 12 megapixels."""
 _LOWEST = 1e-4
 """The lowest level that a filter is told, since it divides by it."""
 TURNS = {1: (0,), 2: (0, 5), 4: range(4), 8: range(bayer.N_VIEWS)}
@@ -47,7 +48,7 @@ class PictureDenoiser(ImageDenoiser):
     Attributes:
         run: ``run(srgb, noise) -> srgb``, called on ``device`` with the noise that is told or estimated.
         estimate: estimates the level of a picture where none is told.
-        level: what it is told every time; None for the estimate.
+        level: the level that it is told every time; None for the estimate.
         views: 1, 2, 4 or 8 turns of the picture; by default as many as the network asks for.
         strength: factor on the estimated level, 0 to 10: 2 removes more, 0.5 less, 0 nothing.
 
@@ -190,6 +191,6 @@ def _denoise_at(network: nn.Module, srgb: Tensor, noise: PictureLevel) -> Tensor
 
 
 def _denoise_by_mean(network: MeanDRUNet, srgb: Tensor, noise: PictureLevel) -> Tensor:
-    """The picture denoised by the mean of two networks: the second alone where nobody has finished the picture."""
+    """The picture denoised by the mean of two networks, or by the second alone where nobody has finished it."""
     share = network.share + (1.0 - network.share) * noise.unfinished
     return _denoise_at(network.with_share(share), srgb, noise)

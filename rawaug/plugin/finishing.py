@@ -9,8 +9,9 @@ Let Y be the luma and C the chroma (R - Y and B - Y, Y of BT.601) of the develop
 The lens, the low-pass filter and demosaicing soften the picture, :math:`G_s`. Luma noise is reduced by the self-guided
 filter (He, Sun and Tang, PAMI 2013). Its weights :math:`a = \max(0, 1 - k \sigma^2 / v)` go from 0 in flat areas to 1
 at edges. There v is the variance of noisy luma in the window, :math:`\sigma^2` the variance of its noise, and
-:math:`\bar a = M a`. So noise is left at edges, as cameras leave it. The clean picture is finished with the weights
-that the noisy one chose, so that it is what the mean of many such shots would be. JPEG acts on the noisy picture alone.
+:math:`\bar a = M a`. Noise is therefore left at edges, as cameras leave it. The clean picture is finished with the
+weights that the noisy one gave, so that it is what the mean of many such shots would be. JPEG acts on the noisy picture
+alone.
 
 Pictures that are shown smaller than they were taken need nothing here. A picture is scaled before its crop, in the
 loader of pictures; a pair could be scaled only by cutting a larger crop than was asked for. ``zoom`` of
@@ -94,7 +95,7 @@ class Finish:
 
     @one_thread()  # the same bits everywhere
     def apply(self, noisy: Tensor, clean: Tensor, finish: Tensor) -> tuple[Tensor, Tensor]:
-        """Finish noisy and clean sRGB ``(B, 3, H, W)`` in [0, 1] alike; ``finish`` comes from :meth:`sample`."""
+        """Finish noisy and clean sRGB ``(B, 3, H, W)`` in [0, 1] alike, by the ``finish`` of :meth:`sample`."""
         pictures = torch.cat([noisy, clean], dim=1)
         is_finished = finish.any(dim=1)
         if is_finished.any():

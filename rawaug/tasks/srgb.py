@@ -55,23 +55,23 @@ BLACK, WHITE = 8192.0, 65535.0
 """The DNG has these black and white levels, which leave room for noise below black."""
 
 _DEVIATIONS = (0.01, 0.015, 0.022, 0.033, 0.05, 0.075, 0.11, 0.16)
-"""Validation chooses a filter's strength from these standard deviations of white noise."""
+"""The standard deviations of white noise among which validation chooses a filter's strength."""
 
 REAL = "real"
-"""The table of real pairs, whose level is not known, has this name."""
+"""The name of the table of real pairs, whose level is not known."""
 
 _WITHOUT_PLANES = ("NonLocalMeans", "TotalVariation", "Wavelet")
 
 
 @dataclass
 class SrgbRecipe(Recipe):
-    """A comparison of blind denoisers of sRGB by what they are trained on.
+    """A comparison of blind denoisers of sRGB that differ in what they are trained on.
 
     ``noise`` is the noise of training. ``data.validation`` and ``data.test`` may also be real pairs of developed
     pictures. Networks are given no level.
 
     Args:
-        rivals: denoisers of RAW to compare with, by name or file, in place of ``untouched``.
+        rivals: denoisers of RAW to compare with, by name or file; they take the place of ``untouched``.
         levels: (shot_var, read_var) of the RAW noise of validation and test frames, with a table for each.
     """
 
@@ -157,7 +157,7 @@ class SrgbTask(Task):
         return (self.recipe.levels,)
 
     def test_noise(self) -> Any:
-        """Return None, since noise is that of each table's level."""
+        """Return None, since the noise is that of each table's level."""
         return None
 
     def denoiser(self, name: str, network: nn.Module, pattern: CFA, views: int = 1) -> PictureDenoiser:

@@ -1,12 +1,12 @@
-r"""Noise drawn on sRGB, as usual in training denoisers of developed pictures, to compare camera noise with.
+r"""Noise drawn on sRGB, as is usual for training denoisers of developed pictures, to compare with camera noise.
 
 .. math:: x_{noisy} = \mathrm{JPEG}_q(x + M n + (P(\lambda x) / \lambda - x))
 
 with white normals n, a matrix M that mixes the colours, photon counts P, and a clip to [0, 1] after each step. As
 elsewhere, ``sample`` draws the parameters, one row for each picture, and a pure ``apply`` uses them. The ranges are
-those of Zhang et al., "Designing a Practical Degradation Model for Deep Blind Image Super-Resolution", ICCV 2021, in
-the code of KAIR and BSRGAN, without its blurs and its resizing. Coloured noise is white noise that a blur has spread
-over neighbours, as earlier denoisers and enlargers leave it.
+those of Zhang et al., "Designing a Practical Degradation Model for Deep Blind Image Super-Resolution", ICCV 2021, as in
+the code of KAIR and BSRGAN, but without its blurs and its resizing. Coloured noise is white noise that a blur has
+spread over neighbours, as earlier denoisers and enlargers leave it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rawaug.registry import Spec, check_settings, require_between, split_spec, s
 from rawaug.seeding import keyed_generator
 
 _LUMA = torch.tensor([0.299, 0.587, 0.114], device="cpu")
-"""R, G and B have these weights in luma (ITU-R BT.601)."""
+"""The weights of R, G and B in luma (ITU-R BT.601)."""
 
 
 class SrgbNoise(Protocol):
@@ -163,8 +163,8 @@ class ColouredNoise:
         """Draw the parameters of pictures.
 
         Returns:
-            ``sigma``, ``blur``, ``grey`` (share of what is the same in all colours), ``quality`` (0 for none), ``seed``
-            and ``chroma_420``, all ``(B,)``; with ``wide`` also ``wide_share`` and ``wide_blur``.
+            ``sigma``, ``blur``, ``grey`` (the share that is the same in all colours), ``quality`` (0 for none),
+            ``seed`` and ``chroma_420``, all ``(B,)``; with ``wide`` also ``wide_share`` and ``wide_blur``.
         """
         strength, coloured, blur, grey, compressed, chroma = uniform(generator, 6, batch)
         quality = torch.randint(self.jpeg[0], self.jpeg[1] + 1, (batch,), generator=generator)
@@ -210,7 +210,7 @@ def _unit_noise(srgb: Tensor, generators: list[torch.Generator], deviation: Tens
 
 
 MODELS: dict[str, type[SrgbNoise]] = {"BSRGAN": BsrganNoise, "Coloured": ColouredNoise, "Gaussian": WhiteNoise}
-"""This maps the names in recipes to models."""
+"""The models by their names in recipes."""
 
 
 def noise_on_srgb(spec: Spec) -> SrgbNoise:

@@ -51,7 +51,7 @@ class Told:
 
     Args:
         unknown: share of the pairs with the level 0, which stands for unknown.
-        exact: share with the deviation of the pair, the root mean square of noisy less clean.
+        exact: share with the deviation of the pair, the root mean square of noisy minus clean.
         factor: largest factor by which the wrong level is off, up or down, drawn by its logarithm.
     """
 
@@ -84,8 +84,8 @@ class SrgbSamples:
 
     Args:
         camera: pairs of target ``"srgb"``; None if all noise is drawn on sRGB.
-        drawn: the other samples; None if there are none.
-        share: share of the other samples.
+        drawn: the samples with noise drawn on sRGB; None if there are none.
+        share: share of the samples that have noise drawn on sRGB.
         told: the level of noise that the network is given; None for none.
     """
 
