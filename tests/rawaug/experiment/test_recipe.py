@@ -24,8 +24,8 @@ from rawaug.training.config import TrainConfig, Weighing
 
 FOLDER = find_recipe("fewshot").parent
 NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(FOLDER.rglob("*.yaml"))]
-OTHERS = {"rgb2raw": "reconstruction", "any": "mosaic", "demosaic": "rgb"}
-"""Recipes that neither train nor are named after their kind."""
+OTHERS = {"pictures": "srgb", "rgb2raw": "reconstruction", "any": "mosaic", "demosaic": "rgb"}
+"""These recipes have another kind than RAW, and are not named after it."""
 HEAD = "camera: universal\ndata: {pairs: null, pictures: 'demo:'}\narms: {augmented: {augmented: 1.0}}\n"
 LAUGHS = "a0: &a0 [ha, ha]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}, *a{k - 1}]\n" for k in range(1, 40))
 
