@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -201,7 +202,9 @@ def test_every_control_changes_the_picture_and_the_code(browser: Any) -> None:
         move()
         try:
             before = changed(browser, "pair", before, 20_000.0)
-        except PlaywrightTimeout:  # Gradio can put a control back that was moved while its limits were updated
+        except PlaywrightTimeout:
+            # About one move in a hundred is lost on a busy machine. The cause is not known, so the test reports it.
+            warnings.warn(f"{control} had to be moved a second time", stacklevel=1)
             move()
             before = changed(browser, "pair", before)
         browser.wait_for_function("() => !document.querySelector('[role=alert]')")
