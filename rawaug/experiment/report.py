@@ -90,7 +90,7 @@ def write_report(report: Report, camera: Camera) -> None:
     title = _title_of(experiment)
     page = Page(title, _lead_of(verdicts))
     page.add_facts(_facts_of(report, others, commands[-1]), next(iter(report.tables.values())))
-    page.add("Methods", terms=_methods_of(recipe, methods))
+    page.add("Methods", terms=_methods_of(experiment, methods))
     for group, results in report.tables.items():
         page.add_scores(results, others[group], group)
 
@@ -206,34 +206,32 @@ def _facts_of(report: Report, others: Mapping[str, Mapping[str, Any]], command: 
     }
 
 
-def _methods_of(recipe: Recipe, methods: Mapping[str, Sequence[Any]]) -> dict[str, str]:
+def _methods_of(experiment: Experiment, methods: Mapping[str, Sequence[Any]]) -> dict[str, str]:
     """Write a line on each row of the tables, by name; ``methods`` are the denoisers besides arms, by table."""
-    names: set[str] = set()
-    for of_group in methods.values():
-        for one in of_group:
-            names.add(one.name)
+    filters = {spec_label(spec) for spec in experiment.recipe.classical}
 
     texts = {}
-    for spec in recipe.classical:
-        if spec_label(spec) in names:
-            texts[spec_label(spec)] = "a filter, nothing is trained"
-    for file in recipe.untouched:
-        if Path(file).stem in names:
-            texts[Path(file).stem] = "trained weights as they are"
-    for label in recipe.arms:
-        texts[label] = _explain(recipe, label)
+    for of_group in methods.values():
+        for one in of_group:
+            if one.name in filters:
+                texts[one.name] = "a filter, nothing is trained"
+            else:
+                texts[one.name] = "trained weights as they are"
+
+    for label in experiment.recipe.arms:
+        texts[label] = _explain(experiment, label)
 
     return texts
 
 
-def _explain(recipe: Recipe, label: str) -> str:
+def _explain(experiment: Experiment, label: str) -> str:
     """Say in a line what an arm is trained on."""
-    arm, network = recipe.arms[label], recipe.network_of(label)
+    arm, network = experiment.recipe.arms[label], experiment.recipe.network_of(label)
     start = f"{network.name} from random weights"
     if network.start is not None:
         start = f"{network.start}, trained further"
 
-    real, synthetic = "real noisy frames", "RAW made from pictures"
+    real, synthetic = "real noisy frames", experiment.task.synthetic
     how = f", by {spec_label(arm.estimator)}"
     if arm.sees_clean:
         real, how = "real pairs", ""

@@ -65,6 +65,9 @@ class Task(ABC):
     compared_in: ClassVar[str] = ""
     """Titles of tables end with this: the domain of the scores, if it is not RAW."""
 
+    synthetic: ClassVar[str] = "RAW made from pictures"
+    """The page of a run says that arms are trained on this, if they are trained on no real frames."""
+
     developed: ClassVar[bool] = False
     """This says whether frames may be pairs of developed pictures."""
 

@@ -110,6 +110,7 @@ class SrgbTask(Task):
 
     settings = SrgbRecipe
     compared_in = "developed sRGB"
+    synthetic = "developed pictures with noise"
     developed = True
     ensembles = False
     evaluate = staticmethod(evaluate_pictures)
@@ -226,7 +227,8 @@ class SrgbTask(Task):
 
 def _level_name(levels: Levels) -> str:
     """Write a level's name in tables and files."""
-    return f"{levels[0]:g}, {levels[1]:g}"
+    shot_var, read_var = levels
+    return f"shot variance {shot_var:g}, read variance {read_var:g}"
 
 
 def srgb_trials(pairs: Sequence[Any], levels: Sequence[Levels], label: str) -> list[Trial]:

@@ -112,7 +112,8 @@ def test_the_recipe_scores_every_arm_and_method_at_every_level(
     assert not list(tmp_path.iterdir())
     assert main(["run", "srgb", *SMALL, "--out", str(tmp_path), "--seeds", "2"]) == 0
     results = json.loads((tmp_path / "srgb" / "results.json").read_text())
-    weak, strong = (results[level] for level in ("0.002, 1e-05", "0.008, 0.0001"))
+    weak = results["shot variance 0.002, read variance 1e-05"]
+    strong = results["shot variance 0.008, read variance 0.0001"]
     assert set(weak["results"]) == {"gaussian", "bsrgan", "camera", "camera without finishing"}
     assert set(weak["others"]) == {"NonLocalMeans"}
     for arm, runs in weak["results"].items():
@@ -123,7 +124,11 @@ def test_the_recipe_scores_every_arm_and_method_at_every_level(
     noisy = strong["results"]["gaussian"][0]["plain"]["psnr_noisy"]
     assert strong["others"]["NonLocalMeans"]["psnr"] > noisy + 1
     said = capsys.readouterr().out
-    assert "0.002, 1e-05" in said and (tmp_path / "srgb" / "picture.png").is_file()
+    assert "shot variance 0.002, read variance 1e-05" in said
+    assert (tmp_path / "srgb" / "picture.png").is_file()
+    page = (tmp_path / "srgb" / "report.html").read_text()
+    assert "Scores, shot variance 0.002, read variance 1e-05" in page
+    assert "on developed pictures with noise" in page and "RAW made from pictures" not in page
     assert main(["run", "srgb", *SMALL, "--out", str(tmp_path), "--seeds", "2"]) == 0
     assert capsys.readouterr().out.count("already trained") == 8
 
@@ -173,7 +178,8 @@ def test_the_strength_of_a_filter_is_chosen_on_validation_whatever_the_test_fram
     found = {}
     for frame in (flat, detailed):
         run(recipe, True, validation=[frame], test=[test])
-        others = json.loads((tmp_path / "a" / "results.json").read_text())["0.008, 0.0001"]["others"]
+        tables = json.loads((tmp_path / "a" / "results.json").read_text())
+        others = tables["shot variance 0.008, read variance 0.0001"]["others"]
         found[frame.name] = others["NonLocalMeans"]["psnr"]
     assert found["flat"] < found["detailed"] - 0.2
     capsys.readouterr()
