@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import os
 import socket
 from collections.abc import Mapping, Sequence
@@ -207,31 +208,31 @@ def _tab(gr: Any, name: str, outputs: dict[str, Any]) -> Any:
 
 
 def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, Any], tabs: dict[str, Any]) -> None:
-    opened = gr.State(next(iter(VIEWS)))
+    opened = gr.Textbox(next(iter(VIEWS)), visible="hidden")  # the name of the open tab
     quiet = {"show_progress": "hidden", "api_visibility": "private"}
 
     for name, tab in tabs.items():
-        tab.select(lambda chosen=name: chosen, None, opened, **quiet)
+        tab.select(None, None, opened, js=f"() => {json.dumps(name)}", **quiet)
 
     def redraw(tab: str, *values: Any) -> list[Any]:
-        changes = show(tab, dict(zip(controls, values, strict=True)))
-        return [changes.get(name, gr.skip()) for name in outputs]
+        by_name = dict(zip(controls, values, strict=True))
+        changes = show(tab, by_name)
 
-    # One event draws everything, so that no late answer to an older one replaces a newer picture.
+        model = by_name["noise"]
+        changes["exposure"] = gr.update(interactive=not by_name["draw_exposure"])
+        changes["iso"] = gr.update(interactive=views.iso_range(model) is not None, info=_about_iso(model))
+        return [changes.get(name, gr.skip()) for name in changing]
+
+    # One event draws everything, so that no late answer to an older one replaces a newer picture. The others are rare
+    # or stay in the browser, since Gradio may lose the answer to one of two events that run at once.
+    changing = outputs | {"exposure": controls["exposure"], "iso": controls["iso"]}
     inputs = list(controls.values())
     triggers = [page.load, opened.change, *(control.change for control in inputs)]
-    gr.on(triggers, redraw, [opened, *inputs], list(outputs.values()), trigger_mode="always_last", **quiet)
+    gr.on(triggers, redraw, [opened, *inputs], list(changing.values()), trigger_mode="always_last", **quiet)
 
-    isp, noise, draw_exposure = controls["isp"], controls["noise"], controls["draw_exposure"]
+    isp, noise = controls["isp"], controls["noise"]
     dependent = [controls["camera"], controls["light"], controls["tone"], noise]
     isp.change(partial(_update_choices, gr), [isp, controls["tone"], noise], dependent, **quiet)
-    noise.change(
-        lambda name: gr.update(interactive=views.iso_range(name) is not None, info=_about_iso(name)),
-        noise,
-        controls["iso"],
-        **quiet,
-    )
-    draw_exposure.change(lambda on: gr.update(interactive=not on), draw_exposure, controls["exposure"], **quiet)
 
 
 def _update_choices(gr: Any, isp: str, tone: str, noise: str) -> list[Any]:
