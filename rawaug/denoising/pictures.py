@@ -3,11 +3,11 @@ r"""Denoisers of developed pictures, sRGB ``(1, 3, H, W)`` in [0, 1], beside :cl
 .. math:: d = x + w\, (f(x, s \sigma) - x)
 
 A network f is told the level of the noise, its standard deviation :math:`\sigma`, and a share w of its correction is
-applied. Both are estimated from the picture, see :mod:`rawaug.denoising.picture_levels`; so is the share of the second
-network in a mean of two. The strength s is 1 unless the user says otherwise.
+applied. Both are estimated from the picture, see :mod:`rawaug.denoising.picture_levels`. The strength s is 1 unless the
+user says otherwise.
 
-A single network that estimates the level sees the picture twice, upright and turned by a quarter, and the two results
-are averaged. This gains half of what the self-ensemble does, which is the mean of eight turns, as for RAW.
+A network that estimates the level sees the picture twice, upright and turned by a quarter, and the two results are
+averaged. This gains half of what the self-ensemble does, which is the mean of eight turns, as for RAW.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from torch import Tensor, nn
 
 import denoisers
 from denoisers.classical import FILTERS
-from denoisers.mean import MeanDRUNet
 from rawaug import bayer
 from rawaug.denoising.base import ImageDenoiser, Noisy, progress_by, read_named
 from rawaug.denoising.picture_levels import PictureLevel, estimate_level, white_level
@@ -117,8 +116,6 @@ class PictureDenoiser(ImageDenoiser):
         if self.level is None:
             noise = self.estimate(srgb)
             noise = noise._replace(level=self.strength * noise.level)
-        elif isinstance(self.network, MeanDRUNet):  # whose shares depend on the picture, whatever level is told
-            noise = self.estimate(srgb)._replace(level=self.level, share=1.0)
         else:
             noise = PictureLevel(self.level, 1.0)
         return torch.lerp(srgb, self.run(srgb, noise), noise.share)
@@ -133,9 +130,7 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> Pictu
     reads_levels = bool(getattr(network, "reads_variance", False))
 
     run: Callable[..., Tensor] = _denoise_blindly
-    if isinstance(network, MeanDRUNet):
-        run = _denoise_by_mean
-    elif reads_levels:
+    if reads_levels:
         run = _denoise_at
 
     return PictureDenoiser(
@@ -188,9 +183,3 @@ def _denoise_at(network: nn.Module, srgb: Tensor, noise: PictureLevel) -> Tensor
     """The picture denoised by a network that is told the deviation of its noise, 0 for unknown."""
     variance = srgb.new_full((1, 1, 1, 1), noise.level**2).expand_as(srgb)
     return denoisers.denoise_tiles(network, srgb, variance, tile=_TILE, each=progress_by("tile")).float()
-
-
-def _denoise_by_mean(network: MeanDRUNet, srgb: Tensor, noise: PictureLevel) -> Tensor:
-    """The picture denoised by the mean of two networks, or by the second alone where nobody has finished it."""
-    share = network.share + (1.0 - network.share) * noise.unfinished
-    return _denoise_at(network.with_share(share), srgb, noise)

@@ -13,12 +13,11 @@ from torch import Tensor
 
 import denoisers
 from rawaug import bayer
-from rawaug.bayer.demosaicing import demosaic
 from rawaug.commands.denoise import run as denoise
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.files import denoise_folder
-from rawaug.denoising.picture_levels import PictureLevel, estimate_level
+from rawaug.denoising.picture_levels import estimate_level
 from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.denoising.sources import PictureFiles, kind_of
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, register
@@ -87,34 +86,16 @@ def test_even_noise_is_removed_and_texture_in_places_is_kept() -> None:
     assert uneven.share < 0.3
 
 
-def test_noise_that_was_only_demosaiced_is_told_from_noise_that_was_finished() -> None:
+def test_coarse_grain_asks_for_a_higher_level_than_grain_of_neighbours() -> None:
     generator = torch.Generator().manual_seed(0)
-    gains = torch.tensor([2.0, 1.0, 1.0, 1.6])[:, None, None]  # of the white balance
-    noise = 0.02 * gains * torch.randn(1, 4, 128, 128, generator=generator)
-    mosaic = bayer.unpack(0.4 + noise, bayer.CFA.RGGB)
-    matrix = torch.tensor([[1.7, -0.5, -0.2], [-0.2, 1.6, -0.4], [0.0, -0.6, 1.6]])
-    demosaiced = torch.einsum("ij,bjhw->bihw", matrix, demosaic(mosaic, bayer.CFA.RGGB, "malvar"))
-    luma = demosaiced.mean(1, keepdim=True)
-    finished = luma + blur(demosaiced - luma, torch.tensor([3.0]))
-
+    grain = torch.randn(1, 3, 256, 256, generator=generator)
+    fine, coarse = (blur(grain, torch.tensor([width])) for width in (0.5, 1.2))
     network = denoisers.from_pretrained("rawaug-srgb")
-    assert estimate_level(network, demosaiced).unfinished > 0.6
-    assert estimate_level(network, finished).unfinished < 0.2
 
-
-def test_a_picture_that_nobody_finished_gets_the_second_network_alone() -> None:
-    denoiser = PictureDenoiser.of("rawaug-srgb")
-    network = denoisers.from_pretrained("rawaug-srgb")
-    assert isinstance(network, denoisers.MeanDRUNet)
-    picture = noisy()[None]
-    variance = torch.full_like(picture, 0.03**2)
-
-    def result(unfinished: float) -> Tensor:
-        with torch.inference_mode():
-            return denoiser.run(picture, PictureLevel(0.03, 1.0, unfinished))
-
-    torch.testing.assert_close(result(1.0), network.second(picture, variance), atol=1e-5, rtol=0.0)
-    torch.testing.assert_close(result(0.0), network(picture, variance), atol=1e-5, rtol=0.0)
+    levels = []
+    for noise in (fine, coarse):
+        levels.append(estimate_level(network, 0.5 + 0.02 * noise / noise.std()).level)
+    assert levels[1] > 1.1 * levels[0]
 
 
 def test_a_self_ensemble_denoises_a_turned_picture_to_the_turned_result() -> None:
@@ -125,22 +106,14 @@ def test_a_self_ensemble_denoises_a_turned_picture_to_the_turned_result() -> Non
     assert error(upright[0]) < error(two(Noisy(noisy()[None]))[0])
 
 
-def test_a_single_network_that_estimates_the_level_sees_a_picture_upright_and_turned_by_a_quarter(
-    tmp_path: Path,
-) -> None:
-    network = denoisers.from_pretrained("rawaug-srgb").get_submodule("first")
-    assert isinstance(network, denoisers.DRUNet)
-    denoisers.save(network, tmp_path / "single.safetensors", {})
-    name = f"{tmp_path / 'single.safetensors'}@10"
-
+def test_a_network_that_is_told_a_level_sees_a_picture_upright_and_turned_by_a_quarter() -> None:
     seen = noisy()[None, :, :48]
-    two, one = PictureDenoiser.of(name), PictureDenoiser.of(name, views=1)
+    two, one = PictureDenoiser.of("rawaug-srgb@10"), PictureDenoiser.of("rawaug-srgb@10", views=1)
     upright = one(Noisy(seen))
     turned = bayer.turn_back(one(Noisy(bayer.turn(seen, 5))), 5)
     assert torch.allclose(two(Noisy(seen)), (upright + turned) / 2, atol=1e-5)
     assert (upright - turned).abs().max() > 1e-3
     assert PictureDenoiser.of("NonLocalMeans@10").views == 1
-    assert PictureDenoiser.of("rawaug-srgb").views == 1, "a mean of two networks"
 
 
 def test_bfloat16_changes_a_picture_by_less_than_two_codes() -> None:
