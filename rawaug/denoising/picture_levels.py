@@ -8,9 +8,9 @@ then removes, :math:`x - f(x, 0)`, tells the level. Its deviation is measured ov
 :math:`r` is the lower quartile: texture raises the upper ones, while noise is everywhere. r and :math:`\sigma` are in
 codes, on the scale where white is 255.
 
-The best level to tell is not that deviation alone. Noise and fine detail are alike, so b is below 1. And the coarser
-the grain is, the higher a level the network needs. The correlations of what is removed show how coarse it is:
-:math:`\rho_1` and :math:`\rho_2`, between pixels one and two apart, in the half of the squares that have the least of
+The best level to tell is not that deviation alone. Noise and fine detail are alike, so b is below 1. And the network
+needs a lower level where the noise was demosaiced and nothing else, which shows in what is removed: :math:`\rho_1` and
+:math:`\rho_2` are its correlations between pixels one and two apart, in the half of the squares that have the least of
 it. Demosaicing makes neighbours alike, but hardly pixels two apart; the denoising, the sharpening and the chroma
 filters of a camera make both alike.
 
@@ -32,9 +32,9 @@ from torch.nn import functional as F
 
 from rawaug.errors import extra
 
-LEVEL, BY_REMOVED, BY_NEIGHBOURS, BY_SECOND_NEIGHBOURS = 2.0, 0.5, 2.1, 2.1
+LEVEL, BY_REMOVED, BY_NEIGHBOURS, BY_SECOND_NEIGHBOURS = 2.16, 0.5, 2.3, 2.2
 """The constants a, b, c and d of the level."""
-SHARE, SHARE_BY_REMOVED = 2.4, 2.1
+SHARE, SHARE_BY_REMOVED = 4.1, 2.2
 """The constants p and q of the share."""
 
 _LOWEST = 2.0

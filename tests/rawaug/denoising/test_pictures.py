@@ -13,6 +13,7 @@ from torch import Tensor
 
 import denoisers
 from rawaug import bayer
+from rawaug.bayer.demosaicing import demosaic
 from rawaug.commands.denoise import run as denoise
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
@@ -77,23 +78,26 @@ def test_a_clean_picture_is_left_alone() -> None:
 def test_even_noise_is_removed_and_texture_in_places_is_kept() -> None:
     network = denoisers.from_pretrained("rawaug-srgb")
     grain = 0.02 * torch.randn(1, 3, 256, 256, generator=torch.Generator().manual_seed(0))
-    strength = torch.linspace(0.0, 3.0, 8).repeat_interleave(32)
+    in_places = torch.zeros(256)
+    in_places[:160] = 1.0
 
     even = estimate_level(network, 0.5 + grain)
-    uneven = estimate_level(network, 0.5 + grain * strength * strength[:, None] / 3.0)
+    uneven = estimate_level(network, 0.5 + grain * in_places)
 
     assert even.share > 0.8
     assert uneven.share < 0.3
 
 
-def test_coarse_grain_asks_for_a_higher_level_than_grain_of_neighbours() -> None:
+def test_noise_that_a_camera_finished_asks_for_a_higher_level_than_noise_that_was_only_demosaiced() -> None:
     generator = torch.Generator().manual_seed(0)
-    grain = torch.randn(1, 3, 256, 256, generator=generator)
-    fine, coarse = (blur(grain, torch.tensor([width])) for width in (0.5, 1.2))
+    mosaic = bayer.unpack(torch.randn(1, 4, 128, 128, generator=generator), bayer.CFA.RGGB)
+    demosaiced = demosaic(mosaic, bayer.CFA.RGGB, "malvar")
+    luma = demosaiced.mean(1, keepdim=True)
+    finished = luma + blur(demosaiced - luma, torch.tensor([3.0]))
     network = denoisers.from_pretrained("rawaug-srgb")
 
     levels = []
-    for noise in (fine, coarse):
+    for noise in (demosaiced, finished):
         levels.append(estimate_level(network, 0.5 + 0.02 * noise / noise.std()).level)
     assert levels[1] > 1.1 * levels[0]
 
