@@ -118,7 +118,9 @@ class PictureDenoiser(ImageDenoiser):
             noise = noise._replace(level=self.strength * noise.level)
         else:
             noise = PictureLevel(self.level, 1.0)
-        return torch.lerp(srgb, self.run(srgb, noise), noise.share)
+
+        denoised = self.run(srgb, noise)
+        return torch.lerp(srgb, denoised, noise.share, out=denoised)  # in place, since pictures are large
 
 
 # -- by what it is made of ---------------------------------------------------------------------------------------------
