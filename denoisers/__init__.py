@@ -16,6 +16,7 @@ from denoisers.files import build, from_pretrained, load, save
 from denoisers.glide import GLIDE
 from denoisers.joint import JointDRUNet
 from denoisers.ksvd import KSVD
+from denoisers.mean import MeanDRUNet
 from denoisers.mosaic import MosaicDRUNet
 from denoisers.nafnet import NAFNet
 from denoisers.network import DENOISERS, Denoiser
@@ -27,7 +28,7 @@ from denoisers.wnnm import WNNM
 
 __all__ = [
     "BM3D", "DENOISERS", "DHDN", "GLIDE", "KSVD", "PMRID", "TNRD", "WNNM", "CascadeDRUNet", "CycleISPDenoiser",
-    "DRUNet", "Denoiser", "DnCNN", "FFDNet", "JointDRUNet", "MosaicDRUNet", "NAFNet", "NonLocalMeans",
+    "DRUNet", "Denoiser", "DnCNN", "FFDNet", "JointDRUNet", "MeanDRUNet", "MosaicDRUNet", "NAFNet", "NonLocalMeans",
     "SelfEnsemble", "Stabilised", "TotalVariation", "UNet", "Wavelet", "build", "denoise_tiles", "from_pretrained",
     "load", "save",
 ]  # fmt: skip

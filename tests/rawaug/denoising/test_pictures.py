@@ -13,7 +13,6 @@ from torch import Tensor
 
 import denoisers
 from rawaug import bayer
-from rawaug.bayer.demosaicing import demosaic
 from rawaug.commands.denoise import run as denoise
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
@@ -78,28 +77,36 @@ def test_a_clean_picture_is_left_alone() -> None:
 def test_even_noise_is_removed_and_texture_in_places_is_kept() -> None:
     network = denoisers.from_pretrained("rawaug-srgb")
     grain = 0.02 * torch.randn(1, 3, 256, 256, generator=torch.Generator().manual_seed(0))
-    in_places = torch.zeros(256)
-    in_places[:160] = 1.0
+    strength = torch.linspace(0.0, 3.0, 8).repeat_interleave(32)
 
     even = estimate_level(network, 0.5 + grain)
-    uneven = estimate_level(network, 0.5 + grain * in_places)
+    uneven = estimate_level(network, 0.5 + grain * strength * strength[:, None] / 3.0)
 
     assert even.share > 0.8
     assert uneven.share < 0.3
 
 
-def test_noise_that_a_camera_finished_asks_for_a_higher_level_than_noise_that_was_only_demosaiced() -> None:
+class _RemovesAll:
+    """A network that removes all noise from a grey picture."""
+
+    light = True
+
+    def __call__(self, noisy: Tensor, variance: Tensor) -> Tensor:
+        return torch.full_like(noisy, 0.5)
+
+
+def test_grain_that_reaches_beyond_neighbours_asks_for_a_higher_level() -> None:
     generator = torch.Generator().manual_seed(0)
-    mosaic = bayer.unpack(torch.randn(1, 4, 128, 128, generator=generator), bayer.CFA.RGGB)
-    demosaiced = demosaic(mosaic, bayer.CFA.RGGB, "malvar")
-    luma = demosaiced.mean(1, keepdim=True)
-    finished = luma + blur(demosaiced - luma, torch.tensor([3.0]))
-    network = denoisers.from_pretrained("rawaug-srgb")
+    white, other = torch.randn(2, 1, 3, 256, 256, generator=generator)
+    of_neighbours = blur(white, torch.tensor([0.6]))
+    wide = blur(other, torch.tensor([3.0]))
+    reaching_far = white + wide / wide.std()
+    removes_all = _RemovesAll()
 
     levels = []
-    for noise in (demosaiced, finished):
-        levels.append(estimate_level(network, 0.5 + 0.02 * noise / noise.std()).level)
-    assert levels[1] > 1.1 * levels[0]
+    for noise in (of_neighbours, reaching_far):
+        levels.append(estimate_level(removes_all, 0.5 + 0.02 * noise / noise.std()).level)
+    assert levels[1] > 1.5 * levels[0]
 
 
 def test_a_self_ensemble_denoises_a_turned_picture_to_the_turned_result() -> None:
