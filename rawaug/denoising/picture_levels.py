@@ -9,8 +9,8 @@ then removes, :math:`x - f(x, 0)`, tells the level. Its deviation is measured ov
 codes, on the scale where white is 255.
 
 The best level to tell is not that deviation alone. Noise and fine detail are alike, so b is below 1. And the network
-needs a higher level the further the grain reaches, which shows in what is removed: :math:`\rho_1` and :math:`\rho_2` are
-its correlations between pixels one and two apart, in the half of the squares that have the least of it. Demosaicing
+needs a higher level the further the grain reaches, which shows in what is removed: :math:`\rho_1` and :math:`\rho_2`
+are its correlations between pixels one and two apart, in the half of the squares that have the least of it. Demosaicing
 makes neighbours alike, but hardly pixels two apart; the wide filters of a camera's noise reduction make both alike.
 
 w is the share of the network's correction that is applied, near 1 for a noisy picture and smaller for a clean one.
