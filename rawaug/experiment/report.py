@@ -187,10 +187,11 @@ def _title_of(experiment: Experiment) -> str:
 
 
 def _lead_of(verdicts: Mapping[str, Verdict]) -> str:
-    """Write the verdict of each table as a sentence."""
+    """Write the verdict of each table as a sentence, headed by what the table is about."""
     sentences = []
     for group, one in verdicts.items():
-        sentences.append(": ".join(filter(None, [group, one.sentence])))
+        heading = group[:1].upper() + group[1:]
+        sentences.append(": ".join(filter(None, [heading, one.sentence])))
 
     return " ".join(sentences)
 
