@@ -13,7 +13,7 @@ the same parameters reproduce the pair bit for bit. :mod:`rawaug.plugin.dataset`
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy, deepcopy
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -248,7 +248,8 @@ class RawAugment(PairMaker):
             raw = self.noise.apply(planes, params.noise)
             _require_finite(raw)
             noisy, clean = bayer.unpack(raw, self.isp.cfa), bayer.unpack(planes, self.isp.cfa)
-            noisy, clean = self.srgb.develop(self._forward_pass(), noisy, clean, params)
+            shots = self._further_shots(self.srgb, planes, params)
+            noisy, clean = self.srgb.develop(self._forward_pass(), noisy, clean, params, shots)
             return noisy, clean, noisy.new_empty(len(noisy), 0)
 
         noisy, variance = self.noise.apply_with_variance(planes, params.noise)
@@ -257,12 +258,26 @@ class RawAugment(PairMaker):
             return noisy, planes, variance
         return bayer.unpack(noisy, CFA.RGGB), bayer.unpack(planes, CFA.RGGB), bayer.unpack(variance, CFA.RGGB)
 
+    def _further_shots(self, target: Srgb, planes: Tensor, params: AugmentParams) -> list[Tensor]:
+        """Make mosaics ``(b, 1, H, W)`` in pairs of opposite noise, of the b pictures whose target is their mean."""
+        averaged = target.needs_shots(params)
+        if not averaged.any():
+            return []
+
+        planes = planes[averaged.to(planes.device)]
+        params = params.map(lambda tensor: tensor[averaged.to(tensor.device)])
+        shots = []
+        for seed in params.extras["shot_seed"].unbind(1):
+            noise = self.noise.disturb(planes, _with_seed(params.noise, seed)) - planes
+            for shot in (planes + noise, planes - noise):
+                shots.append(bayer.unpack(shot.clamp_(max=1.0), self.isp.cfa))
+        return shots
+
     def _burst(self, srgb: Tensor, params: AugmentParams, burst: Burst) -> RawPair:
         """Make pairs of N noisy frames; each frame has its own noise, and all share the sensor's defects."""
         frame_params = params.map(lambda tensor: tensor.repeat_interleave(burst.frames, 0))
-        if "seed" in frame_params.noise:
-            frame_params.noise["sensor_seed"] = frame_params.noise["seed"]
-            frame_params.noise["seed"] = params.extras["frame_seed"].flatten()
+        noise = _with_seed(frame_params.noise, params.extras["frame_seed"].flatten())
+        frame_params = frame_params._replace(noise=noise)
 
         scene = self.baked.colours(srgb, params.isp, params.crop, shaded=False)
         moving = burst.move(scene, params.extras["motion"])
@@ -454,6 +469,13 @@ def _noise_of_cameras(camera: str | Path | Camera | Sequence[str | Path | Camera
         return str(camera)
     names = [str(name) for name in camera]
     return names[0] if len(names) == 1 else names
+
+
+def _with_seed(noise: Mapping[str, Tensor], seed: Tensor) -> dict[str, Tensor]:
+    """Change the seeds ``(B,)`` of the noise that every shot has anew; the defects of the sensor stay."""
+    if "seed" not in noise:
+        return dict(noise)
+    return {**noise, "sensor_seed": noise["seed"], "seed": seed}
 
 
 def _require_finite(raw: Tensor) -> None:

@@ -8,6 +8,15 @@ with the gains g, matrix C and tone curve t of the draw (:class:`rawaug.isp.fast
 developed alike, by a demosaicing method drawn from those available, so that the two differ by the sensor's noise alone.
 The target is the developed clean RAW, not the picture: demosaicing alone would leave the picture at 29 to 31 dB.
 
+The mean of many developed shots is another picture, :math:`E[x(y + n)]`. Where noise is clipped at black, the mean is
+brighter than the developed clean RAW, and where the tone curve bends, darker. References of real pictures are such
+means. With ``shots`` the target is
+
+.. math:: \frac{1}{2 K} \sum_{k=1}^{K} x(y + n_k) + x(y - n_k)
+
+with noise :math:`n_k` that is independent of the input's. Opposite noise cancels wherever developing is linear, so a
+pair or two are enough.
+
 *Bursts* are several noisy frames of one scene, moved by the hand that holds the camera. Frame k shows the scene of the
 first frame at ``R(angle) (p - c) + c + (dy, dx)`` for pixel p and centre c, in sensor pixels. Light is interpolated
 (bicubic, and clipped at black) before the mosaic, so that each frame samples the scene at other places, and each has
@@ -18,6 +27,7 @@ filled by reflection.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import Literal
@@ -49,18 +59,23 @@ class Srgb:
             ``finish``, or no JPEG without it.
         finish: finish both pictures as cameras do, by noise reduction and sharpening, and the noisy one by JPEG: a
             :class:`rawaug.Finish`, or true for its defaults.
+        shots: pairs of further shots with opposite noise, whose mean is the target of a picture that is finished, or
+            of every picture without ``finish``. With 0 the target is the developed clean RAW.
 
     Raises:
-        ValueError: if a demosaicing method is unknown, or the quality is out of range.
+        ValueError: if a demosaicing method is unknown, the quality is out of range, or the number of shots is negative.
     """
 
     demosaicing: tuple[str, ...] | str | None = None
     jpeg: tuple[int, int] | None = None
     finish: Finish | bool = False
+    shots: int = 0
 
     def __post_init__(self) -> None:
         if self.jpeg is not None and (len(self.jpeg) != 2 or not 1 <= self.jpeg[0] <= self.jpeg[1] <= 100):
             raise ValueError(f"jpeg must be (lowest, highest) quality within 1 to 100, got {self.jpeg}")
+        if not isinstance(self.shots, int) or self.shots < 0:
+            raise ValueError(f"shots must be a number of pairs of shots, at least 0, got {self.shots!r}")
         for name in self.methods:
             bayer.require_method(name)
 
@@ -95,10 +110,23 @@ class Srgb:
             extras["quality"] = torch.randint(lowest, highest + 1, (batch,), generator=generator)
         if self.finishing is not None:
             extras |= self.finishing.sample(batch, generator)
+        if self.shots > 0:
+            extras["shot_seed"] = draw_seeds(batch * self.shots, generator).reshape(batch, self.shots)
         return extras
 
+    def needs_shots(self, params: AugmentParams) -> Tensor:
+        """Say of each picture, ``(B,)``, whether its target is the mean of further shots."""
+        if self.finishing is not None:
+            return params.extras["finish"].any(dim=1) & (self.shots > 0)
+        return torch.full_like(params.extras["demosaicing"], self.shots > 0, dtype=torch.bool)
+
     def develop(
-        self, forward: FastForward, noisy: Tensor, clean: Tensor, params: AugmentParams
+        self,
+        forward: FastForward,
+        noisy: Tensor,
+        clean: Tensor,
+        params: AugmentParams,
+        shots: Sequence[Tensor] = (),
     ) -> tuple[Tensor, Tensor]:
         """Develop noisy and clean mosaics ``(B, 1, H, W)`` of the same pictures alike.
 
@@ -107,6 +135,7 @@ class Srgb:
             noisy: mosaics ``(B, 1, H, W)`` of at least 4 x 4; a saturated sensor becomes white.
             clean: mosaics of the same shape.
             params: the parameters that were drawn for them.
+            shots: further noisy mosaics ``(b, 1, H, W)`` of the b pictures whose target is the mean of such shots.
 
         Returns:
             Noisy and clean sRGB ``(B, 3, H, W)`` in [0, 1], the noisy one after its JPEG.
@@ -116,6 +145,13 @@ class Srgb:
 
         methods = [self.methods[number] for number in params.extras["demosaicing"].tolist()]
         noisy, clean = forward.develop((noisy, clean), methods, keep_white(params.isp), params.crop)
+        if shots:
+            averaged = self.needs_shots(params)
+            own = params.map(lambda tensor: tensor[averaged.to(tensor.device)])
+            own_methods = [self.methods[number] for number in own.extras["demosaicing"].tolist()]
+            developed = forward.develop(shots, own_methods, keep_white(own.isp), own.crop)
+            clean[averaged.to(clean.device)] = torch.stack(developed).mean(0)
+
         if self.finishing is not None:
             noisy, clean = self.finishing.apply(noisy, clean, params.extras["finish"])
         if "quality" in params.extras:

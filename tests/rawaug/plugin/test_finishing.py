@@ -109,6 +109,51 @@ def test_pairs_replay_and_do_not_depend_on_their_neighbours() -> None:
     assert pair.params.extras["finish"].shape == (3, 8)
 
 
+@pytest.mark.parametrize("finish", [False, Finish(quality=None)])
+def test_the_target_of_shots_is_the_mean_of_many_though_noise_is_clipped_at_black(finish: Finish | bool) -> None:
+    dark = torch.full((1, 3, 48, 48), 0.04)
+    dark[..., 24:] = 0.5
+
+    def mean_pair(shots: int) -> tuple[Tensor, Tensor]:
+        target = Srgb(demosaicing="bilinear", finish=finish, shots=shots)
+        augment = RawAugment.from_pretrained("universal", noise=(1e-4, 1e-4), target=target)
+        params = augment.sample(dark, torch.Generator().manual_seed(0))
+        noisy, clean = [], []
+        for seed in range(24):
+            params.noise["seed"] = torch.tensor([seed])
+            if shots:
+                params.extras["shot_seed"] = torch.tensor([[1000 + seed, 2000 + seed]])
+            pair = augment.apply(dark, params)
+            noisy.append(pair.noisy[..., 4:20].mean())
+            clean.append(pair.clean[..., 4:20].mean())
+        return torch.stack(noisy).mean(), torch.stack(clean).mean()
+
+    noisy, developed = mean_pair(0)
+    assert noisy - developed > 0.008, "noise that is clipped at black makes dark areas brighter"
+    noisy, mean = mean_pair(2)
+    assert abs(noisy - mean) < 0.0015
+
+
+def test_shots_leave_the_noisy_picture_and_unfinished_targets_as_they_are() -> None:
+    pictures = torch.rand(6, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+
+    def pair(shots: int) -> tuple[Tensor, Tensor, Tensor]:
+        target = Srgb(finish=Finish(unfinished=0.5, quality=None), shots=shots)
+        augment = RawAugment.from_pretrained("universal", noise=(1e-2, 1e-3), target=target)
+        params = augment.sample(pictures, torch.Generator().manual_seed(4))
+        made = augment.apply(pictures, params)
+        again = augment.apply(pictures, params)
+        assert torch.equal(made.clean, again.clean)
+        return made.noisy, made.clean, params.extras["finish"].any(dim=1)
+
+    noisy, clean, finished = pair(0)
+    same, mean, _ = pair(1)
+    assert torch.equal(noisy[~finished], same[~finished]) and torch.equal(clean[~finished], mean[~finished])
+    assert 0 < finished.sum() < 6
+    for k in finished.nonzero()[:, 0]:
+        assert not torch.equal(clean[k], mean[k])
+
+
 def test_jpeg_is_on_the_noisy_picture_alone() -> None:
     pictures = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(1))
 
@@ -132,6 +177,11 @@ def test_ranges_and_shares_are_of_pictures() -> None:
     assert edge.log().mean().item() == pytest.approx(math.log(4.0), abs=0.03), "drawn by its logarithm"
     noisy, clean = step_and_noise()
     assert torch.equal(Finish().apply(noisy, clean, torch.zeros(1, 8))[0], noisy)
+
+
+def test_a_negative_number_of_shots_is_refused() -> None:
+    with pytest.raises(ValueError, match="shots"):
+        Srgb(shots=-1)
 
 
 def test_ranges_out_of_order_are_refused() -> None:
