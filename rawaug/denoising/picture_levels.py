@@ -33,9 +33,9 @@ from torch.nn import functional as F
 
 from rawaug.errors import extra
 
-LEVEL, BY_REMOVED, BY_NEIGHBOURS, BY_SECOND_NEIGHBOURS = 2.16, 0.5, 2.3, 2.2
+LEVEL, BY_REMOVED, BY_NEIGHBOURS, BY_SECOND_NEIGHBOURS = 2.15, 0.5, 2.1, 2.4
 """The constants a, b, c and d of the level."""
-SHARE, SHARE_BY_REMOVED, SHARE_BY_UNEVENNESS = 5.8, 2.0, 6.0
+SHARE, SHARE_BY_REMOVED, SHARE_BY_UNEVENNESS = 6.3, 1.0, 7.5
 """The constants p, q and s of the share."""
 
 _LOWEST = 2.0
