@@ -1,4 +1,4 @@
-"""Every figure of the README and of the model cards stands in the ledger, docs/results.md and results_isp.md."""
+"""Every figure of the README and of the model cards stands in the ledger, docs/results.md and the pages beside it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = [(ROOT / "docs" / name).read_text() for name in ("results.md", "results_isp.md")]
+PAGES = [page.read_text() for page in sorted((ROOT / "docs").glob("results*.md"))]
 LEDGER = "\n".join(PAGES)
 CARDS = sorted([*(ROOT / "denoisers" / "weights").glob("*.md"), *(ROOT / "rawaug" / "weights").glob("*.md")])
 DECIMALS = re.compile(r"(?<![\w.-])\d+\.\d+(?![\w.])(?!e-)")

@@ -1,12 +1,12 @@
 r"""How strong the noise of a developed picture is for a network that is told so, and how sure it is that there is any.
 
 .. math:: \sigma = \exp(a + b \ln r - c \rho_1 + d \rho_2), \qquad
-   w = S(p + q \ln r - s \ln(r_{75} / r_{50})), \qquad S(z) = \frac{1}{1 + e^{-z}}
+   w = S(p - q \ln(r / r_{25})), \qquad S(z) = \frac{1}{1 + e^{-z}}
 
 A network f that is told the level of the noise, its standard deviation, also works where the level is unknown. What it
 then removes, :math:`x - f(x, 0)`, tells the level. Its deviation is measured over squares of 16 x 16 pixels, of which
-:math:`r` is the lower quartile: texture raises the upper ones, while noise is everywhere. r and :math:`\sigma` are in
-codes, on the scale where white is 255.
+:math:`r` is the median and :math:`r_{25}` the lower quartile. r and :math:`\sigma` are in codes, on the scale where
+white is 255.
 
 The best level to tell is not that deviation alone. Noise and fine detail are alike, so b is below 1. And the network
 needs a higher level the further the grain reaches, which shows in what is removed: :math:`\rho_1` and :math:`\rho_2`
@@ -14,9 +14,8 @@ are its correlations between pixels one and two apart, in the half of the square
 makes neighbours alike, but hardly pixels two apart; the wide filters of a camera's noise reduction make both alike.
 
 w is the share of the network's correction that is applied, near 1 for a noisy picture and smaller for a clean one.
-Noise lies evenly over a picture and texture does not, so the ratio of the upper quartile :math:`r_{75}` to the median
-:math:`r_{50}` tells them apart. A low level would not do instead, since a network that is told next to nothing takes
-the level for unknown.
+Noise lies evenly over a picture and texture does not, so the ratio of the median to the lower quartile tells them
+apart. A low level would not do instead, since a network that is told next to nothing takes the level for unknown.
 
 The constants are those with which pictures are denoised best (CC15, developed frames, drawn noise) while clean
 photographs stay as they are.
@@ -33,10 +32,10 @@ from torch.nn import functional as F
 
 from rawaug.errors import extra
 
-LEVEL, BY_REMOVED, BY_NEIGHBOURS, BY_SECOND_NEIGHBOURS = 2.15, 0.5, 2.1, 2.4
+LEVEL, BY_REMOVED, BY_NEIGHBOURS, BY_SECOND_NEIGHBOURS = 1.89, 0.65, 2.5, 3.1
 """The constants a, b, c and d of the level."""
-SHARE, SHARE_BY_REMOVED, SHARE_BY_UNEVENNESS = 6.3, 1.0, 7.5
-"""The constants p, q and s of the share."""
+SHARE, SHARE_BY_UNEVENNESS = 7.0, 5.4
+"""The constants p and q of the share."""
 
 _LOWEST = 2.0
 """No lower level is told, in codes, since the network takes one near 0 for unknown."""
@@ -68,22 +67,19 @@ def estimate_level(network: Any, srgb: Tensor) -> PictureLevel:
         return PictureLevel(white_level(srgb), 1.0)
 
     squares = _removed_squares(network, srgb)
-    percentiles = torch.tensor([0.25, 0.5, 0.75], device=srgb.device)
-    deviations = squares.power.sqrt().quantile(percentiles)
-    quartile, median, upper_quartile = deviations.clamp_min(_SMALLEST)
-    log_removed = (255.0 * quartile).log()
+    percentiles = torch.tensor([0.25, 0.5], device=srgb.device)
+    quartile, median = squares.power.sqrt().quantile(percentiles).clamp_min(_SMALLEST)
 
     even = squares.power <= median.square()
     power = squares.power[even].sum().clamp_min(_SMALLEST**2)
     neighbours = squares.one_apart[even].sum() / power
     second_neighbours = squares.two_apart[even].sum().clamp_min(0.0) / power
 
-    log_level = LEVEL + BY_REMOVED * log_removed
+    log_level = LEVEL + BY_REMOVED * (255.0 * median).log()
     log_level = log_level - BY_NEIGHBOURS * neighbours + BY_SECOND_NEIGHBOURS * second_neighbours
     level = log_level.exp().clamp_min(_LOWEST) / 255.0
 
-    unevenness = (upper_quartile / median).log()
-    share = SHARE + SHARE_BY_REMOVED * log_removed - SHARE_BY_UNEVENNESS * unevenness
+    share = SHARE - SHARE_BY_UNEVENNESS * (median / quartile).log()
     return PictureLevel(float(level), float(share.sigmoid()))
 
 
