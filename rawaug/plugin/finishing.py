@@ -10,8 +10,8 @@ The lens, the low-pass filter and demosaicing soften the picture, :math:`G_s`. L
 filter (He, Sun and Tang, PAMI 2013). Its weights :math:`a = \max(0, 1 - k \sigma^2 / v)` go from 0 in flat areas to 1
 at edges. There v is the variance of noisy luma in the window, :math:`\sigma^2` the variance of its noise, and
 :math:`\bar a = M a`. Noise is therefore left at edges, as cameras leave it. The clean picture is finished with the
-weights that the noisy one gave, so that it is what the mean of many such shots would be. JPEG acts on the noisy picture
-alone.
+weights that the noisy one gave, so that it is what the mean of many such shots would be, if it was their mean before
+(``shots`` of :class:`rawaug.Srgb`). JPEG acts on the noisy picture alone.
 
 Pictures that are shown smaller than they were taken need nothing here. A picture is scaled before its crop, in the
 loader of pictures; a pair could be scaled only by cutting a larger crop than was asked for. ``zoom`` of

@@ -26,9 +26,8 @@ class AugmentParams(NamedTuple):
             which says how the picture was turned after the crop (see :func:`rawaug.bayer.turn`). With a zoom it is
             ``(B, 6)``, and the last is the number of rows that were enlarged to the crop.
         extras: for the target ``"srgb"``, ``demosaicing`` (its number), ``quality`` with JPEG, and with finishing
-            ``chroma_420``, each ``(B,)``, and ``finish`` ``(B, 8)``; ``shot_seed`` ``(B, K)`` for K pairs of shots; for
-            bursts, ``motion`` ``(B, N, 3)`` and
-            ``frame_seed`` ``(B, N)``. Otherwise it is empty.
+            ``chroma_420``, each ``(B,)``, and ``finish`` ``(B, 8)``; with K pairs of further shots, ``shot_seed``
+            ``(B, K)``; for bursts, ``motion`` ``(B, N, 3)`` and ``frame_seed`` ``(B, N)``. Otherwise it is empty.
     """
 
     isp: ISPParams

@@ -141,10 +141,9 @@ def test_shots_leave_the_noisy_picture_and_unfinished_targets_as_they_are() -> N
         target = Srgb(finish=Finish(unfinished=0.5, quality=None), shots=shots)
         augment = RawAugment.from_pretrained("universal", noise=(1e-2, 1e-3), target=target)
         params = augment.sample(pictures, torch.Generator().manual_seed(4))
-        made = augment.apply(pictures, params)
-        again = augment.apply(pictures, params)
-        assert torch.equal(made.clean, again.clean)
-        return made.noisy, made.clean, params.extras["finish"].any(dim=1)
+        first, again = augment.apply(pictures, params), augment.apply(pictures, params)
+        assert torch.equal(first.clean, again.clean)
+        return first.noisy, first.clean, params.extras["finish"].any(dim=1)
 
     noisy, clean, finished = pair(0)
     same, mean, _ = pair(1)
