@@ -28,7 +28,7 @@ from rawaug.denoising.picture_levels import PictureLevel, estimate_level, white_
 from rawaug.denoising.weights import Image
 from rawaug.registry import Spec, spec_label
 
-_TILE = 1280
+_TILE = 1024
 """Side of a tile; without tiles, the default denoiser needs more than 2 GB for 12 megapixels."""
 _LOWEST = 1e-4
 """The lowest level that a filter is told, since it divides by it."""
@@ -103,7 +103,7 @@ class PictureDenoiser(ImageDenoiser):
                 denoised = self._denoise(bayer.turn(srgb, view).contiguous())
                 total += bayer.turn_back(denoised, view)
 
-        mean = (total / self.views).cpu().clamp_(0.0, 1.0)
+        mean = total.div_(self.views).cpu().clamp_(0.0, 1.0)
         return self._require_sound(mean, noisy.image, noisy.image.shape)
 
     def _denoise(self, srgb: Tensor) -> Tensor:
