@@ -260,12 +260,13 @@ class RawAugment(PairMaker):
 
     def _further_shots(self, target: Srgb, planes: Tensor, params: AugmentParams) -> list[Tensor]:
         """Make mosaics ``(b, 1, H, W)`` in pairs of opposite noise, of the b pictures whose target is their mean."""
-        averaged = target.needs_shots(params)
-        if not averaged.any():
+        is_averaged = target.needs_shots(params)
+        if not is_averaged.any():
             return []
 
-        planes = planes[averaged.to(planes.device)]
-        params = params.map(lambda tensor: tensor[averaged.to(tensor.device)])
+        planes = planes[is_averaged.to(planes.device)]
+        params = params.map(lambda tensor: tensor[is_averaged.to(tensor.device)])
+
         shots = []
         for seed in params.extras["shot_seed"].unbind(1):
             noise = self.noise.disturb(planes, _with_seed(params.noise, seed)) - planes

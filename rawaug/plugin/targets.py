@@ -146,11 +146,12 @@ class Srgb:
         methods = [self.methods[number] for number in params.extras["demosaicing"].tolist()]
         noisy, clean = forward.develop((noisy, clean), methods, keep_white(params.isp), params.crop)
         if shots:
-            averaged = self.needs_shots(params)
-            own = params.map(lambda tensor: tensor[averaged.to(tensor.device)])
+            is_averaged = self.needs_shots(params)
+            own = params.map(lambda tensor: tensor[is_averaged.to(tensor.device)])
             own_methods = [self.methods[number] for number in own.extras["demosaicing"].tolist()]
-            developed = forward.develop(shots, own_methods, keep_white(own.isp), own.crop)
-            clean[averaged.to(clean.device)] = torch.stack(developed).mean(0)
+
+            pictures = forward.develop(shots, own_methods, keep_white(own.isp), own.crop)
+            clean[is_averaged.to(clean.device)] = torch.stack(pictures).mean(0)
 
         if self.finishing is not None:
             noisy, clean = self.finishing.apply(noisy, clean, params.extras["finish"])
