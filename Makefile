@@ -16,7 +16,10 @@ LOCKED := \# Exact versions by Python version and platform, written by make lock
 
 BENCHMARKS := augment denoise faults folder fuzz loader networks noise synth
 
-.PHONY: demo test pytest lint docs bench dist lock resolve clean
+.PHONY: help demo test pytest lint docs bench dist archive lock resolve clean
+
+help:  ## what there is to make
+	@sed -n 's/^\([a-z]*\):.*##  *\(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r target text; do printf '%-8s %s\n' "$$target" "$$text"; done
 
 demo: $(VENV)/.demo  ## train a RAW denoiser on a simulated camera, with and without augmentation, and test it on real frames
 	$(BIN)/rawaug run recipes/fewshot.yaml
@@ -25,16 +28,17 @@ demo: $(VENV)/.demo  ## train a RAW denoiser on a simulated camera, with and wit
 test: $(VENV)/.test  ## style, types and all tests, at once
 	$(MAKE) --jobs 2 lint pytest
 
-pytest: $(VENV)/.test
+pytest: $(VENV)/.test  ## the tests alone
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 
-lint: $(VENV)/.test
+lint: $(VENV)/.test  ## style and types alone
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python .ci/advisories.py
 
 docs: $(VENV)/.docs  ## the site, in site/; a broken link or reference stops it
+	$(BIN)/python .ci/cards.py
 	$(BIN)/zensical build --strict --clean
 
 bench: $(VENV)/.demo  ## what things cost and what damaged files do, each benchmark quickly
@@ -43,6 +47,12 @@ bench: $(VENV)/.demo  ## what things cost and what damaged files do, each benchm
 dist: | $(BIN)/python  ## the wheel and the source archive of a release
 	$(BIN)/pip install --quiet --disable-pip-version-check build
 	$(BIN)/python -m build
+
+archive: $(VENV)/.test  ## the source archive, unpacked in build/archive, and its fast tests
+	rm -rf build/archive && mkdir -p build/archive
+	$(BIN)/python -c "from setuptools.build_meta import build_sdist; build_sdist('build/archive')"
+	tar --extract --gzip --strip-components 1 --directory build/archive --file build/archive/rawaug-*.tar.gz
+	cd build/archive && PYTHONPATH=. $(abspath $(BIN))/python -m pytest --numprocesses 2 --dist worksteal -m "not long"
 
 lock: $(WHEEL)  ## constraints.txt anew, for every Python version and platform at once; pins that still hold stay
 	$(COMPILE) --universal --python-version 3.11 --fork-strategy requires-python --output-file constraints.txt $<
@@ -56,7 +66,7 @@ resolve: $(WHEEL)  ## what pip would install by constraints.txt, looked up on th
 	    $$(grep -E '^(torch|triton|rawpy|numpy)==' build/resolve/$$python-$$platform.txt); \
 	done; done
 
-clean:
+clean:  ## remove everything that make writes
 	rm -rf $(VENV) runs build dist site .cache *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
 $(BIN)/python:  # the pip that comes with Python 3.11 takes three times as long to find the packages

@@ -1,9 +1,10 @@
-"""Every Python snippet of the README and of docs/ runs, and the change that the README shows is one line."""
+"""Every Python snippet of the README and of docs/ runs, every link leads somewhere, and the README changes one line."""
 
 from __future__ import annotations
 
 import ast
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -78,3 +79,46 @@ def test_the_change_is_an_import_and_one_line() -> None:
     removed, added = ([line for mark, line in lines_of_the_diff() if mark == side] for side in "-+")
     assert len(removed) == 1
     assert len(added) == 2 and added[0] == "import rawaug"
+
+
+CARDS = runpy.run_path(str(ROOT / ".ci" / "cards.py"))["pages"]()
+DOCUMENTS = [
+    *ROOT.glob("*.md"),
+    *(ROOT / "docs").glob("*.md"),
+    *(ROOT / "rawaug").rglob("*.md"),
+    *(ROOT / "denoisers").rglob("*.md"),
+]
+
+
+def anchors(document: Path) -> set[str]:
+    """The anchors of the headings of a page."""
+    text = re.sub(r"^```.*?^```", "", document.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    slugs = set()
+    for heading in re.findall(r"^#+ +(.+)$", text, re.MULTILINE):
+        words = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading)
+        words = re.sub(r"[^\w\s-]", "", words.lower()).strip()
+        slugs.add(re.sub(r"\s+", "-", words))
+    return slugs
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda document: document.relative_to(ROOT).as_posix())
+def test_every_relative_link_leads_somewhere(document: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", document.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"https?://|mailto:", link):
+            continue
+        place, _, anchor = link.partition("#")
+        target = (document.parent / place).resolve() if place else document
+        assert target.exists(), f"{document.name}: {link} leads nowhere"
+        if anchor and target.parent.name == "cards":
+            target = ROOT / re.findall(r'"(.*)"', target.read_text(encoding="utf-8"))[0]
+        if anchor and target.suffix == ".md":
+            assert anchor in anchors(target), f"{document.name}: {link} has no such heading"
+
+
+def test_every_card_is_a_page_of_the_site() -> None:
+    pages = {page.name: page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "cards").glob("*.md")}
+    assert pages == CARDS, "run python .ci/cards.py"
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    for page in [*pages, *(page.name for page in (ROOT / "docs").glob("*.md"))]:
+        assert re.search(rf"[ /]{re.escape(page)}$", navigation, re.MULTILINE), f"mkdocs.yml does not list {page}"

@@ -174,3 +174,27 @@ def test_recipes_weights_and_tables_are_in_it(site: Path) -> None:
         if file.is_file()
     }
     assert len(wanted) > 100 and wanted <= existing, sorted(wanted - existing)
+    (metadata,) = site.glob("rawaug-*.dist-info")
+    names = {file.name for file in metadata.rglob("*")}
+    assert {"LICENSE", "THIRD_PARTY.md"} <= names, "the wheel states whose works it holds"
+
+
+def test_the_source_archive_holds_what_the_checkout_holds() -> None:
+    """Every file and folder at the top of the checkout is a package or stands in MANIFEST.in."""
+    manifest = (ROOT / "MANIFEST.in").read_text(encoding="utf-8")
+    named = set(re.sub(r"^(include|graft) ", "", manifest, flags=re.MULTILINE).split())
+    packaged = {"rawaug", "denoisers", "README.md", "setup.cfg", "pyproject.toml", "MANIFEST.in", "PKG-INFO"}
+
+    ignored = (ROOT / ".gitignore").read_text(encoding="utf-8").replace("/", "").split()
+    for entry in ROOT.iterdir():
+        if entry.name == ".git" or any(entry.match(pattern) for pattern in ignored):
+            continue
+        assert entry.name in named | packaged, f"{entry.name} is not in the source archive: name it in MANIFEST.in"
+
+
+def test_third_party_names_every_table_that_others_measured() -> None:
+    text = (ROOT / "THIRD_PARTY.md").read_text(encoding="utf-8")
+    tables = [*ROOT.glob("rawaug/**/*.tsv"), ROOT / "benchmarks/tone_curves.json", ROOT / "rawaug/noise/presets.json"]
+    for table in tables:
+        assert table.name in text, f"THIRD_PARTY.md: does not say where {table.name} comes from"
+    assert "[yyyy]" not in (ROOT / "LICENSE").read_text(encoding="utf-8")
