@@ -31,7 +31,7 @@ from benchmarks.universal import (
     tone_points,
     tone_tables,
 )
-from rawaug.isp.cameras import load_cameras
+from rawaug.camera.matrices import load_cameras
 from rawaug.isp.dictionary import CameraDictionary, nearest_in_hull
 from rawaug.isp.model import DictionaryISP
 

@@ -28,7 +28,8 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
-from rawaug.isp.cameras import camera_from_srgb, gains_in_light, load_cameras, sample_lights
+from rawaug.camera.lights import sample_lights
+from rawaug.camera.matrices import camera_from_srgb, gains_in_light, load_cameras
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.dictionary import CameraDictionary, is_plausible, nearest_in_hull
 from rawaug.isp.model import DictionaryISP

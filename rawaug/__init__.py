@@ -12,13 +12,13 @@ from rawaug.version import __version__
 
 if TYPE_CHECKING:
     from rawaug.bayer import CFA as CFA
+    from rawaug.camera.own import Camera as Camera
     from rawaug.denoising.denoiser import RawDenoiser as RawDenoiser
     from rawaug.denoising.frames import denoise as denoise
     from rawaug.isp.config import ISPConfig as ISPConfig
     from rawaug.isp.config import ISPParams as ISPParams
     from rawaug.isp.config import ISPResult as ISPResult
     from rawaug.isp.model import DictionaryISP as DictionaryISP
-    from rawaug.isp.own_cameras import Camera as Camera
     from rawaug.plugin.augment import RawAugment as RawAugment
     from rawaug.plugin.clean_raw import RawNoise as RawNoise
     from rawaug.plugin.dataset import RawPairs as RawPairs
@@ -45,7 +45,7 @@ _PUBLIC = {
     "rawaug.denoising.frames": ("denoise",),
     "rawaug.isp.config": ("ISPConfig", "ISPParams", "ISPResult"),
     "rawaug.isp.model": ("DictionaryISP",),
-    "rawaug.isp.own_cameras": ("Camera",),
+    "rawaug.camera.own": ("Camera",),
     "rawaug.plugin.augment": ("RawAugment",),
     "rawaug.plugin.clean_raw": ("RawNoise",),
     "rawaug.plugin.dataset": ("RawPairStream", "RawPairs"),

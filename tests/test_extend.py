@@ -127,7 +127,7 @@ def test_a_package_is_imported_before_its_network_is_outlined(site: Path, tmp_pa
 
 
 def test_what_is_imported_on_another_device_is_whole(site: Path) -> None:
-    rooms = "rawaug.noise", "rawaug.isp.cameras", "rawaug.data.development", "rawaug.training.srgb_noise"
+    rooms = "rawaug.noise", "rawaug.camera.lights", "rawaug.data.development", "rawaug.training.srgb_noise"
     in_a_fresh_process(
         site,
         "import importlib, torch",

@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FILES = sorted(file.relative_to(ROOT) for part in ("rawaug", "denoisers") for file in (ROOT / part).rglob("*.py"))
 BASE = {"bayer", "errors", "files", "metrics", "progress", "registry", "seeding", "version"}
-CAMERA = BASE | {"isp", "noise", "kernels", "denoisers"}
+CAMERA = BASE | {"camera", "isp", "noise", "kernels", "denoisers"}
 PRODUCT = CAMERA | {"plugin", "data", "io", "synthesis", "denoising", "evaluation", "training"}
 MAY_IMPORT: dict[str, set[str]] = {
     "bayer": {"seeding"},
@@ -29,8 +29,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),
     "denoisers": {"bayer", "errors", "files", "registry"},
     "kernels": {"bayer", "registry"},
-    "noise": BASE | {"isp", "io", "kernels"},
-    "isp": BASE | {"kernels"},
+    "camera": BASE,
+    "noise": BASE | {"camera", "io", "kernels"},
+    "isp": BASE | {"camera", "kernels"},
     "io": BASE,
     "data": BASE | {"io"},
     "plugin": CAMERA | {"data", "io"},
@@ -120,9 +121,10 @@ LOADED: dict[str, set[str]] = {
     "import rawaug": set(),
     "import rawaug.registry": {"registry"},
     "import denoisers": {"bayer", "errors", "files", "registry"},
-    "import rawaug.noise": {"bayer", "seeding", "isp", "kernels", "noise", "errors", "registry"},
+    "import rawaug.noise": {"bayer", "seeding", "camera", "kernels", "noise", "errors", "registry"},
     "from rawaug import DictionaryISP": {
         "bayer",
+        "camera",
         "errors",
         "files",
         "isp",

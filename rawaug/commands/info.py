@@ -9,12 +9,12 @@ from typing import Any
 
 import denoisers
 from denoisers.files import FOLDER
+from rawaug.camera.matrices import load_cameras
+from rawaug.camera.names import camera_key, similar_cameras
+from rawaug.camera.own import Camera, is_camera_file
 from rawaug.errors import count_of
 from rawaug.files import find_weights, read_header, sha256
-from rawaug.isp.camera_names import camera_key, similar_cameras
-from rawaug.isp.cameras import load_cameras
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.own_cameras import Camera, is_camera_file
 from rawaug.noise.cameras import measured_ranges
 from rawaug.noise.profiles import SPREAD, load_profiles, profile_ends
 from rawaug.version import __version__

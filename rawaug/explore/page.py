@@ -20,11 +20,12 @@ from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 
 from rawaug.bayer import PATTERNS
+from rawaug.camera.lights import LAMPS
+from rawaug.camera.matrices import load_cameras
 from rawaug.errors import MissingExtra, escape, extra
 from rawaug.explore import views
 from rawaug.explore.views import VIEWS, Look, Panel
 from rawaug.files import WEIGHTS
-from rawaug.isp.cameras import LAMPS, load_cameras
 from rawaug.plugin.config import AugmentConfig
 from rawaug.plugin.draw import Draw
 

@@ -11,9 +11,10 @@ entries.
     \quad (C, M) = D_\mathrm{cam} w, \quad T = \textstyle\sum_k v_k T_k
 
 with h Brooks' highlight-preserving inverse gains, w a mixture of two of the cameras that the hull was made for, a light
-L (:mod:`rawaug.isp.cameras`), a mixture v of up to three inverse tone curves, and e an exposure in stops. The smallest
-gain is 1, so that clipped RAW develops to white. Shares of a mixture follow the Dirichlet distribution of concentration
-1/2, so that most draws are near one camera. Flat weights would crowd the middle of the hull, where cameras are rare.
+L (:mod:`rawaug.camera.lights`), a mixture v of up to three inverse tone curves, and e an exposure in stops. The
+smallest gain is 1, so that clipped RAW develops to white. Shares of a mixture follow the Dirichlet distribution of
+concentration 1/2, so that most draws are near one camera. Flat weights would crowd the middle of the hull, where
+cameras are rare.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rawaug.isp.cameras import XYZ_TO_SRGB, Array, LightRange, camera_from_srgb, daylight_gains, sample_lights
+from rawaug.camera.lights import XYZ_TO_SRGB, Array, LightRange, sample_lights
+from rawaug.camera.matrices import camera_from_srgb, daylight_gains
 from rawaug.isp.config import ISPParams
 
 PLAUSIBLE_GAINS = (0.4, 6.0)

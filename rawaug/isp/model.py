@@ -18,15 +18,15 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
+from rawaug.camera.lights import D65, light_range, mired_of, weights_in_light, white_point
+from rawaug.camera.matrices import gains_in_light, load_cameras
+from rawaug.camera.names import find_camera
+from rawaug.camera.own import Camera, as_camera, is_camera_file
 from rawaug.errors import count_of
 from rawaug.files import find_weights, parse_object, read_tensors, to_json, write_tensors
 from rawaug.isp import functional, staged, stages
-from rawaug.isp.camera_names import find_camera
-from rawaug.isp.cameras import D65, gains_in_light, light_range, load_cameras, white_point
 from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
 from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weights, log_light
-from rawaug.isp.lights import mired_of, weights_in_light
-from rawaug.isp.own_cameras import Camera, as_camera, is_camera_file
 from rawaug.isp.own_sampler import OwnCameraSampler, own_cameras
 from rawaug.isp.staged import StagedISP, Tone, thumbnail
 from rawaug.registry import suggest
@@ -96,7 +96,7 @@ class DictionaryISP(StagedISP):
 
         Args:
             consistent: whether colour and gains are of one camera in one light; if not, gains are drawn separately.
-            light: a colour temperature in kelvin or one of :data:`rawaug.isp.cameras.LAMPS`; any light by default.
+            light: a colour temperature in kelvin or one of :data:`rawaug.camera.lights.LAMPS`; any light by default.
         """
         if not isinstance(self.colour, CameraDictionary):
             return None

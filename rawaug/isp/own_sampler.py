@@ -8,7 +8,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from rawaug.isp.cameras import Array, LightRange, light_range, sample_lights
+from rawaug.camera.lights import (
+    ILLUMINANTS,
+    Array,
+    LightRange,
+    light_range,
+    light_xyz,
+    mired_of,
+    sample_lights,
+    weights_in_light,
+)
+from rawaug.camera.own import Anchor, Camera
 from rawaug.isp.dictionary import (
     CAMERAS_MIXED,
     PLAUSIBLE_GAINS,
@@ -16,8 +26,6 @@ from rawaug.isp.dictionary import (
     CameraSampler,
     sparse_shares,
 )
-from rawaug.isp.lights import ILLUMINANTS, light_xyz, mired_of, weights_in_light
-from rawaug.isp.own_cameras import Anchor, Camera
 
 _ROUNDS = 100
 

@@ -27,7 +27,7 @@ from copy import copy
 from functools import cache, partial
 from typing import Any, TypeGuard
 
-from rawaug.isp.camera_names import camera_key, find_camera
+from rawaug.camera.names import camera_key, find_camera
 from rawaug.noise.levels import (
     EldLevels,
     FixedLevels,

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from rawaug.isp.camera_names import find_camera
+from rawaug.camera.names import find_camera
 from rawaug.noise.levels import Iso, iso_limits, log_uniform
 
 ANY_CAMERA = "any camera"

@@ -23,10 +23,10 @@ from torch import Tensor, nn
 
 from rawaug import bayer
 from rawaug.bayer import CFA, pattern
+from rawaug.camera.own import Camera
 from rawaug.errors import count_of
 from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP, restrict_to_cameras
-from rawaug.isp.own_cameras import Camera
 from rawaug.kernels.runtime import eager
 from rawaug.noise import Iso
 from rawaug.plugin.camera_noise import AnyNoise, noise_for, noise_label, usual_noise, with_iso

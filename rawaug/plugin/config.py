@@ -7,8 +7,8 @@ from typing import Any, cast
 import torch
 from pydantic import TypeAdapter
 
+from rawaug.camera.own import Camera, as_camera, is_camera_file
 from rawaug.files import parse_object, to_json
-from rawaug.isp.own_cameras import Camera, as_camera, is_camera_file
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.camera_noise import USUAL
 from rawaug.plugin.draw import Draw

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
+from rawaug.camera.own import Camera
 from rawaug.errors import count_of
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.own_cameras import Camera
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.crops import crop_size
 from rawaug.plugin.epochs import Passes, Visits

@@ -39,7 +39,7 @@ class Draw:
             frames for a fitted ISP, and -0.5 to 1 for published cameras, whose headroom above white is not known. To
             train for cameras other than the fitted one, use -1.5 to 0.
         light: colour temperature in kelvin of the light that published cameras are drawn in, or one of
-            :data:`rawaug.isp.cameras.LAMPS` by name, such as ``LED-B3``. Any light by default.
+            :data:`rawaug.camera.lights.LAMPS` by name, such as ``LED-B3``. Any light by default.
         tone: one tone curve of an ISP of published cameras, by name (``rawaug info`` lists them), instead of mixtures.
 
     Raises:

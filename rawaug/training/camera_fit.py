@@ -12,6 +12,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal
 
+from rawaug.camera.own import Camera, as_camera
 from rawaug.data import RawFolder, open_pairs
 from rawaug.data.folders import Kept, Readable, left_out
 from rawaug.data.opening import names_dataset
@@ -19,7 +20,6 @@ from rawaug.data.pairs import LazyPairs, Pair, lazy, shared_frame
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.own_cameras import Camera, as_camera
 from rawaug.training.camera_noise import CameraNoise, measure_camera_noise
 
 WATCHED_PATCHES = 4

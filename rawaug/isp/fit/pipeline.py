@@ -23,6 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rawaug.camera.own import Camera
 from rawaug.files import digest
 from rawaug.isp import functional, stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
@@ -47,7 +48,6 @@ from rawaug.isp.fit.start import (
     set_dictionaries,
 )
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.own_cameras import Camera
 from rawaug.isp.stages import LensShading, Stage
 from rawaug.isp.tone import to_linear
 from rawaug.kernels.runtime import one_thread

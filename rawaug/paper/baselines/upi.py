@@ -22,8 +22,8 @@ import torch
 from torch import Tensor, nn
 
 from rawaug.bayer import CFA
+from rawaug.camera.lights import SRGB_TO_XYZ
 from rawaug.isp import functional
-from rawaug.isp.cameras import SRGB_TO_XYZ
 from rawaug.isp.config import HIGHLIGHT_KNEE
 from rawaug.isp.fit.samples import FramePair, PixelSamples, sample_pixels
 from rawaug.paper.baselines.base import BASELINES, BaselineISP, Training

@@ -7,17 +7,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rawaug.camera.lights import D65, LightRange, sample_lights, white_point
+from rawaug.camera.matrices import camera_from_srgb, gains_in_light, load_cameras
 from rawaug.data import demo_pictures
 from rawaug.isp import dictionary
-from rawaug.isp.cameras import (
-    D65,
-    LightRange,
-    camera_from_srgb,
-    gains_in_light,
-    load_cameras,
-    sample_lights,
-    white_point,
-)
 from rawaug.isp.dictionary import (
     CameraDictionary,
     CameraSampler,

@@ -16,7 +16,7 @@ from benchmarks.universal import (
     inverse_gains_in_any_light,
     tone_tables,
 )
-from rawaug.isp.cameras import camera_from_srgb, load_cameras
+from rawaug.camera.matrices import camera_from_srgb, load_cameras
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.dictionary import CameraDictionary
 from rawaug.isp.model import DictionaryISP

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 import torch
 
-from rawaug.isp.cameras import LAMPS, gains_in_light, light_range, load_cameras, sample_lights, white_point
+from rawaug.camera.lights import LAMPS, light_range, sample_lights, white_point
+from rawaug.camera.matrices import gains_in_light, load_cameras
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.camera_noise import with_iso

@@ -1,12 +1,4 @@
-r"""Published cameras by name, and the lights that pictures are taken in.
-
-A camera is a 3 x 3 matrix M from CIE XYZ to its linear RGB. Its response to a light of white point L is M L, so that
-
-.. math:: \mathrm{wb} = (M L)_G / (M L), \qquad C = \mathrm{diag}(M S 1)^{-1} M S
-
-with S from linear sRGB to XYZ. The rows of C sum to 1, so white stays white and the gains carry all of the balance
-(Brooks et al., CVPR 2019). The matrices are those of LibRaw and rawspeed, most of them Adobe's for D65. Under other
-lights they are an approximation, as in those developers.
+r"""The lights that pictures are taken in: by name, by colour temperature, drawn at random, and between two others.
 
 A light is drawn uniformly in mired, :math:`10^6 / T` of its colour temperature T, or, as most photographs are taken, on
 the daylight locus at T near 5,300 K. On the Planckian locus (Krystek, 1985)
@@ -16,13 +8,22 @@ the daylight locus at T near 5,300 K. On the Planckian locus (Krystek, 1985)
 
 and v likewise; on the daylight locus :math:`y = -3 x^2 + 2.87 x - 0.275` (CIE 15:2018, 4,000 to 25,000 K). Real lights
 lie a step Duv off both, along the normal in CIE 1960 (u, v), positive towards green.
+
+Bradford's adaptation takes XYZ from the white point w of one light to w' of another,
+
+.. math:: B = M^{-1} \, \mathrm{diag}(M w' / M w) \, M .
+
+The correlated colour temperature is McCamy's (1992). Between two lights of temperatures :math:`T_1 < T < T_2` figures
+are mixed linearly in mired, a million over the temperature, as in the DNG specification (Adobe, 1.7),
+
+.. math:: w_1 = \frac{1/T - 1/T_2}{1/T_1 - 1/T_2}, \qquad w_2 = 1 - w_1,
+
+and beyond the outermost light its figures stay constant.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cache
-from importlib import resources
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +31,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rawaug.isp.camera_names import find_camera
 from rawaug.registry import suggest
 
 Array = NDArray[np.float64]
@@ -43,65 +43,6 @@ SRGB_TO_XYZ = torch.tensor(
 )
 """The matrix from linear sRGB (IEC 61966-2-1, D65) to CIE XYZ."""
 XYZ_TO_SRGB = torch.linalg.inv(SRGB_TO_XYZ)
-
-
-class CameraMatrices(NamedTuple):
-    """Matrices from CIE XYZ to camera RGB, each scaled to a green response of 1 to D65.
-
-    Args:
-        names: makers and models of the P cameras.
-        xyz_to_camera: float64 ``(P, 3, 3)``.
-    """
-
-    names: tuple[str, ...]
-    xyz_to_camera: Tensor
-
-    def select(self, names: Sequence[str]) -> Tensor:
-        """Get the matrices ``(N, 3, 3)`` of N cameras by name, in upper or lower case; ValueError if unknown."""
-        rows = []
-        for name in names:
-            listed_name = find_camera(name, self.names)
-            rows.append(self.names.index(listed_name))
-        return self.xyz_to_camera[rows]
-
-
-@cache
-def load_cameras() -> CameraMatrices:
-    """Load the cameras of the package's table; if two sources name one camera, LibRaw's comes first."""
-    text = resources.files("rawaug.isp").joinpath("facts/camera_matrices.tsv").read_text("utf-8")
-    names = []
-    rows = []
-    for line in text.splitlines()[2:]:
-        maker, model, *columns = line.split("\t")
-        names.append(f"{maker} {model}")
-        rows.append([float(value) for value in columns[:9]])
-
-    matrices = torch.tensor(rows, dtype=torch.float64).reshape(-1, 3, 3) / 1e4
-    green = responses(matrices, white_point(D65))[:, 1, None, None]
-    return CameraMatrices(tuple(names), matrices / green)
-
-
-def camera_from_srgb(xyz_to_camera: Tensor) -> Tensor:
-    """Compute C, from linear sRGB to white-balanced camera RGB: ``(..., 3, 3)`` whose rows sum to 1."""
-    matrix = xyz_to_camera @ SRGB_TO_XYZ.to(xyz_to_camera)
-    return matrix / matrix.sum(dim=-1, keepdim=True)
-
-
-def responses(xyz_to_camera: Tensor, light: Tensor) -> Tensor:
-    """Compute the RAW ``(..., 3)`` of a white surface in a light of white point ``(..., 3)``."""
-    return torch.einsum("...ij,...j->...i", xyz_to_camera, light.to(xyz_to_camera))
-
-
-def gains_in_light(xyz_to_camera: Tensor, light: Tensor) -> Tensor:
-    """Compute the gains ``(..., 3)``, green 1, that make white grey in a light of white point ``(..., 3)``."""
-    response = responses(xyz_to_camera, light)
-    return response[..., 1:2] / response
-
-
-def daylight_gains(xyz_to_camera: Tensor) -> Tensor:
-    """Compute the gains ``(..., 3)`` in D65, the light that the matrices ``(..., 3, 3)`` are made for."""
-    return gains_in_light(xyz_to_camera, white_point(D65))
-
 
 LAMPS: dict[str, tuple[float, float]] = {
     "FL1": (0.31310, 0.33727), "FL2": (0.37208, 0.37529), "FL3": (0.40910, 0.39430), "FL4": (0.44018, 0.40329),
@@ -255,3 +196,95 @@ _PLANCKIAN = np.array(
 """Coefficients of 1, T and T^2: the numerators of u and v, then their denominators."""
 _DAYLIGHT = np.array([[0.244063, 0.237040], [0.09911, 0.24748], [2.9678, 1.9018], [-4.6070, -2.0064]])
 """Coefficients of the powers of 1000 / T in x: up to 7,000 K, and above."""
+
+REFERENCE = "D65"
+"""The light whose white point is the white of sRGB."""
+
+ILLUMINANTS = {
+    "A": (0.44758, 0.40745),
+    "D50": (0.34567, 0.35850),
+    "D55": (0.33242, 0.34743),
+    "D65": D65,
+    "D75": (0.29902, 0.31485),
+}
+"""Chromaticities (x, y) of CIE standard illuminants, 2 degree observer (CIE 15:2018, table T.3)."""
+
+_BRADFORD = torch.tensor(
+    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]],
+    dtype=torch.float64,
+    device="cpu",
+)
+"""The matrix M, from XYZ to the responses of the cones."""
+
+
+def _light_chromaticity(light: str) -> tuple[float, float]:
+    """The chromaticity (x, y) of a light by its name or its colour temperature in kelvin; ValueError if unknown."""
+    if light in ILLUMINANTS:
+        return ILLUMINANTS[light]
+    if light in LAMPS:
+        return LAMPS[light]
+
+    try:
+        kelvin = float(light.removesuffix("K").strip())
+    except ValueError:
+        names = [*ILLUMINANTS, *LAMPS]
+        listed = f"{', '.join(names)}{suggest(light, names)}"
+        raise ValueError(f"light {light!r:.40} is unknown; use a number in kelvin, {listed}") from None
+
+    if not 1000 <= kelvin <= 15000:
+        raise ValueError(f"a light must be 1,000 to 15,000 kelvin, got {kelvin:g}")
+
+    locus = planckian if kelvin < 4000 else daylight
+    x, y = locus(np.array(kelvin)).tolist()
+    return x, y
+
+
+def light_xyz(light: str) -> Tensor:
+    """The white point of a light, XYZ ``(3,)`` with Y = 1; that of D65 is the white of sRGB."""
+    if light == REFERENCE:
+        return SRGB_TO_XYZ.sum(dim=1)
+    return white_point(_light_chromaticity(light))
+
+
+def light_mired(light: str) -> float:
+    """A million over the correlated colour temperature of a light."""
+    return float(mired_of(light_xyz(light)[None].numpy())[0])
+
+
+def mired_of(white: Array) -> Array:
+    """A million over the correlated colour temperatures ``(B,)`` of white points ``(B, 3)`` (McCamy, 1992)."""
+    total = white.sum(axis=1)
+    x, y = white[:, 0] / total, white[:, 1] / total
+    n = (x - 0.3320) / (0.1858 - y)
+    kelvin = ((449.0 * n + 3525.0) * n + 6823.3) * n + 5520.33
+    return np.asarray(1e6 / np.maximum(kelvin, 1000.0))
+
+
+def adaptation(white: Tensor, other: Tensor) -> Tensor:
+    """Bradford's adaptation ``(3, 3)`` of XYZ from one white point ``(3,)`` to another."""
+    cones = (_BRADFORD @ other) / (_BRADFORD @ white)
+    return torch.linalg.inv(_BRADFORD) @ torch.diag(cones) @ _BRADFORD
+
+
+def weights_in_light(anchors: Sequence[float], mired: Array) -> Array:
+    """Weights ``(B, N)`` of anchors at ascending or descending mireds, linear between two and constant beyond."""
+    mireds = np.asarray(anchors, dtype=np.float64)
+    if len(mireds) == 1:
+        return np.ones((len(mired), 1))
+
+    order = np.argsort(mireds)
+    rows = np.eye(len(mireds))[order]
+    columns = []
+    for column in rows.T:
+        columns.append(np.interp(mired, mireds[order], column))
+    return np.stack(columns, axis=1)
+
+
+def mix_by_light(matrices: Mapping[str, Tensor], light: str) -> Tensor:
+    """Get the matrix of a light, or the mixture of the matrices of the lights beside it."""
+    if light in matrices:
+        return matrices[light]
+
+    mireds = list(map(light_mired, matrices))
+    weights = torch.from_numpy(weights_in_light(mireds, np.array([light_mired(light)])))[0]
+    return torch.einsum("n,nij->ij", weights, torch.stack(list(matrices.values())))

@@ -11,13 +11,13 @@ import yaml
 from torch import Tensor
 
 import rawaug
+from rawaug.camera.lights import SRGB_TO_XYZ, XYZ_TO_SRGB, adaptation, light_xyz
+from rawaug.camera.matrices import daylight_gains, load_cameras
+from rawaug.camera.own import Camera
 from rawaug.commands import info
 from rawaug.data import demo_pairs
 from rawaug.evaluation.psnr_r import psnr_r
-from rawaug.isp.cameras import SRGB_TO_XYZ, XYZ_TO_SRGB, daylight_gains, load_cameras
-from rawaug.isp.lights import adaptation, light_xyz
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.own_cameras import Camera
 from rawaug.noise.measured import MeasuredNoise
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.config import AugmentConfig

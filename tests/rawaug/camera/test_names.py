@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import pytest
 
+from rawaug.camera.matrices import load_cameras
+from rawaug.camera.names import camera_key, find_camera, similar_cameras
 from rawaug.cli import main
-from rawaug.isp.camera_names import camera_key, find_camera, similar_cameras
-from rawaug.isp.cameras import load_cameras
 from rawaug.noise import noise_levels
 from rawaug.noise.profiles import load_profiles
 

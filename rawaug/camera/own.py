@@ -6,7 +6,7 @@ adaptation from the light's white point to D65, the matrix from XYZ under that l
 
 .. math:: X = \mathrm{diag}(1 / g) \; C \; S^{-1} B(L) .
 
-In other light the matrices of the neighbouring lights are mixed, with the weights of :mod:`rawaug.isp.lights`,
+In other light the matrices of the neighbouring lights are mixed, with the weights of :mod:`rawaug.camera.lights`,
 
 .. math:: C = \sum_i w_i C_i, \qquad g(L) = \frac{(X L)_G}{X L}, \quad X = \sum_i w_i X_i,
 
@@ -35,11 +35,9 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, PATTERNS
-from rawaug.errors import count_of
-from rawaug.files import read_yaml
-from rawaug.isp.cameras import XYZ_TO_SRGB, camera_from_srgb, gains_in_light, load_cameras
-from rawaug.isp.lights import (
+from rawaug.camera.lights import (
     REFERENCE,
+    XYZ_TO_SRGB,
     adaptation,
     light_mired,
     light_xyz,
@@ -47,6 +45,9 @@ from rawaug.isp.lights import (
     mix_by_light,
     weights_in_light,
 )
+from rawaug.camera.matrices import camera_from_srgb, gains_in_light, load_cameras
+from rawaug.errors import count_of
+from rawaug.files import read_yaml
 from rawaug.registry import suggest
 
 _YAML_EXTENSIONS = (".yaml", ".yml")
@@ -92,8 +93,8 @@ class Camera:
     Args:
         name: maker and model, for reports.
         matrix: 3 x 3, or a mapping of lights to such matrices. A light is ``"A"``, ``"D50"``, ``"D55"``, ``"D65"``,
-            ``"D75"``, a lamp of :data:`rawaug.isp.cameras.LAMPS`, or a colour temperature in kelvin. A single matrix is
-            that of D65.
+            ``"D75"``, a lamp of :data:`rawaug.camera.lights.LAMPS`, or a colour temperature in kelvin. A single matrix
+            is that of D65.
         matrix_is: direction of the matrix. ``"xyz_to_camera"``: CIE XYZ under the light to camera RGB before white
             balance, as ColorMatrix in a DNG. ``"srgb_to_camera"``: linear sRGB to white-balanced camera RGB.
             ``"camera_to_srgb"``: the opposite, the colour correction matrix of most ISPs.

@@ -6,22 +6,19 @@ import numpy as np
 import pytest
 import torch
 
-from rawaug.isp.cameras import (
+from rawaug.camera.lights import (
     D65,
     LAMPS,
     PHOTOGRAPHS,
     Array,
     LightRange,
-    camera_from_srgb,
     daylight,
-    gains_in_light,
-    load_cameras,
     move_off_locus,
     planckian,
-    responses,
     sample_lights,
     white_point,
 )
+from rawaug.camera.matrices import camera_from_srgb, gains_in_light, load_cameras, responses
 
 
 def test_white_stays_white_and_the_gains_make_its_raw_grey() -> None:

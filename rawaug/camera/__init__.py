@@ -1,0 +1,1 @@
+"""Cameras: their matrices, names and lights, and cameras of the user's own."""
