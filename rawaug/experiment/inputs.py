@@ -8,7 +8,7 @@ from typing import Any
 
 from rawaug.data import open_pictures
 from rawaug.data.folders import Cached, Readable, left_out
-from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, SomePairs, names_of, shared_frame
+from rawaug.data.pairs import OWN_PICTURES, Middles, Pair, PairPictures, SomePairs, names_of, shared_frame
 from rawaug.data.selection import select_pairs
 from rawaug.errors import count_of
 from rawaug.files import find_weights
@@ -36,6 +36,7 @@ class Inputs:
 
     Attributes:
         pairs: the frames that the ISP is fitted to and that are real training frames.
+        more: all frames that ``pairs`` were chosen from.
         validation: the frames that choose the weights.
         test: the frames that the result is scored on.
         pictures: sRGB pictures to make RAW of.
@@ -44,6 +45,7 @@ class Inputs:
     """
 
     pairs: Sequence[Pair]
+    more: Sequence[Pair]
     validation: Sequence[Any]
     test: Sequence[Any]
     pictures: Any
@@ -141,9 +143,13 @@ def open_inputs(recipe: Recipe, frames: Mapping[str, Sequence[Pair]], task: Task
         available = len(validation)
         _require_unseen(test, validation, "validation")
 
-    training_pairs = SomePairs(pairs, select_pairs(pairs, count, data.count, data.select))
+    training_pairs: Sequence[Pair] = SomePairs(pairs, select_pairs(pairs, count, data.count, data.select))
+    if data.crop is not None:
+        training_pairs = Middles(training_pairs, data.crop)
+
     return Inputs(
         pairs=training_pairs,
+        more=SomePairs(pairs, range(count)),
         validation=task.prepare(validation, "validation"),
         test=task.prepare(test, "test"),
         pictures=_open_pictures(data, training_pairs, recipe.train.crop),

@@ -213,7 +213,9 @@ def train_arm(experiment: Experiment, camera: Camera, arm: str, seed: int) -> De
             print(f"already trained: {path}")
             return model
 
-    stream = experiment.task.stream(arm, camera.pairs, inputs.pictures, camera.isp_of(arm), camera.noise, seed)
+    others = {"pictures": inputs.pictures, "own": camera.pairs, "noise": camera.pairs, "more": inputs.more}
+    source = others[recipe.arms[arm].source]
+    stream = experiment.task.stream(arm, camera.pairs, source, camera.isp_of(arm), camera.noise, seed)
     model = train(
         stream,
         camera.validation_trials(arm),
@@ -262,10 +264,12 @@ def _arm_key(experiment: Experiment, camera: Camera, arm: str, seed: int) -> str
     data, start = recipe.data, experiment.starts[arm]
 
     real = camera.isp.info["key"], recipe.noise, data.pairs, stamps(inputs.pairs)
-    pictures = data.pictures, len(inputs.pictures), data.max_pixels
+    pictures: tuple[Any, ...] = data.pictures, len(inputs.pictures), data.max_pixels
     start_hash = None
     if start is not None:
         start_hash = start.sha256
+    if recipe.arms[arm].source == "more":
+        pictures = (*pictures, *stamps(inputs.more))
     how = recipe.target, asdict(recipe.arms[arm]), experiment.estimators[arm].revision, start_hash
 
     validation = None

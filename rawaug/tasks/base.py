@@ -163,7 +163,7 @@ class Task(ABC):
         Args:
             arm: the arm's name in the recipe.
             frames: the real frames, as :meth:`training_frames` gives them.
-            pictures: the sRGB pictures.
+            pictures: the sRGB pictures, or the pairs that the arm's ``source`` names.
             isp: makes RAW of the pictures, in the CFA of the arm's network.
             noise: the noise that is added to clean RAW.
             seed: seed of the run.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from torch import nn
 
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Pair
+from rawaug.data.pairs import Pair, PairPictures
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.trials import Trial, make_trials, trial_of
 from rawaug.isp.model import DictionaryISP
@@ -19,7 +20,7 @@ from rawaug.plugin.dataset import RawPairs
 from rawaug.registry import Spec
 from rawaug.seeding import derive_seed
 from rawaug.tasks.base import TASKS, Task
-from rawaug.training.crops import WATCHED, PictureCrops, RealCrops, Source, freeze_samples
+from rawaug.training.crops import WATCHED, OwnPictureCrops, PictureCrops, RealCrops, Source, freeze_samples
 from rawaug.training.estimators import ESTIMATORS, SelfSupervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, noisy_frame, r2r_trials
 from rawaug.training.stream import TrainingStream
@@ -41,7 +42,7 @@ class RawTask(Task):
     ) -> TrainingStream:
         """Make crops of the frames, and of pictures as RAW, in the arm's shares."""
         settings = self.recipe.arms[arm]
-        train = self.recipe.train
+        train = self.recipe.loop_of(arm)
         seed = derive_seed(seed, "stream")
         estimator = ESTIMATORS.make(settings.estimator)
 
@@ -61,9 +62,24 @@ class RawTask(Task):
             if frames:
                 real = RealCrops(frames, noise, train.crop, isp.cfa)
             if augment is not None:
-                synthetic = PictureCrops(RawPairs(pictures, augment, train.crop, zoom=settings.zoom))
+                synthetic = self._synthetic_crops(arm, pictures, augment, noise)
 
         return TrainingStream(real, synthetic, train.batch, settings.augmented, seed)
+
+    def _synthetic_crops(self, arm: str, pictures: Any, augment: RawAugment, noise: NoiseModel) -> Source:
+        """Make the samples that join the real crops of a supervised arm, from its ``source``."""
+        settings, crop = self.recipe.arms[arm], self.recipe.train.crop
+        if settings.source == "own":
+            return OwnPictureCrops(pictures, augment, crop)
+        if settings.source == "more":
+            return RealCrops(pictures, noise, crop, augment.isp.cfa)
+        if settings.source == "noise":
+            clean = [replace(pair, noisy=None, noisy_srgb=None, shot_var=None, read_var=None) for pair in pictures]
+            return RealCrops(clean, noise, crop, augment.isp.cfa)
+
+        if isinstance(pictures, PairPictures) and settings.zoom == 1.0:
+            return OwnPictureCrops(pictures.pairs, augment, crop)
+        return PictureCrops(RawPairs(pictures, augment, crop, zoom=settings.zoom))
 
     def validation_trials(
         self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel

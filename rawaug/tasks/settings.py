@@ -36,7 +36,7 @@ _DEMO = "demo:"
 _PAIRS = "pairs:"
 _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("count", "validation_count", "test_count"), (1, MOST)),
-    **dict.fromkeys(("validation_crop", "test_crop"), (32, MOST)),
+    **dict.fromkeys(("crop", "validation_crop", "test_crop"), (32, MOST)),
     "bin": (1, 16),
     "max_pixels": (4, 2**40),
 }
@@ -63,6 +63,8 @@ class DataConfig(PairSettings):
         count: number of pairs to use; null for all.
         select: which pairs to use: first; scenes, whole ones; phones, as many of each; or a list of names of frames or
             their folders.
+        crop: side of the central crop used of each of these pairs; null for the whole frame. Fewer pixels than a
+            network has parameters are a regime in which further samples can help.
         pictures: the sRGB pictures to augment with: a folder, ``demo:``, ``shapes:COUNT``, a list of these, or
             ``pairs``, those of the chosen pairs.
         memory_mb: size in megabytes of the cache of decoded pictures.
@@ -82,6 +84,7 @@ class DataConfig(PairSettings):
     pairs: str | None = "demo:train"
     count: int | None = None
     select: str | list[str] = "first"
+    crop: int | None = None
     pictures: str | list[str] = "demo:"
     memory_mb: int = 0
     max_pixels: int | None = None
@@ -136,7 +139,13 @@ class ArmConfig:
     """One way of training; everything else is the same for all arms.
 
     Args:
-        augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
+        augmented: share of every batch that comes from ``source``, 0 to 1; the rest are crops of the real pairs.
+        source: pictures are made RAW through the ISP; own does so with the pictures of the pairs themselves, cropped
+            and turned so that RAW stays at the sites where it was read; noise are the clean RAW frames of the pairs
+            with noise drawn anew; more are the true pairs of ``data.pairs`` beyond the chosen ones as well, a ceiling
+            of what any augmentation can gain.
+        batch: crops in a step, in place of ``train.batch``; null takes that one. Arms that are compared should see as
+            many real crops: 2 alone against 2 of 8.
         draw: how the camera settings of pictures are drawn.
         srgb: for sRGB targets, how pictures are developed; null draws every demosaicing, without JPEG.
         zoom: for supervised arms, half of the crops of pictures are enlarged by up to this factor, see
@@ -156,6 +165,8 @@ class ArmConfig:
     """
 
     augmented: float = 0.0
+    source: Literal["pictures", "own", "noise", "more"] = "pictures"
+    batch: int | None = None
     draw: Draw = Draw()
     srgb: Srgb | None = None
     zoom: float = 1.0
@@ -171,8 +182,9 @@ class ArmConfig:
     def __post_init__(self) -> None:
         for key in ("augmented", "srgb_share"):
             require_between(key, getattr(self, key), 0.0, 1.0)
-        if self.steps is not None:
-            require_between("steps", self.steps, 1, MOST)
+        for key in ("steps", "batch"):
+            if getattr(self, key) is not None:
+                require_between(key, getattr(self, key), 1, MOST)
         try:
             ESTIMATORS.make(self.estimator)
         except ValueError as error:
@@ -282,6 +294,12 @@ class Recipe:
             if getattr(arm, key) is not None and self.target != "srgb":
                 raise ValueError(f"{key} applies to target 'srgb', not {self.target!r}; leave it out")
 
+        if arm.source != "pictures":
+            if self.data.pairs is None:
+                raise ValueError(f"source: {arm.source} needs real pairs; set data.pairs")
+            if not arm.sees_clean or self.target != "raw":
+                raise ValueError(f"source: {arm.source} is for supervised arms on RAW; leave it out")
+
         name, _ = split_spec(arm.estimator)
         weigh = self.loop_of(label).weigh
         weighings = ESTIMATORS[name].weighings
@@ -293,13 +311,15 @@ class Recipe:
         return self.arms[arm].denoiser or self.denoiser
 
     def loop_of(self, arm: str) -> TrainConfig:
-        """Return the training loop of an arm: the recipe's, with the arm's own learning rate, weighting and steps."""
+        """Return the training loop of an arm: the recipe's, with the arm's own rate, weighting, batch and steps."""
         own = self.arms[arm]
         loop = self.train
         if own.learning_rate is not None:
             loop = replace(loop, learning_rate=own.learning_rate)
         if own.weigh is not None:
             loop = replace(loop, weigh=own.weigh)
+        if own.batch is not None:
+            loop = replace(loop, batch=own.batch)
         if own.steps is not None:
             loop = replace(loop, steps=min(own.steps, loop.steps))
 

@@ -125,7 +125,7 @@ class SrgbTask(Task):
         self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
     ) -> TrainingStream:
         """Make crops of pictures with the camera's noise, noise drawn on them, or both in the arm's shares."""
-        settings, train = self.recipe.arms[arm], self.recipe.train
+        settings, train = self.recipe.arms[arm], self.recipe.loop_of(arm)
 
         camera = None
         if settings.srgb_noise is None or settings.srgb_share < 1.0:

@@ -17,6 +17,7 @@ from rawaug.evaluation.trials import Trial
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.params import AugmentParams
 from rawaug.seeding import keyed_generator
 
 WATCHED = 16
@@ -94,6 +95,52 @@ class PictureCrops:
         if not variance.numel():
             variance = torch.zeros_like(pair.noisy)
         return list(map(Sample, pair.noisy, pair.clean, variance))
+
+
+class OwnPictureCrops:
+    """The real pairs' own pictures as RAW, in eight turns.
+
+    A rendering is as sharp as the readings at the sites of its sensor and as soft as its demosaicing between them. So
+    crops begin where, once turned, the RAW lies at the sites that were read.
+
+    Args:
+        pairs: frames with their pictures.
+        augment: an augmentation of a Bayer pattern.
+        crop: side of the crops in pixels.
+    """
+
+    def __init__(self, pairs: Sequence[Pair], augment: RawAugment, crop: int) -> None:
+        self.pairs = list(pairs)
+        self.augment = augment
+        self.crop = crop
+
+    def draw(self, generator: torch.Generator) -> Sample:
+        """Draw a sample of packed RAW ``(4, crop / 2, crop / 2)``."""
+        return self.draw_batch([generator])[0]
+
+    def draw_batch(self, generators: Sequence[torch.Generator]) -> list[Sample]:
+        """Draw one crop for each generator, all made together."""
+        patches, parameters = [], []
+        for generator in generators:
+            pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
+            patch, place = self.draw_patch(pair, generator)
+            patches.append(patch[None])
+            parameters.append(self.augment.sample(patch[None], generator, place[None]))
+
+        made = self.augment.apply(torch.cat(patches), AugmentParams.concatenate(parameters))
+        return list(map(Sample, made.noisy, made.clean, made.variance))
+
+    def draw_patch(self, pair: Pair, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Cut a patch ``(3, crop, crop)`` out of a pair's picture, turned, with its place as AugmentParams keep it."""
+        height, width = pair.srgb.shape[-2:]
+        view = int(torch.randint(bayer.N_VIEWS, (), generator=generator))
+        before_turn = next(cfa for cfa in CFA if cfa.turn(view) == CFA(self.augment.cfa))
+        row, column = pair.cfa.shift_to(before_turn)
+
+        top = row + 2 * int(torch.randint((height - row - self.crop) // 2 + 1, (), generator=generator))
+        left = column + 2 * int(torch.randint((width - column - self.crop) // 2 + 1, (), generator=generator))
+        patch = pair.srgb[:, top : top + self.crop, left : left + self.crop]
+        return bayer.turn(patch, view), torch.tensor([top, left, height, width, view])
 
 
 class MosaicCrops:

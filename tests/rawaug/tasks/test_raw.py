@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rawaug.commands.run import with_values
-from rawaug.data import demo_pictures
+from rawaug.data import demo_pairs, demo_pictures
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.plugin.targets import Srgb, Target
@@ -47,3 +47,25 @@ def test_a_target_that_an_arm_cannot_have_is_refused() -> None:
     for arm in (ArmConfig(0.5), ArmConfig(1.0, estimator="noise2noise")):
         with pytest.raises(ValueError, match="targets"):
             Developed(arms={"one": arm})
+
+
+def test_an_arm_sees_as_many_real_crops_with_further_ones_as_without() -> None:
+    pairs = demo_pairs("train", count=2)
+    arms = {"real": ArmConfig(batch=2)}
+    for source in ("pictures", "own", "noise", "more"):
+        arms[source] = ArmConfig(0.75, source=source)
+    recipe = Recipe(arms=arms, train=TrainConfig(crop=32, batch=8))
+    others = {"pictures": demo_pictures(1), "own": pairs, "noise": pairs, "more": pairs[1:]}
+
+    isp, noise, known = DictionaryISP(), noise_model((1e-2, 1e-4)), pairs[0].noisy
+    assert known is not None
+    for label, arm in arms.items():
+        batch = recipe.loop_of(label).batch
+        stream = RawTask(recipe).stream(label, pairs[:1], others[arm.source], isp, noise, 0)
+        samples = stream.__getitems__(range(batch))
+        captured = [sample for sample in samples if torch.isin(sample.noisy, known).all()]
+        assert len(captured) == 2, label
+        assert len(samples) == batch
+
+    with pytest.raises(ValueError, match=r"arms\.one: source: own"):
+        Recipe(camera="universal", data=DataConfig(pairs=None), arms={"one": ArmConfig(1.0, source="own")})

@@ -17,7 +17,7 @@ from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.targets import Srgb, Target
 from rawaug.seeding import keyed_generator
-from rawaug.training.crops import RealCrops
+from rawaug.training.crops import OwnPictureCrops, RealCrops
 from rawaug.training.stream import StepSampler, TrainingStream
 
 
@@ -36,6 +36,19 @@ def test_crops_of_any_sensor_come_in_the_networks_pattern(cfa: CFA) -> None:
         sample = crops.draw(torch.Generator().manual_seed(seed))
         assert torch.equal(sample.clean, expected)
         assert torch.equal(sample.noisy, expected)
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_own_pictures_become_raw_at_the_sites_that_were_read(cfa: CFA) -> None:
+    channels = bayer.mosaic(torch.arange(3)[:, None, None].expand(3, 24, 30), cfa)
+    read = torch.nn.functional.one_hot(channels[0].long(), 3).movedim(2, 0)
+    pair = replace(colour_pair(cfa), srgb=(255 * read).to(torch.uint8), raw=torch.zeros(1, 24, 30))
+    crops = OwnPictureCrops([pair], RawAugment(DictionaryISP()), crop=16)
+    for seed in range(16):
+        patch, place = crops.draw_patch(pair, torch.Generator().manual_seed(seed))
+        assert patch.shape == (3, 16, 16) and place[2:4].tolist() == [24, 30]
+        assert (bayer.mosaic(patch, CFA.RGGB) == 255).all()
+    assert crops.draw(torch.Generator().manual_seed(0)).clean.shape == (4, 8, 8)
 
 
 @pytest.mark.parametrize("source", ["captured", "drawn", "made of pictures"])
