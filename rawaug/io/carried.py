@@ -12,6 +12,7 @@ Source: DNG specification 1.4, chapters 2 to 4; TIFF 6.0, section 2; EXIF 2.32, 
 from __future__ import annotations
 
 import struct
+import warnings
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -21,8 +22,9 @@ import numpy as np
 
 from rawaug.errors import extra
 from rawaug.io.directories import EXIF, GPS, INTEROPERABILITY, Tag, TiffFile
+from rawaug.io.opcodes import OPCODE_LIST_1, OPCODE_LISTS, move_opcodes
 from rawaug.io.raw import read_preview
-from rawaug.io.tiff import ACTIVE_AREA, all_pages, is_dng, main_mosaic, opened_tiff
+from rawaug.io.tiff import active_area, all_pages, is_dng, main_mosaic, opened_tiff
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 7, 10, 12
 """These are the numbers of TIFF's types."""
@@ -39,8 +41,8 @@ _OF_PREVIEWS = (*range(512, 522), *range(529, 533), *range(50966, 50972))
 _LEVELS = (33421, 33422, 50711, 50712, *range(50713, 50718), 50829, 50830, 51041)
 _DIGESTS = (50781, 50828, 50972, 50973, 51111, 51114)
 _REPLACED = (274, 305, 347, MAKER_NOTE, *SUB_DIRECTORIES.values())
-_DROPPED = frozenset((*_LAYOUT, *_OF_PREVIEWS, *_LEVELS, *_DIGESTS, *_REPLACED))
-_CROP = (50718, 50719, 50720, 51125)
+_CROP = (50719, 50720)
+_DROPPED = frozenset((*_LAYOUT, *_OF_PREVIEWS, *_LEVELS, *_DIGESTS, *_REPLACED, *_CROP))
 
 _PREVIEW_TAGS = frozenset((*_LAYOUT, *_OF_PREVIEWS, 34675)) - {320, 330}
 """These tags of a preview's directory are copied: its layout, the program that made it, its colour profile."""
@@ -91,8 +93,14 @@ class Carried:
     previews: list[Preview] = field(default_factory=list)
 
 
-def read_carried(path: Path, size: tuple[int, int]) -> Carried:
-    """Read what a DNG with a mosaic of ``size`` (height, width) keeps of the file at ``path``."""
+def read_carried(path: Path, size: tuple[int, int], offset: tuple[int, int] | None = None) -> Carried:
+    """Read what a DNG keeps of the file at ``path``.
+
+    Args:
+        path: the source.
+        size: height and width of the mosaic that the DNG has.
+        offset: rows and columns of the sensor above the mosaic and to its left; None for the origin of the active area.
+    """
     with extra("raw"):
         import tifffile
 
@@ -100,7 +108,10 @@ def read_carried(path: Path, size: tuple[int, int]) -> Carried:
         with opened_tiff(path) as pages_of_file, path.open("rb") as file:
             pages = all_pages(pages_of_file)
             source_is_dng = is_dng(pages)
-            carried = _read_tiff(pages, file, size, source_is_dng)
+            carried = _read_tiff(pages, file, source_is_dng)
+            mosaic = main_mosaic(pages) if source_is_dng else None
+            if mosaic is not None:
+                _move_opcodes(path, carried.tags, mosaic, size, offset)
     except tifffile.TiffFileError:
         carried = Carried()
         source_is_dng = False
@@ -110,7 +121,7 @@ def read_carried(path: Path, size: tuple[int, int]) -> Carried:
     return carried
 
 
-def _read_tiff(pages: list[Any], file: BinaryIO, size: tuple[int, int], source_is_dng: bool) -> Carried:
+def _read_tiff(pages: list[Any], file: BinaryIO, source_is_dng: bool) -> Carried:
     tiff = TiffFile(file)
     mosaic = main_mosaic(pages) if source_is_dng else None
 
@@ -118,9 +129,6 @@ def _read_tiff(pages: list[Any], file: BinaryIO, size: tuple[int, int], source_i
     for page in (pages[0], mosaic):
         if page is not None:
             tags |= _tags_of(page, source_is_dng)
-    if mosaic is not None and not _fills_active_area(mosaic, size):
-        for code in _CROP:
-            tags.pop(code, None)
 
     first = tiff.directory(tiff.first)
     directories = {}
@@ -170,9 +178,25 @@ def _value(tag: Any) -> Any:
     return tag.value
 
 
-def _fills_active_area(mosaic: Any, size: tuple[int, int]) -> bool:
-    area = mosaic.tags.valueof(ACTIVE_AREA) or (0, 0, mosaic.imagelength, mosaic.imagewidth)
-    return bool((area[2] - area[0], area[3] - area[1]) == size)
+def _move_opcodes(path: Path, tags: Tags, mosaic: Any, size: tuple[int, int], offset: tuple[int, int] | None) -> None:
+    """Move the opcodes in ``tags`` from the stored mosaic and its active area to the one that is written."""
+    top, left, bottom, right = active_area(mosaic)
+    if offset is None:
+        offset = (top, left)
+
+    for code in OPCODE_LISTS:
+        if code not in tags:
+            continue
+        dtype, _, opcodes = tags.pop(code)
+        if code == OPCODE_LIST_1:
+            moved, left_out = move_opcodes(bytes(opcodes), offset, (mosaic.imagelength, mosaic.imagewidth), size)
+        else:
+            shift = (offset[0] - top, offset[1] - left)
+            moved, left_out = move_opcodes(bytes(opcodes), shift, (bottom - top, right - left), size)
+        if moved:
+            tags[code] = (dtype, len(moved), moved)
+        for what in left_out:
+            warnings.warn(f"{path}: its DNG is written without {what}", stacklevel=2)
 
 
 def _read_directory(tiff: TiffFile, place: int) -> list[Tag]:

@@ -50,15 +50,9 @@ from rawaug.io.carried import (
 from rawaug.io.damage import tiled_digest
 from rawaug.io.directories import INTEROPERABILITY, Tag, pack_directory, pointer_tag
 from rawaug.io.gain_map import GainMap, of_planes, opcode_list
+from rawaug.io.opcodes import OPCODE_LIST_1, OPCODE_LIST_2, OPCODE_LIST_3
 from rawaug.io.raw import MONOCHROME, XYZ_FROM_SRGB, RawFrame
-from rawaug.io.tiff import (
-    CFA_PHOTOMETRIC,
-    DNG_VERSION,
-    LINEAR_PHOTOMETRIC,
-    OPCODE_LIST_2,
-    OPCODE_LIST_3,
-    tag_damage,
-)
+from rawaug.io.tiff import CFA_PHOTOMETRIC, DNG_VERSION, LINEAR_PHOTOMETRIC, tag_damage
 from rawaug.version import __version__
 
 LINEAR_WHITE = 65535
@@ -77,7 +71,7 @@ _UNIQUE_CAMERA_MODEL = 50708
 _CROP_ORIGIN, _CROP_SIZE = 50719, 50720
 _COLOR_MATRIX, _AS_SHOT_NEUTRAL, _ILLUMINANT = 50721, 50728, 50778
 _NOISE_PROFILE, _NEW_RAW_DIGEST = 51041, 51111
-_OF_MOSAICS = (50710, 50733, 50734, 50737, 50738, 51008, OPCODE_LIST_2)
+_OF_MOSAICS = (50710, 50733, 50734, 50737, 50738, OPCODE_LIST_1, OPCODE_LIST_2)
 """These are green split, Bayer's sharpness, antialias strength, and opcodes for before demosaicing."""
 
 _PADDING = 2
@@ -118,7 +112,7 @@ def write_dng(
 
     carried = Carried()
     if source is not None:
-        carried = read_carried(Path(source), (numbers.shape[0], numbers.shape[1]))
+        carried = read_carried(Path(source), (numbers.shape[0], numbers.shape[1]), frame.offset)
 
     directories = dict(carried.directories)
     if "ExifTag" not in directories:
@@ -143,16 +137,32 @@ def _tags(frame: RawFrame, layout: _Layout, numbers: np.ndarray, carried: Carrie
     tags[_SUBFILE_TYPE] = (LONG, 1, 0)
     tags[_ORIENTATION] = (SHORT, 1, _EXIF_ORIENTATIONS[frame.orientation])
 
-    height, width = numbers.shape[:2]
-    if _CROP_SIZE not in tags and min(height, width) > 4 * _PADDING:
-        tags[_CROP_ORIGIN] = (LONG, 2, (_PADDING, _PADDING))
-        tags[_CROP_SIZE] = (LONG, 2, (width - 2 * _PADDING, height - 2 * _PADDING))
+    tags |= _crop(frame, *numbers.shape[:2])
     if numbers.ndim == 2:
         tags[_NEW_RAW_DIGEST] = (BYTE, 16, tiled_digest(numbers))
 
     for code in layout.inapplicable:
         tags.pop(code, None)
     return tags | layout.tags(frame)
+
+
+def _crop(frame: RawFrame, height: int, width: int) -> Tags:
+    """Make the default crop: the frame's, or all but the sites that demosaicing needs around it."""
+    if frame.crop is not None and frame.crop[0] + frame.crop[2] <= height and frame.crop[1] + frame.crop[3] <= width:
+        top, left, rows, columns = frame.crop
+    elif min(height, width) > 4 * _PADDING:
+        top, left, rows, columns = _PADDING, _PADDING, height - 2 * _PADDING, width - 2 * _PADDING
+    else:
+        return {}
+
+    crop = (left, top, columns, rows)
+    if all(float(number).is_integer() for number in crop):
+        left, top, columns, rows = map(int, crop)
+        return {_CROP_ORIGIN: (LONG, 2, (left, top)), _CROP_SIZE: (LONG, 2, (columns, rows))}
+    return {
+        _CROP_ORIGIN: (RATIONAL, 2, _rationals((left, top), 10**4)),
+        _CROP_SIZE: (RATIONAL, 2, _rationals((columns, rows), 10**4)),
+    }
 
 
 def _write_pixels(

@@ -19,9 +19,8 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
+from rawaug.io.opcodes import GAIN_MAP, Opcode, pack_opcodes, unpack_opcodes
 
-_GAIN_MAP = 9
-_OPCODE = struct.Struct(">4I")  # id, version, flags, bytes that follow
 _GRID = struct.Struct(">10I4dI")
 _DNG_1_3 = 0x01030000
 _MAY_BE_SKIPPED = 1
@@ -58,21 +57,15 @@ def parse_gain_maps(opcodes: bytes, on_mosaic: bool) -> tuple[GainMap, ...]:
         ValueError: if the list is truncated, or a map is incomplete or has spacings or gains that are not positive.
     """
     maps = []
-    try:
-        (count,) = struct.unpack_from(">I", opcodes)
-        place = 4
-        for _ in range(count):
-            code, _, _, size = _OPCODE.unpack_from(opcodes, place)
-            place += _OPCODE.size
-            if code == _GAIN_MAP:
-                maps.append(_parse(opcodes[place : place + size], on_mosaic))
-            place += size
-    except struct.error as error:
-        raise ValueError(f"the opcode list is truncated ({error})") from None
+    for opcode in unpack_opcodes(opcodes):
+        if opcode.code == GAIN_MAP:
+            maps.append(_parse(opcode.body, on_mosaic))
     return tuple(maps)
 
 
 def _parse(body: bytes, on_mosaic: bool) -> GainMap:
+    if len(body) < _GRID.size:
+        raise ValueError("the opcode list is truncated (a gain map)")
     top, left, bottom, right, plane, planes, *rest = _GRID.unpack_from(body)
     rows, columns, points_v, points_h, spacing_v, spacing_h, origin_v, origin_h, map_planes = rest
     size = points_v * points_h * map_planes
@@ -105,8 +98,8 @@ def opcode_list(maps: Iterable[GainMap]) -> bytes:
         grid = (*gain_map.pitch, points_v, points_h, *gain_map.spacing, *gain_map.origin, planes)
         gains = gain_map.gains.permute(1, 2, 0).numpy().astype(">f4")
         body = _GRID.pack(*gain_map.area, *gain_map.planes, *grid) + gains.tobytes()
-        opcodes.append(_OPCODE.pack(_GAIN_MAP, _DNG_1_3, _MAY_BE_SKIPPED, len(body)) + body)
-    return struct.pack(">I", len(opcodes)) + b"".join(opcodes)
+        opcodes.append(Opcode(GAIN_MAP, _DNG_1_3, _MAY_BE_SKIPPED, body))
+    return pack_opcodes(opcodes)
 
 
 def of_planes(gain_map: GainMap, cfa: CFA | str) -> list[GainMap]:

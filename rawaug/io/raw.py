@@ -33,8 +33,9 @@ from rawaug.bayer import CFA, pattern_name, plane_indices
 from rawaug.errors import count_of, extra
 from rawaug.io.ciff import read_shot_info
 from rawaug.io.content import RAW_EXTENSIONS as RAW_EXTENSIONS
-from rawaug.io.gain_map import GainMap
+from rawaug.io.gain_map import GainMap, parse_gain_maps
 from rawaug.io.libraw import KNOWN_PATTERNS, caught_stderr, is_stack, opened_raw
+from rawaug.io.opcodes import OPCODE_LIST_2, OPCODE_LIST_3, move_opcodes
 from rawaug.io.tiff import MAKE, MODEL, TiffTags
 
 MONOCHROME = "MONOCHROME"
@@ -90,6 +91,9 @@ class RawFrame:
         gain_maps: a DNG's correction of the lens shading, which is not applied to ``mosaic``.
         exposure: seconds, f-number, focal length in mm and EXIF date, each None if unknown.
         remarks: statements of the file that cannot be right and are not used, a clause each.
+        offset: rows and columns of the sensor, as the file stores it, above ``mosaic`` and to its left; None if
+            unknown.
+        crop: top, left, height and width of the picture within ``mosaic`` that the file states; None if it states none.
     """
 
     mosaic: Tensor
@@ -108,6 +112,8 @@ class RawFrame:
     gain_maps: tuple[GainMap, ...] = ()
     exposure: Exposure = UNKNOWN
     remarks: tuple[str, ...] = ()
+    offset: tuple[int, int] | None = None
+    crop: tuple[float, float, float, float] | None = None
 
     @property
     def upright_view(self) -> int:
@@ -280,10 +286,59 @@ def _about_the_shot(path: Path, raw: Any, tags: TiffTags) -> dict[str, Any]:
         "noise_profile": tags.noise_profile,
         "orientation": _orientation(raw, tags),
         "name": path.stem,
-        "gain_maps": tags.gain_maps,
+        "gain_maps": _gain_maps(path, raw, tags),
         "exposure": exposure_of(path, raw),
         "remarks": remarks,
+        "offset": (raw.sizes.top_margin, raw.sizes.left_margin),
+        "crop": _crop(raw, tags),
     }
+
+
+def _gain_maps(path: Path, raw: Any, tags: TiffTags) -> tuple[GainMap, ...]:
+    """Read the gain maps of a DNG, moved from its active area to the mosaic."""
+    if tags.area is None:
+        return ()
+
+    top, left, bottom, right = tags.area
+    shift = _from_area(raw, tags)
+    gain_maps: tuple[GainMap, ...] = ()
+    for number, code in ((2, OPCODE_LIST_2), (3, OPCODE_LIST_3)):
+        if code not in tags.opcodes:
+            continue
+        try:
+            parse_gain_maps(tags.opcodes[code], on_mosaic=number == 2)
+            moved, _ = move_opcodes(
+                tags.opcodes[code], shift, (bottom - top, right - left), _even_sides(raw.raw_image_visible)
+            )
+            if moved:
+                gain_maps += parse_gain_maps(moved, on_mosaic=number == 2)
+        except ValueError as error:
+            raise OSError(f"{path}: its TIFF tags are damaged (OpcodeList{number}: {error}); copy it again") from None
+    return gain_maps
+
+
+_SMALLEST_CROP = 0.5
+"""A crop has at least this share of the mosaic's height and width; a smaller one is of another picture of the file."""
+
+
+def _crop(raw: Any, tags: TiffTags) -> tuple[float, float, float, float] | None:
+    """Find the picture within the mosaic: a DNG's default crop, or the camera's own as LibRaw reads it."""
+    sizes = raw.sizes
+    if tags.crop is not None and tags.area is not None:
+        top, left, height, width = tags.crop
+        top += tags.area[0]
+        left += tags.area[1]
+    else:
+        top, left = float(sizes.crop_top_margin), float(sizes.crop_left_margin)
+        height, width = float(sizes.crop_height), float(sizes.crop_width)
+
+    rows, columns = _even_sides(raw.raw_image_visible)
+    bottom = min(top + height - sizes.top_margin, rows)
+    right = min(left + width - sizes.left_margin, columns)
+    top, left = max(0.0, top - sizes.top_margin), max(0.0, left - sizes.left_margin)
+    if bottom - top < _SMALLEST_CROP * rows or right - left < _SMALLEST_CROP * columns:
+        return None
+    return top, left, bottom - top, right - left
 
 
 def _orientation(raw: Any, tags: TiffTags) -> int:
@@ -388,8 +443,7 @@ def _stated_cell(raw: Any, tags: TiffTags) -> np.ndarray:
         indices = []
         for row in tags.cfa:
             indices.append(["RGB".index(colour) for colour in row])
-        rows = raw.sizes.top_margin - tags.area[0]
-        columns = raw.sizes.left_margin - tags.area[1]
+        rows, columns = _from_area(raw, tags)
         return np.roll(np.array(indices), (-rows, -columns), axis=(0, 1))
 
     if raw.raw_pattern is not None and raw.raw_pattern.shape in ((2, 2), (6, 6)):
@@ -461,10 +515,15 @@ def _line_levels(path: Path, levels: Sequence[float], first: int, count: int) ->
     return np.array(levels, np.float32)[first:]
 
 
+def _from_area(raw: Any, tags: TiffTags) -> tuple[int, int]:
+    """Count the rows and columns from the active area's origin to that of the visible mosaic."""
+    top, left = (0, 0) if tags.area is None else tags.area[:2]
+    return raw.sizes.top_margin - top, raw.sizes.left_margin - left
+
+
 def _left_out(raw: Any, tags: TiffTags) -> tuple[int, int]:
     """Count the rows and columns of a DNG's active area before the visible mosaic, 0 or 1 of each."""
-    rows = raw.sizes.top_margin - tags.area[0]
-    columns = raw.sizes.left_margin - tags.area[1]
+    rows, columns = _from_area(raw, tags)
     if {rows, columns} <= {0, 1}:
         return rows, columns
     return 0, 0

@@ -8,10 +8,11 @@ for each. The noise variance is S y + O for a signal y whose black is 0 and whit
 from __future__ import annotations
 
 import logging
+import math
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from rawaug.errors import count_of, extra
-from rawaug.io.gain_map import GainMap, parse_gain_maps
 from rawaug.io.isolated import damage_as_os_error
+from rawaug.io.opcodes import OPCODE_LISTS
 
 MOST_PAGES = 64
 """A TIFF has at most this many directories. Damaged offsets can link directories in a circle."""
@@ -30,7 +31,7 @@ _LINEARIZATION, _RAW_DIGEST, _NEW_RAW_DIGEST = 50712, 50972, 51111
 _CFA_REPEATS, _CFA_PATTERN = 33421, 33422
 _BLACK_REPEATS, _BLACK, _BLACK_COLUMNS, _BLACK_ROWS = 50713, 50714, 50715, 50716
 ACTIVE_AREA = 50829
-OPCODE_LIST_2, OPCODE_LIST_3 = 51009, 51022
+_CROP_ORIGIN, _CROP_SIZE = 50719, 50720
 CFA_PHOTOMETRIC, LINEAR_PHOTOMETRIC = 32803, 34892
 LOSSLESS_JPEG = 7
 _RATIONALS = (5, 10)
@@ -78,9 +79,10 @@ class TiffTags:
         compressions: the TIFF compression code of each directory of a DNG.
         mosaic: how a DNG stores its mosaic.
         black: black levels of the cell that repeats over the active area, ``(rows, columns)``.
-        gain_maps: the lens shading correction of a DNG.
+        opcodes: the opcode lists of a DNG by their tags; see :mod:`rawaug.io.opcodes`.
         black_rows, black_columns: deviation of the black level of each row and column from the mean.
-        area: first row and column of the active area.
+        area: top, left, bottom and right of a DNG's active area.
+        crop: top, left, height and width of the picture within the active area (DefaultCropOrigin, DefaultCropSize).
         cfa: rows of the pattern's cell, in the letters R, G and B.
     """
 
@@ -92,10 +94,11 @@ class TiffTags:
     compressions: tuple[int, ...] = ()
     mosaic: StoredMosaic | None = None
     black: np.ndarray | None = None
-    gain_maps: tuple[GainMap, ...] = ()
+    opcodes: Mapping[int, bytes] = field(default_factory=dict)
     black_rows: Sequence[float] = ()
     black_columns: Sequence[float] = ()
-    area: tuple[int, int] = (0, 0)
+    area: tuple[int, int, int, int] | None = None
+    crop: tuple[float, float, float, float] | None = None
     cfa: tuple[str, ...] | None = None
 
 
@@ -136,15 +139,20 @@ def _tags_of(pages: list[Any]) -> TiffTags:
 
     row_mean, rows = _deltas(page, _BLACK_ROWS)
     column_mean, columns = _deltas(page, _BLACK_COLUMNS)
-    area = page.tags.valueof(ACTIVE_AREA) or (0, 0)
+    opcodes = {}
+    for code in OPCODE_LISTS:
+        if page.tags.valueof(code):
+            opcodes[code] = bytes(page.tags.valueof(code))
+
     return replace(
         tags,
         mosaic=_stored_mosaic(page, pages[0]),
         black=_black(page, row_mean + column_mean),
-        gain_maps=_gain_maps(page),
+        opcodes=opcodes,
         black_rows=rows,
         black_columns=columns,
-        area=(area[0], area[1]),
+        area=active_area(page),
+        crop=_crop(page),
         cfa=_cfa(page),
     )
 
@@ -241,6 +249,28 @@ def main_mosaic(pages: list[Any]) -> Any:
     return max(mosaics, key=area, default=None)
 
 
+def active_area(mosaic: Any) -> tuple[int, int, int, int]:
+    """Read top, left, bottom and right of the active area, which is all of the mosaic if the file states none."""
+    area = mosaic.tags.valueof(ACTIVE_AREA)
+    if area is None:
+        return 0, 0, mosaic.imagelength, mosaic.imagewidth
+    top, left, bottom, right = area
+    return int(top), int(left), int(bottom), int(right)
+
+
+def _crop(mosaic: Any) -> tuple[float, float, float, float] | None:
+    """Read top, left, height and width of the default crop; return None if the file states none, or nonsense."""
+    origin, size = mosaic.tags.get(_CROP_ORIGIN), mosaic.tags.get(_CROP_SIZE)
+    if origin is None or size is None:
+        return None
+
+    left, top = (*_numbers(origin).tolist(), math.nan, math.nan)[:2]
+    width, height = (*_numbers(size).tolist(), math.nan, math.nan)[:2]
+    if not (0 <= top < math.inf and 0 <= left < math.inf and 0 < height < math.inf and 0 < width < math.inf):
+        return None
+    return top, left, height, width
+
+
 def _noise_profile(pages: list[Any]) -> tuple[tuple[float, float] | None, str]:
     """Return the mean over planes of the first profile, and the reason if the profile is unusable."""
     for page in pages:
@@ -328,16 +358,3 @@ def _cfa(mosaic: Any) -> tuple[str, ...] | None:
     for start in range(0, len(letters), width):
         rows.append(letters[start : start + width])
     return tuple(rows)
-
-
-def _gain_maps(mosaic: Any) -> tuple[GainMap, ...]:
-    gain_maps: tuple[GainMap, ...] = ()
-    for number, code in ((2, OPCODE_LIST_2), (3, OPCODE_LIST_3)):
-        opcodes = mosaic.tags.valueof(code)
-        if not opcodes:
-            continue
-        try:
-            gain_maps += parse_gain_maps(opcodes, on_mosaic=number == 2)
-        except ValueError as error:
-            raise ValueError(f"OpcodeList{number}: {error}") from None
-    return gain_maps

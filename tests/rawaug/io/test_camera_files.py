@@ -58,8 +58,16 @@ def test_an_odd_active_area_and_crop_neither_tint_nor_shift(
     assert back.cfa == frame.cfa and torch.allclose(back.mosaic, frame.mosaic, atol=1e-6)
     with tifffile.TiffFile(tmp_path / "b.dng") as file:
         tags = file.pages.first.tags
-        own = (3, 5) if rows == columns == 0 else (2, 2)
-        assert 50829 not in tags and tags["DefaultCropOrigin"].value == own, "a crop of another area"
+        assert 50829 not in tags
+        assert tags["DefaultCropOrigin"].value == (3 - columns, 5 - rows) and tags["DefaultCropSize"].value == (57, 41)
+
+
+def test_the_crop_of_a_crw_is_the_camera_s(tmp_path: Path, camera_files: Path) -> None:
+    source = camera_files / "raw/canon/s40_0101.crw"
+    write_dng(tmp_path / "a.dng", read_raw(source), source)
+    with tifffile.TiffFile(tmp_path / "a.dng") as file:
+        tags = file.pages.first.tags
+        assert tags["DefaultCropOrigin"].value == (20, 8) and tags["DefaultCropSize"].value == (2272, 1704)
 
 
 def test_lens_corrections_are_kept(tmp_path: Path, bayer_dng: Dng) -> None:
