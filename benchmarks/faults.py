@@ -46,13 +46,13 @@ COMMANDS: dict[str, list[str]] = {
 RECIPE = """
 name: small
 data: {pairs: "demo:train", count: 1, pictures: "demo:", validation: null, test: "demo:test", test_count: 1}
-isp: {steps: 2, curve_steps: 2, pixels: 512, batch: 128}
+fit: {steps: 2, curve_steps: 2, pixels: 512, batch: 128}
 noise: [0.001, 1.0e-5]
 denoiser: {name: DnCNN, settings: {width: 4, depth: 2}}
 train: {steps: 12, batch: 2, crop: 32, warmup: 1, validate_every: 6, checkpoint_every: 2, workers: 0}
 classical: []
 self_ensemble: false
-untouched: []
+baselines: []
 device: cpu
 arms: {augmented: {augmented: 1.0}}
 """

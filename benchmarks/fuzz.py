@@ -116,7 +116,7 @@ def _set_up(path: Path) -> None:
         if isinstance(recipe, Recipe):
             with torch.device("meta"):
                 for arm in recipe.arms:
-                    first_network(recipe.network_of(arm), seed=0)
+                    first_network(recipe.network(arm), seed=0)
     except (ValueError, FileNotFoundError) as error:  # the command line has named the file already
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
 

@@ -49,14 +49,14 @@ gone = abroad:Missing
 """
 RECIPE = """
 name: abroad
-camera: universal
+isp: universal
 data: {pairs: null, pictures: "tiny:", validation: null, test: "tiny:validation", test_count: 1}
 denoiser: {name: Shallow, settings: {width: 4}}
 noise: {name: Banded, settings: {row_var: 1.0e-4}}
 train: {steps: 3, batch: 2, crop: 32, validate_every: 2, checkpoint_every: 2, loss: {name: rms}}
 arms: {pictures: {augmented: 1.0}}
 classical: []
-untouched: []
+baselines: []
 device: cpu
 """
 

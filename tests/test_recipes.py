@@ -12,6 +12,7 @@ import pytest
 import yaml
 from torch import Tensor
 
+import denoisers
 from rawaug.cli import main
 from rawaug.experiment.recipe import find_recipe, kind_of, read_recipe
 from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
@@ -53,8 +54,8 @@ def test_an_unknown_key_is_named(name: str, tmp_path: Path, refused: Callable[..
 
 SMALL = [
     "--train.validate-every", "1", "--train.batch", "4", "--train.crop", "32", "--data.test-count", "1", "--data.count",
-    "2", "--data.pictures", "tiny:", "--data.test", "tiny:test", "--data.validation-crop", "64", "--isp.steps", "2",
-    "--isp.curve-steps", "10", "--isp.prior-steps", "10", "--isp.pixels", "512", "--denoiser.settings",
+    "2", "--data.pictures", "tiny:", "--data.test", "tiny:test", "--data.validation-crop", "64", "--fit.steps", "2",
+    "--fit.curve-steps", "10", "--fit.prior-steps", "10", "--fit.pixels", "512", "--denoiser.settings",
     '{"width": 4, "scales": 2}', "--classical", "[]", "--steps", "2", "--device", "cpu",
 ]  # fmt: skip
 """A recipe in seconds."""
@@ -63,7 +64,7 @@ SMALL = [
 @pytest.mark.usefixtures("tiny")
 @pytest.mark.parametrize("name", ["fewshot", "unsupervised"])
 def test_it_runs(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", name, *SMALL, "--untouched", "[]", "--out", str(tmp_path)]) == 0
+    assert main(["run", name, *SMALL, "--baselines", "[]", "--out", str(tmp_path)]) == 0
     arms = yaml.safe_load(find_recipe(name).read_text())["arms"]
     (folder,) = tmp_path.iterdir()
     results = json.loads((folder / "results.json").read_text())
@@ -74,6 +75,19 @@ def test_it_runs(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         assert 10.0 < scores["plain"]["psnr"] < 60.0 and 10.0 < scores["self_ensemble"]["psnr_srgb"] < 60.0
         assert arm[:8] in text
     assert (folder / "report.html").stat().st_size > 30_000
+
+
+@pytest.mark.usefixtures("tiny")
+def test_a_published_camera_is_trained_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    camera = ["--isp.camera", "Nikon D750", "--isp.iso", "800", "--noise", "Nikon D750"]
+    small = [*SMALL, "--arms", "convex", "--baselines", "[]", "--self-ensemble", "false", "--out", str(tmp_path)]
+    assert main(["run", "synthetic", *small, *camera]) == 0
+    assert "ISP       universal as Nikon D750" in capsys.readouterr().out
+    _, info = denoisers.load(tmp_path / "synthetic" / "seed0" / "convex" / "denoiser.safetensors")
+    assert info["noise"] == {"name": "Nikon D750", "settings": {"iso": 800}}
+
+    assert main(["run", "synthetic", *small, *camera[:1], "Canon EOS 5D", "--overwrite"]) == 0
+    assert "already trained" not in capsys.readouterr().out, "the camera decides the weights"
 
 
 @pytest.mark.usefixtures("tiny")
@@ -88,12 +102,12 @@ def test_a_dry_run_takes_every_arm_through_a_step_and_writes_nothing(
         return loss(*given)
 
     monkeypatch.setattr(Supervised, "loss", counted)
-    command = ["run", "synthetic", *SMALL, "--seeds", "3", "--untouched", "[]", "--out", str(tmp_path), "--dry-run"]
+    command = ["run", "synthetic", *SMALL, "--seeds", "3", "--baselines", "[]", "--out", str(tmp_path), "--dry-run"]
     assert main(command) == 0
     said = capsys.readouterr().out
     assert len(steps) == 2 and not list(tmp_path.iterdir())
     assert "test      1 of 2 of tiny:test" in said and said.endswith(f"nothing written to {tmp_path / 'synthetic'}\n")
-    assert "gone" in refused(*command, "--untouched", "[gone]")
+    assert "gone" in refused(*command, "--baselines", "[gone]")
 
 
 @pytest.mark.usefixtures("tiny")
@@ -101,7 +115,7 @@ def test_seeds_steps_and_device_work_and_nothing_is_done_twice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     command = ["run", "synthetic", *SMALL, "--seed", "3", "--seeds", "2", "--out", str(tmp_path)]
-    command += ["--arms", '{"convex": {"augmented": 1.0}}', "--untouched", "[]"]
+    command += ["--arms", '{"convex": {"augmented": 1.0}}', "--baselines", "[]"]
     assert main(command) == 0
     results = json.loads((tmp_path / "synthetic" / "results.json").read_text())
     assert [len(runs) for runs in results["results"].values()] == [2]
@@ -135,7 +149,7 @@ def test_what_cannot_be_run_is_refused_before_anything_is_fitted(tmp_path: Path,
     with pytest.raises(ValueError, match="cannot be mixed"):
         Recipe(arms={**arm, "r2r": ArmConfig(estimator="r2r")})
     with pytest.raises(ValueError, match="augmented: 1"):
-        Recipe(arms=arm, data=DataConfig(pairs=None), camera="universal")
+        Recipe(arms=arm, data=DataConfig(pairs=None), isp="universal")
     elsewhere = ["--out", str(tmp_path)]
     for flags in (["--steps", "0"], ["--train.batch", "0"], ["--train.crop", "63"], ["--train.checkpoint-every", "0"]):
         key = flags[0].removeprefix("--train.").removeprefix("--").replace("-", "_")

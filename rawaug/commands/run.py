@@ -128,9 +128,11 @@ def merge_options(content: Mapping[str, Any], options: Options) -> dict[str, Any
 
 
 def set_value(content: dict[str, Any], path: Sequence[str], value: Any) -> None:
-    """Set a value at a path of keys; whatever is not a mapping on the way there becomes one."""
+    """Set a value at a path of keys; a name on the way there becomes ``{name: ...}``, anything else a mapping."""
     for part in path[:-1]:
-        if not isinstance(content.get(part), dict):
+        if isinstance(content.get(part), str):
+            content[part] = {"name": content[part]}
+        elif not isinstance(content.get(part), dict):
             content[part] = {}
         content = content[part]
 

@@ -11,8 +11,6 @@ from rawaug.data.folders import Cached, Readable, left_out
 from rawaug.data.pairs import OWN_PICTURES, Middles, Pair, PairPictures, SomePairs, names_of, shared_frame
 from rawaug.data.selection import select_pairs
 from rawaug.errors import count_of
-from rawaug.files import find_weights
-from rawaug.isp.model import DictionaryISP
 from rawaug.tasks.base import TASKS, Task
 from rawaug.tasks.settings import HELD_OUT, DataConfig, Recipe
 from rawaug.training.estimators import ESTIMATORS
@@ -68,9 +66,11 @@ class Inputs:
                 source = f"{data.pairs}, held out"
             validate = _listing(self.validation, of_validation, source, _MOST_HELD_OUT)
 
-        isp = f"{recipe.camera}, unchanged"
-        if recipe.camera is None:
-            isp = f"fitted to {count_of(len(self.pairs), 'frame')}"
+        isp = f"fitted to {count_of(len(self.pairs), 'frame')}"
+        if recipe.isp_source is not None:
+            isp = f"{recipe.isp_source.name}, unchanged"
+            if recipe.isp_source.camera is not None:
+                isp = f"{recipe.isp_source.name} as {recipe.isp_source.camera}"
 
         return [
             f"train     {train}",
@@ -237,10 +237,10 @@ def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[P
     real = {name: arm for name, arm in recipe.arms.items() if arm.augmented < 1.0}
 
     for pair in pairs:
-        if recipe.camera is None and not pair.color_known:
+        if recipe.isp is None and not pair.color_known:
             raise ValueError(
                 f"{pair.name}: its white balance and colour matrix are unknown, so no ISP can be fitted to it; "
-                "use a shipped one: camera: universal"
+                "use a shipped one: isp: universal"
             )
         if real and min(pair.raw.shape[-2:]) < recipe.train.crop + _MARGIN:
             size = f"{pair.raw.shape[-2]} x {pair.raw.shape[-1]}"
@@ -258,8 +258,8 @@ def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[P
         return
 
     levels = None
-    if recipe.camera is not None:
-        levels = DictionaryISP.from_pretrained(find_weights(recipe.camera)).info.get("noise")
+    if recipe.isp_source is not None:
+        levels = recipe.isp_source.load().info.get("noise")
 
     noisy_frames = list(validation)
     if real:

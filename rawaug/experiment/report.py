@@ -227,7 +227,7 @@ def _methods_of(experiment: Experiment, methods: Mapping[str, Sequence[Any]]) ->
 
 def _explain(experiment: Experiment, label: str) -> str:
     """Say in a line what an arm is trained on."""
-    arm, network = experiment.recipe.arms[label], experiment.recipe.network_of(label)
+    arm, network = experiment.recipe.arms[label], experiment.recipe.network(label)
     start = f"{network.name} from random weights"
     if network.start is not None:
         start = f"{network.start}, trained further"
@@ -257,7 +257,7 @@ def curves(experiment: Experiment) -> dict[str, bytes]:
 
 def _notes_on_losses(recipe: Recipe) -> list[str]:
     """Write a note if the losses of arms are in different units."""
-    weighings = {recipe.loop_of(arm).weigh for arm in recipe.arms}
+    weighings = {recipe.loop(arm).weigh for arm in recipe.arms}
     if len(weighings) == 1:
         return []
 

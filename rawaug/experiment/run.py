@@ -100,23 +100,27 @@ def prepare(recipe: Recipe, overwrite: bool, frames: dict[str, Sequence[Pair]]) 
     folder = require_free(recipe, overwrite)
     require_trainable(recipe.device, recipe.devices, recipe.train.precision, recipe.train.logger)
 
+    isp = None
+    if recipe.isp_source is not None:
+        isp = recipe.isp_source.load()
+
     task = TASKS[recipe.kind](recipe)
     classical = find_classical(recipe.classical, shown=is_leader())
     if recipe.noise != "camera":
-        noise_model(recipe.noise)
+        noise_model(recipe.noise_at_iso)
 
     estimators = {}
     starts = {}
     for label, arm in recipe.arms.items():
-        config = recipe.network_of(label)
+        config = recipe.network(label)
         network = first_network(config, seed=0)
         estimators[label] = ESTIMATORS.make(arm.estimator)
         estimators[label].require(network)
         task.require_network(network, config.start or type(network).__name__)
         starts[label] = start_of(config)
 
-    untouched = [find_denoiser(name) for name in recipe.untouched]
-    methods = task.open_methods(classical, untouched)
+    baselines = [find_denoiser(name) for name in recipe.baselines]
+    methods = task.open_methods(classical, baselines)
 
     inputs = open_inputs(recipe, frames, task)
     say(*inputs.lines(recipe))
@@ -125,7 +129,7 @@ def prepare(recipe: Recipe, overwrite: bool, frames: dict[str, Sequence[Pair]]) 
     inputs = _hide_clean_frames(recipe, inputs)
     require_usable(recipe, inputs.pairs, inputs.validation)
 
-    return Experiment(recipe, task, folder, inputs, unreadable, classical, methods, estimators, starts)
+    return Experiment(recipe, task, folder, isp, inputs, unreadable, classical, methods, estimators, starts)
 
 
 def _hide_clean_frames(recipe: Recipe, inputs: Inputs) -> Inputs:
@@ -202,6 +206,8 @@ def dry_run(kind: str, settings: Any, overwrite: bool = False) -> None:
     """
     folder = require_free(settings, overwrite)
     if kind in TASKS:
+        if settings.isp_source is not None:
+            settings.isp_source.load()  # a mistyped name is refused before any data are opened
         print("\n".join(open_inputs(settings, {}).lines(settings)))
 
     with TemporaryDirectory() as elsewhere, redirect_stdout(io.StringIO()) as output:

@@ -21,7 +21,7 @@ from rawaug.errors import extra
 from rawaug.evaluation.scores import Row, group_rows, score, summary
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.inputs import Inputs
-from rawaug.files import find_weights, fingerprint, sha256, write_json
+from rawaug.files import fingerprint, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, camera_law
 from rawaug.plugin.camera_noise import noise_for
@@ -53,6 +53,7 @@ class Experiment:
         recipe: the recipe that is run.
         task: everything that is special about its kind of image.
         folder: folder of the run.
+        isp: the ISP that is used as it is; None if each seed fits one.
         inputs: the frames and pictures.
         unreadable: lines that name frames which cannot be read.
         classical: the filters to compare with.
@@ -64,6 +65,7 @@ class Experiment:
     recipe: Recipe
     task: Task
     folder: Path
+    isp: DictionaryISP | None
     inputs: Inputs
     unreadable: list[str]
     classical: list[Spec]
@@ -107,7 +109,7 @@ class Camera:
     def of(cls, experiment: Experiment, isp: DictionaryISP) -> Camera:
         """Make the recipe's noise, which an ISP may have measured, and the frames and trials that have it."""
         task, inputs = experiment.task, experiment.inputs
-        noise = noise_for(isp, experiment.recipe.noise)
+        noise = noise_for(isp, experiment.recipe.noise_at_iso)
         pairs = task.training_frames(inputs.pairs, isp)
         validation = task.training_frames(inputs.validation, isp)
         return cls(experiment, isp, noise, pairs, validation, task.test_trials(inputs.test, isp, noise))
@@ -169,14 +171,11 @@ def change_cfa(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
 def fit_isp(experiment: Experiment, seed: int) -> DictionaryISP:
     """Fit the ISP to the few pairs, or take the recipe's own."""
     recipe, pairs = experiment.recipe, experiment.inputs.pairs
-    if recipe.camera is not None:
-        weights = find_weights(recipe.camera)
-        isp = DictionaryISP.from_pretrained(weights)
-        isp.info["key"] = sha256(weights)
-        return isp
+    if experiment.isp is not None:
+        return experiment.isp
 
     path = experiment.folder / f"seed{seed}" / "isp.safetensors"
-    settings = {**asdict(recipe.isp), "seed": seed}
+    settings = {**asdict(recipe.fit), "seed": seed}
     measures_noise = recipe.noise == "camera"
     key = fingerprint("isp", settings, stamps(pairs), measures_noise, recipe.self_supervised)
 
@@ -219,8 +218,8 @@ def train_arm(experiment: Experiment, camera: Camera, arm: str, seed: int) -> De
     model = train(
         stream,
         camera.validation_trials(arm),
-        recipe.network_of(arm),
-        recipe.loop_of(arm),
+        recipe.network(arm),
+        recipe.loop(arm),
         folder,
         seed,
         device=recipe.device,
@@ -241,17 +240,17 @@ def train_arm(experiment: Experiment, camera: Camera, arm: str, seed: int) -> De
 def _info_of_arm(experiment: Experiment, camera: Camera, arm: str, seed: int, key: str) -> dict[str, Any]:
     """Collect what the file of an arm's weights says about its training."""
     recipe, inputs, start = experiment.recipe, experiment.inputs, experiment.starts[arm]
-    noise: Any = recipe.noise
-    if noise == "camera":
+    noise = recipe.noise_at_iso
+    if recipe.noise == "camera":
         noise = camera_law(camera.isp.info["noise"]).spec()
 
-    steps = recipe.loop_of(arm).steps
+    steps = recipe.loop(arm).steps
     cfa = str(camera.pattern(arm))
     info = {"key": key, "cfa": cfa, "noise": noise, "steps": steps, "seed": seed, "arm": arm}
     if recipe.arms[arm].estimator != "supervised":
         info["estimator"] = recipe.arms[arm].estimator
     if start is not None:
-        info["start"] = recipe.network_of(arm).start
+        info["start"] = recipe.network(arm).start
         info["start_sha256"] = start.sha256
     info["real_pairs"] = [pair.name for pair in inputs.pairs]
     info["pictures"] = recipe.data.pictures
@@ -263,7 +262,7 @@ def _arm_key(experiment: Experiment, camera: Camera, arm: str, seed: int) -> str
     recipe, inputs, task = experiment.recipe, experiment.inputs, experiment.task
     data, start = recipe.data, experiment.starts[arm]
 
-    real = camera.isp.info["key"], recipe.noise, data.pairs, stamps(inputs.pairs)
+    real = camera.isp.info["key"], asdict(recipe.draw), recipe.noise_at_iso, data.pairs, stamps(inputs.pairs)
     pictures: tuple[Any, ...] = data.pictures, len(inputs.pictures), data.max_pixels
     start_hash = None
     if start is not None:
@@ -276,7 +275,7 @@ def _arm_key(experiment: Experiment, camera: Camera, arm: str, seed: int) -> str
     if inputs.validation:
         validation = data.validation, data.validation_crop, stamps(inputs.validation), task.validation_key()
 
-    key = weights_key(recipe.network_of(arm), recipe.loop_of(arm), (seed, *real, *pictures, *how), validation)
+    key = weights_key(recipe.network(arm), recipe.loop(arm), (seed, *real, *pictures, *how), validation)
     more = task.samples_key()
     if more:
         key = fingerprint(key, *more)

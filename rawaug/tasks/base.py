@@ -197,7 +197,7 @@ class Task(ABC):
 
     def test_noise(self) -> Any:
         """Return the noise of test frames without a capture, as the recipe states it."""
-        return self.recipe.noise
+        return self.recipe.noise_at_iso
 
     # -- methods and scores
 
@@ -206,12 +206,12 @@ class Task(ABC):
         """Make the denoiser of an arm for the test; a network whose training diverged is scored as it is."""
 
     @abstractmethod
-    def open_methods(self, classical: Sequence[Spec], untouched: Sequence[Path]) -> list[Any]:
+    def open_methods(self, classical: Sequence[Spec], baselines: Sequence[Path]) -> list[Any]:
         """Open the denoisers that arms are compared with.
 
         Args:
             classical: filters.
-            untouched: files of trained denoisers.
+            baselines: files of trained denoisers.
 
         Raises:
             ValueError: if one gives another kind of image.
@@ -250,7 +250,7 @@ class Task(ABC):
 
     def command_of_method(self, name: str) -> str:
         """Write the command that uses another method, by the name of its row; it is empty for the noisy input."""
-        for trained in self.recipe.untouched:
+        for trained in self.recipe.baselines:
             if name.partition(", ")[0] == Path(trained).stem:
                 return f"rawaug denoise IN.dng OUT.dng --denoiser {trained}"
 

@@ -88,8 +88,8 @@ class MosaicTask(FullColourTask):
         self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
     ) -> TrainingStream:
         """Make crops of pictures as RAW of all patterns."""
-        settings, train = self.recipe.arms[arm], self.recipe.loop_of(arm)
-        augment = RawAugment(isp, noise, draw=settings.draw)
+        settings, train = self.recipe.arms[arm], self.recipe.loop(arm)
+        augment = RawAugment(isp, noise, draw=settings.draw or self.recipe.draw)
         crops = MosaicCrops(pictures, augment, train.crop, settings.zoom, self.recipe.patterns)
         return TrainingStream(None, crops, train.batch, 1.0, derive_seed(seed, "stream"))
 

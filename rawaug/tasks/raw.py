@@ -42,13 +42,15 @@ class RawTask(Task):
     ) -> TrainingStream:
         """Make crops of the frames, and of pictures as RAW, in the arm's shares."""
         settings = self.recipe.arms[arm]
-        train = self.recipe.loop_of(arm)
+        train = self.recipe.loop(arm)
         seed = derive_seed(seed, "stream")
         estimator = ESTIMATORS.make(settings.estimator)
 
         augment = None
         if settings.augmented:
-            augment = RawAugment(isp, noise, draw=settings.draw, target=settings.srgb or self.recipe.target)
+            augment = RawAugment(
+                isp, noise, draw=settings.draw or self.recipe.draw, target=settings.srgb or self.recipe.target
+            )
 
         real: Source | None = None
         synthetic: Source | None = None
@@ -88,7 +90,7 @@ class RawTask(Task):
         if frames and not self.recipe.self_supervised:
             return [trial_of(pair, noise, isp.cfa) for pair in frames]
 
-        augment = RawAugment(isp, noise, target=self.recipe.target)
+        augment = RawAugment(isp, noise, draw=self.recipe.draw, target=self.recipe.target)
         if self.recipe.self_supervised:
             frozen = frames or FrozenPictures(pictures, augment, derive_seed("validation"))[:WATCHED]
             return r2r_trials(frozen, isp.cfa)
@@ -103,12 +105,12 @@ class RawTask(Task):
         """Make a denoiser of the network, in tiles, for its own pattern."""
         return RawDenoiser.of(network, self.recipe.device, name=name, cfa=pattern, views=views, checked=False)
 
-    def open_methods(self, classical: Sequence[Spec], untouched: Sequence[Path]) -> list[RawDenoiser]:
+    def open_methods(self, classical: Sequence[Spec], baselines: Sequence[Path]) -> list[RawDenoiser]:
         """Open filters and trained denoisers of mosaics."""
         denoisers = []
         for spec in classical:
             denoisers.append(RawDenoiser.of(spec).require_mosaic())
-        for file in untouched:
+        for file in baselines:
             denoiser = RawDenoiser.of(file, self.recipe.device, name=file.stem)
             denoisers.append(denoiser.require_mosaic())
 

@@ -1,4 +1,4 @@
-"""Linear camera RGB: networks turn noisy packed RAW into full colour; rivals are RAW denoisers and a demosaicing.
+"""Linear camera RGB: networks turn noisy packed RAW into full colour; baselines are RAW denoisers and a demosaicing.
 
 The demosaicings are those of :func:`rawaug.bayer.demosaic`, and LibRaw's.
 """
@@ -28,14 +28,14 @@ class RgbRecipe(FullColourRecipe):
     """Networks that demosaic and denoise at once.
 
     Args:
-        demosaicing: the demosaicings that follow each denoiser of RAW in ``classical`` and ``untouched``: bilinear,
+        demosaicing: the demosaicings that follow each denoiser of RAW in ``classical`` and ``baselines``: bilinear,
             malvar, or LibRaw's VNG, PPG, AHD, DCB, DHT or AAHD.
     """
 
     kind: ClassVar[str] = "rgb"
     target: ClassVar[Target] = "rgb"
     classical: list[str | dict[str, Any]] = field(default_factory=lambda: ["NonLocalMeans"])
-    untouched: list[str] = field(default_factory=lambda: [DEFAULT])
+    baselines: list[str] = field(default_factory=lambda: [DEFAULT])
     demosaicing: list[str] = field(default_factory=lambda: ["malvar", "AHD", "DCB"])
 
     def __post_init__(self) -> None:

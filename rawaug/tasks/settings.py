@@ -10,7 +10,9 @@ from pydantic import BeforeValidator
 
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import OWN_PICTURES, Pair
+from rawaug.files import find_weights, fingerprint, sha256
 from rawaug.isp.fit import FitConfig
+from rawaug.isp.model import DictionaryISP, restrict_to_cameras
 from rawaug.kernels.runtime import find_device
 from rawaug.noise import noise_model
 from rawaug.plugin.draw import Draw
@@ -19,7 +21,7 @@ from rawaug.registry import require_between, split_spec
 from rawaug.training.config import MOST, DenoiserConfig, TrainConfig, Weighing
 from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.srgb_noise import noise_on_srgb
-from rawaug.training.srgb_samples import Told
+from rawaug.training.srgb_samples import Conditioning
 
 _SHORT_CROP = 256
 """A dry run uses the middles of frames, of this side in pixels."""
@@ -134,6 +136,41 @@ def _is_pair_folder(spec: str | Sequence[Pair] | None) -> bool:
     return isinstance(spec, str) and spec.startswith(_PAIRS)
 
 
+@dataclass(frozen=True)
+class ISPSource:
+    """An ISP that is used as it is.
+
+    Args:
+        name: a shipped ISP by its name, or the file of one; or the YAML file of your own camera, see
+            :class:`rawaug.Camera`.
+        camera: maker and model of a published camera, or the YAML file of your own, in place of all cameras that the
+            ISP knows, as ``universal`` does.
+        iso: ISO of the noise of a measured camera; null for its measured range.
+        draw: how the camera settings of pictures are drawn, unless an arm says otherwise.
+    """
+
+    name: str = "universal"
+    camera: str | None = None
+    iso: float | None = None
+    draw: Draw = Draw()
+
+    def load(self) -> DictionaryISP:
+        """Load the ISP; its ``info["key"]`` is a hash of its file and its camera.
+
+        Raises:
+            FileNotFoundError: if there is no such ISP, or no such file of a camera.
+            ValueError: if the file is damaged, the camera is unknown, or the ISP was fitted to frames of another.
+        """
+        isp = DictionaryISP.from_pretrained(self.name)
+        key = sha256(find_weights(self.name))
+        if self.camera is not None:
+            isp = restrict_to_cameras(isp, self.camera)
+            key = fingerprint(key, isp.info)
+
+        isp.info["key"] = key
+        return isp
+
+
 @dataclass
 class ArmConfig:
     """One way of training; everything else is the same for all arms.
@@ -146,14 +183,14 @@ class ArmConfig:
             of what any augmentation can gain.
         batch: crops in a step, in place of ``train.batch``; null takes that one. Arms that are compared should see as
             many real crops: 2 alone against 2 of 8.
-        draw: how the camera settings of pictures are drawn.
+        draw: how the camera settings of pictures are drawn; null takes ``isp.draw``.
         srgb: for sRGB targets, how pictures are developed; null draws every demosaicing, without JPEG.
         zoom: for supervised arms, half of the crops of pictures are enlarged by up to this factor, see
             :class:`rawaug.RawPairs`; 1 for none.
         srgb_noise: for sRGB targets, noise drawn on the pictures themselves, in place of the camera's: Gaussian,
             BSRGAN, Coloured, or {name, settings}, see :mod:`rawaug.training.srgb_noise`.
         srgb_share: share of the samples that have ``srgb_noise``; the rest have the camera's.
-        told: for sRGB targets, the level of noise that is given to a network that reads one; null for none.
+        noise_level: for sRGB targets, the level of noise that is given to a network that reads one; null for none.
         estimator: training target, a name or {name, settings}: supervised uses clean frames; distilled uses
             what another denoiser makes of the noisy ones; noisier, noise2noise, r2r and neighbor2neighbor use noisy
             frames only, see :mod:`rawaug.training.estimators`.
@@ -167,12 +204,12 @@ class ArmConfig:
     augmented: float = 0.0
     source: Literal["pictures", "own", "noise", "more"] = "pictures"
     batch: int | None = None
-    draw: Draw = Draw()
+    draw: Draw | None = None
     srgb: Srgb | None = None
     zoom: float = 1.0
     srgb_noise: str | dict[str, Any] | None = None
     srgb_share: float = 1.0
-    told: Told | None = None
+    noise_level: Conditioning | None = None
     estimator: str | dict[str, Any] = "supervised"
     denoiser: DenoiserConfig | None = None
     learning_rate: float | None = None
@@ -204,8 +241,9 @@ class Recipe:
     Args:
         name: of the output folder within ``out``.
         data: where pictures come from.
-        isp: how the dictionary ISP is fitted.
-        camera: an ISP to use unchanged, by a shipped one's name or a file; null fits one to ``data.pairs``.
+        isp: an ISP to use as it is, by a shipped one's name or a file, or {name, camera, iso, draw}; null fits one to
+            ``data.pairs``.
+        fit: how the dictionary ISP is fitted, if ``isp`` is null.
         noise: noise added to clean RAW in training, and to test frames without a noisy capture: the name of a preset or
             of a camera, a list of names from which each picture draws one, [shot_var, read_var], {name, settings} of a
             camera or a model, or "camera", the levels measured on the frames that the ISP is fitted to.
@@ -215,7 +253,7 @@ class Recipe:
         classical: classical denoisers to compare with, such as Wavelet, or {name: Wavelet, settings: {strength: 0.8}}.
             BM3D is left out if its wheel is not installed, and a line says so.
         views: number of views of the self-ensemble: 4, the flips, as in the paper, or 8, with quarter turns.
-        untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
+        baselines: trained denoisers to compare with as they are: names of shipped ones, or files.
         self_ensemble: whether every arm is also scored averaged over ``views``, at that many times the cost.
         seed: of the first run.
         steps: optimiser steps, in place of ``train.steps``.
@@ -236,15 +274,15 @@ class Recipe:
 
     name: str = "experiment"
     data: DataConfig = field(default_factory=DataConfig)
-    isp: FitConfig = field(default_factory=FitConfig)
-    camera: str | None = None
+    isp: ISPSource | str | None = None
+    fit: FitConfig = field(default_factory=FitConfig)
     noise: NoiseSetting = "cycleisp_sidd"
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     arms: dict[str, ArmConfig] = field(default_factory=dict)
     classical: list[str | dict[str, Any]] = field(default_factory=list)
     views: Literal[4, 8] = 8
-    untouched: list[str] = field(default_factory=list)
+    baselines: list[str] = field(default_factory=list)
     self_ensemble: bool = True
     steps: int | None = None
     seed: int = 0
@@ -262,6 +300,9 @@ class Recipe:
         if self.steps is not None:
             self.train = replace(self.train, steps=self.steps)
 
+        if self.isp_source is not None and self.isp_source.iso is not None and not isinstance(self.noise, str):
+            raise ValueError("isp.iso: applies to the noise of one camera by name; set noise to its name, or to camera")
+
         self._require_data()
         for label, arm in self.arms.items():
             try:
@@ -274,8 +315,8 @@ class Recipe:
         only_pictures = all(arm.augmented == 1.0 for arm in self.arms.values())
         see_clean = {arm.sees_clean for arm in self.arms.values()}
 
-        if self.data.pairs is None and self.camera is None:
-            raise ValueError("data.pairs: fitting an ISP needs pairs; set it, or camera: universal")
+        if self.data.pairs is None and self.isp is None:
+            raise ValueError("data.pairs: fitting an ISP needs pairs; set it, or isp: universal")
         if self.data.pairs is None and not only_pictures:
             raise ValueError("data.pairs: without real pairs every arm must have augmented: 1")
         if len(see_clean) > 1:
@@ -290,7 +331,7 @@ class Recipe:
         if arm.srgb_noise is not None:
             noise_on_srgb(arm.srgb_noise)
 
-        for key in ("srgb", "srgb_noise", "told"):
+        for key in ("srgb", "srgb_noise", "noise_level"):
             if getattr(arm, key) is not None and self.target != "srgb":
                 raise ValueError(f"{key} applies to target 'srgb', not {self.target!r}; leave it out")
 
@@ -301,16 +342,40 @@ class Recipe:
                 raise ValueError(f"source: {arm.source} is for supervised arms on RAW; leave it out")
 
         name, _ = split_spec(arm.estimator)
-        weigh = self.loop_of(label).weigh
+        weigh = self.loop(label).weigh
         weighings = ESTIMATORS[name].weighings
         if weigh not in weighings:
             raise ValueError(f"weigh: {weigh} is not for noisy targets of {name}; use {' or '.join(weighings)}")
 
-    def network_of(self, arm: str) -> DenoiserConfig:
+    @property
+    def isp_source(self) -> ISPSource | None:
+        """The ISP that is used as it is; None if one is fitted."""
+        if isinstance(self.isp, str):
+            return ISPSource(self.isp)
+
+        return self.isp
+
+    @property
+    def draw(self) -> Draw:
+        """How camera settings are drawn where an arm does not say so."""
+        if self.isp_source is None:
+            return Draw()
+
+        return self.isp_source.draw
+
+    @property
+    def noise_at_iso(self) -> Any:
+        """The noise, at the ISO of ``isp.iso`` if that is set."""
+        if self.isp_source is None or self.isp_source.iso is None:
+            return self.noise
+
+        return {"name": self.noise, "settings": {"iso": self.isp_source.iso}}
+
+    def network(self, arm: str) -> DenoiserConfig:
         """Return the network of an arm: its own, or else the recipe's."""
         return self.arms[arm].denoiser or self.denoiser
 
-    def loop_of(self, arm: str) -> TrainConfig:
+    def loop(self, arm: str) -> TrainConfig:
         """Return the training loop of an arm: the recipe's, with the arm's own rate, weighting, batch and steps."""
         own = self.arms[arm]
         loop = self.train
@@ -332,7 +397,7 @@ class Recipe:
         train = replace(self.train, steps=1, validate_every=1, checkpoint_every=1, workers=min(self.train.workers, 1))
         if find_device(self.device).type == "cpu":
             train = replace(train, batch=min(train.batch, 4 * self.devices))
-        return replace(self, data=data, isp=self.isp.shortest(), train=train, steps=None, seeds=1, views=4)
+        return replace(self, data=data, fit=self.fit.shortest(), train=train, steps=None, seeds=1, views=4)
 
     @property
     def self_supervised(self) -> bool:

@@ -71,31 +71,29 @@ class SrgbRecipe(Recipe):
     pictures. Networks are given no level.
 
     Args:
-        rivals: denoisers of RAW to compare with, by name or file; they take the place of ``untouched``.
+        baselines: denoisers of RAW to compare with, by name or file.
         levels: (shot_var, read_var) of the RAW noise of validation and test frames, with a table for each.
     """
 
     kind: ClassVar[str] = "srgb"
     target: ClassVar[Target] = "srgb"
     from_pictures: ClassVar[bool] = True
-    rivals: list[str] = field(default_factory=lambda: [DEFAULT])
+    baselines: list[str] = field(default_factory=lambda: [DEFAULT])
     levels: list[tuple[float, float]] = field(default_factory=lambda: [(5e-4, 1e-6), (2e-3, 1e-5), (8e-3, 1e-4)])
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.levels or self.data.validation is None:
             raise ValueError("levels and data.validation: give at least one level and frames to choose weights on")
-        if self.untouched:
-            raise ValueError("untouched: denoisers to compare with are named in rivals")
 
         for label, arm in self.arms.items():
-            network = self.network_of(label)
-            reads_level = arm.told is not None
+            network = self.network(label)
+            reads_level = arm.noise_level is not None
             settings = network.settings.get("channels"), network.settings.get("variance_map", True)
             if network.start is None and settings != (3, reads_level):
                 raise ValueError(
                     f"denoiser.settings: set channels: 3, variance_map: {str(reads_level).lower()} for the network of "
-                    f"arms.{label}, as told requires"
+                    f"arms.{label}, as noise_level requires"
                 )
 
         for spec in self.classical:
@@ -125,18 +123,18 @@ class SrgbTask(Task):
         self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
     ) -> TrainingStream:
         """Make crops of pictures with the camera's noise, noise drawn on them, or both in the arm's shares."""
-        settings, train = self.recipe.arms[arm], self.recipe.loop_of(arm)
+        settings, train = self.recipe.arms[arm], self.recipe.loop(arm)
 
         camera = None
         if settings.srgb_noise is None or settings.srgb_share < 1.0:
-            augment = RawAugment(isp, noise, draw=settings.draw, target=settings.srgb or "srgb")
+            augment = RawAugment(isp, noise, draw=settings.draw or self.recipe.draw, target=settings.srgb or "srgb")
             camera = PictureCrops(RawPairs(pictures, augment, train.crop, zoom=settings.zoom))
 
         on_pictures = None
         if settings.srgb_noise is not None:
             on_pictures = NoisyPictures(pictures, noise_on_srgb(settings.srgb_noise), train.crop, settings.zoom)
 
-        samples = SrgbSamples(camera, on_pictures, settings.srgb_share, settings.told)
+        samples = SrgbSamples(camera, on_pictures, settings.srgb_share, settings.noise_level)
         return TrainingStream(None, samples, train.batch, 1.0, derive_seed(seed, "stream"))
 
     def validation_trials(
@@ -165,16 +163,16 @@ class SrgbTask(Task):
         """Make a denoiser of the network, in tiles; one that reads a level estimates it."""
         return PictureDenoiser.of(network, self.recipe.device, name=name, views=1, checked=False)
 
-    def open_methods(self, classical: Sequence[Spec], untouched: Sequence[Path]) -> list[Any]:
-        """Open the rivals, which are denoisers of RAW; filters are made for each level, see :meth:`methods_for`."""
-        return [RawDenoiser.of(name, self.recipe.device).require_mosaic() for name in self.recipe.rivals]
+    def open_methods(self, classical: Sequence[Spec], baselines: Sequence[Path]) -> list[Any]:
+        """Open the baselines, which are denoisers of RAW; filters are made for each level, see :meth:`methods_for`."""
+        return [RawDenoiser.of(name, self.recipe.device).require_mosaic() for name in self.recipe.baselines]
 
     def group(self, trial: Any) -> str:
         """Return the level."""
         return str(trial.strength)
 
     def methods_for(self, group: str, methods: Sequence[Any], validation: Sequence[Any]) -> list[Any]:
-        """Choose the filters, each at its best strength on validation frames of this level, and the rivals."""
+        """Choose the filters, each at its best strength on validation frames of this level, and the baselines."""
         same_level = [trial for trial in validation if trial.strength == group]
         denoisers: list[Any] = []
         for spec in self.recipe.classical:
@@ -203,11 +201,11 @@ class SrgbTask(Task):
         return f"rawaug denoise IN.jpg OUT.jpg --denoiser {path}"
 
     def command_of_method(self, name: str) -> str:
-        """Write the command that denoises pictures with a filter, or RAW with a rival."""
+        """Write the command that denoises pictures with a filter, or RAW with a baseline."""
         method = name.partition(", ")[0]
-        for rival in self.recipe.rivals:
-            if method == Path(rival).stem:
-                return f"rawaug denoise IN.dng OUT.dng --denoiser {rival}"
+        for baseline in self.recipe.baselines:
+            if method == Path(baseline).stem:
+                return f"rawaug denoise IN.dng OUT.dng --denoiser {baseline}"
 
         for spec in self.recipe.classical:
             if method == spec_label(spec):

@@ -44,7 +44,7 @@ class NoisyPictures:
 
 
 @dataclass
-class Told:
+class Conditioning:
     """The level of noise that is given in training to a network that reads one.
 
     A share of the pairs has no level, another share has the pair's own, and the rest have a wrong one.
@@ -60,9 +60,9 @@ class Told:
     factor: float = 1.6
 
     def __post_init__(self) -> None:
-        require_between("told.unknown", self.unknown, 0.0, 1.0)
-        require_between("told.exact", self.exact, 0.0, 1.0 - self.unknown)
-        require_between("told.factor", self.factor, 1.0, 10.0)
+        require_between("noise_level.unknown", self.unknown, 0.0, 1.0)
+        require_between("noise_level.exact", self.exact, 0.0, 1.0 - self.unknown)
+        require_between("noise_level.factor", self.factor, 1.0, 10.0)
 
     def sample(self, generator: torch.Generator) -> float:
         """Draw what the deviation is multiplied by: 0 for unknown, 1, or a factor."""
@@ -86,16 +86,16 @@ class SrgbSamples:
         camera: pairs of target ``"srgb"``; None if all noise is drawn on sRGB.
         drawn: the samples with noise drawn on sRGB; None if there are none.
         share: share of the samples that have noise drawn on sRGB.
-        told: the level of noise that the network is given; None for none.
+        noise_level: the level of noise that the network is given; None for none.
     """
 
     def __init__(
-        self, camera: PictureCrops | None, drawn: NoisyPictures | None, share: float, told: Told | None
+        self, camera: PictureCrops | None, drawn: NoisyPictures | None, share: float, noise_level: Conditioning | None
     ) -> None:
         self.camera = camera
         self.drawn = drawn
         self.share = share
-        self.told = told
+        self.noise_level = noise_level
 
     def draw(self, generator: torch.Generator) -> Sample:
         """Draw one sample."""
@@ -118,8 +118,8 @@ class SrgbSamples:
         in_order = []
         for place, generator in enumerate(generators):
             sample = samples[place]
-            if self.told is not None:
-                sample = self.told.apply(sample, self.told.sample(generator))
+            if self.noise_level is not None:
+                sample = self.noise_level.apply(sample, self.noise_level.sample(generator))
             in_order.append(sample)
         return in_order
 

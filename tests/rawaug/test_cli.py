@@ -30,9 +30,9 @@ TINY = [
 ]  # fmt: skip
 QUICK_RUN = [
     *TINY, "--train.steps", "4", "--train.validate-every", "2", "--train.batch", "2", "--train.crop", "32",
-    "--isp.steps", "2", "--isp.pixels", "512", "--isp.curve-steps", "10", "--isp.prior-steps", "10",
+    "--fit.steps", "2", "--fit.pixels", "512", "--fit.curve-steps", "10", "--fit.prior-steps", "10",
     "--denoiser.settings", '{"width": 4, "scales": 2}',
-    "--classical", "[]", "--untouched", "[]",
+    "--classical", "[]", "--baselines", "[]",
 ]  # fmt: skip
 
 
@@ -103,7 +103,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
         ("run fewshot --arms.real.augmneted 1", "arms.real.augmneted: no such key (nearest: arms.NAME.augmented)"),
         ("run fewshot --arms.real.augmented 7", "arms.real: augmented must be a number from 0.0 to 1.0, got 7"),
         ("run fewshot --data.count few", "data.count: input should be a valid integer"),
-        ("run fewshot --isp.tone curves", "isp.tone: input should be 'auto', 'learned' or 'curve', got 'curves'"),
+        ("run fewshot --fit.tone curves", "fit.tone: input should be 'auto', 'learned' or 'curve', got 'curves'"),
         ("run fewshot --device null", "device: input should be a valid string, got None"),
     ],
 )

@@ -54,9 +54,9 @@ def test_a_function_is_imported_from_the_command_line_alone(tmp_path: Path, monk
     monkeypatch.chdir(tmp_path)
     assert (denoiser_of("blind_one:half")(Noisy(torch.ones(1, 4, 8, 8))) == 0.5).all()
     (tmp_path / "evil.py").write_text("raise SystemExit('imported')\n")
-    given: dict[str, Any] = {"camera": "universal", "arms": {"joint": ArmConfig(1.0)}, "out": str(tmp_path)}
+    given: dict[str, Any] = {"isp": "universal", "arms": {"joint": ArmConfig(1.0)}, "out": str(tmp_path)}
     network = DenoiserConfig("JointDRUNet", {"width": 4, "scales": 2})
-    recipe = RgbRecipe(data=DataConfig(pairs=None), denoiser=network, untouched=["evil:f"], **given)
+    recipe = RgbRecipe(data=DataConfig(pairs=None), denoiser=network, baselines=["evil:f"], **given)
     with pytest.raises(FileNotFoundError, match="evil:f"):
         run(recipe)
     with pytest.raises(ValueError, match="evil:f"):

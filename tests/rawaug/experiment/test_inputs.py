@@ -153,7 +153,7 @@ def test_what_frames_lack_is_found_before_anything_is_fitted() -> None:
     require_usable(replace(supervised, train=replace(supervised.train, crop=66)), [pair], [])
     with pytest.raises(ValueError, match="white balance"):
         require_usable(supervised, [replace(pair, color_known=False)], [])
-    require_usable(replace(supervised, camera="universal", train=replace(supervised.train, crop=66)), [pair], [])
+    require_usable(replace(supervised, isp="universal", train=replace(supervised.train, crop=66)), [pair], [])
 
 
 def test_settings_of_pairs_need_pairs() -> None:
@@ -179,8 +179,8 @@ def test_recipes_are_listed_and_explained_with_their_own_values(capsys: pytest.C
 def test_an_arm_has_a_rate_and_a_weighing_of_its_own_and_at_most_its_own_steps() -> None:
     tuned = ArmConfig(learning_rate=3e-4, weigh="stabilised", steps=10)
     train = TrainConfig(steps=40, learning_rate=7e-4, weigh="mixed")
-    recipe = Recipe(camera="universal", train=train, arms={"a": ArmConfig(), "b": tuned, "c": ArmConfig(steps=90)})
-    a, b, c = (recipe.loop_of(arm) for arm in recipe.arms)
+    recipe = Recipe(isp="universal", train=train, arms={"a": ArmConfig(), "b": tuned, "c": ArmConfig(steps=90)})
+    a, b, c = (recipe.loop(arm) for arm in recipe.arms)
     assert (a.steps, a.learning_rate, a.weigh) == (c.steps, c.learning_rate, c.weigh) == (40, 7e-4, "mixed")
     assert (b.steps, b.learning_rate, b.weigh) == (10, 3e-4, "stabilised")
     with pytest.raises(ValueError, match="steps"):

@@ -18,15 +18,16 @@ from rawaug.isp.fit.samples import BLOCK
 from rawaug.paper.baselines import BASELINES
 from rawaug.paper.methods import FAMILIES, ROWS
 from rawaug.paper.reconstruction import Comparison
+from rawaug.plugin.draw import Draw
 from rawaug.tasks.base import TASKS
-from rawaug.tasks.settings import ArmConfig, Recipe
+from rawaug.tasks.settings import ArmConfig, DataConfig, ISPSource, Recipe
 from rawaug.training.config import TrainConfig, Weighing
 
 FOLDER = find_recipe("fewshot").parent
 NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(FOLDER.rglob("*.yaml"))]
 OTHERS = {"pictures": "srgb", "rgb2raw": "reconstruction", "any": "mosaic", "demosaic": "rgb"}
 """These recipes have another kind than RAW, and are not named after it."""
-HEAD = "camera: universal\ndata: {pairs: null, pictures: 'demo:'}\narms: {augmented: {augmented: 1.0}}\n"
+HEAD = "isp: universal\ndata: {pairs: null, pictures: 'demo:'}\narms: {augmented: {augmented: 1.0}}\n"
 LAUGHS = "a0: &a0 [ha, ha]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}, *a{k - 1}]\n" for k in range(1, 40))
 
 
@@ -117,7 +118,7 @@ def test_a_recipe_that_names_no_kind_trains_and_bytes_are_none(tmp_path: Path) -
         ("train: {steps: 1e25}", r"train\.steps"),
         ("train: null", "train"),
         ("data: 5", "data"),
-        ("isp: {steps: 1e25}", "steps"),
+        ("fit: {steps: 1e25}", "steps"),
         ("seed: 1e25", "seed"),
         ("denoiser: {settings: {scales: 1000000000}}", "scales"),
         ("denoiser: {settings: {width: 1e29}}", "width"),
@@ -156,19 +157,48 @@ def test_a_weighing_that_moves_the_mean_of_noisy_targets_is_refused(name: str) -
 
 
 def test_on_and_off_are_words_and_truth_values_stay(tmp_path: Path) -> None:
-    content = "isp: {encoders: on, shading: off, attention: true}\nself_ensemble: off\narms: {real: {}}\n"
+    content = "fit: {encoders: on, shading: off, attention: true}\nself_ensemble: off\narms: {real: {}}\n"
     (tmp_path / "mine.yaml").write_text(content)
     recipe = with_values(settings_of("raw"), read_recipe(tmp_path / "mine.yaml"), "mine")
-    assert (recipe.isp.encoders, recipe.isp.shading) == ("on", "off")
-    assert recipe.isp.attention is True and recipe.self_ensemble is False
+    assert (recipe.fit.encoders, recipe.fit.shading) == ("on", "off")
+    assert recipe.fit.attention is True and recipe.self_ensemble is False
 
 
 def test_null_is_taken_where_the_types_have_it() -> None:
-    content = {"camera": "universal", "steps": None, "arms": {"real": {"denoiser": None}}}
+    content = {"isp": "universal", "steps": None, "arms": {"real": {"denoiser": None}}}
     recipe = with_values(settings_of("raw"), content, "mine")
-    assert recipe.steps is None and recipe.network_of("real") == recipe.denoiser
-    for key in ("data", "isp", "train", "arms", "device", "seed", "out", "views", "noise"):
+    assert recipe.steps is None and recipe.network("real") == recipe.denoiser
+    for key in ("data", "fit", "train", "arms", "device", "seed", "out", "views", "noise"):
         with pytest.raises(ValueError, match=f"^mine: {key}.* got None"):
             with_values(settings_of("raw"), {key: None}, "mine")
     with pytest.raises(ValueError, match=r"^mine: .*denoiser"):
         with_values(settings_of("raw"), {"arms": {"real": {"denoiser": {"name": None}}}}, "mine")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--isp", "univerzal"], "univerzal: not found"),
+        (["--isp.camera", "Nikon D75O"], r"Nikon D75O.*similar: Nikon D750"),
+        (["--isp", "gopro-hero", "--isp.camera", "Nikon D750"], "camera: needs an ISP with published cameras"),
+        (["--isp.camera", "Nikon D750", "--isp.iso", "800", "--noise", "[1e-3, 1e-5]"], "isp.iso: "),
+        (["--isp.kamera", "Nikon D750"], r"isp\.kamera: no such key \(nearest: isp\.camera\)"),
+    ],
+)
+@pytest.mark.parametrize("dry", [[], ["--dry-run"]])
+def test_a_mistyped_isp_or_camera_is_refused_before_any_frame_is_read(
+    words: list[str], said: str, dry: list[str], unread: str, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    command = ["run", "synthetic", "--data.test", unread, "--data.pictures", unread, "--out", tmp_path]
+    assert re.search(said, refused(*command, *words, *dry))
+
+
+def test_the_noise_of_a_camera_is_at_the_iso_of_the_isp() -> None:
+    arms = {"a": ArmConfig(1.0), "b": ArmConfig(1.0, draw=Draw(sampling="chosen"))}
+    data = DataConfig(pairs=None)
+    camera = ISPSource(camera="Nikon D750", iso=800, draw=Draw(light="A"))
+    recipe = Recipe(arms=arms, data=data, isp=camera, noise="Nikon D750")
+    assert recipe.noise_at_iso == {"name": "Nikon D750", "settings": {"iso": 800}} and recipe.draw.light == "A"
+    assert camera.load().info["cameras"] == ["Nikon D750"]
+    assert camera.load().info["key"] != ISPSource().load().info["key"]
+    assert Recipe(arms=arms, data=data, isp="universal").noise_at_iso == "cycleisp_sidd"

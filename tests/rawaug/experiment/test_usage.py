@@ -51,7 +51,7 @@ def test_a_filter_or_nothing_is_used_as_the_verdict_says() -> None:
 def usage(results: Any, others: Any) -> list[str]:
     recipe: Any = SimpleNamespace(
         arms={"mine": ArmConfig()},
-        untouched=["rawaug-small"],
+        baselines=["rawaug-small"],
         classical=[{"name": "Wavelet", "settings": {"strength": 0.5}}],
     )
     experiment: Any = SimpleNamespace(

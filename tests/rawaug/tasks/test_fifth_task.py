@@ -65,7 +65,7 @@ class BurstTask(RawTask):
 RECIPE = """
 experiment: burst
 name: burst
-camera: universal
+isp: universal
 data: {pairs: null, pictures: "tiny:", validation: null, test: "tiny:validation", test_count: 1}
 denoiser: {name: UNet, settings: {width: 4, scales: 2}}
 noise: [4.0e-3, 4.0e-5]

@@ -87,7 +87,7 @@ def test_a_recipe_without_shares_or_with_unknown_patterns_is_refused() -> None:
     arms = {"any": ArmConfig(augmented=1.0)}
     for patterns, said in (({"X": 1.0}, "CFA 'X' is unknown"), ({"RGGB": 0.0}, "patterns: shares must be")):
         with pytest.raises(ValueError, match=said):
-            MosaicRecipe(camera="universal", patterns=patterns, arms=arms)
+            MosaicRecipe(isp="universal", patterns=patterns, arms=arms)
 
 
 def test_the_recipe_trains_and_scores_by_pattern(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,7 +23,7 @@ def test_other_targets_are_trained_and_watched_on(aim: Target, noisy: tuple[int,
         target: Target = aim  # type: ignore[misc]
 
     arms = {"one": ArmConfig(1.0, srgb=Srgb(jpeg=(10, 10)) if aim == "srgb" else None), "other": ArmConfig(1.0)}
-    recipe = Aimed(data=DataConfig(pairs=None), camera="universal", arms=arms, train=TrainConfig(crop=32))
+    recipe = Aimed(data=DataConfig(pairs=None), isp="universal", arms=arms, train=TrainConfig(crop=32))
     isp, noise = DictionaryISP(), noise_model((1e-4, 1e-6))
     pictures = [picture[:, :96, :128] for picture in demo_pictures(2)]
     task = RawTask(recipe)
@@ -60,7 +60,7 @@ def test_an_arm_sees_as_many_real_crops_with_further_ones_as_without() -> None:
     isp, noise, known = DictionaryISP(), noise_model((1e-2, 1e-4)), pairs[0].noisy
     assert known is not None
     for label, arm in arms.items():
-        batch = recipe.loop_of(label).batch
+        batch = recipe.loop(label).batch
         stream = RawTask(recipe).stream(label, pairs[:1], others[arm.source], isp, noise, 0)
         samples = stream.__getitems__(range(batch))
         captured = [sample for sample in samples if torch.isin(sample.noisy, known).all()]

@@ -84,7 +84,7 @@ def test_what_is_smooth_is_demosaiced_to_itself(method: str) -> None:
 
 def small(folder: Path, **changes: Any) -> RgbRecipe:
     return RgbRecipe(
-        camera="universal",
+        isp="universal",
         arms={"joint": ArmConfig(1.0)},
         denoiser=DenoiserConfig("JointDRUNet", {"width": 4, "scales": 2}),
         train=TrainConfig(steps=2, batch=1, crop=32, validate_every=1),
@@ -92,7 +92,7 @@ def small(folder: Path, **changes: Any) -> RgbRecipe:
         **{
             "data": DataConfig(pairs=None, validation_crop=128, test_crop=128, test_count=1),
             "classical": ["Wavelet"],
-            "untouched": [],
+            "baselines": [],
             "demosaicing": ["malvar", "DCB"],
             **changes,
         },
@@ -116,12 +116,12 @@ def test_what_it_cannot_compare_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="'AMAZE'"):
         small(tmp_path, demosaicing=["AMAZE"])
     with pytest.raises(ValueError, match="rawaug-joint"):
-        run(small(tmp_path, untouched=["rawaug-joint"]), test=[a_pair()], validation=[])
+        run(small(tmp_path, baselines=["rawaug-joint"]), test=[a_pair()], validation=[])
     with pytest.raises(ValueError, match=r"denoiser: .*network"):
         run(replace(small(tmp_path), denoiser=DenoiserConfig("UNet")), test=[a_pair()], validation=[])
     with pytest.raises(ValueError, match=r"denoiser: .*JointDRUNet"):
         train_denoiser(
-            Recipe(arms={"a": ArmConfig(1.0)}, camera="universal", denoiser=small(tmp_path).denoiser, out=str(tmp_path))
+            Recipe(arms={"a": ArmConfig(1.0)}, isp="universal", denoiser=small(tmp_path).denoiser, out=str(tmp_path))
         )
     with pytest.raises(ValueError, match="targets"):
         replace(small(tmp_path), arms={"joint": ArmConfig(0.5)}, data=DataConfig())

@@ -24,12 +24,12 @@ from rawaug.metrics import psnr
 from rawaug.tasks.settings import ArmConfig, DataConfig
 from rawaug.tasks.srgb import REAL, SrgbRecipe, SrgbTask, best_filter, developed, srgb_trials
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.srgb_samples import Told
+from rawaug.training.srgb_samples import Conditioning
 
 LEVELS = [(1e-9, 1e-12), (2e-3, 1e-5)]
 SMALL = [
     "--data.pictures", "tiny:", "--data.validation", "tiny:validation", "--data.test", "tiny:test", "--device", "cpu",
-    "--levels", "[[2.0e-3, 1.0e-5], [8.0e-3, 1.0e-4]]", "--rivals", "[]", "--train.precision", "32-true",
+    "--levels", "[[2.0e-3, 1.0e-5], [8.0e-3, 1.0e-4]]", "--baselines", "[]", "--train.precision", "32-true",
     "--denoiser.settings", '{"width": 4, "scales": 2, "channels": 3}', "--steps", "2",
     "--train.crop", "32", "--train.batch", "4", "--train.validate-every", "1",
 ]  # fmt: skip
@@ -39,11 +39,11 @@ SMALL = [
 RECIPE = SrgbRecipe(
     name="a",
     data=DataConfig(pairs=None, pictures="tiny:"),
-    camera="universal",
+    isp="universal",
     arms={"gaussian": ArmConfig(1.0, srgb_noise="Gaussian")},
     denoiser=DenoiserConfig(settings={"width": 4, "scales": 2, "channels": 3, "variance_map": False}),
     train=TrainConfig(steps=1, batch=1, crop=32),
-    rivals=[],
+    baselines=[],
     levels=[(8e-3, 1e-4)],
     device="cpu",
 )
@@ -194,10 +194,10 @@ def test_what_has_no_meaning_is_refused() -> None:
     for given, said in (
         ({"levels": []}, "at least one level"),
         ({"denoiser": DenoiserConfig()}, "channels: 3, variance_map: false"),
-        ({"arms": {"a": ArmConfig(1.0, told=Told())}}, "channels: 3, variance_map: true"),
+        ({"arms": {"a": ArmConfig(1.0, noise_level=Conditioning())}}, "channels: 3, variance_map: true"),
         ({"classical": ["BM3D"]}, "BM3D"),
         ({"data": DataConfig(pairs=None, validation=None)}, r"data\.validation"),
         ({"arms": {"a": ArmConfig(1.0, srgb_noise="Gausian")}}, "Gaussian"),
     ):
         with pytest.raises(ValueError, match=said):
-            SrgbRecipe(**{"data": data, "camera": "universal", "denoiser": network, "arms": arms, **given})  # type: ignore[arg-type]
+            SrgbRecipe(**{"data": data, "isp": "universal", "denoiser": network, "arms": arms, **given})  # type: ignore[arg-type]

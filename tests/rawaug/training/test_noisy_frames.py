@@ -183,7 +183,7 @@ def test_the_held_out_score_ranks_as_clean_frames_do() -> None:
 def test_without_validation_pairs_pictures_are_watched(pictures: list[torch.Tensor]) -> None:
     recipe = Recipe(
         data=DataConfig(pairs=None, validation=None),
-        camera="universal",
+        isp="universal",
         arms={"convex": ArmConfig(1.0)},
         train=TrainConfig(crop=32),
     )

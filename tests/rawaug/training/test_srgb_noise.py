@@ -20,7 +20,7 @@ from rawaug.training.srgb_noise import (
     WhiteNoise,
     noise_on_srgb,
 )
-from rawaug.training.srgb_samples import NoisyPictures, SrgbSamples, Told
+from rawaug.training.srgb_samples import Conditioning, NoisyPictures, SrgbSamples
 
 GREY = torch.full((6, 3, 128, 128), 0.5)
 
@@ -154,7 +154,7 @@ def test_a_share_of_coloured_noise_is_wide_and_the_deviation_stays() -> None:
 
 
 def test_a_network_is_told_nothing_the_deviation_or_a_wrong_one() -> None:
-    told, generator = Told(unknown=0.3, exact=0.5, factor=2.0), torch.Generator().manual_seed(0)
+    told, generator = Conditioning(unknown=0.3, exact=0.5, factor=2.0), torch.Generator().manual_seed(0)
     times = torch.tensor([told.sample(generator) for _ in range(4000)])
     assert (times == 0).float().mean().item() == pytest.approx(0.3, abs=0.03)
     assert (times == 1).float().mean().item() == pytest.approx(0.5, abs=0.03)
@@ -170,7 +170,7 @@ def test_a_share_of_the_samples_has_noise_drawn_on_srgb_and_each_depends_on_its_
             return [Sample(*torch.rand(3, 3, 8, 8, generator=one)) for one in generators]
 
     grey = NoisyPictures([torch.full((3, 40, 40), 99, dtype=torch.uint8)], WhiteNoise(), 8)
-    mixed = SrgbSamples(Camera(), grey, 0.25, Told())  # type: ignore[arg-type]
+    mixed = SrgbSamples(Camera(), grey, 0.25, Conditioning())  # type: ignore[arg-type]
     samples = mixed.draw_batch([torch.Generator().manual_seed(k) for k in range(400)])
     share = sum(bool((one.clean == 99 / 255).all()) for one in samples) / 400
     assert share == pytest.approx(0.25, abs=0.06)
