@@ -68,4 +68,4 @@ def test_an_arm_sees_as_many_real_crops_with_further_ones_as_without() -> None:
         assert len(samples) == batch
 
     with pytest.raises(ValueError, match=r"arms\.one: source: own"):
-        Recipe(camera="universal", data=DataConfig(pairs=None), arms={"one": ArmConfig(1.0, source="own")})
+        Recipe(isp="universal", data=DataConfig(pairs=None), arms={"one": ArmConfig(1.0, source="own")})
