@@ -14,10 +14,11 @@ from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder
 from rawaug.data.pairs import DATASETS, PICTURES, Binned, Pair
+from rawaug.data.points import Lights
 from rawaug.data.sidd_benchmark import SiddBenchmark, write_submission
 
 __all__ = [
-    "DATASETS", "PICTURES", "Binned", "DemoCamera", "Dnd", "Pair", "PairFolder", "PictureFolder", "RawFolder", "Shapes",
-    "SiddBenchmark", "check", "dead_leaves", "demo_pairs", "demo_photographs", "demo_pictures", "open_pairs",
+    "DATASETS", "PICTURES", "Binned", "DemoCamera", "Dnd", "Lights", "Pair", "PairFolder", "PictureFolder", "RawFolder",
+    "Shapes", "SiddBenchmark", "check", "dead_leaves", "demo_pairs", "demo_photographs", "demo_pictures", "open_pairs",
     "open_pictures", "write_dnd_submission", "write_submission",
 ]  # fmt: skip

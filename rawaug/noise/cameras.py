@@ -44,7 +44,7 @@ from rawaug.noise.models import NOISE, NoiseModel, PoissonGaussianNoise, ShotRea
 from rawaug.noise.profiles import ANY_CAMERA, ProfileLevels, load_profiles
 from rawaug.registry import Spec, check_settings, split_spec, suggest
 
-NoiseSpec = Spec | Sequence[float] | Sequence[str]
+NoiseSpec = Spec | Sequence[float] | Sequence[Spec]
 """A name with or without settings, (shot_var, read_var), or several names, of which each picture draws one."""
 
 
@@ -84,8 +84,9 @@ def noise_levels(spec: NoiseSpec | NoiseLevels | NoiseModel, *, iso: Iso = None)
     """Make levels from a name, from a mixture of names, or fixed ones from (shot_var, read_var).
 
     Args:
-        spec: a preset or camera, several of them of which each picture draws one, or two variances, white = 1. Or a law
-            of your own, such as :class:`MeasuredLevels`, a model with one, or ``{name: MeasuredNoise, settings: ...}``.
+        spec: a preset or camera, several of them of which each picture draws one, or two variances, white = 1. A camera
+            within a range of ISO is ``{name: any camera, settings: {iso: [50, 200]}}``. Or a law of your own, such as
+            :class:`MeasuredLevels`, a model with one, or ``{name: MeasuredNoise, settings: ...}``.
         iso: ISO of a camera: one value, limits, or None for its whole measured range.
 
     Raises:
@@ -96,6 +97,10 @@ def noise_levels(spec: NoiseSpec | NoiseLevels | NoiseModel, *, iso: Iso = None)
         return _levels_at(law, iso)
     if isinstance(spec, str):
         return _levels_by_name(spec, iso)
+    if isinstance(spec, Mapping):
+        name, settings = split_spec(spec)
+        make_levels = partial(_levels_by_name, name)
+        return make_levels(**check_settings(f"noise {name!r}", make_levels, {"iso": iso, **settings}))
     if _is_list_of_names(spec):
         return MixedLevels([noise_levels(name, iso=iso) for name in spec])
 
@@ -156,10 +161,10 @@ def _levels_of_profile(name: str, iso: Iso) -> ProfileLevels:
     return ProfileLevels(name, iso)
 
 
-def _is_list_of_names(spec: Any) -> TypeGuard[Sequence[str]]:
+def _is_list_of_names(spec: Any) -> TypeGuard[Sequence[Spec]]:
     if not isinstance(spec, Sequence) or not spec:
         return False
-    return all(isinstance(name, str) for name in spec)
+    return all(isinstance(name, (str, Mapping)) for name in spec)
 
 
 def _no_iso(spec: object) -> ValueError:

@@ -16,7 +16,7 @@ ones add up. Their parameters share one dictionary and one seed per picture, fro
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import ClassVar
 
@@ -35,7 +35,7 @@ from rawaug.noise.models import (
     draw_seeds,
     per_picture,
 )
-from rawaug.registry import require_between
+from rawaug.registry import Spec, require_between
 
 _NO_STEP = 1e-12
 """Replaces a quantum of 0, which means that nothing is rounded."""
@@ -368,7 +368,7 @@ class SensorNoise(Compose):
 
     def __init__(
         self,
-        levels: NoiseLevels | str | Sequence[float] | Sequence[str],
+        levels: NoiseLevels | Spec | Sequence[float] | Sequence[Spec],
         *,
         poisson: bool = False,
         tukey_lambda: float | tuple[float, float] | None = None,
@@ -388,7 +388,7 @@ class SensorNoise(Compose):
         require_not_negative(told=told)
         require_between("share", share, 0.0, 1.0)
         self.told, self.share = told, share
-        if isinstance(levels, (str, Sequence)):
+        if isinstance(levels, (str, Sequence, Mapping)):
             levels = noise_levels(levels)
 
         # The greens differ in the light that they receive, and photons are counted after that.

@@ -35,6 +35,7 @@ from rawaug.noise.profiles import (
     load_profiles,
     profile_ends,
 )
+from rawaug.registry import Spec
 
 N = 20_000
 LAWS = {  # name: base of the logarithm, shot range, slope, intercept, sigma
@@ -168,6 +169,16 @@ def test_wrong_names_and_options_are_refused_in_one_line() -> None:
         SiddLevels("Pixel")
     with pytest.raises(ValueError, match="ELD camera"):
         EldLevels("Pixel")
+
+
+def test_a_law_of_a_mixture_may_be_a_camera_within_a_range_of_iso() -> None:
+    base_iso: Spec = {"name": "any camera", "settings": {"iso": [50, 200]}}
+    shot, _ = draw(noise_levels(["cycleisp_sidd", base_iso]))
+    alone, _ = draw(noise_levels(base_iso))
+    assert alone.max() < 1e-3 and alone.min() < 1e-5
+    assert (shot < 6.8e-4).float().mean().item() == pytest.approx(0.5, abs=0.1)
+    with pytest.raises(ValueError, match="no setting 'isso'"):
+        noise_levels([{"name": "any camera", "settings": {"isso": 100}}])
 
 
 def test_a_mixture_draws_each_picture_s_levels_from_one_of_its_laws_all_alike() -> None:
