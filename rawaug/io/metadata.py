@@ -68,8 +68,9 @@ _LAYOUT = frozenset(
     )
 )
 """These tags of a TIFF describe how its pixels are stored; 37724 holds Photoshop's layers, which are other pixels."""
-_NOT_IN_EXIF = (XMP_TAG, IPTC_TAG, PHOTOSHOP_TAG, ICC_TAG)
-"""Other files have these tags of a TIFF in separate parts."""
+_DNG_TAGS = range(50706, 52600)
+_NOT_IN_EXIF = frozenset((XMP_TAG, IPTC_TAG, PHOTOSHOP_TAG, ICC_TAG, *_DNG_TAGS))
+"""Other files have these tags of a TIFF in separate parts, or, being no DNG, must not have them."""
 
 _OF_PNG_CODING = (
     *(b"IHDR", b"PLTE", b"IDAT", b"IEND", b"tRNS", b"hIST", b"sPLT", b"bKGD", b"sBIT"),

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from rawaug.bayer import turn
 from rawaug.errors import extra
-from rawaug.files import require_file
+from rawaug.files import replacing, require_file
 from rawaug.io.content import content_of
 from rawaug.io.decoding import MAX_PIXELS as MAX_PIXELS
 from rawaug.io.decoding import Decoded, decode, load_oiio, reason
@@ -164,6 +164,23 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
     success = output.open(str(path), spec) and output.write_image(np.ascontiguousarray(pixels))
     require_written(output, success, path)
+
+
+def write_linear(path: str | Path, light: Tensor) -> None:
+    """Write linear light ``(3, H, W)``, of any range, as an OpenEXR file of 16-bit floating point.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    oiio = load_oiio()
+    pixels = np.ascontiguousarray(light.detach().cpu().permute(1, 2, 0).numpy().astype(np.float32))
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "half")
+    with replacing(path) as partial:
+        partial = partial.with_name(partial.name + ".exr")
+        output = oiio.ImageOutput.create(str(partial))
+        success = output.open(str(partial), spec) and output.write_image(pixels)
+        require_written(output, success, path)
+        partial.replace(partial.with_suffix(""))
 
 
 def require_written(output: Any, success: bool, path: str | Path) -> None:

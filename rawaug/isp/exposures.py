@@ -23,6 +23,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from rawaug.isp.alignment import Motion, contradiction, move_back
 from rawaug.isp.config import ISPParams, ISPResult
 from rawaug.isp.functional import as_display_referred, inverse_gains
 from rawaug.isp.model import DictionaryISP
@@ -35,6 +36,9 @@ _CLIPPED, _RAMP = 0.95, 0.1
 _LAST_RESORT = 1e-4
 """Minimum weight of the shortest exposure, which decides if no other does."""
 
+_NOTHING_ELSE = 1e-8
+"""Minimum weight of the reference, which decides where no other exposure saw the scene."""
+
 _SCENE_WHITE = 0.999
 """Minimum share of pixels that are not clipped."""
 
@@ -45,15 +49,23 @@ def confidence(srgb: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def merge_exposures(isp: DictionaryISP, pictures: Sequence[Tensor], ev: Sequence[float]) -> ISPResult:
-    """Merge aligned pictures of a scene into its RAW at 0 EV; one picture alone is divided by its exposure.
+def merge_exposures(
+    isp: DictionaryISP,
+    pictures: Sequence[Tensor],
+    ev: Sequence[float],
+    motions: Sequence[Motion] | None = None,
+) -> ISPResult:
+    """Merge pictures of a scene into its RAW at 0 EV; one picture alone is divided by its exposure.
 
-    All pictures share the setting that the ISP chooses for the one nearest to 0 EV.
+    All pictures share the setting that the ISP chooses for the one nearest to 0 EV, the reference.
 
     Args:
         isp: the camera.
         pictures: sRGB ``(B, 3, H, W)`` each, uint8 or float in [0, 1].
         ev: exposure of each picture in stops.
+        motions: how each single picture moved against the reference, by
+            :func:`rawaug.isp.alignment.find_motion`. The pictures are brought to the reference's pixels in RAW, and
+            places where one contradicts the reference do not count. Without motions the pictures are aligned.
 
     Returns:
         The RAW ``(B, 3, H, W)`` as ``image``, with all colours at every pixel, and the setting. RAW exceeds 1 where the
@@ -64,20 +76,36 @@ def merge_exposures(isp: DictionaryISP, pictures: Sequence[Tensor], ev: Sequence
     """
     _require_bracket(pictures, ev)
 
-    nearest = min(range(len(ev)), key=lambda k: abs(ev[k]))
-    params = isp.choose(as_display_referred(pictures[nearest]))
+    nearest = reference_exposure(ev)
+    reference = as_display_referred(pictures[nearest])
+    params = isp.choose(reference)
+    reference_weight = confidence(reference)
+    reference_light = _linear_reverse(isp, reference, params) / 2.0 ** ev[nearest]
 
     total = exposure = torch.zeros(())
-    for picture, stops in zip(pictures, ev, strict=True):
+    for number, (picture, stops) in enumerate(zip(pictures, ev, strict=True)):
         x = as_display_referred(picture)
         weight = confidence(x)
         if stops == min(ev):
             weight = weight.clamp_min(_LAST_RESORT)
+        raw = _linear_reverse(isp, x, params)
 
-        total = total + weight * _linear_reverse(isp, x, params)
+        if motions is not None and number != nearest:
+            raw, weight = move_back(raw, motions[number]), move_back(weight, motions[number]).clamp(0.0, 1.0)
+            clear = weight * reference_weight
+            weight = weight * (1.0 - contradiction(reference_light, raw / 2.0**stops, clear))
+        if motions is not None and number == nearest:
+            weight = weight.clamp_min(_NOTHING_ELSE)
+
+        total = total + weight * raw
         exposure = exposure + weight * 2.0**stops
 
     return ISPResult(total / exposure, params)
+
+
+def reference_exposure(ev: Sequence[float]) -> int:
+    """Return the number of the picture nearest to 0 EV, whose pixels and setting the merged picture has."""
+    return min(range(len(ev)), key=lambda number: abs(ev[number]))
 
 
 @torch.no_grad()
@@ -94,14 +122,20 @@ def render_exposure(isp: DictionaryISP, raw: Tensor, params: ISPParams, ev: floa
         sRGB ``(B, 3, H, W)`` in [0, 1].
     """
     raw = raw * 2.0**ev
+    light = linear_light(isp, raw, params).amax(dim=1, keepdim=True)
+
+    compressed = raw * _compress(light) / light.clamp_min(_MIDDLE_GREY)
+    return isp.forward_pixels(compressed, params).clamp(0.0, 1.0)
+
+
+@torch.no_grad()
+def linear_light(isp: DictionaryISP, raw: Tensor, params: ISPParams) -> Tensor:
+    """Convert RAW ``(B, 3, H, W)`` to linear sRGB of the same shape, neither compressed nor clipped."""
     light = raw
     for stage in reversed(isp.ordered_stages):
         if stage.makes > 2:
             light = stage.forward(light, params)
-    light = light.amax(dim=1, keepdim=True)
-
-    compressed = raw * _compress(light) / light.clamp_min(_MIDDLE_GREY)
-    return isp.forward_pixels(compressed, params).clamp(0.0, 1.0)
+    return light
 
 
 def _linear_reverse(isp: DictionaryISP, x: Tensor, params: ISPParams) -> Tensor:

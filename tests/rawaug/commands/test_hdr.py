@@ -13,20 +13,26 @@ import torch
 from rawaug.cli import main
 from rawaug.commands.hdr import exposures, hdr
 from rawaug.commands.hdr import run as hdr_command
+from rawaug.data.demo import demo_photographs
 from rawaug.io import read_picture, write_picture
-from rawaug.io.pictures import read_exposure
+from rawaug.io.pictures import decode_srgb, encode_srgb, read_exposure
+from rawaug.io.stored import read_stored
 
 
-def shot(path: Path, level: int, seconds: float = 0.0, iso: int = 100, size: tuple[int, int] = (8, 12)) -> str:
-    """A grey JPEG, with EXIF if it was exposed for ``seconds`` at f/4."""
+def shot(
+    path: Path, level: int | np.ndarray, seconds: float = 0.0, iso: int = 100, size: tuple[int, int] = (8, 12)
+) -> str:
+    """A JPEG of one grey level, or of pixels ``(H, W, 3)``, with EXIF if it was exposed for ``seconds`` at f/4."""
+    pixels = np.broadcast_to(np.asarray(level, np.uint8), (*size, 3)).copy()
     spec = oiio.ImageSpec(size[1], size[0], 3, "uint8")
+    spec.attribute("CompressionQuality", 97)
     if seconds:
         spec.attribute("ExposureTime", seconds)
         spec.attribute("FNumber", 4.0)
         spec.attribute("Exif:PhotographicSensitivity", iso)
     output = oiio.ImageOutput.create(str(path))
     assert output is not None
-    assert output.open(str(path), spec) and output.write_image(np.full((*size, 3), level, np.uint8)) and output.close()
+    assert output.open(str(path), spec) and output.write_image(pixels) and output.close()
     return str(path)
 
 
@@ -47,7 +53,8 @@ def test_the_command_writes_the_merged_picture(tmp_path: Path, capsys: pytest.Ca
     write_picture(bright, ramp)
     arguments = ["hdr", dark, bright, "--ev", "[-2,0]", "--out", str(out), "--isp", "universal-small"]
     assert main(arguments) == 0
-    assert capsys.readouterr().out == f"{out}\n"
+    undetailed, written = capsys.readouterr().out.splitlines()
+    assert "too little detail" in undetailed and written == str(out)
     merged = hdr([dark, bright], [-2, 0], isp="universal-small")
     assert (read_picture(out) / 255.0 - merged).abs().max() <= 0.51 / 255
     alone, brighter = (hdr([dark], exposure=stops, isp="universal-small").mean() for stops in (0.0, 1.0))
@@ -73,3 +80,39 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
         hdr([str(tmp_path / "none.jpg"), first])
     with pytest.raises(ValueError, match="exposure"):
         hdr([first], exposure=5000.0)
+
+
+def test_a_handheld_bracket_is_written_in_16_bits_with_exif_and_as_linear_light(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = demo_photographs("test")["coffee"].float() / 255
+    paths = []
+    for name, ev, top in (("short", -2, 6), ("middle", 0, 8), ("long", 2, 11)):
+        shown = encode_srgb((decode_srgb(scene) * 0.3 * 2.0**ev).clamp(0, 1))
+        pixels = (shown[:, top : top + 256, top : top + 320] * 255).byte().permute(1, 2, 0).numpy()
+        paths.append(shot(tmp_path / f"{name}.jpg", pixels, 2.0**ev / 100, size=(256, 320)))
+
+    assert main(["hdr", *paths, "--out", str(tmp_path / "merged.tif")]) == 0
+    short, long, _ = capsys.readouterr().out.splitlines()
+    distances = [float(line.split("moved by ")[1].split()[0]) for line in (short, long)]
+    assert distances == pytest.approx([8**0.5, 18**0.5], abs=0.4)
+
+    stored = read_stored(tmp_path / "merged.tif")
+    assert stored.colours.dtype == np.uint16
+    assert read_exposure(tmp_path / "merged.tif") == pytest.approx(read_exposure(paths[1]), abs=1e-3)
+    middle = read_picture(paths[1]).float() / 255
+    shadows = (middle > 0.1) & (middle < 0.3)  # above, highlights are compressed
+    assert (stored.srgb - middle)[shadows].abs().median() < 1.5 / 255
+
+    assert main(["hdr", *paths, "--out", str(tmp_path / "merged.exr"), "--exposure", "2"]) == 0
+    light = oiio.ImageBuf(str(tmp_path / "merged.exr")).get_pixels()
+    assert light.dtype == np.float32 and light.max() > 1.1, "highlights are not clipped"
+
+
+def test_parts_that_move_by_themselves_are_refused_by_name(tmp_path: Path) -> None:
+    scene = demo_photographs("test")["coffee"]
+    torn = torch.cat([scene[:, k : k + 50].roll((3 * k) % 17 - 8, dims=2) for k in range(0, 400, 50)], dim=1)
+    for name, picture in (("a", scene), ("b", torn)):
+        write_picture(tmp_path / f"{name}.png", picture)
+    with pytest.raises(ValueError, match=r"b\.png: .* parts moved otherwise .*--align false"):
+        hdr([tmp_path / "a.png", tmp_path / "b.png"], [0.0, 0.1], isp="universal-small")
