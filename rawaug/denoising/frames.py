@@ -163,6 +163,9 @@ def _rest(levels: Levels | None, strength: float) -> Levels | None:
 
 def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
     """Clip, in place, what a digital number cannot hold; return the share of clipped sites."""
+    if frame.floating:
+        return 0.0
+
     cell = cell_of_planes(frame.cfa)
     size = len(cell)
 

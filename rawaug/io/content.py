@@ -11,7 +11,7 @@ linear RAW (34892). Source: TIFF 6.0; DNG 1.7.1; ISO/IEC 14496-12 (brands of HEI
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,7 +19,7 @@ from typing import BinaryIO, Literal, NamedTuple
 
 from rawaug.errors import count_of, escape, how_to_install
 from rawaug.files import files_below, require_file
-from rawaug.io.directories import PHOTOMETRIC, SUB_DIRECTORIES, DamagedTags, Directory, TiffFile
+from rawaug.io.directories import PHOTOMETRIC, DamagedTags, TiffFile
 
 RAW_EXTENSIONS = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
@@ -75,7 +75,6 @@ _AVIF = (b"avif", b"avis")
 _PORTABLE = tuple(b"P%d" % number for number in range(1, 8))
 _DNG_VERSION, _LEAF = 50706, 34310
 _RAW_PHOTOMETRICS = (32803, 34892)
-_MOST_DIRECTORIES = 32
 
 
 def content_of(path: str | Path) -> Content:
@@ -152,7 +151,7 @@ def _of_tiff(file: BinaryIO) -> Content:
     """Tell RAW from a picture; with damaged directories it is a picture, and its reader will report them."""
     try:
         tiff = TiffFile(file)
-        for directory in _directories(tiff):
+        for directory in tiff.directories():
             if _DNG_VERSION in directory.entries:
                 return Content("raw", "DNG")
             photometric = tiff.number(directory, PHOTOMETRIC, -1)
@@ -161,22 +160,6 @@ def _of_tiff(file: BinaryIO) -> Content:
     except DamagedTags:
         pass
     return Content("picture", "TIFF")
-
-
-def _directories(tiff: TiffFile) -> Iterator[Directory]:
-    """Yield the first directories of a file and those that they point at, each once."""
-    waiting = [tiff.first]
-    places: set[int] = set()
-    while waiting and len(places) < _MOST_DIRECTORIES:
-        place = waiting.pop(0)
-        if not place or place in places:
-            continue
-        places.add(place)
-
-        directory = tiff.directory(place)
-        yield directory
-        waiting.extend(tiff.numbers(directory.entries.get(SUB_DIRECTORIES)))
-        waiting.append(directory.following)
 
 
 # -- folders of files of many kinds ------------------------------------------------------------------------------------

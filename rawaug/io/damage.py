@@ -6,18 +6,27 @@ NewRawImageDigest). The second is lossless JPEG itself: its code words have many
 stream end before its pixels do, or after them. To check this, the last bytes of a stream are changed, others are
 appended, and it is decoded again: in a sound stream the last samples change, and no others do.
 
-Source: DNG specification 1.4, chapter 4; ITU-T T.81, annex H.
+DNG's compression 7 is JPEG of any process. Cinema cameras write the lossy one (DCT of 12 bits), to which the second
+check does not apply; such a stream must have its end.
+
+A RAW file of which only the header is there decodes to zeros in some formats. Its table of strips says how long it
+should be, and rows of one number below black are no picture.
+
+Source: DNG specification 1.4, chapter 4; ITU-T T.81, annexes B and H.
 """
 
 from __future__ import annotations
 
 from hashlib import md5
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 
 from rawaug.errors import extra
-from rawaug.io.tiff import LOSSLESS_JPEG, StoredMosaic
+from rawaug.io.directories import STRIP_BYTES, TILE_BYTES, DamagedTags, TiffFile
+from rawaug.io.headers import jpeg_segments
+from rawaug.io.tiff import JPEG, StoredMosaic
 
 _TILE = 256
 """The tiles of NewRawImageDigest have this side."""
@@ -27,6 +36,15 @@ _CHANGED_BYTES = (2, 16)
 """This many bytes are changed at the end of the data, the larger number if the last two are padding."""
 _MORE = b"\x5a\x33" * 32
 """This is appended to the data, for a decoder that reads on."""
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""These markers start a frame of JPEG; the others of the range are tables."""
+_LOSSLESS_FRAME = 0xC3
+_LEAST_SHARE = 0.5
+"""A file holds at least this share of its strips; Panasonic's tables state 7/4 of the bytes that are there."""
+_VERSIONS = (42, 43, 0x55, 0x4F52, 0x5352)
+"""These are the second numbers of TIFF, of BigTIFF, of RW2 and of two kinds of ORF."""
+_EMPTY_ROWS = 16
+"""This many rows of one number below black, at the end of a mosaic, were never decoded."""
 
 
 def find_fault(path: Path, stored: StoredMosaic, numbers: np.ndarray | None) -> str:
@@ -47,9 +65,45 @@ def find_fault(path: Path, stored: StoredMosaic, numbers: np.ndarray | None) -> 
                 return "its pixels do not match RawImageDigest"
             return ""
 
-    if stored.compression == LOSSLESS_JPEG:
+    if stored.compression == JPEG:
         return _find_fault_in_streams(path, stored)
     return ""
+
+
+def stated_bytes(path: Path) -> int:
+    """Read how many bytes the largest picture of a file based on TIFF has; 0 if it is another kind of file."""
+    most = 0
+    with path.open("rb") as file:
+        try:
+            tiff = TiffFile(file)
+            if tiff.version not in _VERSIONS:
+                return 0
+            for directory in tiff.directories():
+                for code in (STRIP_BYTES, TILE_BYTES):
+                    most = max(most, sum(tiff.numbers(directory.entries.get(code))))
+        except DamagedTags:  # Fuji, Canon's older files and others have no such tables
+            pass
+    return most
+
+
+def is_cut_short(path: Path) -> bool:
+    """Tell whether a file is much shorter than its largest picture."""
+    return path.stat().st_size < _LEAST_SHARE * stated_bytes(path)
+
+
+def count_empty_rows(numbers: np.ndarray, black: float) -> int:
+    """Count the rows ``(H, W)`` at the end that hold one number below black; 0 if they are few."""
+    last = numbers[-1, -1]
+    if last >= black:
+        return 0
+
+    filled = np.flatnonzero((numbers != last).any(axis=1))
+    rows = len(numbers)
+    if filled.size:
+        rows -= 1 + int(filled[-1])
+    if rows < _EMPTY_ROWS:
+        return 0
+    return rows
 
 
 def tiled_digest(numbers: np.ndarray) -> bytes:
@@ -75,6 +129,13 @@ def _find_fault_in_streams(path: Path, stored: StoredMosaic) -> str:
             file.seek(offset)
             stream = file.read(length)
 
+            height, width, components, is_lossless = _frame(stream)
+            if not is_lossless:
+                if _END not in stream:
+                    return f"part {number} of {count} has no end"
+                samples += height * width * components
+                continue
+
             decoded = _decode(stream)
             if decoded is None:
                 return f"part {number} of {count} cannot be decoded"
@@ -86,6 +147,15 @@ def _find_fault_in_streams(path: Path, stored: StoredMosaic) -> str:
     if samples < height * width:
         return f"holds {samples} of {height * width} sites"
     return ""
+
+
+def _frame(stream: bytes) -> tuple[int, int, int, bool]:
+    """Read height, width and components of a JPEG, and whether it is lossless; one without a frame counts as such."""
+    for segment in jpeg_segments(BytesIO(stream)):
+        if segment.marker in _FRAMES and len(segment.data) >= 6:
+            height, width = int.from_bytes(segment.data[1:3], "big"), int.from_bytes(segment.data[3:5], "big")
+            return height, width, segment.data[5], segment.marker == _LOSSLESS_FRAME
+    return 0, 0, 0, True
 
 
 def _decode(stream: bytes) -> np.ndarray | None:

@@ -8,17 +8,19 @@ is converted here, so copied data stay as they were, makers' notes included. Sou
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import BinaryIO, NamedTuple
 
 ORIENTATION, COMPRESSION, PHOTOMETRIC, SUB_DIRECTORIES = 274, 259, 262, 330
 EXIF, GPS, INTEROPERABILITY = 34665, 34853, 40965
+STRIP_BYTES, TILE_BYTES = 279, 325
 THUMBNAIL, THUMBNAIL_BYTES = 513, 514
 POINTERS = (EXIF, GPS, INTEROPERABILITY)
 """The value of these tags is the place of another directory."""
 
 MOST_ENTRIES, MOST_BYTES, MOST_NUMBERS = 4096, 2**26, 2**20
 """These are the limits of a directory and of its values; larger ones count as damaged."""
+_MOST_DIRECTORIES = 32
 
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 """A value has this many bytes, by type."""
@@ -74,8 +76,8 @@ class TiffFile:
             raise DamagedTags("no TIFF header")
         self.order = orders[head[:2]]
 
-        (version,) = struct.unpack_from(self.order + "H", head, 2)
-        self.big = version == 43
+        (self.version,) = struct.unpack_from(self.order + "H", head, 2)
+        self.big = self.version == 43
         self.first: int
         if self.big:
             (self.first,) = struct.unpack_from(self.order + "Q", head, 8)
@@ -108,6 +110,21 @@ class TiffFile:
             entries[code] = Entry(code, dtype, values, at, size)
 
         return Directory(entries, self._following(place + head + count * step, pointer))
+
+    def directories(self) -> Iterator[Directory]:
+        """Yield the first directories of a file and those that they point at, each once."""
+        waiting = [self.first]
+        places: set[int] = set()
+        while waiting and len(places) < _MOST_DIRECTORIES:
+            place = waiting.pop(0)
+            if not place or place in places:
+                continue
+            places.add(place)
+
+            directory = self.directory(place)
+            yield directory
+            waiting.extend(self.numbers(directory.entries.get(SUB_DIRECTORIES)))
+            waiting.append(directory.following)
 
     def tag(self, entry: Entry) -> Tag:
         """Read a tag with its values."""

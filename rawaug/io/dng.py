@@ -1,5 +1,8 @@
 r"""Writing of mosaics and linear RGB as DNG: ``d = round(y (white - black) + black)``, 16 bits a site or sample.
 
+A frame of floating-point numbers is written as such: y itself, with black at 0 and white at 1, in 32 bits that are
+neither rounded nor compressed.
+
 ``AsShotNeutral`` is the colour of grey to the camera, ``1 / white_balance``. ``ColorMatrix1`` takes XYZ to the camera
 under D65, ``X = diag(1 / daylight) M^-1 S^-1``, from the frame's ``color_matrix`` M (white-balanced camera to linear
 sRGB) and S, which takes linear sRGB to XYZ: the inverse of what :func:`rawaug.io.read_raw` does.
@@ -67,7 +70,7 @@ _EXIF_ORIENTATIONS = {0: 1, 1: 2, 3: 3, 2: 4, 4: 5, 6: 6, 7: 7, 5: 8}
 """This maps LibRaw's flip to an EXIF orientation."""
 
 _SUBFILE_TYPE, _ORIENTATION, _PHOTOMETRIC, _SUB_IFDS = 254, 274, 262, 330
-_UNIQUE_CAMERA_MODEL = 50708
+_BACKWARD_VERSION, _UNIQUE_CAMERA_MODEL = 50707, 50708
 _CROP_ORIGIN, _CROP_SIZE = 50719, 50720
 _COLOR_MATRIX, _AS_SHOT_NEUTRAL, _ILLUMINANT = 50721, 50728, 50778
 _NOISE_PROFILE, _NEW_RAW_DIGEST = 51041, 51111
@@ -107,6 +110,8 @@ def write_dng(
     _require_colour(frame, path)
     if rgb is not None:
         layout, numbers = _FULL_COLOUR, linear_numbers(frame, rgb, path)
+    elif frame.floating:
+        layout, numbers = _LAYOUTS.get(frame.cfa, _MOSAIC), floating_numbers(frame, path)
     else:
         layout, numbers = _LAYOUTS.get(frame.cfa, _MOSAIC), digital_numbers(frame, path)
 
@@ -138,7 +143,7 @@ def _tags(frame: RawFrame, layout: _Layout, numbers: np.ndarray, carried: Carrie
     tags[_ORIENTATION] = (SHORT, 1, _EXIF_ORIENTATIONS[frame.orientation])
 
     tags |= _crop(frame, *numbers.shape[:2])
-    if numbers.ndim == 2:
+    if numbers.ndim == 2 and numbers.dtype == np.uint16:
         tags[_NEW_RAW_DIGEST] = (BYTE, 16, tiled_digest(numbers))
 
     for code in layout.inapplicable:
@@ -181,14 +186,15 @@ def _write_pixels(
         columns = numbers.reshape(height, width // 2, 2)
         planes = None
 
-    stream = imagecodecs.jpeg8_encode(columns, lossless=True, predictor=1, bitspersample=16)
+    pixels: dict[str, Any] = {"data": np.ascontiguousarray(numbers)}
+    if numbers.dtype == np.uint16:
+        stream = imagecodecs.jpeg8_encode(columns, lossless=True, predictor=1, bitspersample=16)
+        pixels = {"data": iter([stream]), "bitspersample": 16, "compression": "jpeg"}
+        pixels |= {"shape": numbers.shape, "dtype": numbers.dtype}
+
     with tifffile.TiffWriter(path, byteorder="<" if carried.byte_order == "<" else ">") as tiff:
         tiff.write(
-            iter([stream]),
-            shape=numbers.shape,
-            dtype=numbers.dtype,
-            bitspersample=16,
-            compression="jpeg",
+            **pixels,
             rowsperstrip=height,
             planarconfig=planes,
             photometric=photometric,
@@ -214,9 +220,7 @@ def _require_colour(frame: RawFrame, path: Path) -> None:
 
 def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
     """Convert the mosaic to uint16 ``(H, W)``."""
-    height, width = frame.mosaic.shape[-2:]
-    if frame.mosaic.shape[0] != 1 or frame.mosaic.ndim != 3 or height % 2 or width % 2:
-        raise ValueError(f"{path}: the mosaic must be (1, H, W) with even sides, got {tuple(frame.mosaic.shape)}")
+    height, width = _require_mosaic(frame, path)
     if not 0 <= min(frame.black) <= max(frame.black) < frame.white < _BEYOND_16_BITS:
         raise ValueError(f"{path}: levels must be 0 <= black < white <= 65535, got {frame.black} and {frame.white}")
 
@@ -236,6 +240,19 @@ def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
     return numbers
 
 
+def floating_numbers(frame: RawFrame, path: Path) -> np.ndarray:
+    """Convert the mosaic to float32 ``(H, W)``, with black at 0 and white at 1."""
+    _require_mosaic(frame, path)
+    return np.ascontiguousarray(frame.mosaic[0].numpy(), np.float32)
+
+
+def _require_mosaic(frame: RawFrame, path: Path) -> tuple[int, int]:
+    height, width = frame.mosaic.shape[-2:]
+    if frame.mosaic.shape[0] != 1 or frame.mosaic.ndim != 3 or height % 2 or width % 2:
+        raise ValueError(f"{path}: the mosaic must be (1, H, W) with even sides, got {tuple(frame.mosaic.shape)}")
+    return height, width
+
+
 def cell_of_planes(cfa: str) -> Tensor:
     """Give, for the sites of a pattern's cell, the indices ``(n, n)`` into a frame's ``black``."""
     if cfa == MONOCHROME:
@@ -244,10 +261,15 @@ def cell_of_planes(cfa: str) -> Tensor:
 
 
 def linear_numbers(frame: RawFrame, rgb: Tensor, path: Path) -> np.ndarray:
-    """Convert linear RGB to uint16 ``(H, W, 3)``, with black at 0 and white at 65535, clipped at both."""
+    """Convert linear RGB to uint16 ``(H, W, 3)``, with black at 0 and white at 65535, clipped at both.
+
+    That of a floating-point frame becomes float32 with white at 1, clipped at white.
+    """
     size = frame.mosaic.shape[-2:]
     if rgb.shape != (3, *size):
         raise ValueError(f"{path}: full colour of this frame is (3, {size[0]}, {size[1]}), got {tuple(rgb.shape)}")
+    if frame.floating:
+        return rgb.permute(1, 2, 0).clamp(max=1).contiguous().numpy()
     return (rgb.permute(1, 2, 0).clamp(0, 1) * LINEAR_WHITE).round().numpy().astype(np.uint16)
 
 
@@ -269,7 +291,7 @@ def _converted(frame: RawFrame, baseline_exposure: float) -> Tags:
     needed = 3 if frame.gain_maps else 1
     tags: Tags = {
         DNG_VERSION: (BYTE, 4, bytes((1, 4, 0, 0))),
-        50707: (BYTE, 4, bytes((1, needed, 0, 0))),
+        _BACKWARD_VERSION: (BYTE, 4, bytes((1, needed, 0, 0))),
         50730: (SRATIONAL, 1, _rationals([baseline_exposure])),
         **_opcodes(OPCODE_LIST_2, [m for m in frame.gain_maps if m.on_mosaic]),
         **_opcodes(OPCODE_LIST_3, [m for m in frame.gain_maps if not m.on_mosaic]),
@@ -327,6 +349,10 @@ def _levels(frame: RawFrame, repeats: int, black: Sequence[float]) -> Tags:
         50714: (RATIONAL, len(black), _rationals(black, 2**14)),
         50717: (LONG, 1, round(frame.white)),
     }
+    if frame.floating:
+        tags[50714] = (RATIONAL, len(black), _rationals([0.0] * len(black)))
+        tags[50717] = (LONG, 1, 1)
+        tags[_BACKWARD_VERSION] = (BYTE, 4, bytes((1, 4, 0, 0)))
     if frame.noise_profile is not None:
         tags[_NOISE_PROFILE] = (DOUBLE, 2, frame.noise_profile)
     return tags
@@ -342,7 +368,7 @@ def _of_full_colour(frame: RawFrame) -> Tags:
     return {
         50713: (SHORT, 2, (1, 1)),
         50714: (RATIONAL, 3, _rationals((0, 0, 0))),
-        50717: (LONG, 3, (LINEAR_WHITE,) * 3),
+        50717: (LONG, 3, (1 if frame.floating else LINEAR_WHITE,) * 3),
         **_opcodes(OPCODE_LIST_2, maps),
     }
 

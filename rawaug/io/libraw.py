@@ -22,9 +22,9 @@ import numpy as np
 
 from rawaug.errors import extra
 from rawaug.files import require_file
-from rawaug.io.damage import find_fault
+from rawaug.io.damage import count_empty_rows, find_fault, is_cut_short, stated_bytes
 from rawaug.io.pictures import require_utf8
-from rawaug.io.tiff import TiffTags, read_tiff_tags
+from rawaug.io.tiff import JPEG, TiffTags, read_tiff_tags
 
 MAX_PIXELS = 200_000_000
 """A mosaic has at most this many sites; the largest sensors have 150 million."""
@@ -40,8 +40,17 @@ KNOWN_PATTERNS = "Bayer, X-Trans and Quad-Bayer RAW is supported"
 _DEVELOPED = (b"\xff\xd8\xff", b"\x89PNG", b"RIFF", b"GIF8", b"\x00\x00\x00\x0cJXL", b"\xff\x0a")
 """Files that begin with these bytes cannot hold RAW: JPEG, PNG, WebP, GIF, JPEG XL."""
 
-_UNREAD_COMPRESSIONS = {52546: "JPEG XL (DNG 1.7)", 34892: "lossy JPEG", 8: "deflate", 32946: "deflate"}
-"""LibRaw may fail to decode these compressions, by TIFF's number."""
+_TO_LOSSLESS = "convert it to a DNG in lossless JPEG, as Adobe DNG Converter writes it"
+_UNREAD_COMPRESSIONS = {
+    52546: ("JPEG XL (DNG 1.7)", _TO_LOSSLESS),
+    34892: ("lossy JPEG", _TO_LOSSLESS),
+    9: ("GoPro's VC-5 (GPR)", "convert it with GoPro's gpr_tools (-i IN.GPR -o OUT.DNG) or Adobe DNG Converter"),
+    8: ("deflate", _TO_LOSSLESS),
+    32946: ("deflate", _TO_LOSSLESS),
+    5: ("LZW", _TO_LOSSLESS),
+}
+"""LibRaw may fail to decode these compressions, by TIFF's number; what to do then."""
+_BIG_TIFF = (b"II+\0", b"MM\0+")
 
 _COMPLAINT = re.compile(r": (Unexpected end of file|data corrupted at -?\d+)$")
 _M_PERTURB = -6
@@ -87,6 +96,8 @@ def _require_size(path: Path, raw: Any, tags: TiffTags) -> None:
     size = path.stat().st_size
     if tags.mosaic is not None and tags.mosaic.end > size:
         raise OSError(f"{path}: cannot be read as RAW: truncated, {size} of {tags.mosaic.end} bytes")
+    if tags.mosaic is None and is_cut_short(path):
+        raise OSError(f"{path}: cannot be read as RAW: truncated, {size} of {stated_bytes(path)} bytes")
 
     height, width = raw.sizes.raw_height, raw.sizes.raw_width
     if height * width > MAX_PIXELS:
@@ -95,14 +106,19 @@ def _require_size(path: Path, raw: Any, tags: TiffTags) -> None:
 
 def _unpack(path: Path, raw: Any, tags: TiffTags) -> None:
     """Decode the mosaic; raise OSError if a part of it is missing."""
+    stored = tags.mosaic
+    if stored is not None and stored.compression == JPEG and len(stored.segments) > 1 and not stored.tiled:
+        what = f"its mosaic is in {len(stored.segments)} strips of JPEG, of which LibRaw reads the first"
+        raise ValueError(f"{path}: {what}; {_TO_LOSSLESS}")
+
     with caught_stderr() as lines, _filled_memory() as filled:
         raw.unpack()
     if lines:
         raise OSError(f"{path}: is damaged inside (LibRaw: {lines[0]}); copy it again")
 
     numbers = None if is_stack(raw) else raw.raw_image
-    if tags.mosaic is not None:
-        fault = find_fault(path, tags.mosaic, numbers)
+    if stored is not None:
+        fault = find_fault(path, stored, numbers)
         if fault:
             raise OSError(f"{path}: is damaged inside ({fault}); copy it again")
 
@@ -111,6 +127,12 @@ def _unpack(path: Path, raw: Any, tags: TiffTags) -> None:
         missing = int((visible == FILL).sum())
         if missing >= SMALLEST_GAP:
             raise OSError(f"{path}: is damaged inside ({missing} of {visible.size} sites are missing); copy it again")
+
+    if numbers is not None:
+        empty = count_empty_rows(raw.raw_image_visible, min(raw.black_level_per_channel))
+        if empty:
+            height = raw.raw_image_visible.shape[0]
+            raise OSError(f"{path}: is damaged inside (the last {empty} of {height} rows are empty); copy it again")
 
 
 def is_stack(raw: Any) -> bool:
@@ -127,8 +149,11 @@ def _explained(path: Path, error: Any) -> Exception:
         import rawpy
 
     with path.open("rb") as file:
-        if file.read(12).startswith(_DEVELOPED):
-            return ValueError(f"{path}: this is a developed picture, not RAW; give the camera's RAW file")
+        head = file.read(12)
+    if head.startswith(_DEVELOPED):
+        return ValueError(f"{path}: this is a developed picture, not RAW; give the camera's RAW file")
+    if head.startswith(_BIG_TIFF):
+        return ValueError(f"{path}: is a BigTIFF, which LibRaw does not read; {_TO_LOSSLESS}")
 
     reason = str(error)
     if error.args and isinstance(error.args[0], bytes):
@@ -138,9 +163,8 @@ def _explained(path: Path, error: Any) -> Exception:
         compressions = read_tiff_tags(path).compressions
     except OSError:
         compressions = ()
-    for number, name in _UNREAD_COMPRESSIONS.items():
+    for number, (name, advice) in _UNREAD_COMPRESSIONS.items():
         if number in compressions and isinstance(error, rawpy.LibRawFileUnsupportedError):
-            advice = "convert it to a DNG in lossless JPEG, as Adobe DNG Converter writes it"
             return ValueError(f"{path}: is compressed as {name}, which LibRaw does not read ({reason}); {advice}")
 
     advice = "check that it is complete and from a supported camera"

@@ -36,7 +36,7 @@ from rawaug.io.content import RAW_EXTENSIONS as RAW_EXTENSIONS
 from rawaug.io.gain_map import GainMap, parse_gain_maps
 from rawaug.io.libraw import KNOWN_PATTERNS, caught_stderr, is_stack, opened_raw
 from rawaug.io.opcodes import OPCODE_LIST_2, OPCODE_LIST_3, move_opcodes
-from rawaug.io.tiff import MAKE, MODEL, TiffTags
+from rawaug.io.tiff import MAKE, MODEL, TiffTags, read_floats
 
 MONOCHROME = "MONOCHROME"
 """A sensor without colour filters has this pattern."""
@@ -94,6 +94,7 @@ class RawFrame:
         offset: rows and columns of the sensor, as the file stores it, above ``mosaic`` and to its left; None if
             unknown.
         crop: top, left, height and width of the picture within ``mosaic`` that the file states; None if it states none.
+        floating: whether the digital numbers are floating point.
     """
 
     mosaic: Tensor
@@ -114,6 +115,7 @@ class RawFrame:
     remarks: tuple[str, ...] = ()
     offset: tuple[int, int] | None = None
     crop: tuple[float, float, float, float] | None = None
+    floating: bool = False
 
     @property
     def upright_view(self) -> int:
@@ -222,8 +224,8 @@ def read_preview(path: str | Path) -> bytes | np.ndarray | None:
 def _mosaic_frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
     cell, cfa = _cell(path, raw, tags)
     black = _black_levels(path, raw, cell, tags)
-    white = float(raw.white_level)
-    if white <= black.max():
+    numbers, white = _numbers(path, raw, tags)
+    if not white > black.max():
         raise ValueError(f"{path}: white level {white:g} is not above black level {black.max():g}")
 
     with np.errstate(all="raise"):
@@ -235,7 +237,7 @@ def _mosaic_frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
         daylight = _green_is_1(raw.daylight_whitebalance)
 
     return RawFrame(
-        mosaic=_normalised(raw.raw_image_visible, black, white),
+        mosaic=_normalised(numbers, black, white),
         cfa=cfa,
         black=_mean_levels(_cell_levels(raw, cell, tags), cfa),
         white=white,
@@ -257,13 +259,16 @@ def _monochrome_frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
     if tags.black is not None:
         black = tags.black.astype(np.float32)
 
-    white = float(raw.white_level)
-    if white <= black.max():
+    elif _is_floating(tags):
+        black = np.zeros((1, 1), np.float32)
+
+    numbers, white = _numbers(path, raw, tags)
+    if not white > black.max():
         raise ValueError(f"{path}: white level {white:g} is not above black level {black.max():g}")
 
     level = float(black.mean())
     return RawFrame(
-        mosaic=_normalised(raw.raw_image_visible, black, white),
+        mosaic=_normalised(numbers, black, white),
         cfa=MONOCHROME,
         black=(level, level, level, level),
         white=white,
@@ -291,7 +296,23 @@ def _about_the_shot(path: Path, raw: Any, tags: TiffTags) -> dict[str, Any]:
         "remarks": remarks,
         "offset": (raw.sizes.top_margin, raw.sizes.left_margin),
         "crop": _crop(raw, tags),
+        "floating": _is_floating(tags),
     }
+
+
+def _is_floating(tags: TiffTags) -> bool:
+    return tags.mosaic is not None and tags.mosaic.floating
+
+
+def _numbers(path: Path, raw: Any, tags: TiffTags) -> tuple[np.ndarray, float]:
+    """Read the visible mosaic ``(H, W)`` and its white level: LibRaw's numbers, or the file's own floating point."""
+    if not _is_floating(tags):
+        return raw.raw_image_visible, float(raw.white_level)
+
+    numbers = read_floats(path)
+    height, width = raw.raw_image_visible.shape
+    top, left = raw.sizes.top_margin, raw.sizes.left_margin
+    return numbers[top : top + height, left : left + width], tags.white or 1.0
 
 
 def _gain_maps(path: Path, raw: Any, tags: TiffTags) -> tuple[GainMap, ...]:
@@ -476,6 +497,8 @@ def _cell_levels(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
     # the levels of their neighbours
     per_channel = np.asarray(raw.black_level_per_channel, np.float32)
     levels = per_channel[cell]
+    if _is_floating(tags):
+        levels = np.zeros_like(levels)
     if tags.black is None:
         return levels
 
@@ -485,7 +508,7 @@ def _cell_levels(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
 
     # LibRaw also rounds the means of rows and columns
     allowed = 2 if tags.black_rows or tags.black_columns else 1
-    if exact.shape == (2, 2) and np.abs(exact - levels).max() >= allowed:
+    if exact.shape == (2, 2) and np.abs(exact - levels).max() >= allowed and not _is_floating(tags):
         return levels
 
     first_row, first_column = _left_out(raw, tags)

@@ -29,13 +29,15 @@ MOST_PAGES = 64
 MAKE, MODEL, ORIENTATION, DNG_VERSION, NOISE_PROFILE = 271, 272, 274, 50706, 51041
 _LINEARIZATION, _RAW_DIGEST, _NEW_RAW_DIGEST = 50712, 50972, 51111
 _CFA_REPEATS, _CFA_PATTERN = 33421, 33422
-_BLACK_REPEATS, _BLACK, _BLACK_COLUMNS, _BLACK_ROWS = 50713, 50714, 50715, 50716
+_BLACK_REPEATS, _BLACK, _BLACK_COLUMNS, _BLACK_ROWS, _WHITE = 50713, 50714, 50715, 50716, 50717
 ACTIVE_AREA = 50829
 _CROP_ORIGIN, _CROP_SIZE = 50719, 50720
 CFA_PHOTOMETRIC, LINEAR_PHOTOMETRIC = 32803, 34892
-LOSSLESS_JPEG = 7
+JPEG = 7
+"""This compression is JPEG of any process, most often the lossless one."""
 _RATIONALS = (5, 10)
 _DIGEST_BYTES = 16
+_FLOATING_POINT = 3
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,10 @@ class StoredMosaic:
 
     Attributes:
         size: height and width, including the margins.
-        compression: the TIFF code; 1 means none, 7 means lossless JPEG.
+        compression: the TIFF code; 1 means none, 7 means JPEG.
         segments: offset and length in bytes of each strip or tile.
+        tiled: whether the segments are tiles.
+        floating: whether the numbers are floating point.
         plain: whether the numbers are integers of 9 to 16 bits without a linearisation table.
         digest: MD5 of the numbers, row by row (RawImageDigest); None if the file has none.
         tiled_digest: MD5 of the digests of the 256 x 256 tiles (NewRawImageDigest); None if the file has none.
@@ -54,6 +58,8 @@ class StoredMosaic:
     size: tuple[int, int]
     compression: int
     segments: tuple[tuple[int, int], ...]
+    tiled: bool = False
+    floating: bool = False
     plain: bool = True
     digest: bytes | None = None
     tiled_digest: bytes | None = None
@@ -79,6 +85,7 @@ class TiffTags:
         compressions: the TIFF compression code of each directory of a DNG.
         mosaic: how a DNG stores its mosaic.
         black: black levels of the cell that repeats over the active area, ``(rows, columns)``.
+        white: the saturated level, where a DNG states it; 1 for floating point that does not.
         opcodes: the opcode lists of a DNG by their tags; see :mod:`rawaug.io.opcodes`.
         black_rows, black_columns: deviation of the black level of each row and column from the mean.
         area: top, left, bottom and right of a DNG's active area.
@@ -94,6 +101,7 @@ class TiffTags:
     compressions: tuple[int, ...] = ()
     mosaic: StoredMosaic | None = None
     black: np.ndarray | None = None
+    white: float | None = None
     opcodes: Mapping[int, bytes] = field(default_factory=dict)
     black_rows: Sequence[float] = ()
     black_columns: Sequence[float] = ()
@@ -148,6 +156,7 @@ def _tags_of(pages: list[Any]) -> TiffTags:
         tags,
         mosaic=_stored_mosaic(page, pages[0]),
         black=_black(page, row_mean + column_mean),
+        white=_white(page),
         opcodes=opcodes,
         black_rows=rows,
         black_columns=columns,
@@ -168,6 +177,8 @@ def _stored_mosaic(page: Any, first: Any) -> StoredMosaic:
         size=(page.imagelength, page.imagewidth),
         compression=int(page.compression),
         segments=tuple(zip(page.dataoffsets, page.databytecounts, strict=True)),
+        tiled=bool(page.is_tiled),
+        floating=page.sampleformat == _FLOATING_POINT,
         plain=has_integers and _LINEARIZATION not in page.tags,
         digest=_digest(first, _RAW_DIGEST),
         tiled_digest=_digest(first, _NEW_RAW_DIGEST),
@@ -340,6 +351,26 @@ def _black(mosaic: Any, offset: float) -> np.ndarray | None:
     if len(levels) != rows * columns:
         return None
     return np.asarray(levels.reshape(rows, columns))
+
+
+def _white(mosaic: Any) -> float | None:
+    """Read the white level, the highest of several; floating point has 1 without one."""
+    tag = mosaic.tags.get(_WHITE)
+    if tag is not None:
+        return float(np.max(_numbers(tag)))
+    return 1.0 if mosaic.sampleformat == _FLOATING_POINT else None
+
+
+def read_floats(path: Path) -> np.ndarray:
+    """Read the floating-point numbers of a DNG's mosaic, margins included, float32 ``(H, W)``.
+
+    LibRaw would turn them into integers of 14 bits.
+    """
+    with opened_tiff(path) as tiff:
+        numbers = main_mosaic(all_pages(tiff)).asarray()
+        if not np.isfinite(numbers).all():
+            raise ValueError("the mosaic holds numbers that are not finite")
+    return np.asarray(numbers, np.float32).reshape(numbers.shape[:2])
 
 
 def _cfa(mosaic: Any) -> tuple[str, ...] | None:

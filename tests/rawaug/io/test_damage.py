@@ -15,7 +15,8 @@ import tifffile
 import torch
 
 from rawaug.io import RawFrame, libraw, read_raw, write_dng
-from rawaug.io.damage import find_fault, tiled_digest
+from rawaug.io.damage import find_fault, is_cut_short, tiled_digest
+from rawaug.io.directories import Tag, pack_directory
 from rawaug.io.libraw import FILL, SMALLEST_GAP
 from rawaug.io.tiff import StoredMosaic
 
@@ -138,3 +139,99 @@ def test_lines_of_others_reach_the_standard_error_stream(capfd: pytest.CaptureFi
     with libraw.caught_stderr() as complaints:
         os.write(2, b"a.dng: data corrupted at 12\nof others\n")
     assert complaints == ["data corrupted at 12"] and capfd.readouterr().err == "of others\n"
+
+
+# -- files that are whole but rare, and files of which only the header is there ----------------------------------------
+
+
+def in_streams(path: Path, numbers: np.ndarray, streams: list[bytes], bayer_dng: Dng, **layout: object) -> Path:
+    """A DNG whose strips or tiles are JPEG streams."""
+    with tifffile.TiffFile(bayer_dng(path.with_name("plain.dng"), numbers)) as file:
+        tags = []
+        for tag in file.pages.first.tags:
+            if tag.code in (271, 272, 274, 33421, 33422) or tag.code > 50000:
+                tags.append((tag.code, int(tag.dtype), tag.count, tag.value, True))
+    with tifffile.TiffWriter(path) as file:
+        kind = {"photometric": 32803, "compression": "jpeg", "metadata": None, "extratags": tags}
+        file.write(iter(streams), shape=numbers.shape, dtype=np.uint16, **kind, **layout)  # type: ignore[arg-type]
+    return path
+
+
+def smooth(height: int = 64, width: int = 96) -> np.ndarray:
+    y, x = np.mgrid[:height, :width]
+    return (600 + 20 * x + 5 * y).astype(np.uint16)
+
+
+def lossy_of_12_bits(part: np.ndarray) -> bytes:
+    """A tile as cinema cameras write it: even and odd rows side by side, quantisation of 16 bits."""
+    stream = imagecodecs.jpeg8_encode(np.hstack([part[0::2], part[1::2]]), level=98, bitspersample=12)
+    at = stream.index(b"\xff\xdb\x00\x43\x00")
+    table = b"".join(bytes((0, step)) for step in stream[at + 5 : at + 69])
+    return bytes(stream[:at] + b"\xff\xdb\x00\x83\x10" + table + stream[at + 69 :])
+
+
+def test_lossy_jpeg_of_cinema_cameras_is_whole_and_without_its_end_is_not(bayer_dng: Dng, tmp_path: Path) -> None:
+    numbers = smooth(64, 96)
+    streams = [lossy_of_12_bits(numbers[:, k : k + 48]) for k in (0, 48)]
+    frame = read_raw(in_streams(tmp_path / "a.dng", numbers, streams, bayer_dng, tile=(64, 48), bitspersample=12))
+    assert np.abs(frame.mosaic[0].numpy() * 4095 - numbers).mean() < 8
+    cut = [streams[0], streams[1][:-2] + b"\0\0"]
+    path = in_streams(tmp_path / "b.dng", numbers, cut, bayer_dng, tile=(64, 48), bitspersample=12)
+    with pytest.raises(OSError, match=r"b\.dng: .*damaged"):
+        read_raw(path)
+
+
+def test_strips_of_which_libraw_reads_one_are_not_called_damage(bayer_dng: Dng, tmp_path: Path) -> None:
+    numbers = smooth()
+    streams = []
+    for k in range(0, 64, 16):
+        part = np.ascontiguousarray(numbers[k : k + 16].reshape(16, 48, 2))
+        streams.append(bytes(imagecodecs.jpeg8_encode(part, lossless=True, predictor=1, bitspersample=16)))
+    path = in_streams(tmp_path / "a.dng", numbers, streams, bayer_dng, rowsperstrip=16, bitspersample=16)
+    with pytest.raises(ValueError, match=r"a\.dng: .*4 strips"):
+        read_raw(path)
+
+
+def header_of_rw2(width: int = 664, height: int = 490) -> bytes:
+    """The header of a Panasonic, whose table of strips states two bytes a site."""
+    text = {0x10F: b"Panasonic\0", 0x110: b"DMC-LX3\0"}
+    shorts = {2: width, 3: height, 4: 6, 5: 8, 6: height - 4, 7: width - 16, 8: 1, 9: 4, 10: 12, 14: 4095, 15: 4095}
+    shorts |= {16: 4095, 23: 80, 28: 0, 29: 0, 30: 0, 36: 570, 37: 263, 38: 438, 45: 4, 0x112: 1, 0x116: height}
+    longs = {0x111: 0xFFFFFFFF, 0x117: 2 * width * height, 0x118: 1024}
+    tags = [Tag(1, 7, 4, b"0300"), *(Tag(code, 2, len(value), value) for code, value in text.items())]
+    tags += [Tag(code, 3, 1, struct.pack("<H", value)) for code, value in shorts.items()]
+    tags += [Tag(code, 4, 1, struct.pack("<I", value)) for code, value in longs.items()]
+    return (b"IIU\0" + struct.pack("<I", 24) + bytes(16) + pack_directory("<", tags, 24)).ljust(1024, b"\0")
+
+
+def test_a_raw_file_without_its_pixels_is_truncated_and_panasonic_s_table_counts_too_much(tmp_path: Path) -> None:
+    (tmp_path / "stopped.rw2").write_bytes(header_of_rw2() + bytes(range(1, 23)))
+    with pytest.raises(OSError, match=r"stopped\.rw2: .*1046 of 650720 bytes"):
+        read_raw(tmp_path / "stopped.rw2")
+    (tmp_path / "whole.rw2").write_bytes(header_of_rw2() + bytes(490 * 664 * 8 // 7))
+    assert not is_cut_short(tmp_path / "whole.rw2"), "57 % of the bytes that are stated"
+
+
+def test_rows_that_were_never_decoded_are_told(bayer_dng: Dng, tmp_path: Path) -> None:
+    numbers = smooth()
+    numbers[40:] = 0
+    with pytest.raises(OSError, match=r"a\.dng: .*last 24 of 64 rows"):
+        read_raw(bayer_dng(tmp_path / "a.dng", numbers, black=(64,)))
+    read_raw(bayer_dng(tmp_path / "b.dng", numbers, black=(0,)))  # a camera that clips at black, in the dark
+    numbers[40:] = 4095
+    read_raw(bayer_dng(tmp_path / "c.dng", numbers, black=(64,)))  # clipped lights
+
+
+@pytest.mark.parametrize(
+    ("layout", "said"), [({"compression": "lzw"}, "LZW"), ({"bigtiff": True}, "BigTIFF"), ({"compression": 9}, "VC-5")]
+)
+def test_what_libraw_does_not_read_is_named(
+    layout: dict[str, object], said: str, bayer_dng: Dng, tmp_path: Path
+) -> None:
+    number = layout.pop("compression") if layout.get("compression") == 9 else None
+    path = bayer_dng(tmp_path / "a.dng", smooth(), **layout)
+    if number is not None:
+        with tifffile.TiffFile(path, mode="r+") as tiff:
+            tiff.pages.first.tags["Compression"].overwrite(number)
+    with pytest.raises(ValueError, match=rf"a\.dng: .*{said}.*convert"):
+        read_raw(path)

@@ -411,3 +411,34 @@ def test_monochrome_frames_go_there_and_back(filters: bool, tmp_path: Path, baye
     assert np.array_equal(numbers_in(tmp_path / "a.dng"), numbers)
     assert torch.equal(read_raw(tmp_path / "a.dng", monochrome=True).mosaic, frame.mosaic)
     assert develop(tmp_path / "a.dng").shape == (3, 36, 46)
+
+
+@pytest.mark.parametrize("layout", [{}, {"tile": (16, 16)}, {"byteorder": ">"}])
+@pytest.mark.parametrize("kind", [np.float32, np.float16])
+def test_floating_point_keeps_its_values(
+    kind: type[np.floating], layout: dict[str, Any], tmp_path: Path, bayer_dng: Callable[..., Path]
+) -> None:
+    """LibRaw makes integers of 14 bits of it."""
+    numbers = np.geomspace(1e-5, 1, 33 * 50).reshape(33, 50).astype(kind)
+    area = (50829, 4, 4, (1, 2, 33, 50), True)
+    source = bayer_dng(tmp_path / "a.dng", numbers, black=(0,), white=1, extra=[area], **layout)
+    frame = read_raw(source)
+    assert frame.floating and frame.cfa == CFA.GBRG and frame.offset == (2, 2) and frame.mosaic.shape == (1, 30, 48)
+    seen = numbers[frame.offset[0] :, frame.offset[1] :][: frame.mosaic.shape[1], : frame.mosaic.shape[2]]
+    assert np.array_equal(frame.mosaic[0].numpy(), seen.astype(np.float32))
+    below = dataclasses.replace(frame, mosaic=frame.mosaic - 1e-3)  # noise that was removed leaves values below black
+    write_dng(tmp_path / "b.dng", below, source)
+    assert torch.equal(read_raw(tmp_path / "b.dng").mosaic, below.mosaic)
+    rgb = torch.rand(3, *frame.mosaic.shape[1:], generator=torch.Generator().manual_seed(0)) * 1e-3
+    write_dng(tmp_path / "c.dng", frame, source, rgb=rgb)
+    with tifffile.TiffFile(tmp_path / "c.dng") as file:
+        assert np.array_equal(file.pages.first.asarray(), rgb.permute(1, 2, 0).numpy())
+        assert file.pages.first.tags["WhiteLevel"].value == (1, 1, 1)
+
+
+def test_levels_of_floating_point_are_the_file_s(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+    numbers = np.random.default_rng(0).uniform(0, 1000, (32, 48)).astype(np.float32)
+    frame = read_raw(bayer_dng(tmp_path / "a.dng", numbers, black=(10, 20, 30, 40), white=900))
+    levels = np.tile(np.array([[10, 20], [30, 40]]), (16, 24))
+    assert (frame.black, frame.white) == ((10, 20, 30, 40), 900)
+    assert np.abs(frame.mosaic[0].numpy() - np.minimum((numbers - levels) / (900 - levels), 1)).max() < 1e-6
