@@ -6,12 +6,16 @@ A run has a list for each arm, with one entry per seed: summaries by kind, ``pla
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from rawaug.errors import count_of, escape
 from rawaug.evaluation.scores import METRICS
+from rawaug.evaluation.verdict import input_summary, paired_interval
 
 WIDTH = 140
 """Width of a printed table in columns, if stdout is not a terminal."""
@@ -62,7 +66,8 @@ _PRINTED: Columns = {
 class Table(NamedTuple):
     """A table: its columns, cells by row, which are empty if a figure does not apply, and the best cells of columns.
 
-    A column has no best cell if its highest score comes from keeping the references' own noise.
+    Scores that the frames do not tell from the highest are best, too: their paired interval holds 0. A column has no
+    best cell if its highest score comes from keeping the references' own noise.
     """
 
     columns: list[str]
@@ -72,7 +77,8 @@ class Table(NamedTuple):
 
 def table_of(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, columns: Columns) -> Table:
     """Make a table of the noisy input, other denoisers and the arms, without columns and rows that have no figure."""
-    methods: dict[str, Sequence[Mapping[str, Any]]] = {"noisy input": [{"plain": _of_input(results)}]}
+    first_arm = next(iter(results.values()))
+    methods: dict[str, Sequence[Mapping[str, Any]]] = {"noisy input": [{"plain": input_summary(first_arm[0]["plain"])}]}
     for name, scores in (others or {}).items():
         methods[name] = [{"plain": scores}]
     methods |= results
@@ -88,6 +94,8 @@ def table_of(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, colu
             continue
 
         best = _best_rows(key, values)
+        if key in METRICS:
+            best = _not_told_apart(best, {name: methods[name] for name in methods if values[name]}, kind, key)
         if keeping_noise.isdisjoint(best):
             for name in best:
                 table.best.add((name, len(table.columns)))
@@ -102,17 +110,6 @@ def table_of(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, colu
     return table
 
 
-def _of_input(results: Runs) -> dict[str, Any]:
-    """The scores of the noisy input, which every summary holds beside its own."""
-    first_arm = next(iter(results.values()))
-    scores = {}
-    for key, value in first_arm[0]["plain"].items():
-        if "_noisy" in key:
-            scores[key.replace("_noisy", "")] = value
-
-    return scores
-
-
 def _best_rows(key: str, values: Mapping[str, Sequence[float]]) -> list[str]:
     """Find the rows with the highest mean, as shown, in a column of several; none if less is better."""
     means = {}
@@ -125,6 +122,35 @@ def _best_rows(key: str, values: Mapping[str, Sequence[float]]) -> list[str]:
 
     best = max(means.values())
     return [name for name, mean in means.items() if mean == best]
+
+
+def _not_told_apart(best: Sequence[str], methods: Runs, kind: str, key: str) -> list[str]:
+    """Add to the best rows those that the frames do not tell from them; none if they tell none apart.
+
+    Rows without scores by frame, or of another number of seeds, are compared by their means alone.
+    """
+    if not best:
+        return []
+
+    scores = {}
+    for name, runs in methods.items():
+        by_run = [[image.get(key, math.nan) for image in run.get(kind, {}).get("images", [])] for run in runs]
+        scores[name] = np.array(by_run, np.float64)
+
+    marked = []
+    first = scores[best[0]]
+    for name, others in scores.items():
+        is_alike = name in best
+        if not is_alike and others.shape == first.shape and first.size:
+            differences = first - others
+            paired = differences[:, np.isfinite(differences).all(axis=0)]
+            is_alike = paired_interval(paired)[0] <= 0
+        if is_alike:
+            marked.append(name)
+
+    if len(marked) == len(methods):
+        return []
+    return marked
 
 
 def _keeping_noise(methods: Runs) -> set[str]:

@@ -23,7 +23,8 @@ from rawaug.training.noisy_frames import NoisyFrame, faintness_note, noise_of
 
 
 def scores(psnr: float) -> dict[str, Any]:
-    return {"psnr": psnr, "psnr_noisy": 30.0, "images": [{"name": "a", "psnr": psnr, "psnr_noisy": 30.0}]}
+    images = [{"name": name, "psnr": psnr, "psnr_noisy": 30.0} for name in "ab"]
+    return {"psnr": psnr, "psnr_noisy": 30.0, "images": images}
 
 
 @pytest.mark.parametrize(
