@@ -24,6 +24,7 @@ from torch import Tensor
 
 P = ParamSpec("P")
 R = TypeVar("R")
+T = TypeVar("T")
 
 OF_NO_DATASET = (".DS_Store", "Thumbs.db")
 """macOS and Windows leave these files in folders."""
@@ -362,6 +363,62 @@ def require_file(path: str | Path, what: str = "file") -> None:
 def fingerprint(*settings: Any) -> str:
     """Hash settings to 16 hexadecimal digits, which are equal if the settings are."""
     return digest(json.dumps(settings, sort_keys=True, default=str).encode())[:16]
+
+
+def read_keyed_json(path: Path) -> tuple[dict[str, Any], str | None]:
+    """Read a JSON object and the key that :func:`cached` has written into it; text that is none counts as empty."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return content, content.pop("key", None)
+    except (ValueError, AttributeError, TypeError):
+        return {}, None
+
+
+def write_keyed_json(value: Mapping[str, Any], path: Path, key: str) -> None:
+    """Write a JSON object and its key."""
+    write_json({"key": key, **value}, path)
+
+
+def cached(
+    path: Path,
+    inputs: Any,
+    make: Callable[[], T],
+    read: Callable[[Path], tuple[Any, str | None]] = read_keyed_json,
+    write: Callable[[Any, Path, str], None] = write_keyed_json,
+    done: str = "",
+) -> T:
+    """Read what was made of the same inputs before, or else make and write it.
+
+    Args:
+        path: file of the result.
+        inputs: everything that the result depends on, as JSON: settings, seeds, stamps of frames.
+        make: makes the result.
+        read: ``read(path)`` gives a result and the key that it was written with; a JSON object by default.
+        write: ``write(result, path, key)``.
+        done: what is printed before the path if there is nothing to make, such as ``"already trained"``.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     for seed in (0, 0, 1):
+        ...         cached(Path(folder) / "sum.json", ["sum", seed], lambda: print("adds") or {"sum": seed + 1})["sum"]
+        adds
+        1
+        1
+        adds
+        2
+    """
+    key = fingerprint(inputs)
+    if path.is_file():
+        result, stored = read(path)
+        if stored == key:
+            if done:
+                print(f"{done}: {path}")
+            return result
+
+    result = make()
+    write(result, path, key)
+    return result
 
 
 def require_same_settings(path: Path, settings: Mapping[str, object], overwrite: bool = False) -> None:

@@ -7,11 +7,9 @@ rendering. A shipped ISP, or the file of one, is not fitted; a frame that it was
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
@@ -22,7 +20,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
-from rawaug.files import find_weights, write_json
+from rawaug.files import find_weights
 from rawaug.isp import staged
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fit import FitConfig, fit_isp
@@ -54,18 +52,6 @@ class Fitted(NamedTuple):
     model: Method
     seconds: float
     parameters: int
-
-
-def resume(path: Path, key: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Read the figures in ``path`` if an earlier run wrote them under the same key; else measure and write them."""
-    if path.is_file():
-        figures: dict[str, Any] = json.loads(path.read_text())
-        if figures.get("key") == key:
-            return figures
-
-    figures = {"key": key, **measure()}
-    write_json(figures, path)
-    return figures
 
 
 def is_method(family: str) -> bool:

@@ -28,7 +28,7 @@ from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.folder import claim, require_free, run_folder
 from rawaug.experiment.recipe import EXPERIMENTS
-from rawaug.files import fingerprint, write_json
+from rawaug.files import cached, write_json
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
 from rawaug.noise import noise_model
@@ -44,7 +44,6 @@ from rawaug.paper.methods import (
     is_method,
     learns_by_descent,
     mosaic_only_psnr,
-    resume,
     score_rows,
 )
 from rawaug.plugin.pictures import trim_to_even
@@ -214,7 +213,7 @@ class ComparisonRun:
         self.folder = run_folder(settings)
         self.seeds = range(settings.seed, settings.seed + settings.seeds)
         self.fit = replace(settings.fit, noisy=settings.fit.noisy or bool(settings.noise))
-        self._whole_fits: dict[str, Fitted] = {}
+        self._whole_fits: dict[int, Fitted] = {}
 
         every = open_pairs(settings.data, split="train")
         self.pairs = _training_frames(settings, every)
@@ -326,7 +325,6 @@ class ComparisonRun:
             facts.append(("middle", settings.test_crop))
         if settings.balanced:
             facts.append("balanced")
-        key = fingerprint(*facts)
 
         relation = "on" if settings.test else "without"
         name = names_of(self.scored)[frame]
@@ -347,7 +345,7 @@ class ComparisonRun:
             figures |= {"seconds": method.seconds, "parameters": method.parameters}
             return {**method.model.info, **end_to_end(method.model.info), **figures}
 
-        return resume(path, key, measure)
+        return cached(path, facts, measure)
 
     def _all_frames(self, family: str) -> dict[str, Any]:
         """Measure a fit to all pairs on other data: its cycle and its PSNR_d."""
@@ -373,17 +371,14 @@ class ComparisonRun:
                 result["psnr_d"].append(psnr_d(method.model, self.pictures, downstream, folder, seed))
             return result
 
-        key = fingerprint(*samples, list(self.seeds), downstream and asdict(downstream))
-        figures = resume(self._path(f"{family}-all-frames"), key, measure)
-        figures.pop("key")
-        return figures
+        facts = (*samples, list(self.seeds), downstream and asdict(downstream))
+        return cached(self._path(f"{family}-all-frames"), facts, measure)
 
     def _fit_to_all(self, family: str, seed: int) -> Fitted:
         """Fit to all pairs, for the test frames, the cycle and PSNR_d."""
-        key = fingerprint(*self._fit_key(family, seed))
-        if key not in self._whole_fits:
-            self._whole_fits[key] = self._fit(family, self.pairs, seed)
-        return self._whole_fits[key]
+        if seed not in self._whole_fits:
+            self._whole_fits[seed] = self._fit(family, self.pairs, seed)
+        return self._whole_fits[seed]
 
     def _fit(self, family: str, pairs: Sequence[Pair], seed: int) -> Fitted:
         return fit_family(family, pairs, self.fit, self._training(seed), self.settings.sizes.get(family))

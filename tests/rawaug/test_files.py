@@ -6,6 +6,7 @@ import json
 import os
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from rawaug.experiment.recipe import read_recipe
 from rawaug.files import (
     MOST_BYTES,
     WEIGHTS,
+    cached,
     digest,
     find_weights,
     fingerprint,
@@ -160,3 +162,23 @@ def test_only_regular_files_of_bounded_size_are_read(kind: str, tmp_path: Path) 
     for read in (require_file, sha256, read_picture, read_raw, mat_version, read_recipe):
         with pytest.raises(OSError, match=r"a\.png: (is a pipe|cannot be opened|has \d+ bytes)"):
             read(path)
+
+
+def test_what_was_made_of_the_same_inputs_is_not_made_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "deep" / "figures.json"
+    made: list[Any] = []
+
+    def figures(inputs: Any) -> dict[str, Any]:
+        def make() -> dict[str, Any]:
+            made.append(inputs)
+            return {"psnr": float(len(made))}
+
+        return cached(path, inputs, make, done="already measured")
+
+    assert figures({"seed": 0}) == figures({"seed": 0}) == {"psnr": 1.0}
+    assert capsys.readouterr().out == f"already measured: {path}\n"
+    assert figures({"seed": 1}) == {"psnr": 2.0} and figures({"seed": 0}) == {"psnr": 3.0}
+    for damaged in ("", "[1]", '{"psnr": 9.0}', '{"key": '):  # of another version, or cut short
+        path.write_text(damaged)
+        assert figures({"seed": 0})["psnr"] == float(len(made))
+    assert len(made) == 7
