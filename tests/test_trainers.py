@@ -100,7 +100,6 @@ def test_deepinv(trainer_file: Any) -> None:
     (clean, noisy), (_, again) = next(iter(evaluation)), next(iter(evaluation))
     assert torch.equal(noisy, again)
 
-    pairs = rawaug.RawPairs("demo:", "universal", crop=64)
-    pairs.set_epoch(0)
+    pairs = rawaug.RawPairs("demo:", "universal", crop=64).freeze()
     assert torch.equal(clean[0], pairs[0].clean)
     assert torch.equal(noisy[0], pairs[0].noisy)

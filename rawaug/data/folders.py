@@ -44,9 +44,10 @@ T = TypeVar("T")
 class PictureFolder(Dataset[Tensor]):
     """The pictures of a folder and its subfolders, sorted by path: uint8 ``(3, H, W)`` of any size.
 
-    A file that cannot be used is logged with the reason when it is met; :attr:`skipped` and :meth:`report` list those
-    met so far, by whichever worker. Files of other kinds (RAW, HEIC where its decoder is not installed, text) are
-    counted in :attr:`left_out`. ``rawaug data check`` finds the files that crash a decoder, and a worker with it.
+    A file that cannot be used is logged with the reason when it is met, and the next one stands in for it, as
+    :meth:`file` says; :attr:`skipped` and :meth:`report` list those met so far, by whichever worker. Files of other
+    kinds (RAW, HEIC where its decoder is not installed, text) are counted in :attr:`left_out`. ``rawaug data check``
+    finds the files that crash a decoder, and a worker with it.
 
     Args:
         path: a folder, or one picture. Files are chosen by their extension; links to folders are not followed.
@@ -82,7 +83,10 @@ class PictureFolder(Dataset[Tensor]):
 
     def __getitem__(self, index: int) -> Tensor:
         first = range(len(self))[index]
-        for candidate in chain(range(first, len(self)), range(first)):
+        if self._bad[first]:
+            self._require_few_bad(last=first)
+
+        for candidate in self._from(first):
             if self._bad[candidate]:
                 continue
             picture = self._attempt(candidate)
@@ -90,21 +94,31 @@ class PictureFolder(Dataset[Tensor]):
                 return picture
         raise AssertionError("the share of skipped files is checked before the last one is")
 
+    def _from(self, first: int) -> Iterator[int]:
+        """The indices in the order in which files stand in for file ``first``."""
+        return chain(range(first, len(self)), range(first))
+
     @property
     def names(self) -> list[str]:
         """The paths of all files."""
-        return [str(self.file(index)) for index in range(len(self))]
+        return [str(self._path(index)) for index in range(len(self))]
 
     def file(self, index: int) -> Path:
-        """The path of one file."""
+        """The path of the file whose picture an index gives: the next one if its own was found to be damaged."""
+        for candidate in self._from(range(len(self))[index]):
+            if not self._bad[candidate]:
+                return self._path(candidate)
+        return self._path(index)
+
+    def _path(self, index: int) -> Path:
         return self.path / os.fsdecode(self._names[index])
 
     def read(self, index: int) -> Tensor:
         """Read the picture of one file, not replaced by another; OSError or ValueError if it cannot be used."""
-        picture = read_picture(self.file(index), self.max_pixels)
+        picture = read_picture(self._path(index), self.max_pixels)
         if min(picture.shape[1:]) < self.min_side:
             size = f"{picture.shape[1]} x {picture.shape[2]}"
-            raise ValueError(f"{self.file(index)}: is {size}, smaller than min_side {self.min_side}")
+            raise ValueError(f"{self._path(index)}: is {size}, smaller than min_side {self.min_side}")
         return picture
 
     @property
@@ -112,22 +126,22 @@ class PictureFolder(Dataset[Tensor]):
         """The files that could not be used, with the reason, as far as any worker has met them."""
         reasons: dict[Path, str] = {}
         for index in self._bad_indices():
-            if index not in self._reasons:  # a worker has met it
-                self._reasons[index] = self._ask_again(index)
-            reasons[self.file(index)] = self._reasons[index]
+            reasons[self._path(index)] = self._reason(index)
         return reasons
 
     def _bad_indices(self) -> list[int]:
         indices: list[int] = self._bad.nonzero()[:, 0].tolist()
         return indices
 
-    def _ask_again(self, index: int) -> str:
-        """Read a file again to get the reason why it cannot be used."""
-        try:
-            self.read(index)
-        except (OSError, ValueError) as error:
-            return str(error)
-        return f"{self.file(index)}: was damaged, but is readable now"
+    def _reason(self, index: int) -> str:
+        """Why a file cannot be used; it is read again if a worker has met it."""
+        if index not in self._reasons:
+            self._reasons[index] = f"{self._path(index)}: was damaged, but is readable now"
+            try:
+                self.read(index)
+            except (OSError, ValueError) as error:
+                self._reasons[index] = str(error)
+        return self._reasons[index]
 
     def report(self) -> str:
         """Describe the files that were skipped so far, with the reasons, and the kinds of files not used."""
@@ -156,12 +170,12 @@ class PictureFolder(Dataset[Tensor]):
         if len(bad) <= self.allowed_share * len(self):
             return
 
-        names = [str(self.file(index)) for index in bad[:_MAX_NAMES]]
+        names = [str(self._path(index)) for index in bad[:_MAX_NAMES]]
         if len(bad) > _MAX_NAMES:
             names.append("...")
         pictures = count_of(len(self), "picture")
         count = f"{len(bad)} of {pictures} unusable, more than allowed_share {self.allowed_share:.0%}"
-        raise ValueError(f"{self.path}: {count}: {', '.join(names)}; last: {self._reasons[last]}")
+        raise ValueError(f"{self.path}: {count}: {', '.join(names)}; last: {self._reason(last)}")
 
 
 def reports(pictures: Any) -> list[str]:

@@ -58,8 +58,9 @@ class RawAugment(PairMaker):
         target: what the pair holds. ``"raw"``: noisy and clean RAW. ``"rgb"``: noisy RAW, and clean linear camera RGB
             ``(B, 3, H, W)`` of the full size, for demosaicing. ``"srgb"`` or an :class:`Srgb`: both as sRGB
             ``(B, 3, H, W)`` in [0, 1], developed by the setting that made the RAW, and no variance map.
-        burst: number N of noisy frames of the scene in a pair, ``(B, N, ...)``, or a :class:`Burst`. The clean frame
-            belongs to the first noisy one. By default there is a single frame, without the N.
+        burst: number N of noisy frames of the scene in a pair, ``(B, N, ...)``, that do not move against each other,
+            or a :class:`Burst`, for a moving hand or a bracket. The clean frame belongs to the first noisy one. By
+            default there is a single frame, without the N.
         cfa: pattern of the RAW, by default the ISP's: another Bayer pattern, ``"XTRANS"``, or ``"QUAD-RGGB"`` and the
             like. Patterns other than Bayer's give a mosaic ``(B, 1, H, W)`` instead of packed RAW; see
             :mod:`rawaug.bayer`.
@@ -123,7 +124,7 @@ class RawAugment(PairMaker):
         if self.srgb is not None:
             self.display = freeze(FastForward(isp))
         if burst is not None and not isinstance(burst, Burst):
-            burst = Burst(burst)
+            burst = Burst(burst, motion=(0.0, 0.0))
         self.burst = burst
         self._set_draws(noise, draw)
 

@@ -3,8 +3,9 @@
 Sample i of epoch e comes from a generator seeded with BLAKE2b(seed, "pairs", e, i) alone. It draws the crop, then one
 of eight flips and turns, then camera and noise. So the pairs do not depend on workers, start method or batch size.
 
-The epoch advances by itself: it is the number of earlier requests for picture i (:mod:`rawaug.plugin.epochs`).
-``set_epoch`` pins it: from then on the same index is the same pair.
+The epoch advances by itself: it is the number of earlier requests for picture i (:mod:`rawaug.plugin.resume`).
+``set_epoch`` states it, and a picture that comes again in this epoch is drawn anew; ``freeze`` makes the same index the
+same pair for good.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterator, Sequence, Sized
 from pathlib import Path
-from typing import Any, Generic, TypeVar, overload
+from typing import Any, Generic, Self, TypeVar, overload
 
 import numpy as np
 import torch
@@ -24,10 +25,10 @@ from rawaug.errors import count_of
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.crops import crop_size
-from rawaug.plugin.epochs import Passes, Visits
 from rawaug.plugin.maker import PairMaker
 from rawaug.plugin.params import AugmentParams, Keys, RawPair, pair_form
 from rawaug.plugin.pictures import find_picture, get_picture, replace_picture
+from rawaug.plugin.resume import Passes, Visits
 from rawaug.seeding import keyed_generator
 
 Sample = TypeVar("Sample", covariant=True)
@@ -77,14 +78,35 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
         raise NotImplementedError
 
     def set_epoch(self, epoch: int) -> None:
-        """Pin the epoch: from now on an index is the same pair whenever it is asked for, until the next call.
+        """Begin an epoch: until the next call, a picture's first pair is that of this epoch.
 
-        Call it before each pass to number the epochs yourself, or once for validation data. It is forwarded to the
-        dataset's own ``set_epoch``, if there is one.
+        Call it before each pass to number the epochs yourself. A picture that comes again within the epoch, as from a
+        sampler that draws with replacement, is drawn anew. It is forwarded to the dataset's own ``set_epoch``, if there
+        is one. It does nothing after :meth:`freeze`.
         """
         self._epochs.pin(epoch)
-        if hasattr(self.dataset, "set_epoch"):
+        if hasattr(self.dataset, "set_epoch") and not self._epochs.frozen:
             self.dataset.set_epoch(epoch)
+
+    def freeze(self, epoch: int = 0) -> Self:
+        """Fix the pairs, as for validation: an index is the same pair whenever it is asked for, from now on.
+
+        No later ``set_epoch`` changes that, by whichever library it is called.
+
+        Args:
+            epoch: the epoch whose pairs these are.
+
+        Returns:
+            The dataset itself.
+
+        Example:
+            >>> pairs = RawPairs([torch.rand(3, 32, 32)], "universal", crop=32).freeze()
+            >>> torch.equal(pairs[0].noisy, pairs[0].noisy)
+            True
+        """
+        self.set_epoch(epoch)
+        self._epochs.freeze(epoch)
+        return self
 
     def state_dict(self) -> dict[str, Any]:
         """The state from which :meth:`load_state_dict` goes on with the draws that follow.
@@ -106,8 +128,8 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
             ValueError: if the state is of other pictures, or of the middle of a pass that cannot go on exactly.
         """
         self._epochs.load_state_dict(state, next_epoch)
-        if self._epochs.pinned is not None:
-            self.set_epoch(self._epochs.pinned)
+        if self._epochs.pinned is not None and hasattr(self.dataset, "set_epoch"):
+            self.dataset.set_epoch(self._epochs.pinned)
 
     def __len__(self) -> int:
         if not isinstance(self.dataset, Sized):
@@ -125,8 +147,8 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
             crop = f"crops of {self.crop[0]} x {self.crop[1]}"
         return f"{type(self).__name__} of {pictures}, {crop}, seed {self.seed}\n{self.augment!r}"
 
-    def _generator(self, epoch: int, *names: int | str) -> torch.Generator:
-        return keyed_generator(self.seed, "pairs", epoch, *names)
+    def _generator(self, *key: int | str) -> torch.Generator:
+        return keyed_generator(self.seed, "pairs", *key)
 
     def _make_pair(self, sample: Any, name: int | str, generator: torch.Generator) -> Any:
         where = find_picture(sample, self.key)
@@ -286,7 +308,10 @@ class RawPairs(_Pairs[Sample]):
         )
 
     def _make_epochs(self, dataset: Any) -> Visits:
-        if isinstance(dataset, IterableDataset) or not hasattr(dataset, "__getitem__"):
+        has_index = hasattr(dataset, "__getitem__")
+        if isinstance(dataset, IterableDataset):  # MosaicML's StreamingDataset has an index, too
+            has_index = type(dataset).__getitem__ is not Dataset.__getitem__
+        if not has_index:
             raise TypeError(
                 f"{type(dataset).__name__} has no index; use RawPairStream(dataset, augment) for an iterable"
             )

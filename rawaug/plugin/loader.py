@@ -2,8 +2,8 @@
 
 Batch n of epoch e is drawn from a generator seeded with BLAKE2b(seed, "wrap", e, n), where the seed is the
 augmentation's. So the same batches make the same pairs, whatever the loader's workers do. Each pass is a new epoch. In
-a distributed run each process has its share of the pictures (:mod:`rawaug.plugin.order`), and the keys of all processes
-but the first also contain their rank.
+a distributed run each process has its share of the pictures (:mod:`rawaug.plugin.resume`), and the keys of all
+processes but the first also contain their rank.
 
 :func:`resumable` does the same for the epochs and the order of a loader of any batches, such as those of RawPairs.
 """
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar, overload
+from typing import Any, Generic, NamedTuple, Self, TypeVar, overload
 
 import numpy as np
 import torch
@@ -22,11 +22,19 @@ from torch.utils.data import DataLoader, IterableDataset
 from rawaug.kernels.runtime import find_device
 from rawaug.plugin.crops import crop_size
 from rawaug.plugin.dataset import Maker, as_augment, open_dataset
-from rawaug.plugin.epochs import require_epoch
 from rawaug.plugin.maker import PairMaker
-from rawaug.plugin.order import is_drawn, keep_order, own_share, pack_order, unpack_order, world_size
 from rawaug.plugin.params import Keys, PairForm, RawPair, pair_form
 from rawaug.plugin.pictures import find_picture, get_picture, is_picture, replace_picture
+from rawaug.plugin.resume import (
+    KeptOrder,
+    keep_order,
+    numbering,
+    own_share,
+    pack_order,
+    require_epoch,
+    unpack_order,
+    world_size,
+)
 from rawaug.seeding import keyed_generator, rank_key
 
 Batch = TypeVar("Batch", covariant=True)
@@ -52,8 +60,10 @@ class ResumableLoader(Generic[Batch]):
         self.loader, self.seed = loader, seed
         self._share: Any = None
         self._kept: Any = None
-        self._order: Any = None
+        self._order: KeptOrder | None = None
         self._next = self._at = Position(0, 0)
+        self._begun = 0  # the batch from which the order of the current pass was gone through
+        self._frozen: int | None = None
         self._has_pool = False
         self._resumed_generator: Tensor | None = None
         self._loaded: Mapping[str, Any] | None = None
@@ -73,77 +83,150 @@ class ResumableLoader(Generic[Batch]):
     def set_epoch(self, epoch: int, start: int = 0) -> None:
         """Set the epoch of the next pass and the number of its first batch.
 
-        Without a call every pass counts as the next epoch. Call it with a fixed number before each pass over validation
-        data to repeat the same noise, and with ``start`` if the wrapped loader itself resumes in the middle of an
-        epoch. The epoch is forwarded to the wrapped loader's own ``set_epoch``, if there is one.
+        Without a call every pass counts as the next epoch. Call it with ``start`` if the wrapped loader itself resumes
+        in the middle of an epoch. The epoch is forwarded to the wrapped loader's own ``set_epoch``, if there is one. It
+        does nothing after :meth:`freeze`.
         """
-        self._next = self._at = Position(require_epoch(epoch), require_epoch(start))
+        position = Position(require_epoch(epoch), require_epoch(start))
+        if self._frozen is not None:
+            return
+
+        self._next = self._at = position
         self._loaded = None
         if self._order is not None:
-            self._order.start_at(0)
+            self._order.start_anew()
         if hasattr(self.loader, "set_epoch"):
             self.loader.set_epoch(epoch)
+
+    def freeze(self, epoch: int = 0) -> Self:
+        """Fix the draws, as for validation: every pass is this epoch, whatever ``set_epoch`` is told later.
+
+        Returns:
+            The loader itself.
+        """
+        self._frozen = None
+        self.set_epoch(epoch)
+        self._frozen = epoch
+        return self
 
     def state_dict(self) -> dict[str, Any]:
         """The state from which :meth:`load_state_dict` goes on with the next batch.
 
-        It holds the epoch and the number of that batch. If the loader has these, it also holds the state of the
-        loader's ``generator``, the order of the pass, or the loader's own ``state_dict``.
+        It holds the epoch, the number of that batch, and what the state belongs to. In the middle of a pass it holds
+        the order of the pass and how many samples all processes have visited, and if the loader has these, the state of
+        its ``generator`` or its own ``state_dict``.
 
-        In the middle of a shuffled pass, each process of a distributed run has a state of its own, unless the loader's
-        order comes from ``shuffle`` alone.
+        The processes of a distributed run have one state, unless a sampler other than ``DistributedSampler`` gives each
+        an order of its own; then each saves and loads its own state.
         """
         if self._loaded is not None:  # nothing has been asked for since
             return dict(self._loaded)
 
-        state: dict[str, Any] = {"epoch": self._at.epoch, "batch": self._at.batch}
+        loader, order = self._prepare()
+        state: dict[str, Any] = {"epoch": self._at.epoch, "batch": self._at.batch, **self._describe()}
         if self._generator is not None:
             state["generator"] = self._generator.get_state()
             state["pool"] = self._has_pool
 
-        if hasattr(self.loader, "state_dict"):
-            state["loader"] = self.loader.state_dict()
-        elif self._at.batch and self._order is not None and is_drawn(self._order.sampler):
-            state["order"] = pack_order(self._order.current or [])
-            state["rank"] = rank_key()
+        if order is None:
+            if hasattr(loader, "state_dict"):
+                state["loader"] = loader.state_dict()
+        elif self._at.batch:
+            state["samples"] = order.visited(self._at.batch - self._begun)
+            state["order"] = pack_order(order.order)
+            state["rank"] = None if order.is_shared else rank_key()
         return state
+
+    def _describe(self) -> dict[str, Any]:
+        """What a state belongs to: the seeds, the number of samples, the processes, and how batches are loaded."""
+        dataset = getattr(self.loader, "dataset", None)
+        length = None
+        if isinstance(dataset, Sized) and not isinstance(dataset, IterableDataset):
+            length = len(dataset)
+
+        seeds = [self.seed]
+        for part in numbering(dataset):
+            seeds.append(getattr(part, "seed", 0))
+        return {
+            "seeds": seeds,
+            "length": length,
+            "processes": world_size(),
+            "batch_size": getattr(self.loader, "batch_size", None),
+            "workers": getattr(self.loader, "num_workers", None),
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with the batch after the last one that ``state`` knows of.
 
-        A wrapped loader with its own ``load_state_dict`` goes on by itself. A DataLoader goes on in the order of the
-        pass, and loads nothing twice. Any other loader loads its first batches again and they are passed over, so it
-        must give the same ones.
+        A DataLoader goes on in the order of the pass, and loads nothing twice. Its batches may have another size, and
+        the state of one process, or the order of a ``DistributedSampler``, is dealt to any number of processes. A
+        wrapped loader with its own ``load_state_dict`` goes on by itself. Any other loader loads its first batches
+        again and they are passed over, so it must give the same ones.
 
         Raises:
-            ValueError: if the state is that of another process, or the loader's order cannot be restored.
+            ValueError: if the state belongs to other seeds; in the middle of a pass also if it belongs to another
+                number of samples, or cannot go on with this number of processes, or in this process.
         """
-        epoch, batch = require_epoch(state["epoch"]), require_epoch(state["batch"])
-        self._loaded = None
-        if "loader" in state and hasattr(self.loader, "load_state_dict"):
-            self._next = self._at = Position(epoch, batch)
-            self._load_loader(state, batch)
-            self._loaded = state
-            return
+        missing = sorted({"epoch", "batch", *self._describe()} - set(state))
+        if missing:
+            raise ValueError(f"this is no state of a resumable loader: it lacks {', '.join(missing)}")
 
-        _, order = self._prepare()
-        if order is None:
-            self._require_repeatable(batch)
+        epoch, batch = require_epoch(state["epoch"]), require_epoch(state["batch"])
+        loader, order = self._prepare()
+        self._require_same(state, "seeds")
+        self._loaded = None
+
+        if order is not None:
+            self._load_order(order, state, batch)
+            self._next = self._at = Position(epoch, batch)
+            self._begun = batch
+        elif "loader" in state and hasattr(loader, "load_state_dict"):
+            if batch:
+                self._require_same(state, "processes", "workers")
+            self._load_loader(state, batch)
+            self._next = self._at = Position(epoch, batch)
+        else:
+            self._require_repeatable(state, epoch, batch)
             self._next = self._at = Position(epoch, batch, passed=batch)
             return
-
-        if state.get("rank", rank_key()) != rank_key():
-            raise ValueError("the state is that of another process; save and load one for each process")
-        if batch and is_drawn(order.sampler) and "order" not in state:
-            raise ValueError("the state does not hold the order of the pass; it was saved by another kind of loader")
-
-        self._next = self._at = Position(epoch, batch)
-        visits = None
-        if batch and "order" in state:
-            visits = unpack_order(state["order"])
-        order.start_at(batch, visits)
-        self._restore_generator(state, batch)
         self._loaded = state
+
+    def _require_same(self, state: Mapping[str, Any], *facts: str) -> None:
+        """Raise ValueError if the state belongs to a loader that differs in one of these facts."""
+        present = self._describe()
+        for fact in facts:
+            if state[fact] != present[fact]:
+                raise ValueError(
+                    f"the state is of a loader with {fact} {state[fact]}, this one has {present[fact]}; use the same, "
+                    "or begin the next epoch with set_epoch"
+                )
+
+    def _load_order(self, order: KeptOrder, state: Mapping[str, Any], batch: int) -> None:
+        """Let the next pass go on with the order of the state."""
+        if batch:
+            if "order" not in state:
+                raise ValueError("the state has no order of the pass; it was saved by another kind of loader")
+            self._require_same(state, "length")
+            if state["rank"] is not None:
+                self._require_same(state, "processes")
+                if tuple(state["rank"]) != rank_key():
+                    raise ValueError("the state is that of another process; save and load one for each process")
+
+            visits = unpack_order(state["order"])
+            if order.has_batches != any(isinstance(entry, (list, tuple)) for entry in visits):
+                raise ValueError("the state has batches of a batch sampler where the loader has samples, or vice versa")
+            if world_size() > 1 and not order.is_shared:
+                self._require_same(state, "processes")
+            order.go_on(visits, state["samples"])
+
+        if self._generator is None or "generator" not in state:
+            return
+        if batch:
+            self._resumed_generator = state["generator"]  # the order of this pass is drawn already
+        elif state.get("pool"):  # a new pool of workers draws once more than one that is used again
+            order.draw_from(self._generator, state["generator"])
+        else:
+            self._generator.set_state(state["generator"])
 
     def _load_loader(self, state: Mapping[str, Any], batch: int) -> None:
         """Load the state of a loader that has one, and the state of its generator."""
@@ -157,43 +240,55 @@ class ResumableLoader(Generic[Batch]):
             # At the end of a pass without workers torchdata's loader would draw from its generator once too often.
             generator.set_state(state["generator"])
 
-    def _restore_generator(self, state: Mapping[str, Any], batch: int) -> None:
-        """Restore the loader's generator, from which a new pool of workers draws once more than a reused one."""
-        if self._generator is None or "generator" not in state:
-            return
+    def _require_repeatable(self, state: Mapping[str, Any], epoch: int, batch: int) -> None:
+        """Raise ValueError if the loader cannot be expected to give its first batches again."""
         if batch:
-            self._resumed_generator = state["generator"]  # the order of this pass is drawn already
-        elif state.get("pool"):
-            self._order.draw_from(self._generator, state["generator"])
-        else:
-            self._generator.set_state(state["generator"])
+            self._require_same(state, "length", "processes", "batch_size", "workers")
+        if not isinstance(self.loader, DataLoader):
+            return
 
-    def _require_repeatable(self, batch: int) -> None:
-        """Raise ValueError in the middle of a pass whose order is neither kept nor given by the epoch."""
-        has_order = isinstance(self.loader, DataLoader) and not isinstance(self.loader.dataset, IterableDataset)
-        if batch and has_order:
+        dataset = self.loader.dataset
+        if batch and not isinstance(dataset, IterableDataset):
             raise ValueError(
-                "the loader's sampler has no length, so its order cannot be kept; resume at the start of an epoch, or "
-                "use torchdata's StatefulDataLoader"
+                "the loader's order cannot be kept: its sampler has no length, or it iterates in its own way; resume "
+                "at the start of an epoch, or make the loader resumable instead of preparing it by a library"
             )
+        if (epoch or batch) and self._counts_in_dataset and not numbering(dataset):
+            raise ValueError(
+                f"{type(dataset).__name__} cannot be told the epoch, so its draws would be those of epoch 0; give it a "
+                "set_epoch(epoch) that passes it on to the RawPairStream inside"
+            )
+
+    _counts_in_dataset = True
+    """Whether the draws are made in the loader's dataset, which must know the epoch."""
 
     @property
     def _generator(self) -> torch.Generator | None:
-        return getattr(self.loader, "generator", None)
+        """The generator of the loader, or that of its sampler."""
+        generator: torch.Generator | None = getattr(self.loader, "generator", None)
+        if generator is None and self._order is not None:
+            generator = getattr(self._order.sampler, "generator", None)
+        return generator
 
-    def _prepare(self) -> tuple[Any, Any]:
+    def _prepare(self) -> tuple[Any, KeptOrder | None]:
         """Return the loader to iterate, and its order if that is kept."""
         if self._kept is None:
             self._kept, self._order = keep_order(self.share)
         return self._kept, self._order
 
     def __iter__(self) -> Iterator[Batch]:
-        loader, _ = self._prepare()
+        loader, order = self._prepare()
         self._loaded = None
         epoch, start, passed = self._at = self._next
         self._next = Position(epoch + 1, 0)
+        if self._frozen is not None:
+            self._next = Position(epoch, 0)
+        self._begun = start
+
         if self.share is not self.loader:
             self.share.sampler.set_epoch(epoch)
+        if order is not None:
+            order.epoch = epoch
         self._begin(epoch)
 
         first = start - passed
@@ -212,7 +307,7 @@ class ResumableLoader(Generic[Batch]):
             yield converted
 
         self._at = Position(epoch + 1, 0)
-        if number < start and not start and hasattr(self.loader, "load_state_dict"):
+        if number < start and not start and order is None and hasattr(self.loader, "load_state_dict"):
             yield from self._again(epoch)  # the state was that of the end of the previous pass
 
     def _again(self, epoch: int) -> Iterator[Batch]:
@@ -233,9 +328,8 @@ class ResumableLoader(Generic[Batch]):
         return Position(epoch, number + 1)
 
     def _begin(self, epoch: int) -> None:
-        """Tell the epoch to a dataset that numbers its epochs; this is called before each pass."""
-        dataset: Any = getattr(self.loader, "dataset", None)
-        if hasattr(dataset, "set_epoch"):
+        """Tell the epoch to the datasets that number their epochs; this is called before each pass."""
+        for dataset in numbering(getattr(self.loader, "dataset", None)):
             dataset.set_epoch(epoch)
 
     def _convert(self, batch: Any, epoch: int, number: int) -> Batch:
@@ -264,8 +358,10 @@ class ResumableLoader(Generic[Batch]):
 def resumable(loader: Iterable[Any], seed: int = 0) -> ResumableLoader[Any]:
     """Make a loader that goes on in the middle of an epoch, exactly.
 
-    It numbers its passes and gives the number to a dataset with ``set_epoch``, such as :class:`rawaug.RawPairs`, so
-    that a pair depends on (seed, epoch, index) alone. It keeps the order of a shuffled pass with its state.
+    It numbers its passes, and each index that the sampler draws carries the epoch and how often it came before in it.
+    So every :class:`rawaug.RawPairs` draws by (seed, epoch, index, occurrence), also inside a Subset, a ConcatDataset
+    or a Dataset of your own. A ``set_epoch`` of the dataset, or of those inside it, is called too. The order of a pass
+    is kept with the state.
 
     Args:
         loader: a DataLoader, or anything that iterates like one.
@@ -313,6 +409,8 @@ class WrappedLoader(ResumableLoader[Batch]):
             device = augment.device
         self.device = device
         self.augment = augment.to(device)
+
+    _counts_in_dataset = False
 
     def _begin(self, epoch: int) -> None:
         """Do nothing: the pairs are drawn here, so the dataset keeps its own epochs."""

@@ -106,6 +106,7 @@ def test_an_unreadable_file_is_named_and_replaced_by_the_next(folder: Path) -> N
     (folder / "b.png").write_bytes(b"broken")
     pictures = PictureFolder(folder, allowed_share=0.5)
     assert torch.equal(pictures[1], grey(30))
+    assert [pictures.file(index).name for index in range(3)] == ["z.TIF", "c.bmp", "c.bmp"], "the files that are given"
     (folder / "b.png").unlink()
     assert torch.equal(pictures[1], grey(30)), "and not tried again"
     assert list(pictures.skipped) == [folder / "b.png"] and "cannot be read" in pictures.skipped[folder / "b.png"]
@@ -124,6 +125,8 @@ def test_more_than_the_allowed_share_is_an_error_that_names_them(folder: Path) -
     ) as caught:
         pictures[1]
     assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match="allowed_share"):
+        pictures[1]  # nor later
     with pytest.raises(ValueError, match="allowed_share"):
         PictureFolder(folder)[1]
 

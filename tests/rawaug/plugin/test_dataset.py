@@ -73,8 +73,7 @@ def test_pairs_are_the_same_however_they_are_loaded(
 
 
 def test_patches_are_cropped_then_turned_as_the_parameters_say(augment: RawAugment, pictures: list[Tensor]) -> None:
-    pairs = RawPairs(pictures, augment, crop=16)
-    pairs.set_epoch(0)
+    pairs = RawPairs(pictures, augment, crop=16).freeze()
     views = set()
     for i in range(COUNT):
         top, left, height, width, view = pairs[i].params.crop.tolist()
@@ -90,17 +89,16 @@ def test_patches_are_cropped_then_turned_as_the_parameters_say(augment: RawAugme
 def test_another_epoch_or_seed_is_another_draw(augment: RawAugment, pictures: list[Tensor]) -> None:
     pairs = RawPairs(pictures, augment, crop=16, seed=7)
     first = pairs[0].clean
-    pairs.set_epoch(1)
+    pairs.freeze(1)
     assert torch.equal(pairs[0].clean, pairs[0].clean)
     assert not torch.equal(pairs[0].clean, first)
-    pairs.set_epoch(0)
+    pairs.freeze()
     assert torch.equal(pairs[0].clean, first)
     assert not torch.equal(RawPairs(pictures, augment, crop=16, seed=8)[0].clean, first)
 
 
 def test_indices_are_those_of_a_sequence(augment: RawAugment, pictures: list[Tensor]) -> None:
-    pairs = RawPairs(pictures, augment, crop=16)
-    pairs.set_epoch(0)
+    pairs = RawPairs(pictures, augment, crop=16).freeze()
     assert torch.equal(pairs[-1].noisy, pairs[COUNT - 1].noisy)
     assert torch.equal(pairs[torch.tensor(3)].noisy, pairs[3].noisy)  # type: ignore[index]
     with pytest.raises(IndexError):

@@ -23,7 +23,7 @@ from torch.utils.data import (
 
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs, RawPairStream
-from rawaug.plugin.epochs import Passes, Visits
+from rawaug.plugin.resume import Passes, Visits
 
 COUNT = 6
 
@@ -87,15 +87,21 @@ def test_draws_with_replacement_never_repeat(augment: RawAugment, pictures: list
     assert len({float(patch.sum()) for patch in noisy}) == 20
 
 
-def test_a_pinned_epoch_stays(augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor]) -> None:
+def test_a_pinned_epoch_stays_until_the_next_call(
+    augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor]
+) -> None:
     pairs = RawPairs(pictures, augment, crop=8, seed=3)
     loader = DataLoader(pairs, batch_size=2)
     one_pass(loader)
     pairs.set_epoch(2)
-    assert torch.equal(one_pass(loader), epochs[2]) and torch.equal(one_pass(loader), epochs[2])
     again = RawPairs(pictures, augment, crop=8, seed=3)
     again.load_state_dict(pairs.state_dict())
-    assert torch.equal(one_pass(DataLoader(again, batch_size=4)), epochs[2])
+    assert torch.equal(one_pass(loader), epochs[2]) and torch.equal(
+        one_pass(DataLoader(again, batch_size=4)), epochs[2]
+    )
+    assert not torch.equal(one_pass(loader), epochs[2]), "what comes again is drawn anew"
+    pairs.set_epoch(2)
+    assert torch.equal(one_pass(loader), epochs[2])
 
 
 @pytest.mark.parametrize("workers", [0, 2])

@@ -175,7 +175,8 @@ def test_a_state_goes_on_where_it_was_taken(augment: RawAugment, srgb: Tensor, d
 def test_a_loop_that_stops_at_the_last_batch_has_ended_the_pass(augment: RawAugment, srgb: Tensor) -> None:
     wrapped = wrap(batches_of(srgb, 2), augment)
     list(islice(wrapped, len(wrapped)))
-    assert wrapped.state_dict() == {"epoch": 1, "batch": 0}
+    state = wrapped.state_dict()
+    assert (state["epoch"], state["batch"], "order" in state) == (1, 0, False)
 
 
 class Resumable(list[Tensor]):

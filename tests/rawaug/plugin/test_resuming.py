@@ -18,8 +18,8 @@ import rawaug
 from benchmarks.resuming import Case, Counted, loader_of, outcome, resumable, wrapped
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
-from rawaug.plugin.epochs import Visits
 from rawaug.plugin.loader import wrap
+from rawaug.plugin.resume import Visits
 
 POOLS = [(0, False), (2, True)]
 """Workers, and whether they are persistent; `fork` is fast."""
@@ -149,7 +149,7 @@ def test_an_order_that_cannot_be_kept_is_refused(
     with pytest.raises(ValueError, match="order"):
         shuffled.load_state_dict(without)
     as_rank(1, 2)
-    with pytest.raises(ValueError, match="another process"):
+    with pytest.raises(ValueError, match="processes 1"):
         shuffled.load_state_dict(state)
 
 

@@ -127,8 +127,7 @@ def test_the_target_of_a_jpeg_is_the_picture_before_it_was_compressed(universal:
 def test_datasets_and_loaders_collate_them(universal: DictionaryISP) -> None:
     augment = RawAugment(universal, target=Srgb(jpeg=(80, 90)))
     pictures = list((smooth(4) * 255).to(torch.uint8))
-    pairs = RawPairs(pictures, augment, crop=32)
-    pairs.set_epoch(0)
+    pairs = RawPairs(pictures, augment, crop=32).freeze()
     batch: RawPair = next(iter(DataLoader(pairs, batch_size=4)))
     assert batch.noisy.shape == batch.clean.shape == (4, 3, 32, 32) and batch.variance.shape == (4, 0)
     assert isinstance(batch.params, AugmentParams) and batch.params.extras["quality"].shape == (4,)
