@@ -98,7 +98,8 @@ def _merge(
 
     camera = DictionaryISP.from_pretrained(isp)
     pictures = _read(paths)
-    motions, lines = None, []
+    motions = None
+    lines: list[str] = []
     if align and len(pictures) > 1:
         motions, lines = _find_motions(paths, pictures, stops)
     return merge_exposures(camera, [srgb[None] for srgb in pictures], stops, motions), camera, lines

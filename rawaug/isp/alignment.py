@@ -162,11 +162,13 @@ def contradiction(reference: Tensor, light: Tensor, clear: Tensor) -> Tensor:
     if not len(values):
         return torch.zeros_like(clear)
     edges = np.quantile(levels, np.linspace(0, 1, 17))[1:-1]
-    bins = np.searchsorted(edges, levels)
-    usual = np.array([np.median(values[bins == number]) if (bins == number).any() else 0.0 for number in range(16)])
+    numbers = np.searchsorted(edges, levels)
+    usual = np.zeros(16, np.float32)
+    for number in np.unique(numbers):
+        usual[number] = np.median(values[numbers == number])
 
     bins = torch.bucketize(brightness, torch.from_numpy(edges).float())
-    limit = 3 * torch.from_numpy(usual).float()[bins] + 0.1 * brightness
+    limit = 3 * torch.from_numpy(usual)[bins] + 0.1 * brightness
     contradicts = ((difference > limit) & seen).float()
     contradicts = F.max_pool2d(F.avg_pool2d(contradicts, 5, stride=1, padding=2).gt(0.5).float(), 9, 1, 4)
     return F.avg_pool2d(contradicts, 9, stride=1, padding=4)
@@ -174,9 +176,10 @@ def contradiction(reference: Tensor, light: Tensor, clear: Tensor) -> Tensor:
 
 def _details(light: Tensor, clear: Tensor) -> np.ndarray:
     """Compute log light above a spatial frequency, ``(H, W)``, faded out where it is dark or clipped."""
-    light = light.numpy().clip(0)
-    logarithm = np.log(light + _DARK)
-    return (logarithm - ndimage.gaussian_filter(logarithm, 8.0)) * (light / (light + _DARK)) * clear.numpy()
+    linear = light.numpy().clip(0)
+    logarithm = np.log(linear + _DARK)
+    details: np.ndarray = (logarithm - ndimage.gaussian_filter(logarithm, 8.0)) * clear.numpy()
+    return details * (linear / (linear + _DARK))
 
 
 def _displacement(here: np.ndarray, there: np.ndarray, upsampled: int = 20) -> tuple[np.ndarray, float]:
