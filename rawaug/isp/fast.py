@@ -32,7 +32,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import BatchParams, Stage, Tables, node_colours
 from rawaug.isp.tone import STEPS, to_code
 from rawaug.kernels import fastest
-from rawaug.kernels.reference import Camera, Display, fall_off, look_up, mask_frame, render, unprocess
+from rawaug.kernels.reference import Camera, Display, blur_taps, fall_off, look_up, mask_frame, render, unprocess
 from rawaug.kernels.runtime import one_thread
 
 NODES = 65
@@ -66,7 +66,14 @@ class BakedISP(nn.Module):
             return self.isp.choose(srgb)
 
     @torch.no_grad()
-    def forward(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
+    def forward(
+        self,
+        srgb: Tensor,
+        params: ISPParams,
+        place: Tensor | None = None,
+        white: float = math.inf,
+        blur: Tensor | None = None,
+    ) -> Tensor:
         """Convert sRGB to clean packed RAW.
 
         Args:
@@ -76,13 +83,14 @@ class BakedISP(nn.Module):
                 if the crop was turned or enlarged, its view and how many rows of the frame it has; None for full
                 frames.
             white: the RAW value to clip at; nothing is clipped by default.
+            blur: ``(B,)``, the deviation in pixels of the Gaussian that blurs linear light, at most 1; None for none.
 
         Returns:
             float32 ``(B, 4, H/2, W/2)``, planes R, Gr, Gb, B.
         """
-        _require_batch(srgb, params, place)
+        _require_batch(srgb, params, place, blur)
 
-        camera = self._camera(srgb, params, place)
+        camera = self._camera(srgb, params, place, blur)
         size = srgb.shape[-2], srgb.shape[-1]
         gain = _place_gain(self.isp.ordered_stages, place, size, self.table, forward=False)
         if gain is None:
@@ -95,7 +103,13 @@ class BakedISP(nn.Module):
 
     @torch.no_grad()
     def colours(
-        self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf, shaded: bool = True
+        self,
+        srgb: Tensor,
+        params: ISPParams,
+        place: Tensor | None = None,
+        white: float = math.inf,
+        blur: Tensor | None = None,
+        shaded: bool = True,
     ) -> Tensor:
         """Convert sRGB to RAW of all three colours at every pixel.
 
@@ -104,14 +118,15 @@ class BakedISP(nn.Module):
             params: the settings of the pictures.
             place: as in :meth:`forward`.
             white: as in :meth:`forward`.
+            blur: as in :meth:`forward`.
             shaded: whether the lens is applied; if not, the result is x4, for :meth:`shade`.
 
         Returns:
             float32 ``(B, 3, H, W)``.
         """
-        _require_batch(srgb, params, place)
+        _require_batch(srgb, params, place, blur)
 
-        camera = self._camera(srgb, params, place)
+        camera = self._camera(srgb, params, place, blur)
         gain = None
         if shaded:
             size = srgb.shape[-2], srgb.shape[-1]
@@ -151,7 +166,7 @@ class BakedISP(nn.Module):
             x5 = x5 * gain
         return x5
 
-    def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> Camera:
+    def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None, blur: Tensor | None = None) -> Camera:
         table = self.table
         matrix, floor, frame, curves, shading = _batch_params(self.isp.ordered_stages, srgb, params, place, table)
         if curves.numel():
@@ -166,7 +181,11 @@ class BakedISP(nn.Module):
         sites = []
         for channel, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True):
             sites.append((i, j, channel))
-        return Camera(table, curves, self.attention, colour, knee or 0.0, frame, shading, torch.tensor(sites))
+
+        taps = table.new_empty(len(srgb), 0)
+        if blur is not None:
+            taps = blur_taps(blur.to(table))
+        return Camera(table, curves, self.attention, colour, knee or 0.0, frame, shading, torch.tensor(sites), taps)
 
 
 class FastForward(nn.Module):
@@ -375,11 +394,11 @@ def _pass(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     return fastest("unprocess", srgb, camera, white, otherwise=lambda: unprocess(srgb, camera, white))
 
 
-def _require_batch(srgb: Tensor, params: ISPParams, place: Tensor | None) -> None:
+def _require_batch(srgb: Tensor, params: ISPParams, place: Tensor | None, blur: Tensor | None = None) -> None:
     """Raise ValueError unless ``srgb`` is ``(B, 3, H, W)`` with even sides and all else is for B pictures."""
     if srgb.ndim != 4 or srgb.shape[1] != 3 or srgb.shape[2] % 2 or srgb.shape[3] % 2:
         raise ValueError(f"sRGB must have shape (B, 3, H, W) with even sides, got {tuple(srgb.shape)}")
-    for what, value in (("matrix", params.matrix), ("gains", params.gains), ("place", place)):
+    for what, value in (("matrix", params.matrix), ("gains", params.gains), ("place", place), ("blur", blur)):
         if value is not None and len(value) != len(srgb):
             raise ValueError(f"{what} is for {count_of(len(value), 'picture')}, but the batch has {len(srgb)}")
 

@@ -30,6 +30,9 @@ from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
 _TILE = 256
 """A tile has this many cells of RAW."""
 
+_LINE = _TILE + 2
+"""A line of every second pixel has this many places: those of a tile, and a margin."""
+
 _NOISE_TILE = 512
 """A tile has this many cells of noise."""
 
@@ -88,10 +91,11 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
         _present(camera.frame),
         _present(camera.shading),
         _present(camera.sites),
+        _present(camera.taps),
         np.float32(white),
         raw.numpy(),
     )
-    run_over_rows(batch * height, width, convert)
+    run_over_rows(batch * height // 2, 2 * width, convert)
     return raw
 
 
@@ -229,8 +233,8 @@ def _cell_of(value, scale, last):  # type: ignore[no-untyped-def]
 
 
 @compile_part
-def _look_up(red, green, blue, scale, table, nodes, shares, halves, out):  # type: ignore[no-untyped-def]
-    """Look up the table ``(N, N, N, 4)`` at colours ``(n,)``, and write to ``out`` ``(2, 3, _TILE)``.
+def _look_up(red, green, blue, scale, table, nodes, shares, halves, first, out):  # type: ignore[no-untyped-def]
+    """Look up the table ``(N, N, N, 4)`` at colours ``(n,)``, and write to ``out`` ``(2, 3, width)`` from ``first`` on.
 
     With ``halves`` = 1, even and odd sites go to separate halves of ``out``; with 0, all go to its first half.
     """
@@ -244,11 +248,11 @@ def _look_up(red, green, blue, scale, table, nodes, shares, halves, out):  # typ
         shares[0, j], shares[1, j], shares[2, j] = u, v, w
 
     flat_table, flat_out = table.reshape(-1), out.reshape(-1)
-    row, layer = np.int64(4) * size, np.int64(4) * size * size
+    row, layer, plane = np.int64(4) * size, np.int64(4) * size * size, out.shape[2]
     for j in range(len(red)):
-        at = (j >> halves) + (j & halves) * (3 * _TILE)
+        at = first + (j >> halves) + (j & halves) * (3 * plane)
         u, v, w = shares[0, j], shares[1, j], shares[2, j]
-        _interpolate(flat_table, np.int64(nodes[j]), row, layer, u, v, w, flat_out, at, np.int64(_TILE))
+        _interpolate(flat_table, np.int64(nodes[j]), row, layer, u, v, w, flat_out, at, plane)
 
 
 @compile_part
@@ -315,50 +319,110 @@ def _develop(x2, colour, channel, knee, mask, white, out):  # type: ignore[no-un
 def _attend(x4, channel, table, nodes, shares, attention, white, out):  # type: ignore[no-untyped-def]
     """Multiply one channel of x4 ``(3, n)`` by the attention, which depends on all three."""
     count, scale = len(out), np.float32(len(table) - 1)
-    _look_up(x4[0, :count], x4[1, :count], x4[2, :count], scale, table, nodes, shares, 0, attention)
+    _look_up(x4[0, :count], x4[1, :count], x4[2, :count], scale, table, nodes, shares, 0, 0, attention)
 
     for j in range(count):
         out[j] = _clip(x4[channel, j] * attention[0, 0, j], white)
 
 
+@compile_part
+def _light(srgb, b, i, pixels, scale, table, codes, curves, nodes, shares, first, out):  # type: ignore[no-untyped-def]
+    """Look up linear light of some pixels of a row: even ones go to ``out[0]``, odd ones to ``out[1]``."""
+    if table is not None:
+        red, green, blue = srgb[b, 0, i, pixels], srgb[b, 1, i, pixels], srgb[b, 2, i, pixels]
+        _look_up(red, green, blue, scale, table, nodes, shares, 1, first, out)
+    if codes is not None:
+        for c in range(3):
+            _of_codes(srgb[b, c, i, pixels], codes[b], out[:, c, first:])
+    if curves is not None:
+        for c in range(3):
+            _through_curve(srgb[b, c, i, pixels], scale, curves[b], nodes, shares, out[:, c, first:])
+
+
+@compile_part
+def _blur_down(above, over, upper, lower, under, below, a, b, c, out):  # type: ignore[no-untyped-def]
+    """Blur two rows, between two above and two below, down the columns, to ``out`` and from ``6 * _LINE`` on."""
+    for j in range(len(upper)):
+        out[j] = a * upper[j] + b * (over[j] + lower[j]) + c * (above[j] + under[j])
+        out[6 * _LINE + j] = a * lower[j] + b * (upper[j] + under[j]) + c * (over[j] + below[j])
+
+
+@compile_part
+def _blur_along(even, odd, a, b, c, n, out):  # type: ignore[no-untyped-def]
+    """Blur n cells of a row with a margin of a cell along itself: even pixels to ``out``, odd ones half-way on."""
+    for j in range(n):
+        out[j] = a * even[j + 1] + b * (odd[j] + odd[j + 1]) + c * (even[j] + even[j + 2])
+        out[3 * _TILE + j] = a * odd[j + 1] + b * (even[j + 1] + even[j + 2]) + c * (odd[j] + odd[j + 2])
+
+
+@compile_part
+def _blur(lines, i, end, taps, n, columns, x2):  # type: ignore[no-untyped-def]
+    """Blur n cells of rows i and i + 1; ``lines`` hold the six rows about them, and ``end`` is the last row."""
+    a, b, c = taps[0], taps[1], taps[2]
+    _blur_down(
+        lines[max(i - 2, 0) % 6].reshape(-1), lines[max(i - 1, 0) % 6].reshape(-1), lines[i % 6].reshape(-1),
+        lines[(i + 1) % 6].reshape(-1), lines[min(i + 2, end) % 6].reshape(-1), lines[min(i + 3, end) % 6].reshape(-1),
+        a, b, c, columns,
+    )  # fmt: skip
+
+    width, flat = lines.shape[3], x2.reshape(-1)
+    for row in range(2):
+        for channel in range(3):
+            even = columns[6 * _LINE * row + width * channel :]
+            _blur_along(even, even[3 * width :], a, b, c, n, flat[(6 * row + channel) * _TILE :])
+
+
 @compile_loop
 def _raw_rows(  # type: ignore[no-untyped-def]
-    srgb, scale, table, codes, curves, attention, colour, knee, frame, shading, sites, white, raw, start, stop,
+    srgb, scale, table, codes, curves, attention, colour, knee, frame, shading, sites, taps, white, raw, start, stop,
 ):  # fmt: skip
-    """Convert rows ``start`` to ``stop`` of all pictures' rows of pixels, counted through the batch."""
-    height, width = srgb.shape[2], raw.shape[3]
-    nodes, shares = np.empty(2 * _TILE, np.int32), np.empty((3, 2 * _TILE), np.float32)
-    x2, attended = np.empty((2, 3, _TILE), np.float32), np.empty((2, 3, _TILE), np.float32)
+    """Convert rows ``start`` to ``stop`` of all pictures' rows of cells, counted through the batch."""
+    height, width = raw.shape[2], raw.shape[3]
+    nodes, shares = np.empty(2 * _LINE, np.int32), np.empty((3, 2 * _LINE), np.float32)
+    x2, attended = np.empty((2, 2, 3, _TILE), np.float32), np.empty((2, 3, _TILE), np.float32)
     x4, mask = np.empty((3, _TILE), np.float32), np.ones(_TILE, np.float32)
 
+    # Six rows of light of each tile are kept, with a cell more on either side, for the blur.
+    tiles = -(-width // _TILE)
+    lines = np.zeros((tiles, 6, 2, 3, min(width, _TILE) + 2), np.float32)
+    columns, latest = np.empty(12 * _LINE, np.float32), -1
+
     for row in range(start, stop):
-        b, i = divmod(row, height)
-        red, green, blue = srgb[b, 0, i], srgb[b, 1, i], srgb[b, 2, i]
-        for first in range(0, width, _TILE):
-            last = min(first + _TILE, width)
-            pixels = slice(2 * first, 2 * last)
+        b, k = divmod(row, height)
+        if k == 0 or row == start:
+            latest = max(2 * k - 2, 0) - 1
 
-            if table is not None:
-                _look_up(red[pixels], green[pixels], blue[pixels], scale, table, nodes, shares, 1, x2)
-            if codes is not None:
-                for c in range(3):
-                    _of_codes(srgb[b, c, i, pixels], codes[b], x2[:, c])
-            if curves is not None:
-                for c in range(3):
-                    _through_curve(srgb[b, c, i, pixels], scale, curves[b], nodes, shares, x2[:, c])
+        for tile in range(tiles):
+            first, last = tile * _TILE, min(tile * _TILE + _TILE, width)
+            n = last - first
 
-            for k in range(len(sites)):
-                if sites[k, 0] != i % 2:
-                    continue
-                column, channel, out = sites[k, 1], sites[k, 2], raw[b, k, i // 2, first:last]
+            if taps is None:
+                for i in range(2):
+                    pixels = slice(2 * first, 2 * last)
+                    _light(srgb, b, 2 * k + i, pixels, scale, table, codes, curves, nodes, shares, 0, x2[i])
+            else:
+                left, right = max(first - 1, 0), min(last + 1, width)
+                for i in range(latest + 1, min(2 * k + 4, 2 * height)):
+                    line, pixels = lines[tile, i % 6], slice(2 * left, 2 * right)
+                    _light(srgb, b, i, pixels, scale, table, codes, curves, nodes, shares, left - first + 1, line)
+                    if first == 0:
+                        line[:, :, 0] = line[:1, :, 1]
+                    if last == width:
+                        line[:, :, n + 1] = line[1:, :, n]
+                _blur(lines[tile], 2 * k, 2 * height - 1, taps[b], n, columns, x2)
+
+            for s in range(len(sites)):
+                i, column, channel = sites[s, 0], sites[s, 1], sites[s, 2]
+                out = raw[b, s, k, first:last]
                 if shading is not None:
-                    _fall_off(frame[b], i, 2 * first + column, shading, mask[: last - first])
+                    _fall_off(frame[b], 2 * k + i, 2 * first + column, shading, mask[:n])
                 if attention is not None:
                     for c in range(len(x4)):
-                        _develop(x2[column], colour[b], c, knee, mask, _FAR, x4[c, : last - first])
+                        _develop(x2[i, column], colour[b], c, knee, mask, _FAR, x4[c, :n])
                     _attend(x4, channel, attention, nodes, shares, attended, white, out)
                 else:
-                    _develop(x2[column], colour[b], channel, knee, mask, white, out)
+                    _develop(x2[i, column], colour[b], channel, knee, mask, white, out)
+        latest = 2 * k + 3
 
 
 @compile_part
@@ -451,7 +515,7 @@ def _srgb_rows(  # type: ignore[no-untyped-def]
                         x[c, j] /= mask[j]
             if attention is not None:
                 scale = np.float32(len(attention) - 1)
-                _look_up(x[0, :n], x[1, :n], x[2, :n], scale, attention, nodes, shares, 0, looked_up)
+                _look_up(x[0, :n], x[1, :n], x[2, :n], scale, attention, nodes, shares, 0, 0, looked_up)
                 for c in range(3):
                     for j in range(n):
                         x[c, j] *= looked_up[0, 0, j]
@@ -470,7 +534,7 @@ def _srgb_rows(  # type: ignore[no-untyped-def]
                     _at_curve(root[c, :n], curves[b], nodes, shares[0], srgb[b, c, i, first:last])
             if table is not None:
                 scale = np.float32(len(table) - 1)
-                _look_up(root[0, :n], root[1, :n], root[2, :n], scale, table, nodes, shares, 0, looked_up)
+                _look_up(root[0, :n], root[1, :n], root[2, :n], scale, table, nodes, shares, 0, 0, looked_up)
                 for c in range(3):
                     for j in range(n):
                         y = _at_least(looked_up[0, c, j], _ZERO)

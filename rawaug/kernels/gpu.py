@@ -29,14 +29,23 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     largest_code = 255.0 if srgb.dtype == torch.uint8 else 1.0
     scale = ((entries or nodes) - 1) / largest_code
     sites = [i + 2 * j + 4 * channel for i, j, channel in camera.sites.tolist()]
-    parts = (camera.table, camera.curves, camera.attention, camera.colour, camera.frame, camera.shading)
+    parts = (camera.table, camera.curves, camera.attention, camera.colour, camera.frame, camera.shading, camera.taps)
     tensors = [part.contiguous() for part in parts]
+    source, is_linear = srgb.contiguous(), False
+    blurs = camera.taps.numel() > 0
 
     with torch.cuda.device_of(srgb):  # which need not be the current one
+        if blurs and not entries:  # a table is read once for each pixel, not for each neighbour
+            light = torch.empty(srgb.shape, device=srgb.device, dtype=torch.float32)
+            _light[(triton.cdiv(height * width, _RAW_BLOCK), batch)](
+                source, tensors[0], light, height * width, scale, NODES=nodes, BLOCK=_RAW_BLOCK, enable_fp_fusion=True
+            )
+            source, is_linear = light, True
+
         _raw_cells[(triton.cdiv(h * w, _RAW_BLOCK), batch)](
-            srgb.contiguous(), *tensors, raw, h, w, scale, camera.knee, white, *sites,
+            source, *tensors, raw, h, w, scale, camera.knee, white, *sites,
             NODES=nodes, ENTRIES=entries, ATTENDS=camera.attention.numel() > 0, SHADES=camera.shading.numel() > 0,
-            BLOCK=_RAW_BLOCK, enable_fp_fusion=True,
+            BLURS=blurs, LINEAR=is_linear, BLOCK=_RAW_BLOCK, enable_fp_fusion=True,
         )  # fmt: skip
     return raw
 
@@ -73,6 +82,49 @@ def _curve(curve, x, ENTRIES: tl.constexpr):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
+def _linear(  # type: ignore[no-untyped-def]
+    srgb, table, curve, pixel, size, inside, scale, NODES: tl.constexpr, ENTRIES: tl.constexpr, LINEAR: tl.constexpr
+):
+    """Read pixels of planes of ``size`` as linear light, through a curve or the table, or as they are."""
+    r = tl.load(srgb + pixel, mask=inside, other=0).to(tl.float32)
+    g = tl.load(srgb + size + pixel, mask=inside, other=0).to(tl.float32)
+    b = tl.load(srgb + 2 * size + pixel, mask=inside, other=0).to(tl.float32)
+
+    if not LINEAR:
+        r, g, b = r * scale, g * scale, b * scale
+        if ENTRIES:
+            r, g, b = _curve(curve, r, ENTRIES), _curve(curve, g, ENTRIES), _curve(curve, b, ENTRIES)
+        else:
+            red, u = _axis(r, NODES)
+            green, v = _axis(g, NODES)
+            blue, t = _axis(b, NODES)
+            at = ((blue * NODES + green) * NODES + red) * 4
+            r = _read(table, at, u, v, t, NODES)
+            g = _read(table, at + 1, u, v, t, NODES)
+            b = _read(table, at + 2, u, v, t, NODES)
+    return r, g, b
+
+
+@triton.jit
+def _light(srgb, table, light, size, scale, NODES: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Convert every pixel to linear light by the table."""
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = pixel < size
+    plane = size.to(tl.int64)
+    picture = tl.program_id(1).to(tl.int64) * 3 * plane
+    r, g, b = _linear(srgb + picture, table, table, pixel, plane, inside, scale, NODES, 0, False)
+    tl.store(light + picture + pixel, r, mask=inside)
+    tl.store(light + picture + plane + pixel, g, mask=inside)
+    tl.store(light + picture + 2 * plane + pixel, b, mask=inside)
+
+
+@triton.jit
+def _tap(taps, distance):  # type: ignore[no-untyped-def]
+    """The weight of a pixel at a distance of -2 to 2."""
+    return tl.load(taps + tl.where(distance < 0, -distance, distance))
+
+
+@triton.jit
 def _row(colour, k, r, g, b):  # type: ignore[no-untyped-def]
     """Multiply row ``k`` of the matrix (3: the mean of its rows) by a colour."""
     return tl.load(colour + 3 * k) * r + tl.load(colour + 3 * k + 1) * g + tl.load(colour + 3 * k + 2) * b
@@ -86,29 +138,31 @@ def _channel(colour, k, r, g, b, m, shade):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _site(  # type: ignore[no-untyped-def]
-    srgb, table, curve, attention, colour, frame, shading, raw, cell, h, w, scale, knee, white,
+    srgb, table, curve, attention, colour, frame, shading, taps, raw, cell, h, w, scale, knee, white,
     SITE: tl.constexpr, NODES: tl.constexpr, ENTRIES: tl.constexpr, ATTENDS: tl.constexpr, SHADES: tl.constexpr,
+    BLURS: tl.constexpr, LINEAR: tl.constexpr,
 ):  # fmt: skip
     """Convert one plane of the cells; SITE is row + 2 column + 4 colour of its sites."""
     size = h.to(tl.int64) * w
     inside = cell < h * w
     row, column = cell // w * 2 + SITE % 2, cell % w * 2 + SITE // 2 % 2
-    pixel = row.to(tl.int64) * (2 * w) + column
 
-    r = tl.load(srgb + pixel, mask=inside, other=0).to(tl.float32) * scale
-    g = tl.load(srgb + 4 * size + pixel, mask=inside, other=0).to(tl.float32) * scale
-    b = tl.load(srgb + 8 * size + pixel, mask=inside, other=0).to(tl.float32) * scale
-
-    if ENTRIES:
-        r, g, b = _curve(curve, r, ENTRIES), _curve(curve, g, ENTRIES), _curve(curve, b, ENTRIES)
+    if BLURS:
+        zero = (cell * 0).to(tl.float32)
+        r, g, b = zero, zero, zero
+        for i in range(-2, 3):
+            line = tl.minimum(tl.maximum(row + i, 0), 2 * h - 1).to(tl.int64) * (2 * w)
+            r_line, g_line, b_line = zero, zero, zero
+            for j in range(-2, 3):
+                pixel = line + tl.minimum(tl.maximum(column + j, 0), 2 * w - 1)
+                red, green, blue = _linear(srgb, table, curve, pixel, 4 * size, inside, scale, NODES, ENTRIES, LINEAR)
+                weight = _tap(taps, j)
+                r_line, g_line, b_line = r_line + weight * red, g_line + weight * green, b_line + weight * blue
+            weight = _tap(taps, i)
+            r, g, b = r + weight * r_line, g + weight * g_line, b + weight * b_line
     else:
-        red, u = _axis(r, NODES)
-        green, v = _axis(g, NODES)
-        blue, t = _axis(b, NODES)
-        at = ((blue * NODES + green) * NODES + red) * 4
-        r = _read(table, at, u, v, t, NODES)
-        g = _read(table, at + 1, u, v, t, NODES)
-        b = _read(table, at + 2, u, v, t, NODES)
+        pixel = row.to(tl.int64) * (2 * w) + column
+        r, g, b = _linear(srgb, table, curve, pixel, 4 * size, inside, scale, NODES, ENTRIES, LINEAR)
 
     m = tl.minimum(tl.maximum((_row(colour, 3, r, g, b) - knee) / (1.0 - knee), 0.0), 1.0)
     shade = 1.0
@@ -131,23 +185,24 @@ def _site(  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _raw_cells(  # type: ignore[no-untyped-def]
-    srgb, table, curves, attention, colour, frame, shading, raw, h, w, scale, knee, white,
+    srgb, table, curves, attention, colour, frame, shading, taps, raw, h, w, scale, knee, white,
     S0: tl.constexpr, S1: tl.constexpr, S2: tl.constexpr, S3: tl.constexpr,
-    NODES: tl.constexpr, ENTRIES: tl.constexpr, ATTENDS: tl.constexpr, SHADES: tl.constexpr, BLOCK: tl.constexpr,
+    NODES: tl.constexpr, ENTRIES: tl.constexpr, ATTENDS: tl.constexpr, SHADES: tl.constexpr,
+    BLURS: tl.constexpr, LINEAR: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     picture = tl.program_id(1).to(tl.int64)
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     size = h.to(tl.int64) * w
     x, y = srgb + picture * 12 * size, raw + picture * 4 * size
-    c, f, curve = colour + picture * 18, frame + picture * 6, curves + picture * ENTRIES
-    _site(x, table, curve, attention, c, f, shading, y, cell, h, w, scale, knee, white,
-          S0, NODES, ENTRIES, ATTENDS, SHADES)  # fmt: skip
-    _site(x, table, curve, attention, c, f, shading, y + size, cell, h, w, scale, knee, white,
-          S1, NODES, ENTRIES, ATTENDS, SHADES)  # fmt: skip
-    _site(x, table, curve, attention, c, f, shading, y + 2 * size, cell, h, w, scale, knee, white,
-          S2, NODES, ENTRIES, ATTENDS, SHADES)  # fmt: skip
-    _site(x, table, curve, attention, c, f, shading, y + 3 * size, cell, h, w, scale, knee, white,
-          S3, NODES, ENTRIES, ATTENDS, SHADES)  # fmt: skip
+    c, f, curve, t = colour + picture * 18, frame + picture * 6, curves + picture * ENTRIES, taps + picture * 3
+    _site(x, table, curve, attention, c, f, shading, t, y, cell, h, w, scale, knee, white,
+          S0, NODES, ENTRIES, ATTENDS, SHADES, BLURS, LINEAR)  # fmt: skip
+    _site(x, table, curve, attention, c, f, shading, t, y + size, cell, h, w, scale, knee, white,
+          S1, NODES, ENTRIES, ATTENDS, SHADES, BLURS, LINEAR)  # fmt: skip
+    _site(x, table, curve, attention, c, f, shading, t, y + 2 * size, cell, h, w, scale, knee, white,
+          S2, NODES, ENTRIES, ATTENDS, SHADES, BLURS, LINEAR)  # fmt: skip
+    _site(x, table, curve, attention, c, f, shading, t, y + 3 * size, cell, h, w, scale, knee, white,
+          S3, NODES, ENTRIES, ATTENDS, SHADES, BLURS, LINEAR)  # fmt: skip
 
 
 def shot_read(clean: Tensor, levels: Tensor, keys: list[int], white: float, mapped: bool) -> tuple[Tensor, Tensor]:

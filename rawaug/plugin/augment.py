@@ -54,7 +54,7 @@ class RawAugment(PairMaker):
             :class:`rawaug.noise.MeasuredLevels`, a :class:`rawaug.noise.NoiseModel`, or ``"camera"`` for the levels
             that were measured when the ISP was fitted, or that a :class:`rawaug.Camera` states.
             The default is the noise of the :class:`rawaug.Camera`, else ``"cycleisp_sidd"``.
-        draw: how cameras, lights, tone curves and exposures are drawn.
+        draw: how cameras, lights, tone curves, exposures and the blur of the lens are drawn.
         target: what the pair holds. ``"raw"``: noisy and clean RAW. ``"rgb"``: noisy RAW, and clean linear camera RGB
             ``(B, 3, H, W)`` of the full size, for demosaicing. ``"srgb"`` or an :class:`Srgb`: both as sRGB
             ``(B, 3, H, W)`` in [0, 1], developed by the setting that made the RAW, and no variance map.
@@ -217,6 +217,7 @@ class RawAugment(PairMaker):
                 extras |= self.srgb.sample(len(batch), generator)
             if self.burst is not None:
                 extras |= self.burst.sample(len(batch), generator)
+            extras |= self.settings.sample_blur(len(batch), generator)
         return AugmentParams(setting, noise, crop, extras)
 
     def apply_params(self, batch: Tensor, params: AugmentParams) -> RawPair:
@@ -229,13 +230,13 @@ class RawAugment(PairMaker):
 
             noisy, clean, variance = self._noisy(self._clean(batch, params), params)
             if self.target == "rgb":
-                clean = self.baked.colours(batch, params.isp, params.crop, white=1.0)
+                clean = self.baked.colours(batch, params.isp, params.crop, 1.0, params.extras.get("blur"))
             return RawPair(noisy, clean, variance, params)
 
     def _clean(self, srgb: Tensor, params: AugmentParams) -> Tensor:
         if self.pattern is None:
-            return self.baked(srgb, params.isp, params.crop, white=1.0)
-        return self._planes(self.baked.colours(srgb, params.isp, params.crop, white=1.0))
+            return self.baked(srgb, params.isp, params.crop, 1.0, params.extras.get("blur"))
+        return self._planes(self.baked.colours(srgb, params.isp, params.crop, 1.0, params.extras.get("blur")))
 
     def _planes(self, rgb: Tensor) -> Tensor:
         """Sample RGB ``(B, 3, H, W)`` as four planes: packed RAW, or the sites of 2 x 2 squares for other patterns."""
@@ -281,7 +282,7 @@ class RawAugment(PairMaker):
         noise = _with_seed(frame_params.noise, params.extras["frame_seed"].flatten())
         frame_params = frame_params._replace(noise=noise)
 
-        scene = self.baked.colours(srgb, params.isp, params.crop, shaded=False)
+        scene = self.baked.colours(srgb, params.isp, params.crop, blur=params.extras.get("blur"), shaded=False)
         moving = burst.move(scene, params.extras["motion"])
         frames = burst.expose(self.baked.shade(moving, frame_params.isp, frame_params.crop))
         noisy, clean, variance = self._noisy(self._planes(frames), frame_params)

@@ -3,11 +3,15 @@ r"""The camera settings that pictures are given: cameras, lights, tone curves an
 A setting is a colour matrix C, gains g and a tone curve T. It comes from the hulls of the dictionaries' atoms or, for
 an ISP of published cameras, is one camera in one light (:mod:`rawaug.isp.dictionary`). An exposure of e stops divides
 the gains of the forward direction by :math:`2^e`.
+
+Lens, optical low-pass filter and pixel aperture blur the light before the mosaic, while pictures for the screen have
+been scaled down and sharpened. Light is therefore blurred by a Gaussian (:mod:`rawaug.kernels.reference`). Its
+modulation is half at a frequency of :math:`\sqrt{\ln 2 / 2} / (\pi \sigma) = 0.187 / \sigma` cycles a pixel (MTF50).
 """
 
 from __future__ import annotations
 
-import math
+import sys
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any, Literal, get_args
@@ -20,6 +24,9 @@ from rawaug.isp.dictionary import EXPOSURE, perturb
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
 from rawaug.registry import suggest
+
+_FAR = sys.float_info.max
+"""The largest finite number."""
 
 Sampling = Literal["convex", "independent", "perturb", "chosen"]
 
@@ -41,9 +48,12 @@ class Draw:
         light: colour temperature in kelvin of the light that published cameras are drawn in, or one of
             :data:`rawaug.camera.lights.LAMPS` by name, such as ``LED-B3``. Any light by default.
         tone: one tone curve of an ISP of published cameras, by name (``rawaug info`` lists them), instead of mixtures.
+        blur: lowest and highest standard deviation, or a single one, of the Gaussian that blurs linear light before the
+            mosaic, in pixels of the mosaic, from 0 to 1. Pictures for the screen are sharper, pixel by pixel, than RAW
+            of a lens and an optical low-pass filter. 0 leaves them as they are.
 
     Raises:
-        ValueError: if the sampling is unknown, or the strength or the exposure is out of range.
+        ValueError: if the sampling is unknown, or the strength, the exposure or the blur is out of range.
     """
 
     sampling: Sampling = "convex"
@@ -51,6 +61,7 @@ class Draw:
     exposure: tuple[float, float] | float | None = None
     light: float | str | None = None
     tone: str | None = None
+    blur: tuple[float, float] | float = 0.0
 
     def __post_init__(self) -> None:
         if self.sampling not in get_args(Sampling):
@@ -58,7 +69,8 @@ class Draw:
         if not self.strength >= 0:
             raise ValueError(f"strength must be at least 0, got {self.strength}")
         if self.exposure is not None:
-            _require_range("exposure", self.exposure)
+            _require_range("exposure", self.exposure, "stops")
+        _require_range("blur", self.blur, "pixels", limits=(0.0, 1.0))
 
     @property
     def exposure_range(self) -> tuple[float, float] | None:
@@ -67,16 +79,28 @@ class Draw:
             return self.exposure, self.exposure
         return self.exposure
 
+    @property
+    def blur_range(self) -> tuple[float, float]:
+        """The least and the largest standard deviation of the blur, in pixels."""
+        if isinstance(self.blur, (int, float)):
+            return self.blur, self.blur
+        return self.blur
 
-def _require_range(key: str, limits: Any) -> None:
-    """Refuse anything that is neither a finite number nor (lowest, highest)."""
-    ends = limits if isinstance(limits, (list, tuple)) else (limits, limits)
+
+def _require_range(key: str, value: Any, unit: str, limits: tuple[float, float] = (-_FAR, _FAR)) -> None:
+    """Refuse anything that is neither a finite number within limits nor (lowest, highest) of such numbers."""
+    ends = value if isinstance(value, (list, tuple)) else (value, value)
 
     is_range = len(ends) == 2
     for end in ends:
-        is_range = is_range and isinstance(end, Real) and math.isfinite(end)
-    if not is_range or ends[0] > ends[1]:
-        raise ValueError(f"{key} must be (lowest, highest) in stops or one number, got {limits!r:.100}")
+        is_range = is_range and isinstance(end, Real) and limits[0] <= float(end) <= limits[1]
+    if is_range and ends[0] <= ends[1]:
+        return
+
+    within = ""
+    if limits[1] < _FAR:
+        within = f" within {limits[0]:g} to {limits[1]:g}"
+    raise ValueError(f"{key} must be (lowest, highest) in {unit} or one number{within}, got {value!r:.100}")
 
 
 class SettingSampler:
@@ -116,6 +140,13 @@ class SettingSampler:
         stops = low + (high - low) * torch.rand(len(srgb), 1, generator=generator, dtype=torch.float32)
         return setting._replace(gains=setting.gains * torch.exp2(-stops).to(setting.gains))
 
+    def sample_blur(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draw ``blur`` ``(batch,)``, standard deviations in pixels; nothing if pictures are left as they are."""
+        low, high = self.draw.blur_range
+        if not high:
+            return {}
+        return {"blur": low + (high - low) * torch.rand(batch, generator=generator, dtype=torch.float32)}
+
     def _sample_at_exposure_0(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
         if self.draw.sampling == "chosen":
             return self.baked.choose(srgb)
@@ -137,7 +168,7 @@ class SettingSampler:
         return self.isp.params_from_weights(*weights)
 
     def __repr__(self) -> str:
-        """Describe the camera, the sampling, the light and the exposure in a line."""
+        """Describe the camera, the sampling, the light, the exposure and the blur in a line."""
         count = self.isp.config.cameras
         if count == 1:
             line = str(self.isp.info["cameras"][0])
@@ -149,7 +180,12 @@ class SettingSampler:
         line += f", {self.draw.sampling}"
         if self.draw.light is not None:
             line += f", light {self.draw.light}"
-        return f"{line}, exposure {self.exposure[0]:g} to {self.exposure[1]:g} stops"
+        line += f", exposure {self.exposure[0]:g} to {self.exposure[1]:g} stops"
+
+        low, high = self.draw.blur_range
+        if high:
+            line += f", blur {low:g} to {high:g} pixels"
+        return line
 
 
 def tone_weights(isp: DictionaryISP, name: str) -> Tensor:

@@ -27,7 +27,8 @@ class AugmentParams(NamedTuple):
             ``(B, 6)``, and the last is the number of rows that were enlarged to the crop.
         extras: for the target ``"srgb"``, ``demosaicing`` (its number), ``quality`` with JPEG, and with finishing
             ``chroma_420``, each ``(B,)``, and ``finish`` ``(B, 8)``; with K pairs of further shots, ``shot_seed``
-            ``(B, K)``; for bursts, ``motion`` ``(B, N, 3)`` and ``frame_seed`` ``(B, N)``. Otherwise it is empty.
+            ``(B, K)``; for bursts, ``motion`` ``(B, N, 3)`` and ``frame_seed`` ``(B, N)``. ``blur`` ``(B,)`` is the
+            standard deviation in pixels by which light is blurred, if it is. Otherwise it is empty.
     """
 
     isp: ISPParams

@@ -23,16 +23,16 @@ FLOATS = ("all stages", "curves")
 """Configurations for float pictures too: a table or curves are what looks a pixel up."""
 
 
-def camera_of(srgb: torch.Tensor, **settings: Any) -> reference.Camera:
+def camera_of(srgb: torch.Tensor, blur: torch.Tensor | None, **settings: Any) -> reference.Camera:
     isp = full_isp(**settings)
     place = torch.tensor([[6, 34, 40, 60, 5], [0, 0, *srgb.shape[-2:], 0]])
-    return BakedISP(isp)._camera(srgb, isp.choose(srgb), place)
+    return BakedISP(isp)._camera(srgb, isp.choose(srgb), place, blur)
 
 
-def check_raw(settings: dict[str, Any], dtype: torch.dtype) -> None:
+def check_raw(settings: dict[str, Any], dtype: torch.dtype, blur: torch.Tensor | None = None) -> None:
     srgb = torch.randint(256, (2, 3, 18, 34), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
     srgb = srgb if dtype == torch.uint8 else srgb / 255.0
-    camera = camera_of(srgb, **settings)
+    camera = camera_of(srgb, blur, **settings)
     raw = gpu.unprocess(srgb, camera, 0.3)
     torch.testing.assert_close(raw, reference.unprocess(srgb, camera, 0.3), atol=2e-6, rtol=1e-5)
     assert raw.max() == torch.tensor(0.3)
@@ -69,6 +69,9 @@ if __name__ == "__main__":
     for settings, dtype in [*product(CONFIGURATIONS.values(), [torch.uint8]), *product(floats, [torch.float32])]:
         check_raw(settings, dtype)
         print("raw")
+    for name in FLOATS:
+        check_raw(CONFIGURATIONS[name], torch.uint8, blur=torch.tensor([0.0, 0.8]))
+        print("blurred")
     for white in (1.0, float("inf")):
         check_noise(white)
         print("noise")

@@ -23,7 +23,7 @@ def test_step_by_step_they_do_what_the_cpu_does() -> None:
     environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": paths}
     done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
-    assert done.stdout.split() == 6 * ["raw"] + 2 * ["noise"] + ["used"]
+    assert done.stdout.split() == 6 * ["raw"] + 2 * ["blurred"] + 2 * ["noise"] + ["used"]
 
 
 @pytest.mark.parametrize("with_map", [True, False])
@@ -35,17 +35,20 @@ def test_the_noise_compiles_for_a_gpu(with_map: bool) -> None:
     assert "st.global" in compiled_for_a_gpu(gpu._noise_cells, types, {"MAP": with_map, "BLOCK": 512})
 
 
-@pytest.mark.parametrize(("pixels", "all_stages"), [("*u8", True), ("*fp32", False)])
-def test_the_raw_compiles_for_a_gpu(pixels: str, all_stages: bool) -> None:
+@pytest.mark.parametrize(
+    ("pixels", "all_stages", "blurs"),
+    [("*u8", True, False), ("*fp32", False, False), ("*fp32", True, True), ("*u8", False, True)],
+)
+def test_the_raw_compiles_for_a_gpu(pixels: str, all_stages: bool, blurs: bool) -> None:
     from rawaug.kernels import gpu
 
     types = {
         "srgb": pixels,
-        **dict.fromkeys(("table", "curves", "attention", "colour", "frame", "shading", "raw"), "*fp32"),
+        **dict.fromkeys(("table", "curves", "attention", "colour", "frame", "shading", "taps", "raw"), "*fp32"),
     }
     types |= {"h": "i32", "w": "i32", **dict.fromkeys(("scale", "knee", "white"), "fp32")}
     constants = {"S0": 0, "S1": 6, "S2": 5, "S3": 11, "NODES": 65, "ENTRIES": 0 if all_stages else 256, "BLOCK": 256}
-    constants |= {"ATTENDS": all_stages, "SHADES": all_stages}
+    constants |= {"ATTENDS": all_stages, "SHADES": all_stages, "BLURS": blurs, "LINEAR": blurs and all_stages}
     assert "st.global" in compiled_for_a_gpu(gpu._raw_cells, types, constants)
 
 

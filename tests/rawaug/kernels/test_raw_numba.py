@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from rawaug.kernels import cpu
-from rawaug.kernels.reference import Camera, apply_curves, mask_frame, unprocess
+from rawaug.kernels.reference import Camera, apply_curves, blur_taps, mask_frame, unprocess
 
 NODES = 9
 
 
-def camera(batch: int, attention: bool, shading: bool, seed: int = 0, entries: int = 0) -> Camera:
+def camera(batch: int, attention: bool, shading: bool, seed: int = 0, entries: int = 0, blurs: bool = False) -> Camera:
     generator = torch.Generator().manual_seed(seed)
     table = torch.rand(NODES, NODES, NODES, 4, generator=generator)
     frames = [mask_frame([2 * k, 4, 200, 300, k], 10, 12, (0.1, -0.05)) for k in range(batch)]
@@ -29,6 +29,7 @@ def camera(batch: int, attention: bool, shading: bool, seed: int = 0, entries: i
         frame=torch.tensor(frames).reshape(batch, 6),
         shading=torch.tensor([0.9, 0.4, 0.7]) if shading else torch.empty(0),
         sites=torch.tensor([(1, 0, 0), (1, 1, 1), (0, 0, 1), (0, 1, 2)]),
+        taps=blur_taps(torch.linspace(0.0, 1.0, batch)) if blurs else torch.empty(batch, 0),
     )
 
 
@@ -50,6 +51,20 @@ def test_compiled_is_the_same_pass(attention: bool, shading: bool, white: float)
     srgb, setting = pictures(3, 3, 6, 1100), camera(3, attention, shading)
     for x in (srgb, srgb / 255.0) if attention and shading else (srgb,):  # each compiles code of its own
         torch.testing.assert_close(cpu.unprocess(x, setting, white), unprocess(x, setting, white), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("entries", [0, 256])
+@pytest.mark.parametrize("size", [(2, 2), (4, 6), (34, 512), (40, 1100)])
+def test_blurred_light_is_the_same_pass_with_any_number_of_threads(
+    entries: int, size: tuple[int, int], threads: None
+) -> None:
+    srgb, setting = pictures(3, 3, *size), camera(3, False, False, entries=entries, blurs=True)
+    torch.set_num_threads(1)
+    raw = cpu.unprocess(srgb, setting, 0.9)
+    torch.testing.assert_close(raw, unprocess(srgb, setting, 0.9, band=8 * size[1]), atol=1e-4, rtol=0)
+    assert not torch.equal(raw, cpu.unprocess(srgb, setting._replace(taps=torch.empty(3, 0)), 0.9))
+    torch.set_num_threads(3)
+    assert torch.equal(raw, cpu.unprocess(srgb, setting, 0.9))
 
 
 @pytest.mark.parametrize("entries", [256, 1021])
