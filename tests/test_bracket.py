@@ -87,3 +87,14 @@ def test_shifts_are_found_both_ways() -> None:
 def test_a_folder_that_is_no_bracket_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="RAW"):
         bracket.bracket(tmp_path)
+
+
+def test_a_denoiser_that_is_better_in_most_blocks_and_far_worse_in_one_gains_by_the_median() -> None:
+    steady = [(1e-6, 1e-4)] * 15
+    daring = [(0.8e-6, 1e-4)] * 14 + [(1e-4, 1e-2)]
+    assert bracket.decibels([raw for raw, _ in daring]) < bracket.decibels([raw for raw, _ in steady])
+    middle, low, high = bracket.gains({"steady": steady, "daring": daring}, "steady")["daring"]
+    assert middle == pytest.approx(10 * math.log10(1 / 0.8), abs=0.01)
+    assert 0 < low <= middle <= high
+    (only,) = bracket.gains({"daring": [*daring, (-1e-9, 0.0)], "steady": [*steady, (1e-6, 0.0)]}, "daring").values()
+    assert only[0] == pytest.approx(-middle, abs=0.01), "a block without an error of its own has no gain"
