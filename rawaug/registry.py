@@ -5,7 +5,8 @@ So is one that another installed package offers as an entry point in the group `
 when a name is first asked for, and an entry point is imported when its own name is, so importing this module loads
 nothing.
 
-Recipes name a thing as ``{name: r2r, settings: {alpha: 0.5}}``; the settings are the keyword arguments of the class.
+Recipes name a thing as ``{name: r2r, alpha: 0.5}``, or ``{name: r2r, settings: {alpha: 0.5}}``; the settings are the
+keyword arguments of the class.
 A name that is nearly right is answered with the nearest one.
 """
 
@@ -32,32 +33,30 @@ class UnknownName(ValueError, KeyError):
 
 
 Spec = str | Mapping[str, Any]
-"""It is a name, or ``{"name": ..., "settings": {...}}``."""
+"""A name, ``{"name": ..., key: value, ...}``, or ``{"name": ..., "settings": {key: value, ...}}``."""
 
 
 def split_spec(spec: Spec) -> tuple[str, dict[str, Any]]:
     """Split a spec into its name and its settings; a bare name has none.
 
     Raises:
-        ValueError: if it has no name, or another key.
+        ValueError: if it has no name, or settings in both places.
 
     Example:
-        >>> split_spec({"name": "r2r", "settings": {"alpha": 0.5}})
-        ('r2r', {'alpha': 0.5})
+        >>> split_spec({"name": "r2r", "alpha": 0.5}), split_spec({"name": "r2r", "settings": {"alpha": 0.5}})
+        (('r2r', {'alpha': 0.5}), ('r2r', {'alpha': 0.5}))
     """
     if isinstance(spec, str):
         return spec, {}
-    if not isinstance(spec, Mapping) or not spec.keys() <= {"name", "settings"}:
-        raise _not_a_spec(spec)
 
-    name, settings = spec.get("name"), spec.get("settings") or {}
-    if not isinstance(name, str) or not isinstance(settings, Mapping):
-        raise _not_a_spec(spec)
-    return name, dict(settings)
-
-
-def _not_a_spec(spec: object) -> ValueError:
-    return ValueError(f"expected a name or {{name: ..., settings: {{...}}}}, got {spec!r}")
+    if isinstance(spec, Mapping) and isinstance(spec.get("name"), str):
+        settings = {key: value for key, value in spec.items() if key != "name"}
+        if "settings" not in settings:
+            return spec["name"], settings
+        nested = settings.pop("settings") or {}
+        if not settings and isinstance(nested, Mapping):
+            return spec["name"], dict(nested)
+    raise ValueError(f"expected a name or {{name: ..., key: value, ...}}, got {spec!r}")
 
 
 def spec_label(spec: Spec) -> str:

@@ -121,7 +121,7 @@ LOADED: dict[str, set[str]] = {
     "import rawaug": set(),
     "import rawaug.registry": {"registry"},
     "import denoisers": {"bayer", "errors", "files", "registry"},
-    "import rawaug.noise": {"bayer", "seeding", "camera", "kernels", "noise", "errors", "registry"},
+    "import rawaug.noise": {"bayer", "seeding", "camera", "kernels", "noise", "errors", "files", "registry"},
     "from rawaug import DictionaryISP": {
         "bayer",
         "camera",

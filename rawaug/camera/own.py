@@ -483,6 +483,12 @@ def as_camera(camera: str | Path | Camera) -> Camera:
     return Camera.load(camera) if is_camera_file(camera) else Camera.published(str(camera))
 
 
+def own_cameras(info: Mapping[str, Any]) -> list[Camera]:
+    """Get the user's own cameras that an ISP was made of, from its ``info``; other ISPs have none."""
+    contents: Sequence[Mapping[str, Any]] = info.get("own_cameras", [])
+    return [Camera.from_json(content, "the ISP's camera") for content in contents]
+
+
 def _is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 

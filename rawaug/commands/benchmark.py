@@ -36,8 +36,8 @@ def run(
         bin: average this many sites of a colour in both directions, to reduce the frames' own noise.
         count: number of frames.
         crop: side of the middle of each frame that is used, in pixels of the mosaic.
-        noise: noise in place of the four strengths: a preset, a measured camera, [shot_var, read_var], or a law of
-            your own as {name: MeasuredNoise, settings: ...}.
+        noise: noise in place of the four strengths: a preset, a measured camera, [shot_var, read_var], an ISP's file, a
+            camera's .yaml sheet, or a law of your own as {name: MeasuredNoise, levels: ...}.
         iso: ISO values of that camera or law, one column for each.
         seed: seed of the noise.
         device: device for networks: cpu, cuda, ...

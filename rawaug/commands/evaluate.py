@@ -50,8 +50,9 @@ def run(
             pictures cc15:DIR, polyu:DIR, sidd-srgb:DIR or pictures:DIR.
         self_ensemble: also score the average over eight views (denoisers).
         views: also score the average over 4 views, the flips, or 8, with quarter turns.
-        noise: noise to add to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
-            {name, settings}.
+        noise: noise to add to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], camera
+            (the law that the denoiser was trained for), an ISP's file, a camera's .yaml sheet, or a model as
+            {name, key: value}; by default that of the denoiser's training.
         seed: seed of that noise.
         bin: K bins the frames K x K by colour site first, for clean references of real photographs (denoisers).
         classical: classical filters to score on the same noise: NonLocalMeans, Wavelet, TotalVariation, BM3D.

@@ -15,7 +15,7 @@ from rawaug.camera.own import Camera, is_camera_file
 from rawaug.errors import count_of
 from rawaug.files import find_weights, read_header, sha256
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise.cameras import measured_ranges
+from rawaug.noise.names import measured_ranges
 from rawaug.noise.profiles import SPREAD, load_profiles, profile_ends
 from rawaug.version import __version__
 

@@ -10,18 +10,20 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
+from rawaug.camera.own import is_camera_file
 from rawaug.denoising.base import ImageDenoiser
 from rawaug.io import RawFrame
-from rawaug.isp.model import DictionaryISP
 from rawaug.noise import (
     EldLevels,
     FixedLevels,
     MeasuredLevels,
     camera_law,
+    camera_laws,
     camera_names,
     estimate_noise,
     noise_levels,
 )
+from rawaug.noise.names import CAMERA
 from rawaug.noise.profiles import ProfileLevels
 from rawaug.seeding import keyed_generator
 
@@ -162,24 +164,23 @@ def _of_other_files(levels: Shots, frame: RawFrame) -> tuple[float, float, str]:
 
 
 def load_noise(noise: Noise, denoiser: ImageDenoiser) -> Noise:
-    """Turn ``"camera"`` or an ISP's file into the law that the denoiser's or the ISP's file holds; keep all else.
+    """Turn ``"camera"``, an ISP's file or a camera's sheet into the law that it holds; keep all else.
 
     Raises:
-        ValueError: if the file holds no camera's noise law.
+        ValueError: if it holds no camera's noise law, or those of several.
     """
-    if not isinstance(noise, str):
+    if not isinstance(noise, str) or noise in ("auto", "profile", "estimate"):
         return noise
-    if noise == "camera":
-        file, info = denoiser.name, denoiser.info
-    elif noise.endswith(".safetensors"):
-        file, info = noise, DictionaryISP.from_pretrained(noise).info
-    else:
+    if noise != CAMERA and not noise.endswith(".safetensors") and not is_camera_file(noise):
         return noise
 
-    law = info.get("noise")
-    if not isinstance(law, Mapping) or not ("shot_var" in law or law.get("name") == "MeasuredNoise"):
-        raise ValueError(f"{file}: holds no camera's noise law; give an ISP's file that does, or --noise estimate")
-    return camera_law(law)
+    try:
+        laws = camera_laws(noise, denoiser.info)
+    except ValueError as error:
+        raise ValueError(f"{denoiser.name}: {error}") from None
+    if len(laws) > 1:
+        raise ValueError(f"noise {noise!r}: holds the noise of {len(laws)} cameras; give the sheet of one")
+    return camera_law(laws[0])
 
 
 def as_json(noise: Noise) -> Any:

@@ -87,7 +87,7 @@ def evaluate_raw(evaluation: Evaluation) -> dict[str, Any]:
     denoiser = replace(denoiser_of(evaluation.denoiser, evaluation.device), checked=False).require_mosaic()
     filters = [RawDenoiser.of(spec) for spec in evaluation.classical]
     noise = evaluation.noise or denoiser.info.get("noise", PRESET)
-    model = noise_model(noise)
+    model = noise_model(noise, info=denoiser.info)
 
     pairs = open_pairs(evaluation.data, split="test", **vars(evaluation.settings))
     frames = Readable(Kept(Binned(Measured(pairs), evaluation.bin)))

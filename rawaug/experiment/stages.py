@@ -23,8 +23,7 @@ from rawaug.evaluation.trials import Trial
 from rawaug.experiment.inputs import Inputs
 from rawaug.files import fingerprint, sha256, write_json
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseModel, camera_law
-from rawaug.plugin.camera_noise import noise_for
+from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.progress import progress
 from rawaug.registry import Spec
 from rawaug.tasks.base import Task
@@ -109,7 +108,7 @@ class Camera:
     def of(cls, experiment: Experiment, isp: DictionaryISP) -> Camera:
         """Make the recipe's noise, which an ISP may have measured, and the frames and trials that have it."""
         task, inputs = experiment.task, experiment.inputs
-        noise = noise_for(isp, experiment.recipe.noise_at_iso)
+        noise = noise_model(experiment.recipe.noise_at_iso, info=isp.info)
         pairs = task.training_frames(inputs.pairs, isp)
         validation = task.training_frames(inputs.validation, isp)
         return cls(experiment, isp, noise, pairs, validation, task.test_trials(inputs.test, isp, noise))

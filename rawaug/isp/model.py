@@ -21,13 +21,13 @@ from rawaug.bayer import CFA
 from rawaug.camera.lights import D65, light_range, mired_of, weights_in_light, white_point
 from rawaug.camera.matrices import gains_in_light, load_cameras
 from rawaug.camera.names import find_camera
-from rawaug.camera.own import Camera, as_camera, is_camera_file
+from rawaug.camera.own import Camera, as_camera, is_camera_file, own_cameras
 from rawaug.errors import count_of
 from rawaug.files import find_weights, parse_object, read_tensors, to_json, write_tensors
 from rawaug.isp import functional, staged, stages
 from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
 from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weights, log_light
-from rawaug.isp.own_sampler import OwnCameraSampler, own_cameras
+from rawaug.isp.own_sampler import OwnCameraSampler
 from rawaug.isp.staged import StagedISP, Tone, thumbnail
 from rawaug.registry import suggest
 

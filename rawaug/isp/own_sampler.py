@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -113,9 +112,3 @@ class OwnCameraSampler(CameraSampler):
         from_xyz = np.einsum("bn,nij->bij", weights, self._from_xyz)
         response = np.einsum("bij,bj->bi", from_xyz, light)
         return np.asarray(response[:, 1:2] / response)
-
-
-def own_cameras(info: Mapping[str, Any]) -> list[Camera]:
-    """Get the user's own cameras that an ISP was made of, from its ``info``; other ISPs have none."""
-    contents: Sequence[Mapping[str, Any]] = info.get("own_cameras", [])
-    return [Camera.from_json(content, "the ISP's camera") for content in contents]

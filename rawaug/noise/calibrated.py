@@ -16,9 +16,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from rawaug.noise.cameras import noise_levels
 from rawaug.noise.levels import NoiseLevels
 from rawaug.noise.models import NOISE, ShotReadNoise
+from rawaug.noise.names import noise_levels
 from rawaug.seeding import keyed_generator
 
 TYPICAL_SIGNAL = 0.104

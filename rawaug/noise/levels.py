@@ -162,29 +162,6 @@ def interpolate_levels(table: Tensor, iso: Tensor) -> tuple[Tensor, Tensor]:
     return shot_var, read_var
 
 
-class SiddLevels:
-    """One of SIDD's phones, interpolated in the logarithms of ISO and variance between the tabulated ISOs.
-
-    Args:
-        phone: ``iPhone 7``, ``Google Pixel``, ``Samsung Galaxy S6 Edge``, ``Motorola Nexus 6`` or ``LG G4``.
-        iso: one ISO, the limits of a log-uniform draw, or None for the whole tabulated range.
-    """
-
-    def __init__(self, phone: str, iso: Iso = None) -> None:
-        levels = _entry("SIDD phone", phone, load_presets()["sidd_noise_level_function"]["cameras"])
-        rows = []
-        for row_iso, (shot_var, read_var) in levels.items():
-            rows.append((float(row_iso), shot_var, read_var))
-        rows.sort()
-
-        self.table = torch.tensor(rows, dtype=torch.float64).log().T.contiguous()
-        self.iso = iso_limits(phone, iso, (rows[0][0], rows[-1][0]))
-
-    def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw an ISO for each picture, log-uniformly, and interpolate its levels, ``(batch,)``."""
-        return interpolate_levels(self.table.to(generator.device), log_uniform(self.iso, batch, generator))
-
-
 class PmridLevels:
     """The OPPO Reno 10x of PMRID, whose gain is linear and whose read variance is quadratic in the ISO, 100 to 6400."""
 

@@ -12,7 +12,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from rawaug.noise.levels import FixedLevels, Iso, MixedLevels, NoiseLevels, interpolate_levels, iso_limits, log_uniform
+from rawaug.noise.levels import (
+    FixedLevels,
+    Iso,
+    MixedLevels,
+    NoiseLevels,
+    interpolate_levels,
+    iso_limits,
+    load_presets,
+    log_uniform,
+)
 from rawaug.noise.models import NOISE, Params, ShotReadNoise, per_picture
 
 _LEAST = 1e-12
@@ -42,9 +51,10 @@ class MeasuredLevels:
     Args:
         levels: one for each ISO, or a single one without an ISO.
         camera: make and model, for messages.
+        iso: one ISO, the limits of a log-uniform draw, or None for the whole measured range.
 
     Raises:
-        ValueError: if there is no level, two have the same ISO, or one of several has no ISO.
+        ValueError: if there is no level, two have the same ISO, one of several has no ISO, or ``iso`` was not measured.
 
     Example:
         >>> law = MeasuredLevels([IsoLevel(100, 1e-4, 1e-7), IsoLevel(400, 4e-4, 1.6e-6)], "Maker Model")
@@ -52,7 +62,7 @@ class MeasuredLevels:
         ['0.0002', '4e-07']
     """
 
-    def __init__(self, levels: Sequence[IsoLevel], camera: str = "unknown") -> None:
+    def __init__(self, levels: Sequence[IsoLevel], camera: str = "unknown", iso: Iso = None) -> None:
         values = [level.iso for level in levels]
         if not values or len(set(values)) < len(values) or (None in values and len(values) > 1):
             raise ValueError(f"a noise law takes levels of different ISO values, or one without; got {values}")
@@ -63,6 +73,12 @@ class MeasuredLevels:
         for level in self.levels:
             rows.append((level.iso or 1.0, max(level.shot_var, _LEAST), max(level.read_var, _LEAST)))
         self.table = torch.tensor(rows, dtype=torch.float64).log().T.contiguous()
+
+        self.iso: tuple[float, float] | None = None
+        if self.limits is not None:
+            self.iso = iso_limits(camera, iso, self.limits)
+        elif iso is not None:
+            raise ValueError(f"the noise of {camera} was measured at no ISO; omit iso")
 
     @property
     def limits(self) -> tuple[float, float] | None:
@@ -88,11 +104,10 @@ class MeasuredLevels:
         return float(shot_var), float(read_var)
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw an ISO for each picture, log-uniformly over the measured range, and its levels, ``(batch,)``."""
-        if self.limits is None or len(self.levels) == 1:
+        """Draw an ISO for each picture, log-uniformly over the range, and its levels, ``(batch,)``."""
+        if self.iso is None or len(self.levels) == 1:
             return FixedLevels(*self.at(None)).sample(batch, generator)
-        table = self.table.to(generator.device)
-        return interpolate_levels(table, log_uniform(self.limits, batch, generator))
+        return interpolate_levels(self.table.to(generator.device), log_uniform(self.iso, batch, generator))
 
     def within(self, iso: float | tuple[float, float]) -> NoiseLevels:
         """Restrict the law to one ISO, or to the range between two; ValueError outside the measured range.
@@ -103,19 +118,10 @@ class MeasuredLevels:
             >>> bool(shot_var.max() < 2.001e-4)
             True
         """
-        if self.limits is None:
-            raise ValueError(f"the noise of {self.camera} was measured at no ISO; omit iso")
-
-        low, high = iso_limits(self.camera, iso, self.limits)
-        if low == high:
-            return FixedLevels(*self.at(low))
-
-        levels = [IsoLevel(low, *self.at(low))]
-        for level in self.levels:
-            if level.iso is not None and low < level.iso < high:
-                levels.append(level)
-        levels.append(IsoLevel(high, *self.at(high)))
-        return MeasuredLevels(levels, self.camera)
+        law = MeasuredLevels(self.levels, self.camera, iso)
+        if law.iso is not None and law.iso[0] == law.iso[1]:
+            return FixedLevels(*self.at(law.iso[0]))
+        return law
 
     def spec(self) -> dict[str, Any]:
         """Write the law as a name with settings, the form that weight files store and :func:`noise_model` reads."""
@@ -123,6 +129,26 @@ class MeasuredLevels:
         for level in self.levels:
             rows.append({key: value for key, value in level._asdict().items() if value is not None})
         return {"name": "MeasuredNoise", "settings": {"camera": self.camera, "levels": rows}}
+
+
+def sidd_levels(phone: str, iso: Iso = None) -> MeasuredLevels:
+    """The levels of one of SIDD's phones at the tabulated ISO values and between them.
+
+    Args:
+        phone: ``iPhone 7``, ``Google Pixel``, ``Samsung Galaxy S6 Edge``, ``Motorola Nexus 6`` or ``LG G4``.
+        iso: one ISO, the limits of a log-uniform draw, or None for the whole tabulated range.
+
+    Raises:
+        ValueError: if there is no such phone, or the ISO is outside the tabulated range.
+    """
+    phones = load_presets()["sidd_noise_level_function"]["cameras"]
+    if phone not in phones:
+        raise ValueError(f"SIDD phone {phone!r} is unknown; use one of {', '.join(phones)}")
+
+    levels = []
+    for value, (shot_var, read_var) in phones[phone].items():
+        levels.append(IsoLevel(float(value), shot_var, read_var))
+    return MeasuredLevels(levels, phone, iso)
 
 
 class RoundedNoise(ShotReadNoise):
@@ -220,8 +246,6 @@ class MeasuredNoise(RoundedNoise):
 
 def camera_law(stored: Mapping[str, Any]) -> MeasuredLevels:
     """Read the law in the entry ``noise`` of an ISP's file; ValueError if it is not a camera's law."""
-    if "shot_var" in stored:  # a single level, as in the shipped canon-powershot
-        return MeasuredLevels([IsoLevel(None, stored["shot_var"], stored["read_var"], stored.get("r2"))])
     if stored.get("name") != "MeasuredNoise":
         raise ValueError(f"expected the noise law of a camera, got {dict(stored)}; fit the ISP again")
     return MeasuredNoise(**stored["settings"]).law

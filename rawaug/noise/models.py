@@ -34,7 +34,7 @@ from rawaug.registry import Registry
 from rawaug.seeding import derive_seed, keyed_generator
 
 NOISE = Registry("noise", "rawaug.noise", "rawaug.noise")
-"""The noise models by name, subclasses of :class:`NoiseModel`; :mod:`rawaug.noise.cameras` has presets and cameras."""
+"""The noise models by name, subclasses of :class:`NoiseModel`; :mod:`rawaug.noise.names` has presets and cameras."""
 
 Params = dict[str, Tensor]
 """Parameters of a batch by name; they are tensors whose first dimension is B."""

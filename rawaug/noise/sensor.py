@@ -23,7 +23,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from rawaug.noise.cameras import noise_levels
 from rawaug.noise.levels import EldLevels, FixedLevels, Iso, NoiseLevels, log_uniform, normal, uniform
 from rawaug.noise.models import (
     NOISE,
@@ -35,6 +34,7 @@ from rawaug.noise.models import (
     draw_seeds,
     per_picture,
 )
+from rawaug.noise.names import noise_levels
 from rawaug.registry import Spec, require_between
 
 _NO_STEP = 1e-12

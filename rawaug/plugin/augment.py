@@ -28,8 +28,8 @@ from rawaug.errors import count_of
 from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP, restrict_to_cameras
 from rawaug.kernels.runtime import eager
-from rawaug.noise import Iso
-from rawaug.plugin.camera_noise import AnyNoise, noise_for, noise_label, usual_noise, with_iso
+from rawaug.noise import Iso, NoiseSpec, noise_model
+from rawaug.plugin.camera_noise import noise_label, usual_noise, with_iso
 from rawaug.plugin.crops import cut_patch, draw_patch
 from rawaug.plugin.draw import Draw, SettingSampler
 from rawaug.plugin.maker import PairMaker
@@ -85,7 +85,7 @@ class RawAugment(PairMaker):
     def __init__(
         self,
         isp: DictionaryISP | Camera,
-        noise: AnyNoise | None = None,
+        noise: NoiseSpec | None = None,
         *,
         draw: Draw = Draw(),
         target: Target | Srgb = "raw",
@@ -128,15 +128,15 @@ class RawAugment(PairMaker):
         self.burst = burst
         self._set_draws(noise, draw)
 
-    def _set_draws(self, noise: AnyNoise, draw: Draw) -> None:
+    def _set_draws(self, noise: NoiseSpec, draw: Draw) -> None:
         self.settings = SettingSampler(draw, self.isp, self.baked)
-        self.noise = noise_for(self.isp, noise)
+        self.noise = noise_model(noise, info=self.isp.info)
         self.noise_name = noise_label(noise)
         if self.pattern is not None and self.noise.by_plane:
             raise ValueError(f"this noise needs the planes R, Gr, Gb, B, which {self.pattern.name} does not have")
         self._calls = 0
 
-    def with_draws(self, noise: AnyNoise, draw: Draw = Draw()) -> RawAugment:
+    def with_draws(self, noise: NoiseSpec, draw: Draw = Draw()) -> RawAugment:
         """Make an augmentation with the same ISP, pattern and target but other draws; nothing is baked again.
 
         Args:
@@ -150,7 +150,7 @@ class RawAugment(PairMaker):
     def from_pretrained(
         cls,
         isp: str | Path | DictionaryISP | Camera,
-        noise: AnyNoise | None = None,
+        noise: NoiseSpec | None = None,
         *,
         camera: str | Path | Camera | Sequence[str | Path | Camera] | None = None,
         iso: Iso = None,

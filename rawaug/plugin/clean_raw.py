@@ -19,8 +19,8 @@ from torch.utils.data import Dataset
 from rawaug import bayer
 from rawaug.bayer import CFA, canonical_cfa, pattern
 from rawaug.isp.config import ISPParams
-from rawaug.noise import Iso, noise_model
-from rawaug.plugin.camera_noise import USUAL, AnyNoise
+from rawaug.noise import Iso, NoiseSpec, noise_model
+from rawaug.plugin.camera_noise import USUAL
 from rawaug.plugin.maker import PairMaker
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import Where, describe
@@ -63,7 +63,7 @@ class RawNoise(PairMaker):
 
     def __init__(
         self,
-        noise: AnyNoise = USUAL,
+        noise: NoiseSpec = USUAL,
         *,
         cfa: str | None = None,
         iso: Iso = None,

@@ -32,8 +32,9 @@ class AugmentConfig:
         isp: ISP file, or the name of a shipped ISP.
         camera: maker and model of a published camera, or a YAML file with the figures of your own, in place of the
             ISP's cameras.
-        noise: a preset, a measured camera, camera (as measured by the fit, or stated by your camera), or
-            [shot_var, read_var]. By default that of your camera where its file states one, else cycleisp_sidd.
+        noise: a preset, a measured camera, camera (as measured by the fit, or stated by your camera), an ISP's file, a
+            camera's .yaml sheet, or [shot_var, read_var]. By default that of your camera where its file states one,
+            else cycleisp_sidd.
         iso: ISO of a measured camera's noise, instead of a draw from its measured range.
         draw: how the camera settings are drawn.
         target: raw, rgb for clean linear camera RGB, or srgb for noisy and clean developed pictures.

@@ -36,7 +36,7 @@ def test_unknown_names_settings_and_types_are_refused_with_the_nearest() -> None
         ({"name": "r2r", "settings": {"alhpa": 1.0}}, r"estimator r2r has no setting 'alhpa'; .*\(nearest: alpha\)$"),
         ({"name": "r2r", "settings": {"alpha": "big"}}, "r2r: alpha must be float, got 'big'"),
         ({"name": "noisier", "settings": {"correct": 1}}, "noisier: correct must be bool, got 1"),
-        ({"nmae": "r2r"}, "expected a name or {name: ..., settings"),
+        ({"nmae": "r2r"}, "expected a name or {name: ..., key"),
     ):
         with pytest.raises(ValueError, match=message):
             ArmConfig(estimator=spec)

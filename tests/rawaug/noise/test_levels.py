@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
 from scipy import stats
 
+from rawaug.files import find_weights
+from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 from rawaug.noise import (
     CalibratedNoise,
@@ -19,11 +22,12 @@ from rawaug.noise import (
     PoissonGaussianNoise,
     Preset,
     ShotReadNoise,
-    SiddLevels,
+    camera_law,
     camera_names,
     noise_levels,
     noise_model,
     noise_names,
+    sidd_levels,
 )
 from rawaug.noise.levels import MixedLevels
 from rawaug.noise.models import NoiseModel
@@ -82,17 +86,17 @@ def test_natural_and_base_10_logarithms_are_reported_apart() -> None:
     ],
 )
 def test_sidd_phones_at_tabulated_isos(phone: str, iso: int, levels: tuple[float, float]) -> None:
-    shot, read = draw(SiddLevels(phone, iso), 2)
+    shot, read = draw(sidd_levels(phone, iso), 2)
     assert (float(shot[0]), float(read[0])) == pytest.approx(levels, rel=1e-4)
 
 
 def test_sidd_between_isos_and_over_the_range() -> None:
-    shot, read = draw(SiddLevels("Google Pixel", 1131.37), 1)  # halfway, in the logarithm, from 800 to 1600
+    shot, read = draw(sidd_levels("Google Pixel", 1131.37), 1)  # halfway, in the logarithm, from 800 to 1600
     assert float(shot) == pytest.approx(math.sqrt(0.001764 * 0.003519), rel=1e-3)
     assert float(read) == pytest.approx(math.sqrt(1.2e-5 * 4.5e-5), rel=1e-3)
-    shot, _ = draw(SiddLevels("Google Pixel"))
+    shot, _ = draw(sidd_levels("Google Pixel"))
     assert shot.min() >= 0.000228 * 0.999 and shot.max() <= 0.007029 * 1.001
-    assert shot.median() == pytest.approx(float(draw(SiddLevels("Google Pixel", 565.7), 1)[0]), rel=0.05)
+    assert shot.median() == pytest.approx(float(draw(sidd_levels("Google Pixel", 565.7), 1)[0]), rel=0.05)
 
 
 def test_pmrid_line() -> None:
@@ -166,7 +170,7 @@ def test_wrong_names_and_options_are_refused_in_one_line() -> None:
     with pytest.raises(ValueError, match="upi"):
         Preset("nlf")
     with pytest.raises(ValueError, match="SIDD phone"):
-        SiddLevels("Pixel")
+        sidd_levels("Pixel")
     with pytest.raises(ValueError, match="ELD camera"):
         EldLevels("Pixel")
 
@@ -349,3 +353,26 @@ def test_levels_in_the_wrong_order_are_questioned_once() -> None:
         noise_model((1e-6, 0.1))
     noise_model((1e-6, 0.1))  # a second warning would be an error here
     noise_model((0.0, 0.1))  # white noise is asked for
+
+
+def test_a_file_a_sheet_and_camera_are_spellings_of_one_law(tmp_path: Path) -> None:
+    isp = DictionaryISP.from_pretrained("gopro-hero")
+    (shot_var, read_var) = camera_law(isp.info["noise"]).at(None)
+    sheet = tmp_path / "mine.yaml"
+    matrix = "[[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.0, -0.6, 1.6]]"
+    figures = f"matrix: {matrix}, matrix_is: camera_to_srgb, white_balance: [2.1, 1.0, 1.7]"
+    sheet.write_text(f"{{name: Mine, {figures}, noise: [{shot_var}, {read_var}]}}")
+
+    file = str(find_weights("gopro-hero"))
+    for spec in (file, "camera", str(sheet), isp.info["noise"], (shot_var, read_var)):
+        shot, read = noise_levels(spec, info=isp.info).sample(2, torch.Generator())
+        params = noise_model(spec, info=isp.info).sample(2, torch.Generator())
+        torch.testing.assert_close(params["shot_var"], shot)
+        torch.testing.assert_close((shot[0].item(), read[0].item()), (shot_var, read_var))
+
+    with pytest.raises(ValueError, match="camera"):
+        noise_model("camera")
+    with pytest.raises(ValueError, match="no noise of a camera"):
+        noise_model(str(find_weights("phones")))
+    with pytest.raises(ValueError, match=r"rawaug fit.*\.yaml"):
+        noise_model("no such noise")

@@ -20,7 +20,6 @@ from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.denoising.levels import find_levels, load_noise
 from rawaug.io import RawFrame
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, camera_law, estimate_noise, noise_model
-from rawaug.plugin.camera_noise import noise_for
 from rawaug.training.camera_fit import fit
 from rawaug.training.camera_noise import measure_camera_noise
 from rawaug.training.noisy_frames import noisy_frame
@@ -108,7 +107,7 @@ def test_a_law_over_iso_is_measured_stored_and_drawn_from(noisy_pair: Pair, tmp_
     isp = fit(pairs, progress=False, noise="on", noise_figure=tmp_path / "noise.png", **TINY)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["noise-iso100.png", "noise-iso400.png"]
     assert isp.info["rendering"] == "sRGB of the pairs (2 of 2)"
-    shot_var = noise_for(isp, "camera").sample(200, torch.Generator().manual_seed(0))["shot_var"]
+    shot_var = noise_model("camera", info=isp.info).sample(200, torch.Generator().manual_seed(0))["shot_var"]
     assert 1.7e-4 < float(shot_var.min()) < 2.4e-4 and 6.5e-4 < float(shot_var.max()) < 9e-4
     law = camera_law(json.loads(json.dumps(isp.info))["noise"])
     assert law.camera == "Maker Model" and law.limits == (100, 400)
@@ -130,8 +129,8 @@ def test_a_law_over_iso_is_measured_stored_and_drawn_from(noisy_pair: Pair, tmp_
     assert (frame.shot_var, frame.read_var) == law.at(100)
 
 
-def test_a_file_of_version_0_1_has_one_level_for_every_iso() -> None:
-    law = camera_law({"shot_var": 1e-3, "read_var": 1e-5, "r2": 0.9})
+def test_files_without_an_iso_have_one_level_for_every_iso() -> None:
+    law = camera_law({"name": "MeasuredNoise", "settings": {"levels": [{"shot_var": 1e-3, "read_var": 1e-5}]}})
     assert law.at(None) == law.at(1600) == (1e-3, 1e-5)
     with pytest.raises(ValueError, match="camera"):
         camera_law({"name": "upi"})
