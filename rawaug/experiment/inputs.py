@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rawaug.data import open_pictures
-from rawaug.data.folders import Cached, Readable, left_out
+from rawaug.data.folders import Cached, Kept, Readable, left_out
 from rawaug.data.pairs import OWN_PICTURES, Middles, Pair, PairPictures, SomePairs, names_of, shared_frame
 from rawaug.data.selection import select_pairs
 from rawaug.errors import count_of
@@ -149,7 +149,7 @@ def open_inputs(recipe: Recipe, frames: Mapping[str, Sequence[Pair]], task: Task
 
     return Inputs(
         pairs=training_pairs,
-        more=SomePairs(pairs, range(count)),
+        more=Kept(SomePairs(pairs, range(count)), megabytes=2048),
         validation=task.prepare(validation, "validation"),
         test=task.prepare(test, "test"),
         pictures=_open_pictures(data, training_pairs, recipe.train.crop),
