@@ -20,11 +20,11 @@ import numpy as np
 
 from rawaug.errors import extra, how_to_install
 from rawaug.files import require_file
+from rawaug.io.colour import Colour, colour_of_numbers, require_sdr
 from rawaug.io.content import content_of_opened, reads_avif, reads_heic
 from rawaug.io.directories import COMPRESSION, DamagedTags, TiffFile
 from rawaug.io.headers import Headers, headers_of_opened, png_fault
 from rawaug.io.isolated import damage_as_os_error
-from rawaug.io.profiles import profile_of_code_points
 
 MAX_PIXELS = 2**26
 """A picture has at most this many pixels by default: 8192 x 8192."""
@@ -49,8 +49,7 @@ class Decoded(NamedTuple):
         alpha: ``(H, W, 1)`` of the same type, if there is transparency.
         associated: whether ``colours`` are already multiplied by alpha.
         format: of the content, such as ``"JPEG"``.
-        linear: whether the numbers are linear light, as those of OpenEXR are.
-        profile: the ICC profile.
+        colour: the space of the colours.
         orientation: of EXIF, 1 to 8.
         headers: EXIF and other metadata as bytes.
     """
@@ -59,8 +58,7 @@ class Decoded(NamedTuple):
     alpha: np.ndarray | None
     associated: bool
     format: str
-    linear: bool
-    profile: bytes | None
+    colour: Colour
     orientation: int
     headers: Headers
 
@@ -77,7 +75,7 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, coarse: bool = False) -> De
         FileNotFoundError: if there is no such file.
         OSError: if the file is not a picture, or is truncated.
         ValueError: if its header declares more than ``max_pixels``, it is camera RAW or animated, or its colours are
-            neither grey nor RGB.
+            neither grey nor RGB, or HDR.
     """
     require_file(path, "picture file")
     require_utf8(path)
@@ -88,18 +86,29 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, coarse: bool = False) -> De
         raise ValueError(f"{path}: is camera RAW ({content.format}), not a developed picture; develop it first")
     if headers.animated:
         raise ValueError(f"{path}: is an animation; save a single frame")
+    if headers.unread:
+        raise ValueError(f"{path}: {headers.unread}; save it as sRGB")
+    if headers.colour is not None:
+        require_sdr(headers.colour, path)
 
-    if content.format == "PNG":
+    decoded = _decode(path, content.format, max_pixels, coarse, headers)
+    require_sdr(decoded.colour, path)
+    return decoded
+
+
+def _decode(path: Path, name: str, max_pixels: int, coarse: bool, headers: Headers) -> Decoded:
+    """Decode by the library that reads a format correctly."""
+    if name == "PNG":
         fault = png_fault(path)
         if fault is not None:
             raise OSError(f"{path}: cannot be read as a picture (PNG: {fault}); copy it again")
-    if content.format in ("HEIC", "AVIF"):
-        return _decode_heif(path, content.format, max_pixels, headers)
-    if content.format == "BMP":
+    if name in ("HEIC", "AVIF"):
+        return _decode_heif(path, name, max_pixels, headers)
+    if name == "BMP":
         return _decode_with_pillow(path, "BMP", max_pixels, headers)
-    if content.format == "TIFF" and _is_jpeg_of_many_bits(path):
+    if name == "TIFF" and _is_jpeg_of_many_bits(path):
         return _decode_with_tifffile(path, max_pixels, headers)
-    return _decode_with_oiio(path, content.format, max_pixels, coarse, headers)
+    return _decode_with_oiio(path, name, max_pixels, coarse, headers)
 
 
 def require_utf8(path: Path) -> None:
@@ -167,9 +176,9 @@ def _decode_with_oiio(path: Path, name: str, max_pixels: int, coarse: bool, head
         return _decode_with_pillow(path, "JPEG", max_pixels, headers)
 
     has_alpha = _require_grey_or_rgb(spec, path)
-    profile = spec.getattribute("ICCProfile")
+    colour = _colour_of_spec(spec, name, headers)
     kind = _number_type(stored, path)
-    if coarse and kind == "uint16" and profile is None and not has_alpha:
+    if coarse and kind == "uint16" and colour.is_srgb and not has_alpha:
         kind = "uint8"
 
     try:
@@ -190,19 +199,30 @@ def _decode_with_oiio(path: Path, name: str, max_pixels: int, coarse: bool, head
         orientation = spec.get_int_attribute("Orientation", 1)
     if name in _UPRIGHT:
         orientation = 1
-    if profile is not None:
-        profile = bytes(profile)
     colours, alpha = _split_alpha(pixels, has_alpha)
     return Decoded(
         colours=colours,
         alpha=alpha,
         associated=associated,
         format=name,
-        linear=name in _LINEAR_FORMATS,
-        profile=profile,
+        colour=colour,
         orientation=orientation,
         headers=headers,
     )
+
+
+def _colour_of_spec(spec: Any, name: str, headers: Headers) -> Colour:
+    """Find the space: what the header states before a profile, the profile, or linear light with its chromaticities."""
+    if headers.colour is not None:
+        return headers.colour
+    profile = spec.getattribute("ICCProfile")
+    if profile is not None:
+        return Colour(bytes(profile))
+    if name not in _LINEAR_FORMATS:
+        return Colour()
+
+    chromaticities = spec.getattribute("chromaticities")
+    return colour_of_numbers(chromaticities, 1.0)
 
 
 def _split_alpha(pixels: np.ndarray, has_alpha: bool) -> tuple[np.ndarray, np.ndarray | None]:
@@ -287,28 +307,21 @@ def _of_pillow(image: Any, path: Path, name: str, headers: Headers, orientation:
         alpha=alpha,
         associated=False,
         format=name,
-        linear=False,
-        profile=profile or None,
+        colour=headers.colour or Colour(profile or None),
         orientation=orientation or headers.orientation or 1,
         headers=headers,
     )
 
 
 def _decode_heif(path: Path, name: str, max_pixels: int, headers: Headers) -> Decoded:
-    """Decode HEIC by libheif and AVIF by Pillow; colours that only numbers name get a profile."""
+    """Decode HEIC by libheif and AVIF by Pillow."""
     if name == "HEIC":
         if not reads_heic():
             raise ValueError(f"{path}: is HEIC, and pillow_heif is not installed; {how_to_install('heif')}")
-        decoded = _decode_heic(path, max_pixels)
-    else:
-        if not reads_avif():
-            raise ValueError(f"{path}: is AVIF, and this Pillow does not read AVIF; {how_to_install('heif')}")
-        decoded = _decode_avif(path, max_pixels, headers)
-
-    if decoded.profile is None and headers.code_points is not None:
-        primaries, transfer = headers.code_points
-        decoded = decoded._replace(profile=profile_of_code_points(primaries, transfer, path))
-    return decoded
+        return _decode_heic(path, max_pixels, headers)
+    if not reads_avif():
+        raise ValueError(f"{path}: is AVIF, and this Pillow does not read AVIF; {how_to_install('heif')}")
+    return _decode_avif(path, max_pixels, headers)
 
 
 def _decode_avif(path: Path, max_pixels: int, headers: Headers) -> Decoded:
@@ -324,7 +337,7 @@ def _decode_avif(path: Path, max_pixels: int, headers: Headers) -> Decoded:
         return _of_pillow(image, path, "AVIF", headers._replace(exif=image.info.get("exif")), orientation)
 
 
-def _decode_heic(path: Path, max_pixels: int) -> Decoded:
+def _decode_heic(path: Path, max_pixels: int, headers: Headers) -> Decoded:
     """Decode HEIC of 8, 10 or 12 bits. libheif turns it upright; 10 and 12 bits come as 16."""
     with extra("heif"):
         import pillow_heif
@@ -345,8 +358,7 @@ def _decode_heic(path: Path, max_pixels: int) -> Decoded:
         alpha=alpha,
         associated="a" in mode,  # "RGBa" is multiplied by alpha, "RGBA" is not
         format="HEIC",
-        linear=False,
-        profile=info.get("icc_profile") or None,
+        colour=headers.colour or Colour(info.get("icc_profile") or None),
         orientation=1,
         headers=Headers(exif=_without_prefix(info.get("exif")), xmp=info.get("xmp") or None),
     )
@@ -383,4 +395,5 @@ def _decode_with_tifffile(path: Path, max_pixels: int, headers: Headers) -> Deco
         profile = page.tags.valueof(34675)
 
     pixels = pixels.reshape(*pixels.shape[:2], -1)
-    return Decoded(pixels, None, False, "TIFF", False, profile, headers.orientation or 1, headers)
+    colour = headers.colour or Colour(profile)
+    return Decoded(pixels, None, False, "TIFF", colour, headers.orientation or 1, headers)

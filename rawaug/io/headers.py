@@ -16,18 +16,21 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from rawaug.io.directories import ORIENTATION, DamagedTags, TiffFile
+from rawaug.io.colour import ADOBE_RGB, SRGB_COLOUR, Colour, colour_of_code_points, colour_of_numbers
+from rawaug.io.directories import EXIF, INTEROPERABILITY, ORIENTATION, DamagedTags, TiffFile
 
 EXIF_PREFIX = b"Exif\0\0"
 XMP_PREFIX = b"http://ns.adobe.com/xap/1.0/\0"
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 XMP_KEYWORD = b"XML:com.adobe.xmp"
-XMP_TAG = 700
+XMP_TAG, ICC_TAG = 700, 34675
 
 _MOST_CHUNKS = 2**20
 _MOST_BYTES = 2**26
 _PIECE = 2**20
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
+ICC_PREFIX = b"ICC_PROFILE\0"
+_COLOR_SPACE, _INTEROPERABILITY_INDEX = 40961, 1
 _XMP_ORIENTATION = re.compile(rb"""tiff:Orientation(?:>|=["'])([1-8])\b""")
 
 
@@ -39,14 +42,16 @@ class Headers(NamedTuple):
         xmp: a packet of XMP.
         stated: the orientation of a TIFF, whose tags are not a block.
         animated: whether the file says that it has several frames.
-        code_points: primaries and transfer function of HEIF by the numbers of ITU-T H.273.
+        colour: the space that the container states by other means than an ICC profile, where that counts.
+        unread: why the colours cannot be read; empty if they can.
     """
 
     exif: bytes | None = None
     xmp: bytes | None = None
     stated: int | None = None
     animated: bool = False
-    code_points: tuple[int, int] | None = None
+    colour: Colour | None = None
+    unread: str = ""
 
     @property
     def orientation(self) -> int | None:
@@ -123,14 +128,43 @@ def jpeg_segments(file: BinaryIO) -> Iterator[Segment]:
 
 def _of_jpeg(file: BinaryIO) -> Headers:
     exif, xmp = None, None
+    has_profile = False
     for segment in jpeg_segments(file):
+        has_profile |= segment.marker == 0xE2 and segment.data.startswith(ICC_PREFIX)
         if segment.marker != 0xE1:
             continue
         if segment.data.startswith(EXIF_PREFIX) and exif is None:
             exif = segment.data[len(EXIF_PREFIX) :]
         elif segment.data.startswith(XMP_PREFIX) and xmp is None:
             xmp = segment.data[len(XMP_PREFIX) :]
-    return Headers(exif, xmp)
+
+    colour = None
+    if exif is not None and not has_profile:
+        colour = colour_of_exif(BytesIO(exif))
+    return Headers(exif, xmp, colour=colour)
+
+
+def colour_of_exif(file: BinaryIO) -> Colour | None:
+    """Find the space that EXIF states: Adobe RGB by R03 (DCF's option file), or by ColorSpace 2 of older cameras."""
+    try:
+        tiff = TiffFile(file)
+        exif_place = tiff.number(tiff.directory(tiff.first), EXIF)
+        if not exif_place:
+            return None
+
+        exif = tiff.directory(exif_place)
+        space = tiff.number(exif, _COLOR_SPACE)
+        index = b""
+        place = tiff.number(exif, INTEROPERABILITY)
+        if place:
+            entry = tiff.directory(place).entries.get(_INTEROPERABILITY_INDEX)
+            index = tiff.tag(entry).data if entry is not None else b""
+    except DamagedTags:
+        return None
+
+    if space == 2 or (space != 1 and index.startswith(b"R03")):
+        return ADOBE_RGB
+    return None
 
 
 # -- PNG ---------------------------------------------------------------------------------------------------------------
@@ -198,8 +232,11 @@ def chunk_data(file: BinaryIO, chunk: Chunk) -> bytes:
 def _of_png(file: BinaryIO) -> Headers:
     exif, xmp, raw_profile = None, None, None
     animated = False
+    spaces: dict[bytes, bytes] = {}
     for chunk in png_chunks(file):
-        if chunk.name == b"acTL":
+        if chunk.name in _PNG_SPACES:
+            spaces.setdefault(chunk.name, chunk_data(file, chunk))
+        elif chunk.name == b"acTL":
             animated = True
         elif chunk.name == b"eXIf":
             exif = chunk_data(file, chunk).removeprefix(EXIF_PREFIX)
@@ -207,7 +244,38 @@ def _of_png(file: BinaryIO) -> Headers:
             xmp = xmp_of_text(chunk_data(file, chunk)) or xmp
         elif chunk.name in (b"zTXt", b"tEXt"):
             raw_profile = _raw_profile(chunk.name, chunk_data(file, chunk)) or raw_profile
-    return Headers(exif or raw_profile, xmp, animated=animated)
+
+    colour, unread = None, ""
+    try:
+        colour = _colour_of_png(spaces)
+    except ValueError as error:
+        unread = str(error)
+    return Headers(exif or raw_profile, xmp, animated=animated, colour=colour, unread=unread)
+
+
+_PNG_SPACES = (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM")
+
+
+def _colour_of_png(chunks: dict[bytes, bytes]) -> Colour | None:
+    """Find the space by the first of its chunks that counts; return None for that of the profile, or of none."""
+    if len(chunks.get(b"cICP", b"")) == 4:
+        primaries, transfer, matrix, is_full_range = chunks[b"cICP"]
+        if matrix or not is_full_range:
+            raise ValueError("its cICP states a matrix, or the range of video")
+        return colour_of_code_points(primaries, transfer)
+    if b"iCCP" in chunks:
+        return None
+    if b"sRGB" in chunks:
+        return SRGB_COLOUR
+
+    exponent, chromaticities = None, None
+    if len(chunks.get(b"gAMA", b"")) == 4:
+        (gamma,) = struct.unpack(">I", chunks[b"gAMA"])
+        exponent = 1e5 / gamma if gamma else None
+    if len(chunks.get(b"cHRM", b"")) == 32:
+        numbers = [number / 1e5 for number in struct.unpack(">8I", chunks[b"cHRM"])]
+        chromaticities = numbers[2:] + numbers[:2]  # white comes first
+    return colour_of_numbers(chromaticities, exponent)
 
 
 def xmp_of_text(data: bytes) -> bytes | None:
@@ -277,7 +345,10 @@ def _of_tiff(file: BinaryIO) -> Headers:
     first = tiff.directory(tiff.first)
     stated = tiff.number(first, ORIENTATION)
     xmp = first.entries.get(XMP_TAG)
-    return Headers(None, tiff.tag(xmp).data if xmp else None, stated if 1 <= stated <= 8 else None)
+    colour = None
+    if ICC_TAG not in first.entries:
+        colour = colour_of_exif(file)
+    return Headers(xmp=tiff.tag(xmp).data if xmp else None, stated=stated if 1 <= stated <= 8 else None, colour=colour)
 
 
 # -- boxes of HEIF and JPEG XL -----------------------------------------------------------------------------------------
@@ -312,21 +383,76 @@ def boxes(file: BinaryIO, start: int, end: int) -> Iterator[Box]:
 
 
 def _of_heif(file: BinaryIO) -> Headers:
-    """Read the code points of the first colour box; the decoder gives EXIF."""
-    start, end = 0, file.seek(0, 2)
-    for name, skipped in ((b"meta", 4), (b"iprp", 0), (b"ipco", 0)):
-        inside = [box for box in boxes(file, start, end) if box.name == name]
-        if not inside:
-            return Headers()
-        start, end = inside[0].start + skipped, inside[0].end
+    """Read the colour of the primary item, whose profile counts before its code points; the decoder gives EXIF."""
+    meta = _inner_boxes(file, Box(b"", 0, file.seek(0, 2))).get(b"meta")
+    if meta is None:
+        return Headers()
+    in_meta = _inner_boxes(file, meta._replace(start=meta.start + 4))
+    properties = _inner_boxes(file, in_meta[b"iprp"]) if b"iprp" in in_meta else {}
+    if b"ipco" not in properties:
+        return Headers()
 
-    for box in boxes(file, start, end):
+    all_properties = list(boxes(file, properties[b"ipco"].start, properties[b"ipco"].end))
+    indices = list(range(len(all_properties)))
+    if b"pitm" in in_meta and b"ipma" in properties:
+        indices = _properties_of_item(file, properties[b"ipma"], _primary_item(file, in_meta[b"pitm"])) or indices
+
+    code_points = None
+    for index in indices:
+        box = all_properties[index] if index < len(all_properties) else None
+        if box is None or box.name != b"colr":
+            continue
         file.seek(box.start)
         data = file.read(8)
-        if box.name == b"colr" and data.startswith(b"nclx"):
-            primaries, transfer = struct.unpack(">HH", data[4:])
-            return Headers(code_points=(primaries, transfer))
-    return Headers()
+        if data.startswith((b"prof", b"rICC")):
+            return Headers()
+        if data.startswith(b"nclx") and code_points is None:
+            code_points = struct.unpack(">HH", data[4:])
+
+    if code_points is None:
+        return Headers()
+    try:
+        return Headers(colour=colour_of_code_points(*code_points))
+    except ValueError as error:
+        return Headers(unread=str(error))
+
+
+def _inner_boxes(file: BinaryIO, outer: Box) -> dict[bytes, Box]:
+    """Find the first box of each name within a box."""
+    inner: dict[bytes, Box] = {}
+    for box in boxes(file, outer.start, outer.end):
+        inner.setdefault(box.name, box)
+    return inner
+
+
+def _primary_item(file: BinaryIO, box: Box) -> int:
+    """Read the number of the item that is the picture."""
+    file.seek(box.start)
+    data = file.read(min(8, box.end - box.start))
+    return int.from_bytes(data[4:8] if data[0] else data[4:6], "big")
+
+
+def _properties_of_item(file: BinaryIO, box: Box, item: int) -> list[int]:
+    """Read the places of an item's properties in their list, the first being 0."""
+    file.seek(box.start)
+    data = file.read(min(box.end - box.start, _MOST_BYTES))
+    wide_items, wide_indices = data[0] > 0, data[3] & 1
+    (count,) = struct.unpack_from(">I", data, 4)
+    place = 8
+    indices = []
+    for _ in range(count):
+        (number,) = struct.unpack_from(">I" if wide_items else ">H", data, place)
+        place += 4 if wide_items else 2
+        associations = data[place]
+        place += 1
+        for _ in range(associations):
+            index = data[place] & 0x7F
+            if wide_indices:
+                index = struct.unpack_from(">H", data, place)[0] & 0x7FFF
+            place += 1 + wide_indices
+            if number == item and index:
+                indices.append(index - 1)
+    return indices
 
 
 def _of_jpeg_xl(file: BinaryIO) -> Headers:

@@ -39,6 +39,8 @@ from rawaug.io.directories import (
 )
 from rawaug.io.headers import (
     EXIF_PREFIX,
+    ICC_PREFIX,
+    ICC_TAG,
     PNG_SIGNATURE,
     XMP_KEYWORD,
     XMP_PREFIX,
@@ -50,9 +52,8 @@ from rawaug.io.headers import (
     read_headers,
 )
 
-ICC_TAG, IPTC_TAG, PHOTOSHOP_TAG = 34675, 33723, 34377
+IPTC_TAG, PHOTOSHOP_TAG = 33723, 34377
 _STRIP_OFFSETS, _STRIP_BYTES = 273, 279
-_ICC_PREFIX = b"ICC_PROFILE\0"
 _MPF_PREFIX = b"MPF\0"
 _JFXX_PREFIX = b"JFXX\0"
 _APP0, _APP1, _APP2, _APP14, _APP15, _COMMENT = 0xE0, 0xE1, 0xE2, 0xEE, 0xEF, 0xFE
@@ -298,12 +299,12 @@ def _pack_if_short(what: str, data: bytes, source: Path) -> bytes:
 
 def _profile_segments(profile: bytes) -> bytes:
     """Pack an ICC profile into as many segments as it needs, each with its number and their count."""
-    step = _MOST_IN_SEGMENT - len(_ICC_PREFIX) - 2
+    step = _MOST_IN_SEGMENT - len(ICC_PREFIX) - 2
     starts = range(0, len(profile), step)
 
     packed = b""
     for number, start in enumerate(starts, 1):
-        head = _ICC_PREFIX + bytes((number, len(starts)))
+        head = ICC_PREFIX + bytes((number, len(starts)))
         packed += _pack_segment(Segment(_APP2, head + profile[start : start + step]))
     return packed
 

@@ -5,9 +5,9 @@ The display transfer of sRGB (IEC 61966-2-1:1999), for linear light l and displa
     v = 12.92 l                      for l <= 0.0031308
     v = 1.055 l^(1/2.4) - 0.055      otherwise
 
-OpenEXR and Radiance files hold l; everything else is taken to hold v. An embedded ICC profile of another space (Display
-P3, Adobe RGB, linear light, grey of another gamma) is applied by :mod:`rawaug.io.profiles`; without one, a picture is
-taken to be sRGB whatever else its tags say. Pictures that are denoised are read by :mod:`rawaug.io.stored`.
+OpenEXR and Radiance files hold l; everything else is taken to hold v. Another space that the file states, by a profile,
+by numbers or by EXIF, is converted by :mod:`rawaug.io.colour`. Pictures that are denoised are read by
+:mod:`rawaug.io.stored`.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from torch import Tensor
 from rawaug.bayer import turn
 from rawaug.errors import extra
 from rawaug.files import replacing, require_file
+from rawaug.io.colour import SRGB, to_srgb
 from rawaug.io.content import content_of
 from rawaug.io.decoding import MAX_PIXELS as MAX_PIXELS
 from rawaug.io.decoding import Decoded, decode, load_oiio, reason
 from rawaug.io.decoding import require_utf8 as require_utf8
 from rawaug.io.directories import EXIF, DamagedTags, TiffFile
 from rawaug.io.metadata import read_exif
-from rawaug.io.profiles import to_srgb
 
 _VIEW_OF_EXIF_ORIENTATION = (0, 1, 3, 2, 4, 5, 7, 6)
 """These views of :func:`rawaug.bayer.turn` bring EXIF orientations 1 to 8 upright."""
@@ -123,11 +123,10 @@ def _as_srgb(colours: np.ndarray, picture: Decoded, path: Path) -> np.ndarray:
 
     if pixels.dtype.kind == "f":
         pixels = require_unit_range(pixels, path)
-    if picture.linear:
+    if picture.colour.is_linear and picture.colour.chromaticities == SRGB and pixels.dtype.kind == "f":
         pixels = encode_srgb(torch.from_numpy(pixels)).numpy()
-
-    if picture.profile is not None:
-        pixels = to_srgb(pixels, picture.profile, path)
+    else:
+        pixels = to_srgb(pixels, picture.colour, path)
     if pixels.dtype == np.uint16:
         pixels = pixels * np.float32(1.0 / 65535.0)
     if pixels.dtype != np.uint8:

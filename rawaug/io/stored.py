@@ -83,8 +83,8 @@ def read_stored(path: str | Path, max_pixels: int = MAX_PIXELS) -> StoredPicture
     """
     path = Path(path)
     picture = decode(path, max_pixels)
-    if picture.linear:
-        raise ValueError(f"{path}: is {picture.format}, which holds linear light; save it as a developed picture")
+    if picture.colour.is_linear:
+        raise ValueError(f"{path}: is {picture.format} and holds linear light; save it as a developed picture")
     if picture.format == "TIFF":
         _require_one_page(path)
 
@@ -98,7 +98,7 @@ def read_stored(path: str | Path, max_pixels: int = MAX_PIXELS) -> StoredPicture
     if picture.format == "TIFF":
         exif = read_exif(path, "TIFF")
 
-    metadata = Metadata(path, picture.format, exif, picture.headers.xmp, picture.profile)
+    metadata = Metadata(path, picture.format, exif, picture.headers.xmp, picture.colour.icc())
     return StoredPicture(np.ascontiguousarray(colours), alpha, metadata)
 
 

@@ -153,7 +153,7 @@ def in_streams(path: Path, numbers: np.ndarray, streams: list[bytes], bayer_dng:
                 tags.append((tag.code, int(tag.dtype), tag.count, tag.value, True))
     with tifffile.TiffWriter(path) as file:
         kind = {"photometric": 32803, "compression": "jpeg", "metadata": None, "extratags": tags}
-        file.write(iter(streams), shape=numbers.shape, dtype=np.uint16, **kind, **layout)  # type: ignore[arg-type]
+        file.write(iter(streams), shape=numbers.shape, dtype=np.uint16, **kind, **layout)
     return path
 
 
