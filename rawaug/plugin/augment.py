@@ -25,6 +25,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA, pattern
 from rawaug.camera.own import Camera
 from rawaug.errors import count_of
+from rawaug.isp.config import ISPParams
 from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP, restrict_to_cameras
 from rawaug.kernels.runtime import eager
@@ -200,17 +201,35 @@ class RawAugment(PairMaker):
 
     # -- draw, apply: see PairMaker -----------------------------------------------------------------------------------
 
-    def draw_params(self, batch: Tensor, generator: torch.Generator, crop: Tensor | None) -> AugmentParams:
+    def look(self, whole: Any, bgr: bool = False) -> ISPParams | None:
+        """Choose the setting of a whole picture for the samplings ``perturb`` and ``chosen``; None for the others.
+
+        Args:
+            whole: a picture, in any form; None if it is unknown, and the constants of the ISP serve.
+            bgr: whether its channels are in the order B, G, R.
+        """
+        if not self.settings.looks:
+            return None
+        if whole is None:
+            return self.settings.constants
+        return self.settings.choose(to_rgb_tensor(whole, bgr)[None].to(self.device))
+
+    def draw_params(
+        self, batch: Tensor, generator: torch.Generator, crop: Tensor | None, chosen: ISPParams | None = None
+    ) -> AugmentParams:
         """Draw the parameters of pictures ``(B, 3, H, W)``.
 
-        The samplings ``perturb`` and ``chosen`` look at the pictures; the others only count them.
+        The samplings ``perturb`` and ``chosen`` look at whole pictures for which nothing was chosen; the others only
+        count them.
         """
         self._require_here(batch)
+        if chosen is None and crop is not None:
+            chosen = self.look(None)
         if crop is None:
             crop = torch.tensor([0, 0, *batch.shape[-2:], 0]).repeat(len(batch), 1)
 
         with _float32(batch):
-            setting = self.settings.sample(batch, generator)
+            setting = self.settings.sample(batch, generator, chosen)
             noise = self.noise.sample(len(batch), generator)
             extras: dict[str, Tensor] = {}
             if self.srgb is not None:

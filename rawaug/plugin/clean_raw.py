@@ -85,7 +85,9 @@ class RawNoise(PairMaker):
 
     # -- draw, apply: see PairMaker -----------------------------------------------------------------------------------
 
-    def draw_params(self, batch: Tensor, generator: torch.Generator, crop: Tensor | None) -> AugmentParams:
+    def draw_params(
+        self, batch: Tensor, generator: torch.Generator, crop: Tensor | None, chosen: ISPParams | None = None
+    ) -> AugmentParams:
         """Draw the parameters of frames ``(B, 4, h, w)`` or mosaics ``(B, 1, H, W)``; there is no camera setting."""
         if crop is None:
             scale = bayer.sites_per_value(batch)

@@ -156,7 +156,8 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
 
         try:
             patch, place = self.augment.draw_patch(picture, self.crop, self.turns, generator, self.zoom, self.bgr)
-            batch = self.augment.make_pair(patch[None], generator, place[None])
+            chosen = self.augment.look(picture, self.bgr)
+            batch = self.augment.make_pair(patch[None], generator, place[None], chosen)
         except ValueError as error:
             raise ValueError(f"picture {name}: {error}") from error
 
@@ -353,7 +354,8 @@ class RawPairs(_Pairs[Sample]):
             picture = self.dataset[index]
             patch, place = self.augment.draw_patch(picture, self.crop, self.turns, generator, self.zoom, self.bgr)
             patches.append(patch[None])
-            parameters.append(self.augment.sample(patch[None], generator, place[None]))
+            chosen = self.augment.look(picture, self.bgr)
+            parameters.append(self.augment.sample(patch[None], generator, place[None], chosen))
 
         pair: RawPair = self.augment.apply(torch.cat(patches), AugmentParams.concatenate(parameters))
         return pair

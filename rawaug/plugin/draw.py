@@ -40,8 +40,10 @@ class Draw:
             if the ISP knows published cameras, as ``universal`` does, and mixtures of the atoms for a fitted ISP.
             ``independent`` does the same with the gains of another camera in another light, to measure the value of
             consistency. ``perturb`` adds Gaussian noise to the weights that the ISP chooses for the picture;
-            ``chosen`` takes them as they are.
-        strength: standard deviation of the noise that ``perturb`` adds to the weights.
+            ``chosen`` takes them as they are. The choice is made on the whole picture, whose crops share it; where only
+            a crop is at hand, the ISP's constants serve.
+        strength: standard deviation of the noise that ``perturb`` adds to the weights. 0.03 moves the gains of
+            ``phones`` by a tenth of a stop, where what it chooses differs by half a stop from picture to picture.
         exposure: lowest and highest exposure of the RAW in stops, or a single one. The default is the range of the
             frames for a fitted ISP, and -0.5 to 1 for published cameras, whose headroom above white is not known. To
             train for cameras other than the fitted one, use -1.5 to 0.
@@ -57,7 +59,7 @@ class Draw:
     """
 
     sampling: Sampling = "convex"
-    strength: float = 0.1
+    strength: float = 0.03
     exposure: tuple[float, float] | float | None = None
     light: float | str | None = None
     tone: str | None = None
@@ -130,9 +132,30 @@ class SettingSampler:
         self._cameras = isp.camera_sampler(draw.sampling == "convex", draw.light)
         self._tone = None if draw.tone is None else tone_weights(isp, draw.tone)
 
-    def sample(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
-        """Draw the settings of ``srgb`` ``(B, 3, H, W)``, exposure included, from a generator on the CPU."""
-        setting = self._sample_at_exposure_0(srgb, generator)
+    @property
+    def looks(self) -> bool:
+        """Whether the draws depend on what is in the pictures."""
+        return self.draw.sampling in ("perturb", "chosen") and self.isp.config.encoders
+
+    @property
+    def constants(self) -> ISPParams:
+        """The setting ``(1, ...)`` of an unknown picture."""
+        return self.isp.typical_setting()
+
+    def choose(self, srgb: Tensor) -> ISPParams:
+        """Choose the settings of whole pictures ``(B, 3, H, W)``, before any draw."""
+        return self.baked.choose(srgb)
+
+    def sample(self, srgb: Tensor, generator: torch.Generator, chosen: ISPParams | None = None) -> ISPParams:
+        """Draw the settings of pictures, exposure included.
+
+        Args:
+            srgb: ``(B, 3, H, W)``.
+            generator: a generator on the CPU.
+            chosen: settings of B pictures, or a single one for all, to use where the sampling looks at the pictures;
+                by default those of :meth:`choose`.
+        """
+        setting = self._sample_at_exposure_0(srgb, generator, chosen)
         if not any(self.exposure):
             return setting
 
@@ -147,11 +170,14 @@ class SettingSampler:
             return {}
         return {"blur": low + (high - low) * torch.rand(batch, generator=generator, dtype=torch.float32)}
 
-    def _sample_at_exposure_0(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
-        if self.draw.sampling == "chosen":
-            return self.baked.choose(srgb)
-        if self.draw.sampling == "perturb":
-            return self._perturb(self.baked.choose(srgb), generator)
+    def _sample_at_exposure_0(self, srgb: Tensor, generator: torch.Generator, chosen: ISPParams | None) -> ISPParams:
+        if self.draw.sampling in ("perturb", "chosen"):
+            if chosen is None:
+                chosen = self.choose(srgb)
+            setting = chosen.map(lambda tensor: tensor.expand(len(srgb), *tensor.shape[1:]))
+            if self.draw.sampling == "perturb":
+                setting = self._perturb(setting, generator)
+            return setting
         if self._cameras is None:
             return self.isp.draw_setting(len(srgb), generator)
 

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
+from rawaug.isp.config import ISPParams
 from rawaug.kernels.runtime import find_device
 from rawaug.plugin.crops import crop_size
 from rawaug.plugin.dataset import Maker, as_augment, open_dataset
@@ -434,24 +435,31 @@ class WrappedLoader(ResumableLoader[Batch]):
 
     def _make_pair(self, pictures: Any, generator: torch.Generator) -> RawPair:
         if self.crop is None:
-            whole = self.augment.as_batch(pictures, self.bgr).to(self.device, non_blocking=True)
-            return self.augment.make_pair(whole, generator)
+            batch = self.augment.as_batch(pictures, self.bgr).to(self.device, non_blocking=True)
+            return self.augment.make_pair(batch, generator, chosen=self.augment.look(None))  # they may be crops
 
-        patches, places = self._draw_crops(pictures, generator)
-        return self.augment.make_pair(patches.to(self.device, non_blocking=True), generator, places)
+        patches, places, chosen = self._draw_crops(pictures, generator)
+        return self.augment.make_pair(patches.to(self.device, non_blocking=True), generator, places, chosen)
 
-    def _draw_crops(self, pictures: Any, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw one crop of each picture ``(B, C, height, width)``, and their places ``(B, 5)``."""
+    def _draw_crops(self, pictures: Any, generator: torch.Generator) -> tuple[Tensor, Tensor, ISPParams | None]:
+        """Draw a crop of each picture ``(B, C, height, width)``, their places ``(B, 5)``, and their chosen settings."""
         if is_picture(pictures):
             pictures = [pictures]
 
-        patches, places = [], []
+        patches, places, settings = [], [], []
         for picture in pictures:
             patch, place = self.augment.draw_patch(picture, self.crop, False, generator, bgr=self.bgr)
             patches.append(patch)
             places.append(place)
 
-        return self.augment.stack(patches), torch.stack(places)
+            setting = self.augment.look(picture, self.bgr)
+            if setting is not None:
+                settings.append(setting)
+
+        chosen = None
+        if settings:
+            chosen = ISPParams(*map(torch.cat, zip(*settings, strict=True)))
+        return self.augment.stack(patches), torch.stack(places), chosen
 
 
 @overload

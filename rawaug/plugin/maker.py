@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
+from rawaug.isp.config import ISPParams
 from rawaug.kernels.runtime import eager
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import Where, find_picture, get_picture, replace_picture
@@ -78,9 +79,20 @@ class PairMaker(nn.Module, ABC):
     def cut_patch(self, whole: Any, place: Tensor, size: tuple[int, int] | None, bgr: bool = False) -> Tensor:
         """Cut the patch of a drawn place out of an input."""
 
+    def look(self, whole: Any, bgr: bool = False) -> ISPParams | None:
+        """Choose the setting of a whole input, for the draws of its crops; None if they do not look at the input.
+
+        Args:
+            whole: the input, or None if it is unknown.
+            bgr: as for :meth:`as_batch`.
+        """
+        return None
+
     @abstractmethod
-    def draw_params(self, batch: Tensor, generator: torch.Generator, crop: Tensor | None) -> AugmentParams:
-        """Draw the parameters of a batch ``(B, C, H, W)``; ``crop`` ``(B, 5)`` is None for whole inputs."""
+    def draw_params(
+        self, batch: Tensor, generator: torch.Generator, crop: Tensor | None, chosen: ISPParams | None = None
+    ) -> AugmentParams:
+        """Draw the parameters of a batch ``(B, C, H, W)``; the rest is as for :meth:`sample`."""
 
     @abstractmethod
     def apply_params(self, batch: Tensor, params: AugmentParams) -> RawPair:
@@ -95,7 +107,11 @@ class PairMaker(nn.Module, ABC):
     @eager
     @torch.no_grad()
     def sample(
-        self, inputs: Any, generator: torch.Generator | None = None, crop: Tensor | None = None
+        self,
+        inputs: Any,
+        generator: torch.Generator | None = None,
+        crop: Tensor | None = None,
+        chosen: ISPParams | None = None,
     ) -> AugmentParams:
         """Draw the parameters of a batch; the parameters of a single input have no leading B.
 
@@ -104,8 +120,10 @@ class PairMaker(nn.Module, ABC):
             generator: a generator on the CPU; the module's own by default.
             crop: ``(B, 5)`` if the inputs lie in larger frames, as in :class:`AugmentParams`; by default they are full
                 frames.
+            chosen: what :meth:`look` chose for the whole inputs; by default it is what the inputs themselves suggest,
+                or the constants if they lie in larger frames.
         """
-        params = self.draw_params(self._batch(inputs), generator or self._own_generator(), crop)
+        params = self.draw_params(self._batch(inputs), generator or self._own_generator(), crop, chosen)
         if self.is_single(inputs):
             return params.map(_first)
         return params
@@ -135,15 +153,21 @@ class PairMaker(nn.Module, ABC):
 
     @eager
     @torch.no_grad()
-    def make_pair(self, batch: Tensor, generator: torch.Generator, crop: Tensor | None = None) -> RawPair:
+    def make_pair(
+        self,
+        batch: Tensor,
+        generator: torch.Generator,
+        crop: Tensor | None = None,
+        chosen: ISPParams | None = None,
+    ) -> RawPair:
         """Sample, then apply, without converting the inputs.
 
         Args:
             batch: ``(B, C, H, W)`` as :meth:`as_batch` gives it, on the module's device.
             generator: a generator on the CPU.
-            crop: ``(B, 5)``, as for :meth:`sample`.
+            crop, chosen: as for :meth:`sample`.
         """
-        return self.apply_params(batch, self.draw_params(batch, generator, crop))
+        return self.apply_params(batch, self.draw_params(batch, generator, crop, chosen))
 
     @overload
     def forward(self, batch: Tensor, generator: torch.Generator | None = None, key: None = None) -> RawPair: ...

@@ -125,7 +125,8 @@ class OwnPictureCrops:
             pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
             patch, place = self.draw_patch(pair, generator)
             patches.append(patch[None])
-            parameters.append(self.augment.sample(patch[None], generator, place[None]))
+            chosen = self.augment.look(pair.srgb)
+            parameters.append(self.augment.sample(patch[None], generator, place[None], chosen))
 
         made = self.augment.apply(torch.cat(patches), AugmentParams.concatenate(parameters))
         return list(map(Sample, made.noisy, made.clean, made.variance))
