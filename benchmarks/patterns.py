@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.measure import arguments, finish, start
-from denoisers import NonLocalMeans
+from denoisers import NonLocalMeans, anscombe
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
@@ -27,7 +27,7 @@ from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import compare, to_domain
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial
-from rawaug.noise import anscombe, noise_model
+from rawaug.noise import noise_model
 from rawaug.progress import progress
 from rawaug.tasks.full_colour import libraw_demosaic
 from rawaug.tasks.mosaic import mosaic_trial

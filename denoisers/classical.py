@@ -11,12 +11,13 @@ from abc import ABC, abstractmethod
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import product
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from denoisers import anscombe
 from denoisers.domains import fit_levels
 from rawaug.bayer import noise_variance
 from rawaug.errors import how_to_install
@@ -193,34 +194,21 @@ class BM3D(Classical):
         return from_opponent(cleaned)
 
 
-class Transform(Protocol):
-    """A variance-stabilising transform: after ``forward`` the noise has variance 1; ``inverse`` is free of bias."""
-
-    def forward(self, y: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
-        """Transform RAW ``(B, 4, h, w)`` with var(y) = shot_var y + read_var, both ``(B,)``, to unit variance."""
-
-    def inverse(self, z: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
-        """Transform an estimate ``(B, 4, h, w)`` in this domain back to RAW."""
-
-
 class Stabilised:
-    """A denoiser of white noise on RAW: ``inverse(denoiser(forward(noisy), 1))`` (Makitalo and Foi 2013).
+    """A denoiser of white noise on RAW: ``inverse(denoiser(forward(noisy), 1))`` of :mod:`denoisers.anscombe`.
 
     Args:
         denoiser: one of the classes above, or any ``denoiser(noisy, variance)``.
-        transform: a :class:`Transform`, e.g. the module ``rawaug.noise.anscombe``.
 
     Example:
         >>> from denoisers import TotalVariation
-        >>> from rawaug.noise import anscombe
-        >>> denoiser = Stabilised(TotalVariation(), anscombe)
+        >>> denoiser = Stabilised(TotalVariation())
         >>> denoiser(torch.rand(1, 4, 16, 16), shot_var=1e-3, read_var=1e-5).shape
         torch.Size([1, 4, 16, 16])
     """
 
-    def __init__(self, denoiser: Classical, transform: Transform) -> None:
+    def __init__(self, denoiser: Classical) -> None:
         self.denoiser = denoiser
-        self.transform = transform
 
     def __call__(
         self,
@@ -252,9 +240,9 @@ class Stabilised:
             levels = (shot_var.reshape(-1, 1, 1, 1), read_var.reshape(-1, 1, 1, 1))
             return self.denoiser(noisy, noise_variance(noisy, *levels))
 
-        stable = self.transform.forward(noisy, shot_var, read_var)
+        stable = anscombe.forward(noisy, shot_var, read_var)
         denoised = self.denoiser(stable, torch.ones_like(stable))
-        return self.transform.inverse(denoised, shot_var, read_var)
+        return anscombe.inverse(denoised, shot_var, read_var)
 
 
 def _fit_line(noisy: Tensor, variance: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -18,9 +18,9 @@ from torch import Tensor, nn
 
 import denoisers
 from denoisers.files import FOLDER, find_denoiser
+from denoisers.onnx import feeds, open_session
 from rawaug.commands import YAML
 from rawaug.data import demo_pairs
-from rawaug.denoising.foreign import feeds, session_of
 from rawaug.errors import extra
 from rawaug.evaluation.trials import trial_of
 from rawaug.files import find_weights, read_header, replacing
@@ -79,7 +79,7 @@ def write_onnx(
         graph = onnx.load(str(path))
         onnx.helper.set_model_props(graph, dict(metadata))
         onnx.save(graph, str(path))
-    return session_of(path)
+    return open_session(path)
 
 
 def difference_from(expected: Tensor, session: Any, inputs: Mapping[str, Tensor], path: Path) -> float:

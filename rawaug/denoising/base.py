@@ -21,9 +21,9 @@ from torch import Tensor, nn
 
 from denoisers.classical import FILTERS
 from denoisers.files import find_denoiser, list_shipped
+from denoisers.published import Image, NetworkFile, image_of_header, read_network
 from rawaug import bayer
 from rawaug.bayer import CFA, noise_variance
-from rawaug.denoising.weights import Image, NetworkFile, image_of_header, read_network
 from rawaug.files import read_header
 from rawaug.kernels.runtime import find_device, has_fast_bfloat16
 from rawaug.progress import progress

@@ -18,24 +18,23 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 import denoisers
 from denoisers.classical import FILTERS, Stabilised
 from denoisers.files import DEFAULT, JOINT, find_denoiser, list_shipped
 from denoisers.mosaic import BayerAdapter, MosaicDRUNet, denoise_mosaic
-from denoisers.network import DENOISERS, PACKED
+from denoisers.network import DENOISERS
+from denoisers.onnx import STRIDE, OnnxNetwork
+from denoisers.patterns import crop_to_pattern, extend_to_pattern
+from denoisers.published import Image
 from denoisers.tiles import TILE
 from rawaug import bayer
-from rawaug.bayer import CFA, crop_to_cfa
+from rawaug.bayer import CFA
 from rawaug.denoising.base import ImageDenoiser, progress_by, read_named
 from rawaug.denoising.base import Levels as Levels
 from rawaug.denoising.base import Noisy as Noisy
-from rawaug.denoising.foreign import STRIDE, OnnxNetwork
-from rawaug.denoising.weights import Image
 from rawaug.files import read_header, sha256
 from rawaug.io import RawFrame
-from rawaug.noise import anscombe
 from rawaug.registry import Spec, spec_label, split_spec
 
 Model = Callable[[Tensor, Tensor | None], Tensor]
@@ -139,14 +138,14 @@ class RawDenoiser(ImageDenoiser):
     def _of_packed(self, noisy: Noisy) -> Tensor:
         cfa = CFA(noisy.cfa)
         own = self.cfa or cfa
-        image = _continue(noisy.image, cfa, own)
+        image = extend_to_pattern(noisy.image, cfa, own)
         variance = noisy.variance
         if variance is not None:
-            variance = _continue(variance, cfa, own)
+            variance = extend_to_pattern(variance, cfa, own)
 
         run = self._whole(self.model(noisy.levels), own)
         denoised = self._run(run, image, variance, self._result_shape(image))
-        return _crop(denoised, own, cfa)
+        return crop_to_pattern(denoised, own, cfa)
 
     def _result_shape(self, packed: Tensor) -> tuple[int, ...]:
         """Return the shape of the result for packed RAW."""
@@ -251,26 +250,6 @@ class JointDenoiser(RawDenoiser):
         return 1, 3, 2 * height, 2 * width
 
 
-def _continue(packed: Tensor, cfa: CFA, own: CFA) -> Tensor:
-    """Extend a mosaic to the pattern ``own``, by a mirrored line on the sides where the patterns differ."""
-    if own == cfa:
-        return packed
-    rows, columns = cfa.shift_to(own)
-    mosaic = F.pad(bayer.unpack(packed, cfa), (columns, columns, rows, rows), mode="reflect")
-    return bayer.pack(mosaic, own)
-
-
-def _crop(image: Tensor, own: CFA, cfa: CFA) -> Tensor:
-    """Crop the lines that :func:`_continue` added from a result, and pack it by ``cfa`` again."""
-    if own == cfa:
-        return image
-    if image.shape[1] != PACKED:
-        return crop_to_cfa(image, own, cfa)
-
-    mosaic = crop_to_cfa(bayer.unpack(image, own), own, cfa)
-    return bayer.pack(mosaic, cfa)
-
-
 # -- by what it is made of ---------------------------------------------------------------------------------------------
 
 
@@ -357,7 +336,7 @@ class _Foreign(nn.Module):
 def _of_filter(spec: Spec) -> RawDenoiser:
     require_classical([spec])
     denoiser = FILTERS.make(spec)
-    stabilised = Stabilised(denoiser, anscombe)
+    stabilised = Stabilised(denoiser)
 
     def model(levels: Levels | None) -> Model:
         """Take noise of an unknown law for white noise, at the mean level of its map."""

@@ -22,10 +22,10 @@ from torch import Tensor, nn
 
 import denoisers
 from denoisers.classical import FILTERS
+from denoisers.published import Image
 from rawaug import bayer
 from rawaug.denoising.base import ImageDenoiser, Noisy, progress_by, read_named
 from rawaug.denoising.picture_levels import PictureLevel, estimate_level, white_level
-from rawaug.denoising.weights import Image
 from rawaug.registry import Spec, spec_label
 
 _TILE = 1024

@@ -1,4 +1,4 @@
-"""The noise of real sensors: models, published levels, estimation from a camera's own files, and stabilisation."""
+"""The noise of real sensors: models, published levels, and estimation from a camera's own files."""
 
 from rawaug.noise.calibrated import CalibratedNoise
 from rawaug.noise.estimate import (

@@ -29,7 +29,7 @@ from rawaug.bayer import CFA, crop_to_cfa
 from rawaug.data.development import develop_packed
 from rawaug.data.pairs import Lazy, Pair
 from rawaug.evaluation.trials import Trial
-from rawaug.noise import ShotReadModel, anscombe, camera_law
+from rawaug.noise import ShotReadModel, camera_law
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import to_rgb_tensor, trim_to_even
 from rawaug.progress import progress
@@ -53,7 +53,7 @@ def signal_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) -
         return noisy
 
     packed = bayer.pack(noisy[None], cfa)
-    denoised = Stabilised(NonLocalMeans(), anscombe)(packed, shot_var=shot_var, read_var=read_var)
+    denoised = Stabilised(NonLocalMeans())(packed, shot_var=shot_var, read_var=read_var)
     return bayer.unpack(denoised, cfa)[0]
 
 

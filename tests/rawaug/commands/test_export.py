@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 import denoisers
 from denoisers.domains import fit_levels
+from denoisers.onnx import open_session
 from rawaug.bayer import CFA, noise_variance
 from rawaug.cli import main
 from rawaug.commands.export import export, write_onnx
 from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.denoising.foreign import session_of
 from rawaug.errors import MissingExtra
 from rawaug.io import RawFrame
 
@@ -53,7 +53,7 @@ def test_any_size_gives_pytorch_s_numbers(
     ]
     assert both[0].shape == (3 if linear else 1, 130, 94) and (both[0] - frame.mosaic).abs().max() > 1e-3
     assert (both[0] - both[1]).abs().max() < 1e-4
-    session = session_of(out)
+    session = open_session(out)
     for batch, height, width in ((1, 64, 32), (3, 31, 45), (2, 5, 130)):
         noisy = torch.rand(batch, 4, height, width, generator=torch.Generator().manual_seed(0)) - 0.05
         variance = noise_variance(noisy, 1e-3 * torch.arange(1.0, batch + 1).reshape(-1, 1, 1, 1), 1e-5)

@@ -15,9 +15,9 @@ from torch.nn import functional as F
 
 import denoisers
 from denoisers.pbrid import PBRID
+from denoisers.published import BiasFreeDnCNN
 from rawaug.bayer import CFA, pack, unpack
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
-from rawaug.denoising.foreign import BiasFreeDnCNN
 from rawaug.evaluation.evaluate import denoiser_of
 from rawaug.experiment.run import run
 from rawaug.tasks.rgb import RgbRecipe

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from denoisers.anscombe import TABLE_COUNTS, forward, inverse
 from rawaug.noise import FixedLevels, PoissonGaussianNoise
-from rawaug.noise.anscombe import TABLE_COUNTS, forward, inverse
 
 LEVELS = torch.tensor([0.0, 1e-3, 5e-3, 0.02, 0.1, 0.3, 0.6, 0.9])
 
