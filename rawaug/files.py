@@ -13,7 +13,7 @@ import os
 import re
 import stat
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import wraps
 from pathlib import Path
@@ -25,6 +25,7 @@ from torch import Tensor
 P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")
+Content = bytes | memoryview
 
 OF_NO_DATASET = (".DS_Store", "Thumbs.db")
 """macOS and Windows leave these files in folders."""
@@ -214,15 +215,52 @@ def parse_object(text: str) -> dict[str, Any]:
     return value
 
 
-def require_writable(path: str | Path, option: str = "", folder: bool = False) -> None:
-    """Refuse, before any work, a file (or ``folder``) that could not be written at the end or has no name."""
-    if not str(path):
-        raise ValueError(f"--{option}: needs the name of a file")
-    path = Path(path)
-    if path.is_dir() and not folder:
-        raise OSError(f"{path}: cannot be written: is a folder; give the name of a file")
+def require_output(
+    path: str | Path,
+    overwrite: bool = False,
+    extensions: Sequence[str] = (),
+    inputs: Iterable[str | Path] = (),
+    advice: str = "",
+) -> Path:
+    """Refuse, before any work, an output file that would replace something or could not be written.
 
-    above = path if folder else path.absolute().parent
+    Args:
+        path: the file.
+        overwrite: whether an existing file may be replaced.
+        extensions: the endings that the file may have, in lower case; any, if there are none.
+        inputs: the files that are read, which are never replaced.
+        advice: the end of the message about another ending.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: if it has no name or another ending, is an input, or exists and may not be replaced.
+        OSError: if it cannot be written.
+    """
+    if not str(path):
+        raise ValueError("the name of an output file is empty; give one")
+
+    path = Path(path)
+    if path.is_dir():
+        raise OSError(f"{path}: cannot be written: is a folder; give the name of a file")
+    if extensions and path.suffix.lower() not in extensions:
+        advice = advice or f"give a name that ends in {' or '.join(extensions)}"
+        raise ValueError(f"{path}: {advice}")
+    for file in inputs:
+        if path.resolve() == Path(file).resolve() or (path.exists() and Path(file).exists() and path.samefile(file)):
+            raise ValueError(f"{path}: is the input file; give another name")
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path}: exists; give another name, or --overwrite to replace it")
+
+    require_folder(path.absolute().parent, path)
+    return path
+
+
+def require_folder(folder: str | Path, output: str | Path | None = None) -> None:
+    """Refuse, before any work, a folder that could not be made or written to, for the sake of ``output`` in it."""
+    path = Path(output or folder)
+    above = Path(folder)
     while not above.exists():
         above = above.absolute().parent
     if not above.is_dir():
@@ -234,11 +272,24 @@ def require_writable(path: str | Path, option: str = "", folder: bool = False) -
         raise OSError(f"{path}: cannot be written: {above}: {error.strerror}") from None
 
 
+def write_bytes(content: Content, path: str | Path) -> None:
+    """Write a file, completely or not at all.
+
+    Encoders of pictures, figures and archives write to memory first: some of them do not report a full disk, and one
+    ends the process.
+    """
+    with replacing(path) as partial:
+        partial.write_bytes(content)
+
+
+def write_text(text: str, path: str | Path) -> None:
+    """Write a text file in UTF-8, completely or not at all; what UTF-8 cannot hold is escaped."""
+    write_bytes(text.encode("utf-8", errors="backslashreplace"), path)
+
+
 def write_json(value: Any, path: str | Path) -> None:
     """Write a JSON file, completely or not at all."""
-    text = to_json(value, indent=1)
-    with replacing(path) as partial:
-        partial.write_text(f"{text}\n", encoding="utf-8")
+    write_text(f"{to_json(value, indent=1)}\n", path)
 
 
 def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path: str | Path) -> None:
@@ -251,8 +302,7 @@ def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path
     end = 8 + int.from_bytes(content[:8], "little")
     sorted_header = json.dumps(json.loads(content[8:end]), sort_keys=True).encode()
     sorted_header += b" " * (-len(sorted_header) % 8)
-    with replacing(path) as partial:
-        partial.write_bytes(len(sorted_header).to_bytes(8, "little") + sorted_header + content[end:])
+    write_bytes(len(sorted_header).to_bytes(8, "little") + sorted_header + content[end:], path)
 
 
 def read_tensors(

@@ -20,7 +20,10 @@ from benchmarks import faults
 from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.data import PictureFolder
+from rawaug.data.formats import write_npz, write_tiff
 from rawaug.errors import resource_error
+from rawaug.evaluation.figures import new_figure, save_figure
+from rawaug.evaluation.page import Page
 from rawaug.files import LOCK, locked, write_json, write_tensors
 from rawaug.io import RawFrame, read_picture, write_dng, write_picture
 from rawaug.synthesis import files as pair_files
@@ -130,11 +133,27 @@ def _save_checkpoint(path: Path) -> None:
     TrainingState(denoisers.build("DnCNN", width=24, depth=4), TrainConfig(steps=1)).save(path, key="key")
 
 
+NOISE = torch.rand((3, 128, 128), generator=torch.Generator().manual_seed(0))
+
+
+def _figure() -> Any:
+    figure = new_figure(4, 3)
+    figure.subplots().plot(range(1000), NOISE.flatten()[:1000])
+    return figure
+
+
 WRITERS: dict[str, Callable[[Path], object]] = {
     "safetensors": lambda path: write_tensors({"x": torch.zeros(40_000)}, {"format": "rawaug"}, path),
     "json": lambda path: write_json(["x" * 100_000], path),
     "dng": lambda path: write_dng(path, FRAME),
     "checkpoint": _save_checkpoint,
+    "png": lambda path: write_picture(path, NOISE),
+    "jpg": lambda path: write_picture(path, NOISE),
+    "tif": lambda path: write_picture(path, NOISE),
+    "npz": lambda path: write_npz(path, NOISE, NOISE, {}),
+    "tiff": lambda path: write_tiff(path, NOISE, {}),
+    "html": lambda path: Page("x" * 100_000).write(path, {}),
+    "svg": lambda path: save_figure(_figure(), path),
     "denoiser": lambda path: denoisers.save(denoisers.build("DnCNN", width=32, depth=4), path, {"cfa": "RGGB"}),
 }
 

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from cyclopts import Parameter
 
-from rawaug.files import yaml_value
+from rawaug.files import require_output, yaml_value
 
 OPTIONS = Parameter(name="*")
 """The fields of a dataclass become options of their own."""
+
+
+def require_results(json: str | None, report: str | None, overwrite: bool, inputs: Iterable[str] = ()) -> None:
+    """Refuse, before any work, files of ``--json`` and ``--report`` that would replace something, or another ending."""
+    files = list(inputs)
+    if json is not None:
+        require_output(json, overwrite, (".json",), files)
+    if report is not None:
+        require_output(report, overwrite, (".html", ".htm"), files)
 
 
 def value_of(text: str) -> Any:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from rawaug.commands import YAML
+from rawaug.commands import YAML, require_results
 from rawaug.evaluation.comparison import Comparison
-from rawaug.files import require_writable
 from rawaug.tasks.base import task_of
 
 
@@ -22,6 +21,7 @@ def run(
     device: str = "cpu",
     json: str | None = None,
     report: str | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Compare denoisers on the same frozen noise over clean references.
 
@@ -43,10 +43,9 @@ def run(
         device: device for networks: cpu, cuda, ...
         json: write the result as JSON to this file.
         report: write an HTML page with tables and crops to this file.
+        overwrite: replace these two files if they exist.
     """
-    for option, path in (("json", json), ("report", report)):
-        if path is not None:
-            require_writable(path, option)
+    require_results(json, report, overwrite, [*denoisers, data])
 
     comparison = Comparison(denoisers, data, bin, count, crop, noise, iso, seed, device, json, report)
     task_of(data).benchmark(comparison)

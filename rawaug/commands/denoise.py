@@ -6,12 +6,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
-from rawaug.commands import YAML
+from rawaug.commands import YAML, require_results
 from rawaug.denoising.corrections import Correction
 from rawaug.denoising.files import DenoisedFolder, denoise_file, denoise_folder
 from rawaug.denoising.sources import Options, kind_of
 from rawaug.errors import count_of, escape
-from rawaug.files import require_writable, write_json
+from rawaug.files import write_json
 from rawaug.registry import Spec
 
 
@@ -59,8 +59,7 @@ def run(
         overwrite: replace existing results.
     """
     options = Options(denoiser, classical, noise, strength, linear, self_ensemble, greens, device)
-    if json:
-        require_writable(Path(json))
+    require_results(json, None, overwrite, [source])
     kind = kind_of(source).of(source, options)
 
     if Path(source).is_dir():
@@ -71,7 +70,7 @@ def run(
     else:
         result = DenoisedFolder([denoise_file(source, out, kind, preview=preview, overwrite=overwrite)])
 
-    if json:
+    if json is not None:
         write_json({"files": [asdict(done) for done in result.files], "broken": result.broken}, json)
     print_denoised(result)
     if result.broken:

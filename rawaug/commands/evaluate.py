@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from denoisers.files import FOLDER
-from rawaug.commands import OPTIONS, YAML
+from rawaug.commands import OPTIONS, YAML, require_results
 from rawaug.data import open_pairs
 from rawaug.data.folders import Readable
 from rawaug.data.pair_folder import PairSettings
@@ -15,7 +15,7 @@ from rawaug.evaluation.evaluate import Evaluation, require_finite
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import Row, require_numbers, summary
 from rawaug.evaluation.tables import print_scores
-from rawaug.files import find_weights, read_metadata, require_writable
+from rawaug.files import find_weights, read_metadata
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseSpec
 from rawaug.progress import progress
@@ -39,6 +39,7 @@ def run(
     device: str = "cpu",
     report: str | None = None,
     json: str | None = None,
+    overwrite: bool = False,
     settings: Annotated[PairSettings, OPTIONS] | None = None,
 ) -> dict[str, Any]:
     """Measure PSNR and SSIM of a denoiser or an ISP.
@@ -61,14 +62,13 @@ def run(
         device: device for a denoiser: cpu, cuda, ...
         report: write an HTML page with a denoiser's scores and crops to this file.
         json: write the result as JSON to this file.
+        overwrite: replace these two files if they exist.
         settings: settings of pairs:PATH.
 
     Returns:
         What ``--json`` writes.
     """
-    for option, path in (("json", json), ("report", report)):
-        if path is not None:
-            require_writable(path, option)
+    require_results(json, report, overwrite, [weights, data])
     require_classical(classical or ())
 
     evaluation = Evaluation(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from rawaug.data.demo import demo_files
 from rawaug.errors import extra
@@ -23,10 +25,12 @@ def run(pictures: str | None = None, /, *, isp: str = "universal", host: str = "
     with extra("explore"):  # one line names all that the page needs, before the pictures ask for theirs
         import gradio  # noqa: F401
 
-    page = build(*choices(pictures), isp=isp)
-    with open_socket(host, port) as listener, suppress(KeyboardInterrupt):
-        print(f"{socket_url(listener)} (press Ctrl-C to stop)", flush=True)
-        make_server(page).run(sockets=[listener])
+    with TemporaryDirectory(prefix="rawaug-explore-") as uploads:  # not Gradio's own, in which other pages' files lie
+        os.environ["GRADIO_TEMP_DIR"] = uploads
+        page = build(*choices(pictures), isp=isp)
+        with open_socket(host, port) as listener, suppress(KeyboardInterrupt):
+            print(f"{socket_url(listener)} (press Ctrl-C to stop)", flush=True)
+            make_server(page).run(sockets=[listener])
 
 
 def choices(pictures: str | None) -> tuple[list[Path], list[str]]:

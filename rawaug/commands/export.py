@@ -23,7 +23,7 @@ from rawaug.commands import YAML
 from rawaug.data import demo_pairs
 from rawaug.errors import extra
 from rawaug.evaluation.trials import trial_of
-from rawaug.files import find_weights, read_header, replacing
+from rawaug.files import find_weights, read_header, replacing, require_output, write_text
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.progress import progress
@@ -120,8 +120,7 @@ def export_cube(isp: DictionaryISP, out: str | Path, white_balance: Sequence[flo
     ]
     for red, green, blue in isp.reverse_table(setting, NODES).tolist():
         lines.append(f"{red:.7f} {green:.7f} {blue:.7f}")
-    with replacing(path) as partial:
-        partial.write_text("\n".join(lines) + "\n")
+    write_text("\n".join(lines) + "\n", path)
 
 
 def run(
@@ -130,6 +129,7 @@ def run(
     /,
     *,
     white_balance: Annotated[tuple[float, float, float] | None, YAML] = None,
+    overwrite: bool = False,
 ) -> None:
     """Write a denoiser as ONNX, or an ISP as a .cube.
 
@@ -137,7 +137,9 @@ def run(
         weights: a .safetensors file written by rawaug run or rawaug fit, or the name of a shipped denoiser or ISP.
         out: the .onnx file of a denoiser, or the .cube of an ISP.
         white_balance: as-shot multipliers R, G, B for which an ISP is exported; by default the fit's typical ones.
+        overwrite: replace the output file if it exists.
     """
+    require_output(out, overwrite)
     if read_header(find_weights(weights, FOLDER))["kind"] == "isp":
         export_cube(DictionaryISP.from_pretrained(weights), out, white_balance)
         print(f"{out}: {Path(out).stat().st_size / 1e6:.1f} MB")

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from rawaug.commands import OPTIONS
 from rawaug.data.pair_folder import MosaicSettings
 from rawaug.errors import count_of, escape
-from rawaug.files import locked, require_writable
+from rawaug.files import locked, require_output
 from rawaug.isp.fit import FitConfig
 from rawaug.noise import MeasuredLevels, camera_law
 from rawaug.training.camera_fit import fit
@@ -27,6 +27,7 @@ def run(
     noise: Literal["auto", "on", "off"] = "auto",
     dark: str | None = None,
     camera: str | None = None,
+    overwrite: bool = False,
     mosaics: Annotated[MosaicSettings, OPTIONS] | None = None,
     config: Annotated[FitConfig, OPTIONS] | None = None,
 ) -> None:
@@ -41,12 +42,11 @@ def run(
             it.
         dark: folder of dark frames to measure the read variance.
         camera: figures of the camera to start from, a YAML file or the name of a published camera.
+        overwrite: replace the output file if it exists.
         mosaics: CFA and levels of pairs:PATH.
         config: settings of the fit.
     """
-    if Path(out).suffix != ".safetensors":
-        raise ValueError(f"--out {out}: the file must end in .safetensors")
-    require_writable(out)
+    require_output(out, overwrite, (".safetensors",), data)
 
     figure = Path(out).with_name(f"{Path(out).stem}-noise.png")
     figure.parent.mkdir(parents=True, exist_ok=True)

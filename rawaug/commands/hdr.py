@@ -16,13 +16,13 @@ from torch import Tensor
 
 from rawaug.commands import YAML
 from rawaug.errors import count_of
-from rawaug.files import require_writable
+from rawaug.files import require_output
 from rawaug.io.content import content_of
 from rawaug.io.isolated import isolated
 from rawaug.io.metadata import Metadata, mend_exif, read_exif
 from rawaug.io.pictures import decode_srgb, write_linear
 from rawaug.io.shots import read_shot, read_shot_exposure
-from rawaug.io.stored import StoredPicture, write_stored
+from rawaug.io.stored import PICTURE_FORMATS, StoredPicture, write_stored
 from rawaug.isp.alignment import Motion, find_motion
 from rawaug.isp.config import ISPResult
 from rawaug.isp.exposures import confidence, linear_light, merge_exposures, reference_exposure, render_exposure
@@ -57,10 +57,7 @@ def run(
         align: bring pictures that were taken by hand to the one nearest to 0 EV, and leave out what moved in the scene.
         overwrite: replace the output file if it exists.
     """
-    target = Path(out)
-    require_writable(target)
-    if target.exists() and not overwrite:
-        raise FileExistsError(f"{out}: exists; choose another name, or add --overwrite")
+    target = require_output(out, overwrite, (*PICTURE_FORMATS, ".exr"), pictures)
 
     stops = exposures(pictures, ev)
     merged, camera, lines = _merge(pictures, stops, exposure, isp, align)

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import pattern
-from rawaug.evaluation.figures import new_figure
+from rawaug.evaluation.figures import FIGURES, new_figure, save_figure
 from rawaug.explore.views import stage_pictures
-from rawaug.files import require_writable
+from rawaug.files import require_output
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.io.shots import read_shot
 from rawaug.isp.functional import frame_coordinates
@@ -40,29 +40,30 @@ def run(
     seed: int = 0,
     cfa: str | None = None,
     max_pixels: int = MAX_PIXELS,
+    overwrite: bool = False,
 ) -> None:
     """Draw a picture at every stage of an ISP, and as augmented RAW.
 
     Args:
         picture: an sRGB picture, or a RAW file, which LibRaw develops.
-        out: output PNG.
+        out: the figure to write, a .png, .jpg, .pdf or .svg.
         isp: ISP file, or the name of a shipped ISP.
         count: number of augmented RAWs to plot.
         seed: random seed of the augmented RAWs.
         cfa: pattern of the RAW: RGGB, BGGR, GRBG, GBRG, XTRANS, or QUAD-RGGB and the like; the ISP's by default.
         max_pixels: a larger picture is refused before it is decoded.
+        overwrite: replace the output file if it exists.
     """
     if count < 0:
         raise ValueError(f"count must be at least 0, got {count}")
     path = Path(out)
     if not path.suffix:
         path = Path(f"{out}.png")
-    require_writable(path)
+    require_output(path, overwrite, FIGURES, [picture])
 
     augment = RawAugment.from_pretrained(isp, cfa=cfa)
     whole = trim_to_even(read_shot(picture, max_pixels))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _draw_stages(augment, whole, count, seed).savefig(path, dpi=130)
+    save_figure(_draw_stages(augment, whole, count, seed), path)
     print(path)
 
 

@@ -19,7 +19,7 @@ from rawaug.data.sidd_benchmark import SiddBenchmark, write_submission
 from rawaug.data.sidd_blocks import BLOCKS
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.denoising.sources import Options
-from rawaug.files import require_writable
+from rawaug.files import require_output
 from rawaug.io import RawFrame
 from rawaug.noise import estimate_noise
 from rawaug.progress import progress
@@ -38,6 +38,7 @@ def run(
     classical: Annotated[Spec | None, YAML] = None,
     self_ensemble: bool = False,
     device: str = "auto",
+    overwrite: bool = False,
 ) -> None:
     """Denoise the noisy blocks of a benchmark, in the form that its server takes.
 
@@ -49,11 +50,15 @@ def run(
             or {name, settings}.
         self_ensemble: average eight views of a network, at eight times the cost.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
+        overwrite: replace an existing submission.
     """
     kind, _, path = benchmark.partition(":")
     if kind not in ("sidd", "dnd") or not path:
         raise ValueError(f"{benchmark}: not a benchmark; use sidd:PATH or dnd:PATH")
-    require_writable(Path(out), folder=kind == "dnd")
+    if kind == "dnd":
+        require_output(Path(out) / "0001.mat", overwrite)
+    else:
+        require_output(out, overwrite, (".csv",))
 
     options = Options(denoiser, classical, self_ensemble=self_ensemble)
     spec = RawDenoiser.default if options.spec is None else options.spec

@@ -11,6 +11,7 @@ transposed to a reader that does not exchange its axes: GBRG then looks like GRB
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from rawaug.bayer import CFA
 from rawaug.data.development import gains_from_neutral, srgb_from_camera
 from rawaug.data.mat import read_array, read_value, to_raw
 from rawaug.data.pairs import DATASETS, Lazy, Pair
+from rawaug.files import write_bytes
 from rawaug.io import RawFrame
 
 FRAMES, BOXES = 50, 20
@@ -139,7 +141,6 @@ def write_dnd_submission(folder: str | Path, denoised: Iterable[Tensor]) -> None
     from scipy.io import savemat
 
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     cells = np.empty(BOXES, object)
     count = 0
 
@@ -148,7 +149,9 @@ def write_dnd_submission(folder: str | Path, denoised: Iterable[Tensor]) -> None
         count += 1
         if count % BOXES == 0 and count <= FRAMES * BOXES:
             file = folder / f"{count // BOXES:04d}.mat"
-            savemat(file, {"Idenoised": cells, "israw": True, "eval_version": "1.0"})
+            content = BytesIO()
+            savemat(content, {"Idenoised": cells, "israw": True, "eval_version": "1.0"})
+            write_bytes(content.getbuffer(), file)
 
     if count != FRAMES * BOXES:
         raise ValueError(f"{folder}: a submission must have {FRAMES * BOXES} boxes, got {count}")

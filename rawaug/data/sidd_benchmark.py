@@ -17,6 +17,7 @@ from torch import Tensor
 from rawaug.data.pairs import Lazy
 from rawaug.data.sidd_blocks import BLOCKS, Once, block_names, blocks_of_scenes
 from rawaug.data.sidd_scenes import HELD_BACK, find_file, noise_level_functions, phone_of
+from rawaug.files import replacing
 from rawaug.io import RawFrame
 
 
@@ -67,7 +68,7 @@ def write_submission(path: str | Path, blocks: Iterable[Tensor], side: int = 256
     if len(rows) != len(HELD_BACK) * BLOCKS:
         raise ValueError(f"{path}: a submission must have {len(HELD_BACK) * BLOCKS} blocks, got {len(rows)}")
 
-    with path.open("w", encoding="ascii", newline="") as file:
+    with replacing(path) as partial, partial.open("w", encoding="ascii", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(["ID", "BLOCK"])
         table.writerows(rows)

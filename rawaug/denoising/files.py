@@ -10,11 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Generic
 
-from rawaug.denoising.frames import require_output
 from rawaug.denoising.levels import UnknownNoise
 from rawaug.denoising.sources import PREVIEWS, Files, T
 from rawaug.errors import count_of
-from rawaug.files import one_at_a_time, require_file, require_same_settings, require_writable
+from rawaug.files import one_at_a_time, require_file, require_folder, require_output, require_same_settings
 from rawaug.progress import progress
 
 SETTINGS = "denoise.json"
@@ -67,15 +66,13 @@ def denoise_file(
     """
     source, out = Path(source), Path(out)
     require_file(source, f"{kind.what} file")
-    if out.resolve() == source.resolve():
-        raise ValueError(f"{out}: is the input file; give another name")
-    require_output(out, overwrite, kind.formats, kind.format_advice)
+    require_output(out, overwrite, kind.formats, [source], kind.format_advice)
 
     if preview is None:
         return kind.denoise(source, out)
 
     preview = Path(preview)
-    require_output(preview, overwrite, PREVIEWS, "the preview is a .jpg or .png")
+    require_output(preview, overwrite, PREVIEWS, [source], "the preview is a .jpg or .png")
     kind.require_preview(preview)
     return kind.denoise(source, out, preview)
 
@@ -111,7 +108,7 @@ def denoise_folder(
     targets = _targets(source, out, kind, listing.files)
     previews_of = _preview_targets(out, kind, targets, previews)
 
-    require_writable(out, folder=True)
+    require_folder(out)
     if kind.settings is not None:
         require_same_settings(out / SETTINGS, kind.settings, overwrite)
 
@@ -176,7 +173,7 @@ def _preview_targets(
     kind.require_preview(folder)
     if folder.suffix.lower() in PREVIEWS and not folder.is_dir():
         raise ValueError(f"--preview {folder}: the source is a folder, and so are its previews; give a folder")
-    require_writable(folder, folder=True)
+    require_folder(folder)
 
     return {file: folder / target.relative_to(out).with_suffix(".jpg") for file, target in targets.items()}
 

@@ -13,7 +13,6 @@ A monochrome frame is denoised as the mosaic of a grey scene, which it is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -27,7 +26,7 @@ from rawaug.denoising.base import Levels
 from rawaug.denoising.corrections import Corrected, Correction, Corrections
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.denoising.levels import Noise, as_json, find_levels, load_noise
-from rawaug.files import require_writable
+from rawaug.files import require_output
 from rawaug.io import RawFrame, read_raw, write_dng
 from rawaug.io.dng import LINEAR_WHITE, cell_of_planes
 from rawaug.io.raw import MONOCHROME
@@ -181,15 +180,6 @@ def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
     return below / mosaic.numel()
 
 
-def require_output(path: Path, overwrite: bool, extensions: Sequence[str], advice: str) -> None:
-    """Raise an error, before any work, if a file already exists, has another extension, or cannot be written."""
-    if path.exists() and not overwrite:
-        raise ValueError(f"{path}: exists; give another name, or --overwrite to replace it")
-    if path.suffix.lower() not in extensions:
-        raise ValueError(f"{path}: {advice}")
-    require_writable(path)
-
-
 def denoise(
     source: str | Path | RawFrame,
     out: str | Path | None = None,
@@ -232,7 +222,8 @@ def denoise(
     denoise_frame = FrameDenoiser(denoiser, noise, Corrections(greens), device, strength=strength, views=views)
     denoise_frame.usual.require_mosaic()
     if out is not None:
-        require_output(Path(out), overwrite, (".dng",), DNG_ADVICE)
+        inputs = [] if isinstance(source, RawFrame) else [source]
+        require_output(out, overwrite, (".dng",), inputs, DNG_ADVICE)
 
     if isinstance(source, RawFrame):
         frame, file = source, None
@@ -241,6 +232,5 @@ def denoise(
 
     denoised = denoise_frame(frame).frame
     if out is not None:
-        Path(out).parent.mkdir(parents=True, exist_ok=True)
         write_dng(out, denoised, file)
     return denoised

@@ -22,7 +22,11 @@ from rawaug.data.pairs import centre
 from rawaug.errors import escape, extra
 from rawaug.evaluation.scores import NOISY, Denoiser, to_domain
 from rawaug.evaluation.trials import Trial
+from rawaug.files import write_bytes
 from rawaug.metrics import psnr
+
+FIGURES = (".png", ".jpg", ".pdf", ".svg")
+"""Figures are written to files of these extensions."""
 
 WINDOW = 64
 """Side of an enlarged window, in packed pixels."""
@@ -153,8 +157,7 @@ def save_picture(rows: Sequence[Panels], path: Path) -> Path:
             axis.set_title(caption, fontsize=9, parse_math=False)
         first += height
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    save_figure(figure, path)
     return path
 
 
@@ -254,6 +257,15 @@ def plot_costs(rows: Mapping[str, tuple[float | None, float, float]]) -> bytes:
 
 
 def _png(figure: Any) -> bytes:
+    return _encode(figure, "png")
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """Write a figure in the format of the path's extension, completely or not at all."""
+    write_bytes(_encode(figure, path.suffix.removeprefix(".")), path)
+
+
+def _encode(figure: Any, extension: str) -> bytes:
     file = io.BytesIO()
-    figure.savefig(file, dpi=130)
+    figure.savefig(file, dpi=130, format=extension)
     return file.getvalue()

@@ -31,6 +31,7 @@ from rawaug.evaluation.tables import (
 )
 from rawaug.evaluation.trials import Trial, evenly_spaced, own_noise_note
 from rawaug.evaluation.verdict import verdict
+from rawaug.files import write_text
 from rawaug.io.pictures import encode_png
 
 _WHOLE = 640
@@ -192,8 +193,7 @@ class Page:
         as_yaml = yaml.safe_dump(json.loads(json.dumps(settings)), sort_keys=False, allow_unicode=True)
         text = template.render(title=self.title, lead=self.lead, parts=self.parts, settings=as_yaml)
 
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8", errors="backslashreplace")
+        write_text(text, path)
         write_tables(path, self.parts)
         return path
 

@@ -7,12 +7,14 @@ LaTeX needs no package; the best figures are bold.
 from __future__ import annotations
 
 import csv
+import io
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rawaug.errors import escape
+from rawaug.files import write_text
 
 _ESCAPES = {
     "\\": r"\textbackslash{}",
@@ -27,6 +29,8 @@ _ESCAPES = {
     "^": r"\textasciicircum{}",
     "±": r"$\pm$",
 }
+_FORMULA = ("=", "+", "-", "@")
+"""Spreadsheets take a cell that begins with one of these for a formula."""
 _LATEX = str.maketrans(_ESCAPES)
 
 
@@ -51,7 +55,7 @@ def write_tables(page: Path, parts: Iterable[Mapping[str, Any]]) -> list[Path]:
         paths.append(path)
 
         path = path.with_suffix(".tex")
-        path.write_text(latex_table(part["head"], part["rows"], part["best"]), encoding="utf-8")
+        write_text(latex_table(part["head"], part["rows"], part["best"]), path)
         paths.append(path)
 
     return paths
@@ -59,11 +63,20 @@ def write_tables(page: Path, parts: Iterable[Mapping[str, Any]]) -> list[Path]:
 
 def _write_csv(path: Path, head: Sequence[str], rows: Mapping[str, Sequence[str]]) -> None:
     """Write a table with the names of its columns in ``head`` and its cells by the name of a row."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(head)
-        for name, cells in rows.items():
-            writer.writerow([escape(name), *cells])
+    table = io.StringIO(newline="")
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(head)
+    for name, cells in rows.items():
+        writer.writerow([_plain(name), *cells])
+    write_text(table.getvalue(), path)
+
+
+def _plain(name: str) -> str:
+    """Put an apostrophe before a name that a spreadsheet would take for a formula."""
+    text = escape(name)
+    if text.startswith(_FORMULA):
+        return f"'{text}"
+    return text
 
 
 def latex_table(head: Sequence[str], rows: Mapping[str, Sequence[str]], best: Collection[tuple[str, int]] = ()) -> str:

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rawaug.files import LOCK, require_writable, write_json
+from rawaug.files import LOCK, require_folder, write_json
 from rawaug.training.config import SAME_WEIGHTS
 
 STAMP = "run.json"
@@ -42,7 +42,7 @@ def run_folder(settings: Any) -> Path:
 def require_free(settings: Any, overwrite: bool = False) -> Path:
     """Return a run's folder; raise ValueError unless it is writable, and empty, this run's or to be replaced."""
     folder = run_folder(settings)
-    require_writable(folder, folder=True)
+    require_folder(folder)
     if overwrite or not _holds_results(folder):
         return folder
 

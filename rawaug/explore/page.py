@@ -1,6 +1,8 @@
 """The page: controls on one side, a tab for each view on the other; every change redraws only the open tab.
 
-Nothing is loaded from elsewhere and nothing is sent: pictures are data in the page, and fonts are the system's.
+Nothing is loaded from elsewhere and nothing is sent: pictures are data in the page, and fonts are the system's. The
+server reads the pictures it was started with and those that were uploaded, which requests name by a number; a request
+that names any other file is refused.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ import io
 import json
 import os
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -136,7 +138,7 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None, isp: str
 
     if names is None:
         names = [picture.name for picture in pictures]
-    choices = list(zip(names, map(str, pictures), strict=True))
+    files = list(pictures)
 
     private = {"analytics_enabled": False, "delete_cache": (3600, 86400)}  # uploads go when the page stops
     with gr.Blocks(title="rawaug explore", fill_width=True, **private) as page:
@@ -144,7 +146,7 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None, isp: str
         outputs: dict[str, Any] = {"message": gr.HTML(elem_id="message")}
         with gr.Row(elem_id="layout"):
             with gr.Column(scale=1, min_width=300, elem_id="controls"):
-                controls = _controls(gr, choices, isp)
+                controls = _controls(gr, files, names, isp)
             with gr.Column(scale=3, min_width=300, elem_id="views"), gr.Tabs(overflow_behavior="wrap"):
                 tabs = {name: _tab(gr, name, outputs) for name in (*VIEWS, DENOISE)}
                 with gr.Tab("Code"):
@@ -152,11 +154,13 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None, isp: str
                     form = {"interactive": False, "wrap_lines": True, "show_line_numbers": False, "buttons": ["copy"]}
                     outputs["python"] = gr.Code(label="Python", language="python", elem_id="python", **form)
                     outputs["command"] = gr.Code(label="Command", language="shell", elem_id="command", **form)
-        _connect(gr, page, controls, outputs, tabs)
+        _connect(gr, page, files, controls, outputs, tabs)
     return page
 
 
-def _controls(gr: Any, choices: Sequence[tuple[str, str]], isp: str) -> dict[str, Any]:
+def _controls(gr: Any, files: list[Path], names: Sequence[str], isp: str) -> dict[str, Any]:
+    """Make the controls; a picture is named by its number in ``files``, to which uploaded ones are appended."""
+    choices = [(name, number) for number, name in enumerate(names)]
     isps = sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))
     if isp not in isps:
         isps.insert(0, isp)
@@ -167,7 +171,7 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]], isp: str) -> dict[str
     controls: dict[str, Any] = {}
     whole = {"num_choices_shown": None}  # in a list shown in part, a retyped choice gives way to the first one
     with gr.Group():
-        controls["picture"] = gr.Dropdown(choices, value=choices[0][1] if choices else None, label="Picture", **whole)
+        controls["picture"] = gr.Dropdown(choices, value=0 if choices else None, label="Picture", **whole)
         upload = gr.UploadButton("Open your own", size="sm", elem_id="upload")
 
     with gr.Group():
@@ -186,13 +190,13 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]], isp: str) -> dict[str
     for name, control in controls.items():
         control.elem_id = name
 
-    quiet = {"show_progress": "hidden", "api_visibility": "private"}
-    upload.upload(
-        lambda file: gr.update(choices=[*choices, (Path(file).name, file)], value=file),
-        upload,
-        controls["picture"],
-        **quiet,
-    )
+    def add_picture(upload: str) -> Any:
+        require_uploaded(upload)
+        files.append(Path(upload))
+        number = len(files) - 1
+        return gr.update(choices=[*choices, (Path(upload).name, number)], value=number)
+
+    upload.upload(add_picture, upload, controls["picture"], show_progress="hidden", api_visibility="private")
     return controls
 
 
@@ -208,7 +212,9 @@ def _tab(gr: Any, name: str, outputs: dict[str, Any]) -> Any:
     return tab
 
 
-def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, Any], tabs: dict[str, Any]) -> None:
+def _connect(
+    gr: Any, page: Any, files: Sequence[Path], controls: dict[str, Any], outputs: dict[str, Any], tabs: dict[str, Any]
+) -> None:
     opened = gr.Textbox(next(iter(VIEWS)), visible="hidden")  # the name of the open tab
     quiet = {"show_progress": "hidden", "api_visibility": "private"}
 
@@ -217,6 +223,8 @@ def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, An
 
     def redraw(tab: str, *values: Any) -> list[Any]:
         by_name = dict(zip(controls, values, strict=True))
+        if by_name["picture"] is not None:
+            by_name["picture"] = files[by_name["picture"]]
         changes = show(tab, by_name)
 
         model = by_name["noise"]
@@ -260,6 +268,65 @@ def _about_iso(noise: str) -> str:
     return f"0: drawn from {limits[0]:g} to {limits[1]:g}"
 
 
+def upload_folder() -> Path:
+    """Return the folder in which Gradio keeps uploaded files, :envvar:`GRADIO_TEMP_DIR`."""
+    from gradio.utils import get_upload_folder
+
+    return Path(get_upload_folder()).resolve()
+
+
+def require_uploaded(path: str) -> None:
+    """Raise ValueError unless a file lies in the folder of uploaded files."""
+    if not Path(path).resolve().is_relative_to(upload_folder()):
+        raise ValueError(f"{path}: was not uploaded")
+
+
+class UploadsOnly:
+    """ASGI middleware that refuses requests which name a file that was not uploaded.
+
+    Gradio takes a copy of any file that a request names, and serves the copy. It checks the name only on pages that
+    it has launched itself, which a mounted page is not.
+    """
+
+    def __init__(self, app: Any) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        """Pass a request on, with its body, or answer it with status 403."""
+        from starlette.requests import Request
+        from starlette.responses import PlainTextResponse
+
+        if scope["type"] != "http" or scope["path"].endswith("/upload"):  # its body is the file itself
+            await self.app(scope, receive, send)
+            return
+
+        body = await Request(scope, receive).body()
+        try:
+            for path in _paths_in(json.loads(body or b"null")):
+                require_uploaded(path)
+        except (ValueError, OSError, RecursionError) as error:
+            await PlainTextResponse(escape(error), 403)(scope, receive, send)
+            return
+
+        pending = [{"type": "http.request", "body": body}]
+
+        async def receive_again() -> Any:
+            return pending.pop() if pending else await receive()
+
+        await self.app(scope, receive_again, send)
+
+
+def _paths_in(value: Any) -> Iterator[str]:
+    """Find the files that a request names, anywhere in its JSON."""
+    if isinstance(value, Mapping):
+        if isinstance(value.get("path"), str):
+            yield value["path"]
+        value = list(value.values())
+    if isinstance(value, list):
+        for inner in value:
+            yield from _paths_in(inner)
+
+
 def make_server(page: Any) -> Any:
     """Make uvicorn's server of a page; ``server.run(sockets=[...])`` runs it until it is interrupted."""
     with extra("explore"):
@@ -271,6 +338,7 @@ def make_server(page: Any) -> Any:
     form = {"theme": theme, "css_paths": Path(__file__).with_name("page.css"), "footer_links": []}
 
     app = gr.mount_gradio_app(fastapi.FastAPI(), page, "/", ssr_mode=False, **form)
+    app.add_middleware(UploadsOnly)
     return uvicorn.Server(uvicorn.Config(app, log_level="error"))
 
 

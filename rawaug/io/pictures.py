@@ -23,7 +23,7 @@ from torch import Tensor
 
 from rawaug.bayer import turn
 from rawaug.errors import extra
-from rawaug.files import replacing, require_file
+from rawaug.files import replacing, require_file, write_bytes
 from rawaug.io.colour import SRGB, to_srgb
 from rawaug.io.content import content_of
 from rawaug.io.decoding import MAX_PIXELS as MAX_PIXELS
@@ -142,14 +142,34 @@ def require_unit_range(pixels: np.ndarray, path: str | Path) -> np.ndarray:
     return np.clip(pixels, 0, 1)
 
 
+WRITTEN: dict[str, dict[str, Any]] = {
+    ".png": {},
+    ".jpg": {"quality": 98},
+    ".jpeg": {"quality": 98},
+    ".tif": {"compression": "tiff_lzw"},
+    ".tiff": {"compression": "tiff_lzw"},
+    ".webp": {"quality": 98},
+    ".bmp": {},
+    ".ppm": {},
+}
+""":func:`write_picture` writes files of these extensions, with these settings of Pillow."""
+
+
 def write_picture(path: str | Path, srgb: Tensor) -> None:
     """Write sRGB ``(3, H, W)``, uint8 or floating point in [0, 1], as 8 bits in the format of the path's extension.
+
+    The file is written completely or not at all.
 
     Raises:
         ValueError: if the shape is wrong, a value leaves [0, 1], or the extension is unknown.
         OSError: if the file cannot be written.
     """
-    oiio = load_oiio()
+    with extra("raw"):
+        from PIL import Image
+
+    extension = Path(path).suffix.lower()
+    if extension not in WRITTEN:
+        raise ValueError(f"{path}: unsupported extension; use one of {', '.join(WRITTEN)}")
     if srgb.ndim != 3 or srgb.shape[0] != 3:
         raise ValueError(f"{path}: the picture must have shape (3, H, W), got {tuple(srgb.shape)}")
 
@@ -157,12 +177,10 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
     if pixels.dtype != np.uint8:
         pixels = np.rint(require_unit_range(pixels, path) * 255).astype(np.uint8)
 
-    output = oiio.ImageOutput.create(str(path))
-    if output is None:
-        raise ValueError(f"{path}: unsupported extension; use .png, .tif or .jpg ({oiio.geterror()})")
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
-    success = output.open(str(path), spec) and output.write_image(np.ascontiguousarray(pixels))
-    require_written(output, success, path)
+    file = BytesIO()
+    picture = Image.fromarray(np.ascontiguousarray(pixels))
+    picture.save(file, Image.registered_extensions()[extension], **WRITTEN[extension])
+    write_bytes(file.getbuffer(), path)
 
 
 def write_linear(path: str | Path, light: Tensor) -> None:
@@ -172,20 +190,24 @@ def write_linear(path: str | Path, light: Tensor) -> None:
         OSError: if the file cannot be written.
     """
     oiio = load_oiio()
-    pixels = np.ascontiguousarray(light.detach().cpu().permute(1, 2, 0).numpy().astype(np.float32))
+    pixels = np.ascontiguousarray(light.detach().cpu().permute(1, 2, 0).numpy().astype(np.float16))
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "half")
     with replacing(path) as partial:
-        partial = partial.with_name(partial.name + ".exr")
-        output = oiio.ImageOutput.create(str(partial))
+        output = oiio.ImageOutput.create("openexr")
         success = output.open(str(partial), spec) and output.write_image(pixels)
-        require_written(output, success, path)
-        partial.replace(partial.with_suffix(""))
+        if not (output.close() and success and _holds(partial, pixels)):
+            raise OSError(f"{path}: cannot be written (OpenImageIO: {reason(output) or 'the file is not whole'})")
 
 
-def require_written(output: Any, success: bool, path: str | Path) -> None:
-    """Close OpenImageIO's ``output``; raise OSError if that fails, or if writing to it was no ``success``."""
-    if not (output.close() and success):
-        raise OSError(f"{path}: cannot be written (OpenImageIO: {reason(output) or 'no reason given'})")
+def _holds(path: Path, pixels: np.ndarray) -> bool:
+    """Tell whether an OpenEXR file has these pixels; OpenEXR does not report all that a full disk cuts off."""
+    written = load_oiio().ImageInput.open(str(path))
+    if written is None:
+        return False
+
+    image = written.read_image("half")
+    written.close()
+    return image is not None and np.array_equal(image, pixels, equal_nan=True)
 
 
 def encode_png(srgb: Tensor) -> bytes:

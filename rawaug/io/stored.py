@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug.errors import extra
-from rawaug.files import replacing
+from rawaug.files import write_bytes
 from rawaug.io.decoding import MAX_PIXELS, decode
 from rawaug.io.directories import DamagedTags, TiffFile
 from rawaug.io.headers import webp_chunks
@@ -129,8 +129,7 @@ def write_stored(path: str | Path, srgb: Tensor, like: StoredPicture) -> None:
     else:
         data = _tiff(planes, like, upright)
 
-    with replacing(path) as partial:
-        partial.write_bytes(data)
+    write_bytes(data, path)
 
 
 def _numbers(planes: Tensor, dtype: np.dtype) -> np.ndarray:

@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -478,5 +479,9 @@ def plot_noise(estimate: NoiseEstimate, path: str | Path | None = None, *, title
 
     figure.suptitle(escape(title), parse_math=False)
     if path is not None:
-        figure.savefig(Path(path), dpi=120)
+        from rawaug.files import write_bytes
+
+        file = BytesIO()
+        figure.savefig(file, dpi=120, format=Path(path).suffix.removeprefix("."))
+        write_bytes(file.getbuffer(), path)
     return figure

@@ -21,7 +21,7 @@ from rawaug import bayer
 from rawaug.data import open_pairs
 from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.figures import new_figure
+from rawaug.evaluation.figures import new_figure, save_figure
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.tables import print_rows
 from rawaug.experiment.folder import claim, require_free
@@ -231,4 +231,4 @@ def _draw(result: dict[str, Any], path: Path, title: str) -> None:
     axes[-1].set_xlabel("PSNR_r, as-shot gains (dB)")
     axes[-1].invert_yaxis()
     figure.suptitle(title)
-    figure.savefig(path, dpi=130)
+    save_figure(figure, path)

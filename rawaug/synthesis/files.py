@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from rawaug.data.formats import write_npz, write_tiff
-from rawaug.files import digest, find_weights, read_header, replacing, sha256, write_tensors
+from rawaug.files import digest, find_weights, read_header, sha256, write_bytes, write_tensors
 from rawaug.io import GainMap, RawFrame, read_picture, write_dng
 from rawaug.io.pictures import MAX_PIXELS, encode_png
 from rawaug.isp.functional import frame_coordinates
@@ -267,8 +267,7 @@ def _write_tiffs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
 
 def _write_pngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
     for end, image in _images(pair, augment).items():
-        with replacing(f"{stem}{end}.png") as partial:
-            partial.write_bytes(encode_png(image))
+        write_bytes(encode_png(image), f"{stem}{end}.png")
 
 
 _WRITERS: dict[Format, Callable[[Path, RawPair, RawAugment], None]] = {

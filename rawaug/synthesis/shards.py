@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.files import digest, parse_object, replacing, write_json
+from rawaug.files import digest, parse_object, replacing, write_json, write_text
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.targets import Burst
 from rawaug.synthesis.files import Origin, PairMaker, Settings, pair_levels, replay_pair
@@ -207,8 +207,7 @@ def write_index(out: Path, count: int, settings: Settings) -> None:
         shards.append({"url": record["url"], "nsamples": record["nsamples"], "filesize": record["filesize"]})
     index = {"__kind__": "wids-shard-index-v1", "wids_version": 1, "name": "rawaug pairs", "shardlist": shards}
     write_json(index, out / "index.json")
-    with replacing(out / "README.md") as partial:
-        partial.write_text(_dataset_card(shards, settings), encoding="utf-8")
+    write_text(_dataset_card(shards, settings), out / "README.md")
 
 
 def _dataset_card(shards: Sequence[Mapping[str, Any]], settings: Settings) -> str:

@@ -20,7 +20,7 @@ import denoisers
 from denoisers.files import find_denoiser
 from denoisers.network import Denoiser
 from rawaug.bayer import CFA
-from rawaug.files import replacing, sha256
+from rawaug.files import sha256, write_bytes
 from rawaug.seeding import derive_seed
 from rawaug.training.config import DenoiserConfig, TrainConfig
 
@@ -152,8 +152,7 @@ class TrainingState:
 
         content = io.BytesIO()  # PyTorch's own writer does not say that a disk is full
         torch.save(state, content)
-        with replacing(path) as partial:
-            partial.write_bytes(content.getbuffer())
+        write_bytes(content.getbuffer(), path)
 
     def set_up(self, fabric: Any) -> Any:
         """Move everything to Fabric's device, and return the model to train, compiled if the settings say so."""

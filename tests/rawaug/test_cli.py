@@ -167,7 +167,7 @@ def test_quiet_prints_no_progress(
     fit = ["fit", "tiny:validation", "--out", str(tmp_path / "isp.safetensors"), *QUICK_FIT]
     assert main(fit) == 0
     assert "steps, 00:00 elapsed" in capsys.readouterr().err
-    assert main([*fit, "--quiet"]) == 0
+    assert main([*fit, "--quiet", "--overwrite"]) == 0
     assert capsys.readouterr().err == ""
 
 

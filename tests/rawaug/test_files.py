@@ -25,7 +25,8 @@ from rawaug.files import (
     read_tensors,
     replacing,
     require_file,
-    require_writable,
+    require_folder,
+    require_output,
     sha256,
     write_json,
     write_tensors,
@@ -70,18 +71,35 @@ def test_hashes() -> None:
 
 def test_what_cannot_be_written_is_refused_and_nothing_is_left(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    require_writable(tmp_path / "new" / "folder" / "report.html")
-    require_writable(tmp_path / "file")
-    require_writable(tmp_path, folder=True)
-    require_writable(tmp_path / "new", folder=True)
+    require_output(tmp_path / "new" / "folder" / "report.html")
+    require_output(tmp_path / "file", overwrite=True)
+    require_folder(tmp_path)
+    require_folder(tmp_path / "new")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
-    for path, folder, why in (
-        (tmp_path, False, "is a folder; give the name of a file"),
-        (tmp_path / "file" / "report.html", False, "file is not a folder"),
-        (tmp_path / "file", True, "file is not a folder"),
-    ):
-        with pytest.raises(OSError, match=f"{why}"):
-            require_writable(path, folder=folder)
+    with pytest.raises(OSError, match="is a folder; give the name of a file"):
+        require_output(tmp_path)
+    with pytest.raises(OSError, match="file is not a folder"):
+        require_output(tmp_path / "file" / "report.html")
+    with pytest.raises(OSError, match="file is not a folder"):
+        require_folder(tmp_path / "file")
+
+
+def test_an_output_replaces_nothing_unasked_and_an_input_never(tmp_path: Path) -> None:
+    photograph = tmp_path / "a.png"
+    photograph.write_bytes(b"irreplaceable")
+    (tmp_path / "link.png").symlink_to(photograph)
+    (tmp_path / "copy.png").hardlink_to(photograph)
+
+    with pytest.raises(ValueError, match="exists; give another name, or --overwrite"):
+        require_output(photograph)
+    require_output(photograph, overwrite=True)
+    for name in ("a.png", "link.png", "copy.png"):
+        with pytest.raises(ValueError, match=f"{name}: is the input file"):
+            require_output(tmp_path / name, True, inputs=["demo:", photograph])
+    with pytest.raises(ValueError, match=r"ends in \.json or \.txt"):
+        require_output(photograph, True, (".json", ".txt"))
+    with pytest.raises(ValueError, match="empty"):
+        require_output("")
 
 
 def test_two_writers_take_turns_and_what_a_killed_one_left_is_removed(tmp_path: Path) -> None:

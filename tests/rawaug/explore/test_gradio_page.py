@@ -5,10 +5,7 @@ from __future__ import annotations
 import base64
 import importlib.util
 import io
-import multiprocessing
-import os
 import shutil
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,11 +16,9 @@ import torch
 from PIL import Image
 
 from rawaug.commands.explore import choices
-from rawaug.data import demo_pictures
 from rawaug.explore import views as looks
 from rawaug.explore.page import FIRST_SEED, open_socket
 from rawaug.explore.views import pair as view
-from rawaug.io import write_picture
 
 pytestmark = pytest.mark.long
 WAIT = 60_000
@@ -31,56 +26,14 @@ WAIT = 60_000
 
 
 @pytest.fixture(scope="module")
-def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of two small pictures, and a broken one beside it."""
-    folder = tmp_path_factory.mktemp("explore")
-    (folder / "in").mkdir()
-    for k, name in enumerate(("a.png", "b.png")):
-        write_picture(folder / "in" / name, demo_pictures(2)[k][:, 100:164, 120:216])
-    write_picture(folder / "own.png", demo_pictures(1)[0][:, :32, :48])
-    (folder / "broken.png").write_bytes(b"no picture")
-    return folder
-
-
-@pytest.fixture(scope="module")
 def chromium() -> str:
     """The browser, if all that the tests need is there."""
-    for module, install in (("gradio", "rawaug[explore]"), ("playwright", "rawaug[test]")):
-        if importlib.util.find_spec(module) is None:
-            pytest.skip(f"{module} is not installed: pip install '{install}'")
+    if importlib.util.find_spec("playwright") is None:
+        pytest.skip("playwright is not installed: pip install 'rawaug[test]'")
     found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if found is None:
         pytest.skip("no Chromium on this machine: apt install chromium")
     return found
-
-
-SERVE = """
-import sys
-from rawaug.cli import main
-sys.stdout = open(out.fileno(), "w", closefd=False)
-raise SystemExit(main(["explore", folder, "--port", "0"]))
-"""
-
-
-@pytest.fixture(scope="module")
-def served(pictures: Path, chromium: str) -> Iterator[str]:
-    """The address of the page, in a process of its own: Gradio leaves event loops and sockets to Python."""
-    said, out = multiprocessing.Pipe(duplex=False)
-    variables = {"folder": str(pictures / "in"), "out": out}
-    process = multiprocessing.get_context("forkserver").Process(target=exec, args=(SERVE, variables))
-    process.start()
-    out.close()
-    assert process.pid is not None
-    try:
-        with open(said.fileno(), closefd=False) as lines:
-            address, _, hint = lines.readline().partition(" ")
-            assert "Ctrl-C" in hint
-            yield address
-            os.kill(process.pid, signal.SIGINT)
-            process.join(60)
-            assert process.exitcode == 0
-    finally:
-        process.kill()
 
 
 @pytest.fixture(scope="module")

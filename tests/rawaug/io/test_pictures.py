@@ -40,7 +40,7 @@ def test_lossless_formats_give_back_every_bit(tmp_path: Path, extension: str) ->
     assert picture.dtype == torch.uint8 and torch.equal(picture, SRGB)
 
 
-@pytest.mark.parametrize("extension", ["jpg", "webp", "jxl"])
+@pytest.mark.parametrize("extension", ["jpg", "webp"])
 def test_lossy_formats_are_close(tmp_path: Path, extension: str) -> None:
     smooth = torch.linspace(0, 255, 64).expand(3, 48, 64).round().to(torch.uint8)
     write_picture(tmp_path / f"picture.{extension}", smooth)
@@ -194,8 +194,9 @@ def test_cut_short_is_one_line_that_names_the_file(tmp_path: Path, extension: st
 def test_missing_files_and_unwritable_ones_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"none\.png:"):
         read_picture(tmp_path / "none.png")
-    with pytest.raises(OSError, match=r"nowhere/a\.png"):
-        write_picture(tmp_path / "nowhere" / "a.png", SRGB)
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(OSError, match=r"file"):
+        write_picture(tmp_path / "file" / "a.png", SRGB)
     with pytest.raises(ValueError, match=r"a\.xyz: unsupported extension"):
         write_picture(tmp_path / "a.xyz", SRGB)
     with pytest.raises(ValueError, match=r"shape \(3, H, W\), got \(1, 24, 37\)"):
