@@ -36,6 +36,9 @@ LOCK = "rawaug.lock"
 MOST_BYTES = 2**32
 """An input file has at most this size; larger ones are refused before they are read."""
 
+MOST_NAME_BYTES = 200
+"""A name in a recipe that becomes a folder has at most this length."""
+
 WEIGHTS = Path(__file__).parent / "weights"
 """This folder holds the shipped ISPs."""
 
@@ -255,6 +258,22 @@ def require_output(
 
     require_folder(path.absolute().parent, path)
     return path
+
+
+def require_folder_name(name: str, key: str) -> None:
+    """Refuse a name in a recipe, perhaps a stranger's, that would not become a single folder inside another one.
+
+    Args:
+        name: the name.
+        key: the key of the recipe, which heads the message.
+
+    Raises:
+        ValueError: if it is empty, ``.`` or ``..``, has a slash, a backslash or what a terminal cannot print, or is too
+            long for the name of a file.
+    """
+    is_one_folder = name not in ("", ".", "..") and not set(name) & set("/\\")
+    if not is_one_folder or not name.isprintable() or len(os.fsencode(name)) > MOST_NAME_BYTES:
+        raise ValueError(f"{key}: {name[:80]!r} cannot be the name of a folder; use letters, digits, - and _")
 
 
 def require_folder(folder: str | Path, output: str | Path | None = None) -> None:

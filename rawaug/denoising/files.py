@@ -106,7 +106,7 @@ def denoise_folder(
     source, out = Path(source), Path(out)
     listing = kind.listing(source)
     targets = _targets(source, out, kind, listing.files)
-    previews_of = _preview_targets(out, kind, targets, previews)
+    previews_of = _preview_targets(source, out, kind, targets, previews, overwrite)
 
     require_folder(out)
     if kind.settings is not None:
@@ -115,18 +115,20 @@ def denoise_folder(
     result: DenoisedFolder[T] = DenoisedFolder(left_out=listing.lines())
     unknown = []
     for file in progress(listing.files, label="denoise", unit="file", leave=True):
-        target = targets[file]
+        target, preview = targets[file], previews_of.get(file)
         if target.exists() and not overwrite:
             result.existing += 1
+            if preview is not None and not preview.exists():  # a run was stopped between the two
+                kind.write_preview(target, preview)
             continue
 
         try:
-            result.files.append(kind.denoise(file, target, previews_of.get(file), isolate=True))
+            result.files.append(kind.denoise(file, target, preview, isolate=True))
         except UnknownNoise as error:
             unknown.append(file)
             result.broken[str(file)] = f"noise unknown: {_with_name(error, file)}"
         except (OSError, ValueError) as error:
-            _raise_if_unwritable(error, target, previews_of.get(file))
+            _raise_if_unwritable(error, target, preview)
             result.broken[str(file)] = f"broken: {_with_name(error, file)}"
 
     informed = kind.informed_by(result.files)
@@ -150,8 +152,7 @@ def denoise_folder(
 
 def _targets(source: Path, out: Path, kind: Files[T], files: list[Path]) -> dict[Path, Path]:
     """Name the result of each file."""
-    if out.resolve().is_relative_to(source.resolve()):
-        raise ValueError(f"{out}: is inside the source folder {source}; choose an output folder outside it")
+    _require_outside(out, source)
 
     sources: dict[Path, Path] = {}
     for file in files:
@@ -163,9 +164,18 @@ def _targets(source: Path, out: Path, kind: Files[T], files: list[Path]) -> dict
 
 
 def _preview_targets(
-    out: Path, kind: Files[T], targets: dict[Path, Path], previews: str | Path | None
+    source: Path,
+    out: Path,
+    kind: Files[T],
+    targets: dict[Path, Path],
+    previews: str | Path | None,
+    overwrite: bool,
 ) -> dict[Path, Path]:
-    """Name the preview of each file, in the subfolders of ``previews``; there are none without such a folder."""
+    """Name the preview of each file, in the subfolders of ``previews``; there are none without such a folder.
+
+    Previews never lie among the sources, where a JPEG of the same name is the camera's own. A JPEG without a result
+    beside it is not a preview of ours, and is not replaced.
+    """
     if previews is None:
         return {}
 
@@ -173,9 +183,22 @@ def _preview_targets(
     kind.require_preview(folder)
     if folder.suffix.lower() in PREVIEWS and not folder.is_dir():
         raise ValueError(f"--preview {folder}: the source is a folder, and so are its previews; give a folder")
+    _require_outside(folder, source)
     require_folder(folder)
 
-    return {file: folder / target.relative_to(out).with_suffix(".jpg") for file, target in targets.items()}
+    previews_of = {}
+    for file, target in targets.items():
+        preview = folder / target.relative_to(out).with_suffix(".jpg")
+        if not target.exists():
+            require_output(preview, overwrite)
+        previews_of[file] = preview
+    return previews_of
+
+
+def _require_outside(folder: Path, source: Path) -> None:
+    """Raise ValueError if an output folder is the source folder or lies inside it."""
+    if folder.resolve().is_relative_to(source.resolve()):
+        raise ValueError(f"{folder}: is inside the source folder {source}; choose an output folder outside it")
 
 
 def _raise_if_unwritable(error: Exception, *files: Path | None) -> None:

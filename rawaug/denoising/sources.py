@@ -199,6 +199,10 @@ class Files(ABC, Generic[T]):
     def require_preview(self, preview: Path) -> None:
         """Raise ValueError if this kind writes no previews."""
 
+    def write_preview(self, result: Path, preview: Path) -> None:
+        """Write a picture of a result that is there already."""
+        raise NotImplementedError(f"{self.what}: has no previews")
+
     @abstractmethod
     def denoise(self, source: Path, out: Path, preview: Path | None = None, isolate: bool = False) -> T:
         """Read, denoise and write a file, in a helper process if a file from a stranger is to be isolated.
@@ -263,6 +267,10 @@ class RawFiles(Files[Denoised]):
     def require_preview(self, preview: Path) -> None:
         self.denoiser.usual.require_preview(preview)
 
+    def write_preview(self, result: Path, preview: Path) -> None:
+        upright = read_raw(result, monochrome=True).upright_view
+        write_picture(preview, bayer.turn(develop(result), upright))
+
     def denoise(self, source: Path, out: Path, preview: Path | None = None, isolate: bool = False) -> Denoised:
         start = time.perf_counter()
         frame: RawFrame
@@ -273,13 +281,11 @@ class RawFiles(Files[Denoised]):
 
         denoised = self.denoiser(frame, self._levels)
 
-        out.parent.mkdir(parents=True, exist_ok=True)
         write_dng(out, denoised.frame, source, rgb=denoised.rgb)
         seconds = time.perf_counter() - start
 
         if preview is not None:
-            preview.parent.mkdir(parents=True, exist_ok=True)
-            write_picture(preview, bayer.turn(develop(out), denoised.frame.upright_view))
+            self.write_preview(out, preview)
 
         shot_var, read_var = denoised.levels or (0.0, 0.0)
         return Denoised(
@@ -369,7 +375,6 @@ class PictureFiles(Files[DenoisedPicture]):
         denoised = self.denoiser(Noisy(srgb[None]))[0]
         deviation = 255.0 * (denoised - srgb).square().mean().sqrt().item()
 
-        out.parent.mkdir(parents=True, exist_ok=True)
         write_stored(out, denoised, picture)
         return DenoisedPicture(source, out, deviation, time.perf_counter() - start)
 

@@ -65,7 +65,7 @@ def _write_csv(path: Path, head: Sequence[str], rows: Mapping[str, Sequence[str]
     """Write a table with the names of its columns in ``head`` and its cells by the name of a row."""
     table = io.StringIO(newline="")
     writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(head)
+    writer.writerow(map(_plain, head))
     for name, cells in rows.items():
         writer.writerow([_plain(name), *cells])
     write_text(table.getvalue(), path)

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rawaug.files import LOCK, require_folder, write_json
+from rawaug.files import LOCK, require_folder, require_folder_name, write_json
 from rawaug.training.config import SAME_WEIGHTS
 
 STAMP = "run.json"
@@ -29,14 +29,12 @@ _SHOWN = 3
 
 
 def run_folder(settings: Any) -> Path:
-    """Return ``OUT/NAME`` of a recipe; raise ValueError if the name leads out of OUT."""
-    out, name = Path(settings.out), Path(settings.name)
-    if name.is_absolute() or ".." in name.parts or not name.parts:
-        raise ValueError(
-            f"name {settings.name!r}: must be a folder within {out}; give a name without .. and not beginning with /"
-        )
+    """Return ``OUT/NAME`` of a recipe; raise ValueError if the name, or a part between slashes, is no folder's."""
+    parts = settings.name.split("/")
+    for part in parts:
+        require_folder_name(part, "name")
 
-    return out / name
+    return Path(settings.out, *parts)
 
 
 def require_free(settings: Any, overwrite: bool = False) -> Path:

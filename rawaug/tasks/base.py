@@ -246,20 +246,18 @@ class Task(ABC):
 
     def command_of_weights(self, path: Path) -> str:
         """Write the command that uses the weights of an arm."""
-        return f"rawaug denoise IN.dng OUT.dng --denoiser {path}"
+        return f"rawaug denoise IN.dng OUT.dng --denoiser {shlex.quote(str(path))}"
 
     def command_of_method(self, name: str) -> str:
         """Write the command that uses another method, by the name of its row; it is empty for the noisy input."""
         for trained in self.recipe.baselines:
             if name.partition(", ")[0] == Path(trained).stem:
-                return f"rawaug denoise IN.dng OUT.dng --denoiser {trained}"
+                return f"rawaug denoise IN.dng OUT.dng --denoiser {shlex.quote(trained)}"
 
         for spec in self.recipe.classical:
             if f"{name}, ".startswith(f"{spec_label(spec)}, "):
-                text = spec
-                if not isinstance(spec, str):
-                    text = shlex.quote(json.dumps(spec))
-                return f"rawaug denoise IN.dng OUT.dng --classical {text}"
+                text = spec if isinstance(spec, str) else json.dumps(spec)
+                return f"rawaug denoise IN.dng OUT.dng --classical {shlex.quote(text)}"
 
         return ""
 

@@ -10,7 +10,7 @@ from pydantic import BeforeValidator
 
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import OWN_PICTURES, Pair
-from rawaug.files import find_weights, fingerprint, sha256
+from rawaug.files import find_weights, fingerprint, require_folder_name, sha256
 from rawaug.isp.fit import FitConfig
 from rawaug.isp.model import DictionaryISP, restrict_to_cameras
 from rawaug.kernels.runtime import find_device
@@ -305,6 +305,7 @@ class Recipe:
 
         self._require_data()
         for label, arm in self.arms.items():
+            require_folder_name(label, "arms")
             try:
                 self._require_arm(label, arm)
             except ValueError as error:

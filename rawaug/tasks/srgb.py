@@ -11,6 +11,7 @@ are developed afterwards. Real pairs are those of :mod:`rawaug.data.picture_pair
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -198,18 +199,18 @@ class SrgbTask(Task):
 
     def command_of_weights(self, path: Path) -> str:
         """Write the command that denoises pictures with the weights of an arm."""
-        return f"rawaug denoise IN.jpg OUT.jpg --denoiser {path}"
+        return f"rawaug denoise IN.jpg OUT.jpg --denoiser {shlex.quote(str(path))}"
 
     def command_of_method(self, name: str) -> str:
         """Write the command that denoises pictures with a filter, or RAW with a baseline."""
         method = name.partition(", ")[0]
         for baseline in self.recipe.baselines:
             if method == Path(baseline).stem:
-                return f"rawaug denoise IN.dng OUT.dng --denoiser {baseline}"
+                return f"rawaug denoise IN.dng OUT.dng --denoiser {shlex.quote(baseline)}"
 
         for spec in self.recipe.classical:
             if method == spec_label(spec):
-                return f"rawaug denoise IN.jpg OUT.jpg --denoiser {split_spec(spec)[0]}"
+                return f"rawaug denoise IN.jpg OUT.jpg --denoiser {shlex.quote(split_spec(spec)[0])}"
 
         return ""
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
-from rawaug.files import replacing
+from rawaug.files import write_text
 
 
 class Journal:
@@ -20,29 +19,27 @@ class Journal:
 
     def __init__(self, folder: Path, start: int) -> None:
         self.path = folder / "log.csv"
+        self._text = ""
         if self.path.is_file():
-            self._drop_rows_after(start)
+            self._keep_rows(self.path.read_text(errors="replace"), start)
 
-    def _drop_rows_after(self, step: int) -> None:
-        """Write the file anew without the rows of later steps."""
-        head, *rows = self.path.read_text().splitlines(keepends=True)
+    def _keep_rows(self, text: str, last: int) -> None:
+        """Write the file anew with the rows up to the step ``last``, without those that are damaged."""
+        head, *rows = text.splitlines(keepends=True) or [""]
         earlier = []
         for row in rows:
-            is_whole = row.endswith("\n")  # a killed training may have cut its last row short
-            if is_whole and int(row.split(",")[0]) <= step:
+            step = row.partition(",")[0]
+            is_whole = row.endswith("\n") and step.isdecimal()
+            if is_whole and int(step) <= last:
                 earlier.append(row)
 
-        text = ""
         if earlier:
-            text = "".join([head, *earlier])
-        with replacing(self.path) as partial:
-            partial.write_text(text)
+            self._text = "".join([head, *earlier])
+        write_text(self._text, self.path)
 
     def log(self, step: int, **values: float) -> None:
-        """Write a row."""
-        is_empty = not self.path.is_file() or not self.path.stat().st_size
-        with self.path.open("a", newline="") as file:
-            rows = csv.writer(file, lineterminator="\n")
-            if is_empty:
-                rows.writerow(["step", *values])
-            rows.writerow([step, *[f"{value:.6g}" for value in values.values()]])
+        """Write the file anew with one more row; on a full disk, the rows before it stay."""
+        if not self._text:
+            self._text = ",".join(["step", *values]) + "\n"
+        self._text += ",".join([str(step), *[f"{value:.6g}" for value in values.values()]]) + "\n"
+        write_text(self._text, self.path)

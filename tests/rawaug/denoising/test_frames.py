@@ -399,6 +399,26 @@ def test_a_folder_has_a_preview_of_each_file(tmp_path: Path, bayer_dng: Dng, ide
     assert read_picture(tmp_path / "previews" / "a.jpg").shape == (3, 96, 128)
     assert read_picture(tmp_path / "previews" / "sub" / "a.jpg").shape == (3, 128, 96)
 
+    lost = (tmp_path / "previews" / "sub" / "a.jpg").read_bytes()
+    (tmp_path / "previews" / "sub" / "a.jpg").unlink()  # as if a run had been stopped before it
+    assert main([*command, "--preview", str(tmp_path / "previews")]) == 0
+    assert (tmp_path / "previews" / "sub" / "a.jpg").read_bytes() == lost
+
+
+def test_previews_replace_no_picture_of_the_camera(
+    tmp_path: Path, bayer_dng: Dng, identity: Path, refused: Callable[..., str]
+) -> None:
+    for folder in ("in", "elsewhere"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a.jpg").write_bytes(b"the camera's own")
+    shot(tmp_path / "in" / "a.dng", bayer_dng)
+    command = ["denoise", tmp_path / "in", tmp_path / "out", "--denoiser", identity, "--preview"]
+    assert "in: is inside the source folder" in refused(*command, tmp_path / "in")
+    assert "a.jpg: exists" in refused(*command, tmp_path / "elsewhere")
+    for folder in ("in", "elsewhere"):
+        assert (tmp_path / folder / "a.jpg").read_bytes() == b"the camera's own"
+    assert not (tmp_path / "out" / "a.dng").exists()
+
 
 def test_a_folder_names_what_is_left_out(
     tmp_path: Path, bayer_dng: Dng, identity: Path, capsys: pytest.CaptureFixture[str]

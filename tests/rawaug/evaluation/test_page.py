@@ -106,6 +106,17 @@ def test_its_tables_lie_beside_it_as_csv_and_latex(page: str, tmp_path: Path) ->
     assert latex_table(["", "a_b"], {"50 % & more": ["1"]}).count("\\") > 6
 
 
+def test_no_name_of_a_file_is_a_formula_in_a_spreadsheet(tmp_path: Path) -> None:
+    rows = {name: ["1"] for name in ("=cmd|' calc'!A1", "+1", "-1", "@x", "\t=1", "a=b")}
+    page = Page("title")
+    page.add("Scores", head=["", "+PSNR"], rows=rows)
+    page.write(tmp_path / "r.html", {})
+    with (tmp_path / "r_scores.csv").open(newline="") as file:
+        head, *table = csv.reader(file)
+    names = [head[1], *(row[0] for row in table)]
+    assert len(names) == 7 and not any(name.startswith(("=", "+", "-", "@", "\t")) for name in names)
+
+
 def test_a_middle_is_not_called_a_whole_frame(page: str) -> None:
     assert "whole frame, 800 x 200, clean" in page
     assert name_part(512, 512, crop=512) == "middle, 512 x 512"

@@ -50,11 +50,20 @@ def test_files_of_an_unknown_run_are_not_touched(recipe: Recipe) -> None:
         require_free(recipe)
 
 
-@pytest.mark.parametrize("name", ["../mine", "/mine", "a/../../mine", "", "."])
+@pytest.mark.parametrize(
+    "name", ["../mine", "/mine", "a/../../mine", "", ".", "a//b", "..\\mine", "a\x1b[31m", "a" * 201]
+)
 def test_a_name_stays_within_out(recipe: Recipe, name: str) -> None:
     with pytest.raises(ValueError, match=r"^name"):
         require_free(replace(recipe, name=name))
     assert require_free(replace(recipe, name="sidd/few")) == Path(recipe.out) / "sidd" / "few"
+
+
+@pytest.mark.parametrize("name", ["../outside", "/outside", "a/b", "..", "", "a\x1b[31m", "a\nb"])
+def test_an_arm_is_one_folder_of_its_run(recipe: Recipe, name: str) -> None:
+    with pytest.raises(ValueError, match=r"^arms: "):
+        replace(recipe, arms={name: ArmConfig()})
+    replace(recipe, arms={"with 50 %, twice": ArmConfig()})
 
 
 def test_every_kind_of_experiment_claims_its_folder(tmp_path: Path) -> None:

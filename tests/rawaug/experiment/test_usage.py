@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ from rawaug.experiment import report
 from rawaug.experiment import run as experiment
 from rawaug.tasks.raw import RawTask
 from rawaug.tasks.settings import ArmConfig
+from rawaug.tasks.srgb import SrgbTask
 from rawaug.training.noisy_frames import NoisyFrame, faintness_note, noise_of
 
 
@@ -47,6 +49,14 @@ def test_a_filter_or_nothing_is_used_as_the_verdict_says() -> None:
         """--classical '{"name": "Wavelet", "settings": {"strength": 0.5}}'"""
     )
     assert usage(results, {})[-1] == "to use: nothing, the frames are best as they are"
+
+
+def test_the_command_can_be_pasted_whatever_a_run_is_called() -> None:
+    path = Path("my run; touch PWNED") / "denoiser.safetensors"
+    recipe: Any = SimpleNamespace(untouched=["a b.safetensors"], classical=[], baselines=["a b.safetensors"])
+    for task in (RawTask(recipe), SrgbTask(recipe)):
+        assert shlex.split(task.command_of_weights(path))[-1] == str(path)
+        assert shlex.split(task.command_of_method("a b"))[-1] == "a b.safetensors"
 
 
 def usage(results: Any, others: Any) -> list[str]:

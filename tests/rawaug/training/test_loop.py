@@ -202,6 +202,14 @@ def test_the_log_has_the_rows_of_this_run_alone(tmp_path: Path) -> None:
     assert [row.split(",")[:2] for row in rows[1:]] == [["1", "0.5"], ["2", "0.5"], ["3", "0.25"], ["4", "0.25"]]
 
 
+@pytest.mark.parametrize("damaged", ["", "step,loss\n1,0.5\nabc,1\n", "step,loss\n1,0.5\n2,0", "\0\xff"])
+def test_a_damaged_log_stops_no_training(tmp_path: Path, damaged: str) -> None:
+    (tmp_path / "log.csv").write_text(damaged)
+    Journal(tmp_path, 2).log(3, loss=0.25)
+    steps = [row["step"] for row in read_log(tmp_path / "log.csv")]
+    assert steps == (["1", "3"] if "0.5" in damaged else ["3"])
+
+
 def test_a_short_training_has_a_curve_and_a_long_one_its_own_period() -> None:
     assert replace(CONFIG, steps=100, validate_every=100).validation_period == 20
     assert replace(CONFIG, steps=3, validate_every=100).validation_period == 1
