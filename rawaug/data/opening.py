@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,10 @@ from torch.utils.data import ConcatDataset
 
 from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.pair_folder import require_no_pairs
-from rawaug.data.pairs import DATASETS, PICTURES, Binned, LazyPairs, Pair
+from rawaug.data.pairs import DATASETS, OWN_PICTURES, PICTURES, Binned, LazyPairs, Pair
 from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
+from rawaug.files import fingerprint
+from rawaug.io.content import list_pictures
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.registry import Registry, check_settings, suggest
 
@@ -128,6 +131,25 @@ def open_pictures(spec: str | Path | Sequence[str | Path], min_side: int = 2, ma
     if kind is None:
         return PictureFolder(path, min_side, max_pixels or MAX_PIXELS)
     return _reader(PICTURES, spec, kind, path, "a folder")(path, min_side)
+
+
+def picture_stamp(spec: str | Path | Sequence[str | Path]) -> str:
+    """Compute a fingerprint of the files that :func:`open_pictures` opens, by name, size and modification time.
+
+    No file is read. Pictures that are no files have their spec as fingerprint.
+    """
+    if not isinstance(spec, (str, Path)):
+        return fingerprint([picture_stamp(one) for one in spec])
+
+    kind, path = _kind_and_path(str(spec))
+    if kind is not None or spec == OWN_PICTURES:
+        return str(spec)
+
+    files = []
+    for file in list_pictures(path).files:
+        status = file.stat()
+        files.append((os.path.relpath(file, path), status.st_size, status.st_mtime_ns))
+    return fingerprint(files)
 
 
 def _reader(kinds: Registry, spec: str, kind: str, path: str, other: str) -> Callable[[str, Any], Any]:

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import denoisers
 from denoisers.network import Denoiser
 from rawaug.bayer import CFA
+from rawaug.data.opening import picture_stamp
 from rawaug.data.pairs import stamps
 from rawaug.errors import extra
 from rawaug.evaluation.scores import Row, group_rows, score, summary
@@ -262,7 +263,7 @@ def _arm_key(experiment: Experiment, camera: Camera, arm: str, seed: int) -> str
     data, start = recipe.data, experiment.starts[arm]
 
     real = camera.isp.info["key"], asdict(recipe.draw), recipe.noise_at_iso, data.pairs, stamps(inputs.pairs)
-    pictures: tuple[Any, ...] = data.pictures, len(inputs.pictures), data.max_pixels
+    pictures: tuple[Any, ...] = data.pictures, picture_stamp(data.pictures), data.max_pixels
     start_hash = None
     if start is not None:
         start_hash = start.sha256

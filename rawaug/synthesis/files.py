@@ -1,9 +1,9 @@
 r"""A pair on disk: ``NAME.npz``, or ``NAME_clean`` and ``NAME_noisy`` as ``.dng``, ``.tif`` or ``.png``.
 
 :mod:`rawaug.data.formats` describes their contents. The noisy frames of a burst are ``NAME_noisy_0`` and so on, or one
-array in NPZ. ``NAME.safetensors``, the parameters that replay the pair, is written last: a pair exists once its
-parameters do. A DNG's black level is as high as the darkest noisy value needs, so that nothing is clipped at black; all
-files of a pair have the same levels.
+array in NPZ. ``NAME.safetensors``, the parameters that replay the pair, is written last. A pair exists if they do, its
+picture is the one that they name, and its other files have the sizes that they state. A DNG's black level is as high as
+the darkest noisy value needs, so that nothing is clipped at black; all files of a pair have the same levels.
 """
 
 from __future__ import annotations
@@ -161,15 +161,26 @@ class PictureTask:
         self.picture = picture
         self.key = key
         self.stem = stem
-        self.numbers = []
-        for number in range(per_image):
-            if not Path(f"{stem}_{number}.safetensors").exists():
-                self.numbers.append(number)
+        self.per_image = per_image
+        self.numbers: list[int] = []
 
         self.pictures = 1
-        self.existing = per_image - len(self.numbers)
-        self.todo = bool(self.numbers)
+        self.existing = 0
+        self.todo = True
         self.broken: dict[str, str] = {}  # a picture that cannot be read is tried again
+
+    def find_existing(self) -> None:
+        """Count the pairs that exist, as an earlier run has written them."""
+        picture_sha256 = None
+        for number in range(self.per_image):
+            params = Path(f"{self.stem}_{number}.safetensors")
+            if params.exists() and picture_sha256 is None:
+                picture_sha256 = sha256(self.picture)
+            if not params.exists() or not _is_whole(params, picture_sha256):
+                self.numbers.append(number)
+
+        self.existing = self.per_image - len(self.numbers)
+        self.todo = bool(self.numbers)
 
     def make(self, maker: PairMaker) -> tuple[int, dict[str, str]]:
         """Write the missing pairs; return their number, and the reason if the picture cannot be read."""
@@ -181,6 +192,19 @@ class PictureTask:
         for number, pair in pairs:
             write_pair(Path(f"{self.stem}_{number}"), pair, maker.augment, maker.settings.format, origin)
         return len(self.numbers), {}
+
+
+def _is_whole(params: Path, picture_sha256: str | None) -> bool:
+    """Tell whether a pair with these parameters is of this picture, and has its other files in their sizes."""
+    try:
+        header = read_header(params)
+        origin, sizes = json.loads(header["origin"]), json.loads(header["sizes"])
+    except (ValueError, KeyError):
+        return False
+
+    files = [params.with_name(name) for name in sizes]
+    are_whole = [file.is_file() and file.stat().st_size == sizes[file.name] for file in files]
+    return origin["picture_sha256"] == picture_sha256 and all(are_whole)
 
 
 def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: int) -> Iterator[PictureTask]:
@@ -227,9 +251,11 @@ def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, o
         format: a format of files, not of shards.
         origin: what the pair was made from.
     """
-    _WRITERS[format](stem, pair, augment)
+    files = _WRITERS[format](stem, pair, augment)
 
+    sizes = {file.name: file.stat().st_size for file in files}
     header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(asdict(origin))}
+    header["sizes"] = json.dumps(sizes)
     write_tensors(pair.params.tensors(), header, f"{stem}.safetensors")
 
 
@@ -248,29 +274,40 @@ def _images(pair: RawPair, augment: RawAugment) -> dict[str, Tensor]:
     return images
 
 
-def _write_dngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
+def _write_dngs(stem: Path, pair: RawPair, augment: RawAugment) -> list[Path]:
     frames, stops = camera_frames(pair, augment)
+    files = []
     for end, frame in frames.items():
-        write_dng(Path(f"{stem}{end}.dng"), frame, baseline_exposure=stops)
+        files.append(Path(f"{stem}{end}.dng"))
+        write_dng(files[-1], frame, baseline_exposure=stops)
+    return files
 
 
-def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> None:
-    write_npz(Path(f"{stem}.npz"), pair.clean, pair.noisy, _metadata(pair, augment))
+def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> list[Path]:
+    file = Path(f"{stem}.npz")
+    write_npz(file, pair.clean, pair.noisy, _metadata(pair, augment))
+    return [file]
 
 
-def _write_tiffs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
+def _write_tiffs(stem: Path, pair: RawPair, augment: RawAugment) -> list[Path]:
+    files = []
     for end, image in _images(pair, augment).items():
         if augment.target == "srgb":  # viewers expect integers
             image = (image * 65535.0).round().to(torch.uint16)
-        write_tiff(Path(f"{stem}{end}.tif"), image, _metadata(pair, augment))
+        files.append(Path(f"{stem}{end}.tif"))
+        write_tiff(files[-1], image, _metadata(pair, augment))
+    return files
 
 
-def _write_pngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
+def _write_pngs(stem: Path, pair: RawPair, augment: RawAugment) -> list[Path]:
+    files = []
     for end, image in _images(pair, augment).items():
-        write_bytes(encode_png(image), f"{stem}{end}.png")
+        files.append(Path(f"{stem}{end}.png"))
+        write_bytes(encode_png(image), files[-1])
+    return files
 
 
-_WRITERS: dict[Format, Callable[[Path, RawPair, RawAugment], None]] = {
+_WRITERS: dict[Format, Callable[[Path, RawPair, RawAugment], list[Path]]] = {
     "dng": _write_dngs,
     "npz": _write_npz,
     "tiff": _write_tiffs,

@@ -164,6 +164,7 @@ def _run(out: Path, tasks: Sequence[Task], settings: Settings, max_pixels: int, 
     result = Synthesis(out)
     todo: list[Task] = []
     for task in tasks:
+        task.find_existing()
         result.pictures += task.pictures
         result.existing += task.existing
         result.broken |= task.broken

@@ -5,9 +5,10 @@ sample is three files with one key, ``PICTURE_NUMBER``: ``KEY.clean.npy`` and ``
 :class:`rawaug.RawPair`, and ``KEY.json`` with picture and ISP and their SHA-256, CFA, the mosaic's height and width,
 noise levels and parameters.
 
-The bytes of a shard depend only on its pictures and the settings. A shard is complete once
-``.shards/shard-000012.json`` exists, which is written last. Once all shards are complete, ``index.json`` (sizes, as
-WebDataset's ``wids`` reads them) and the dataset card ``README.md`` are written.
+The bytes of a shard depend only on its pictures and the settings. ``.shards/shard-000012.json`` is written last. A
+shard is complete if it has the size that is stated there, and its pictures are those of which it was made. Once all
+shards are complete, ``index.json`` (sizes, as WebDataset's ``wids`` reads them) and the dataset card ``README.md`` are
+written.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.files import digest, parse_object, replacing, write_json, write_text
+from rawaug.files import digest, fingerprint, parse_object, replacing, sha256, write_json, write_text
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.targets import Burst
 from rawaug.synthesis.files import Origin, PairMaker, Settings, pair_levels, replay_pair
@@ -55,11 +56,28 @@ class ShardTask:
         self.names = names
         self.per_image = per_image
 
-        record = _read_record(path)
         self.pictures = len(names)
-        self.existing = int(record.get("nsamples", 0))
-        self.broken: dict[str, str] = dict(record.get("broken", {}))
-        self.todo = not record
+        self.existing = 0
+        self.todo = True
+        self.broken: dict[str, str] = {}
+
+    def find_existing(self) -> None:
+        """Count the pairs of a shard that is complete."""
+        record = _read_record(self.path)
+        if record and record["pictures_sha256"] == self._digest_pictures():
+            self.existing = record["nsamples"]
+            self.broken = record["broken"]
+            self.todo = False
+
+    def _digest_pictures(self) -> str:
+        """Hash the pictures; those that cannot be read have no hash."""
+        hashes = []
+        for name in self.names:
+            try:
+                hashes.append(sha256(self.source / name))
+            except OSError:
+                hashes.append("")
+        return fingerprint(hashes)
 
     def make(self, maker: PairMaker) -> tuple[int, dict[str, str]]:
         """Write the shard; return the number of its pairs, and the reason for each picture that cannot be read."""
@@ -79,6 +97,7 @@ class ShardTask:
 
         size = self.path.stat().st_size
         record = {"url": self.path.name, "nsamples": count, "filesize": size, "broken": broken}
+        record["pictures_sha256"] = self._digest_pictures()
         write_json(record, _record_path(self.path))
         return count, broken
 
@@ -92,11 +111,15 @@ def _record_path(shard: Path) -> Path:
 
 
 def _read_record(shard: Path) -> dict[str, Any]:
-    """Read the record that marks a shard as complete; it is empty if there is none."""
-    record = _record_path(shard)
-    if not record.is_file():
+    """Read the record that marks a shard as complete; it is empty if there is none, or the shard has another size."""
+    file = _record_path(shard)
+    if not file.is_file() or not shard.is_file():
         return {}
-    return parse_object(record.read_text())
+
+    record = parse_object(file.read_text())
+    if record["filesize"] != shard.stat().st_size:
+        return {}
+    return record
 
 
 def shard_tasks(

@@ -222,7 +222,7 @@ def test_frames_that_cannot_be_read_are_named_and_the_rest_is_scored(
     result = json.loads(figures.read_text())
     assert [image["name"] for image in result["images"]] == ["0"] and len(result["broken"]) == 1 and page.is_file()
     (crops / "0.npy").write_bytes(b"")
-    assert main(arguments) == 2 and "none of the 2 frames can be read" in capsys.readouterr().err
+    assert main([*arguments, "--overwrite"]) == 2 and "none of the 2 frames can be read" in capsys.readouterr().err
 
 
 def test_whatever_is_benchmarked_can_be_evaluated(middles: list[Pair], tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -120,6 +121,23 @@ def test_pairs_do_not_depend_on_what_was_there(tmp_path: Path, pictures: Path) -
     assert synth(pictures, parts, per_image=2, workers=0).made == 0
     other = synth(pictures, tmp_path / "other", seed=1, workers=0).out
     assert contents(other)["c_0_noisy.dng"] != contents(whole)["c_0_noisy.dng"]
+
+
+def test_what_is_gone_torn_or_of_another_picture_is_made_again(tmp_path: Path, pictures: Path) -> None:
+    source, out = tmp_path / "in", tmp_path / "out"
+    shutil.copytree(pictures, source)
+    synth(source, out, workers=0)
+    whole = contents(out)
+    (out / "c_0_noisy.dng").unlink()
+    (out / "sub/b_0_clean.dng").write_bytes(whole["sub/b_0_clean.dng"][:100])
+    again = synth(source, out, workers=0)
+    assert again.made == 2 and contents(out) == whole
+
+    other = torch.full((3, 96, 64), 90, dtype=torch.uint8)
+    write_picture(source / "sub" / "b.png", other)
+    assert synth(source, out, workers=0).made == 1
+    assert contents(out)["sub/b_0_clean.dng"] != whole["sub/b_0_clean.dng"]
+    assert contents(out)["c_0_clean.dng"] == whole["c_0_clean.dng"]
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc to see the processes of a session")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import tarfile
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,23 @@ def test_a_killed_run_is_resumed_by_shard(pictures: Path, whole: Path, tmp_path:
     again = shards(pictures, tmp_path)
     assert (again.made, again.existing) == (0, 14)
     assert list(again.broken) == ["broken.png"], "what a shard lacks is reported by every run"
+
+
+def test_a_shard_that_is_gone_torn_or_of_other_pictures_is_made_again(
+    pictures: Path, whole: Path, tmp_path: Path
+) -> None:
+    source, out = tmp_path / "in", tmp_path / "out"
+    shutil.copytree(pictures, source)
+    shards(source, out)
+    (out / "shard-000000.tar").unlink()
+    torn = (out / "shard-000001.tar").read_bytes()
+    (out / "shard-000001.tar").write_bytes(torn[: len(torn) // 2])
+    again = shards(source, out)
+    assert again.made > 0 and contents(out) == contents(whole)
+
+    write_picture(sorted(source.glob("*.png"))[0], torch.full((3, 16, 16), 90, dtype=torch.uint8))
+    assert 0 < shards(source, out).made < again.made + again.existing
+    assert contents(out) != contents(whole)
 
 
 def test_the_pairs_are_those_of_other_formats(pictures: Path, whole: Path, tmp_path: Path) -> None:
