@@ -64,7 +64,7 @@ def yaml_value(text: str) -> Any:
     Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+0123456789"))
     try:
         return yaml.load(text, Loader)  # only safe values
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, LookupError, AttributeError, TypeError, OverflowError) as error:  # of a tag without a value
         raise ValueError(f"not YAML: {' '.join(str(error).split())}") from None
 
 
@@ -361,14 +361,15 @@ def read_header(path: str | Path) -> dict[str, str]:
 
 
 def _read_safetensors(path: str | Path, advice: str, with_tensors: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
+    from safetensors.torch import load
+
     tensors = {}
     try:
         with safe_open(str(path), framework="pt") as file:
             header = dict(file.metadata() or {})
-            if with_tensors:
-                for name in file.keys():  # noqa: SIM118  (it is no mapping)
-                    tensors[name] = file.get_tensor(name)
-            return header, tensors
+        if with_tensors:
+            tensors = load(Path(path).read_bytes())  # get_tensor turns Ctrl-C into an error of the file
+        return header, tensors
     except (SafetensorError, OSError, ValueError, TypeError, RuntimeError, KeyError, AttributeError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{path}: not a readable safetensors file ({reason}); {advice}") from error

@@ -24,7 +24,7 @@ of :math:`1 / (12 V^2)`, so it is subtracted from ``read_var`` before the roundi
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, fields
 from numbers import Real
 from pathlib import Path
@@ -56,6 +56,10 @@ _YAML_EXTENSIONS = (".yaml", ".yml")
 MatrixKind = Literal["xyz_to_camera", "srgb_to_camera", "camera_to_srgb"]
 NoiseUnit = Literal["variance", "DN"]
 
+_LARGEST = 1e9
+"""No figure of a camera is larger."""
+_MOST_GAIN = 100.0
+"""Gains are between this and one over it."""
 _LARGEST_VAR = 0.2
 """A shot_var above it means fewer than five electrons at white; such numbers are more likely in DN."""
 
@@ -147,10 +151,11 @@ class Camera:
             raise ValueError(f"a camera needs a name, got {self.name!r:.100}")
 
         # Everything that was given is kept as plain values, so that a camera can be printed, compared and stored.
-        object.__setattr__(self, "matrix", _plain(self.matrix))
-        object.__setattr__(self, "white_balance", _plain(self.white_balance))
-        object.__setattr__(self, "noise", _plain(self.noise))
-        object.__setattr__(self, "tone", _plain(self.tone))
+        for field in fields(self):
+            object.__setattr__(self, field.name, _plain(getattr(self, field.name)))
+            for number in _numbers(getattr(self, field.name)):
+                if abs(number) > _LARGEST:
+                    raise self._error(field.name, f"has a number beyond {_LARGEST:g}, as no camera has")
 
         self._check_choices()
         self._check_grid()
@@ -260,18 +265,16 @@ class Camera:
         first, second = float(values[0]), float(values[1])
         if min(first, second) < 0:
             raise self._error("noise", f"{where} must not be negative, got {first:g} and {second:g}")
-        if not in_dn:
-            if max(first, second) > _LARGEST_VAR:
-                advice = "(K, sigma) in DN needs noise_in='DN'"
-                raise self._error(
-                    "noise", f"{where} has variances {first:g} and {second:g}, as no sensor has; {advice}"
-                )
+        advice = "(K, sigma) in DN needs noise_in='DN'"
+        if in_dn:
+            if self.bits is None and self.white_level is None:
+                raise self._error("noise", f"{where} is in DN: give white_level or bits, and black_level")
+            first, second = first / self.full_scale, (second / self.full_scale) ** 2
+            advice = "check K, sigma and the levels"
 
-            return first, second
-
-        if self.bits is None and self.white_level is None:
-            raise self._error("noise", f"{where} is in DN: give white_level or bits, and black_level")
-        return first / self.full_scale, (second / self.full_scale) ** 2
+        if max(first, second) > _LARGEST_VAR:
+            raise self._error("noise", f"{where} has variances {first:g} and {second:g}, as no sensor has; {advice}")
+        return first, second
 
     def noise_spec(self) -> dict[str, Any] | None:
         """The noise as a name with settings, which :func:`rawaug.noise.noise_model` reads; None if unknown.
@@ -340,8 +343,9 @@ class Camera:
                 size = " x ".join(map(str, shape))
                 raise self._error(key, f"of light {name} must be {size} finite numbers, got {numbers!r:.100}")
 
-            if key == "white_balance" and not (by_light[name] > 0).all():
-                raise self._error(key, f"of light {name} must be positive, got {numbers!r:.100}")
+            if key == "white_balance" and not _are_gains(by_light[name]):
+                reason = f"must be from {1 / _MOST_GAIN:g} to {_MOST_GAIN:g}"
+                raise self._error(key, f"of light {name} {reason}, got {numbers!r:.100}")
 
         if not by_light:
             raise self._error(key, "names no light")
@@ -354,7 +358,7 @@ class Camera:
             return camera_from_srgb(matrix @ under_light)
 
         if self.matrix_is == "camera_to_srgb":
-            if float(torch.linalg.cond(matrix)) > 1e6:
+            if not float(torch.linalg.cond(matrix)) <= 1e6:  # NaN for a matrix of zeros
                 raise self._error("matrix", f"of light {light} cannot be inverted")
 
             matrix = torch.linalg.inv(matrix)
@@ -491,6 +495,22 @@ def own_cameras(info: Mapping[str, Any]) -> list[Camera]:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _are_gains(values: Tensor) -> bool:
+    """Tell whether values are between :data:`_MOST_GAIN` and one over it."""
+    return bool(((values >= 1 / _MOST_GAIN) & (values <= _MOST_GAIN)).all())
+
+
+def _numbers(value: Any) -> Iterator[Real]:
+    """Yield the numbers in plain values, keys included."""
+    if isinstance(value, dict):
+        value = [*value, *value.values()]
+    if isinstance(value, list):
+        for inner in value:
+            yield from _numbers(inner)
+    elif isinstance(value, Real):
+        yield value
 
 
 def _plain(value: Any) -> Any:

@@ -16,10 +16,11 @@ OPTIONS = Parameter(name="*")
 def require_results(json: str | None, report: str | None, overwrite: bool, inputs: Iterable[str] = ()) -> None:
     """Refuse, before any work, files of ``--json`` and ``--report`` that would replace something, or another ending."""
     files = list(inputs)
-    if json is not None:
-        require_output(json, overwrite, (".json",), files)
-    if report is not None:
-        require_output(report, overwrite, (".html", ".htm"), files)
+    for option, path, extensions in (("json", json, (".json",)), ("report", report, (".html", ".htm"))):
+        if path == "":
+            raise ValueError(f"--{option}: needs the name of a file")
+        if path is not None:
+            require_output(path, overwrite, extensions, files)
 
 
 def value_of(text: str) -> Any:

@@ -315,7 +315,13 @@ class DictionaryISP(StagedISP):
             ValueError: if the file does not contain an ISP, or is damaged.
         """
         if is_camera_file(name):
-            return restrict_to_cameras(cls.from_pretrained("universal"), name)
+            try:
+                return restrict_to_cameras(cls.from_pretrained("universal"), name)
+            except ValueError as error:
+                text = str(error)
+                if text.startswith(str(name)):
+                    raise
+                raise ValueError(f"{name}: {text}") from None
 
         path = find_weights(name)
         header, state = read_tensors(path, _ADVICE, _INFINITE)

@@ -190,7 +190,14 @@ def test_mosaics_of_other_patterns() -> None:
         ({"matrix": [[1, 0], [0, 1]]}, "3 x 3"),
         ({"matrix": [[2.0, 0, 0], [0, 1, 0], [0, 0, 1]]}, "keep white"),
         ({"white_balance": None}, "needs the gains"),
-        ({"white_balance": (2.0, 1.0, -1.0)}, "positive"),
+        ({"white_balance": (2.0, 1.0, -1.0)}, "from 0.01 to 100"),
+        ({"white_balance": (1e308, 1.0, 1.0)}, "white_balance"),
+        ({"matrix": [[0, 0, 0]] * 3}, "inverted"),
+        ({"matrix": [[10**4000, 0, 0], [0, 1, 0], [0, 0, 1]]}, "matrix has a number beyond"),
+        ({"white_level": 10**4000, "bits": None}, "white_level has a number beyond"),
+        ({"noise": {10**4000: (1e-4, 1e-6)}}, "noise has a number beyond"),
+        ({"noise": {100: {"K": 1e8, "sigma": 1.1}}}, "as no sensor has"),
+        ({"tone": [(0, 0), (0.5, 10**4000), (1, 1)]}, "tone has a number beyond"),
         ({"white_balance": {"D66": (2, 1, 2)}}, "D66"),
         ({"cfa": "XXXX"}, "cfa"),
         ({"bits": 99}, "bits"),
@@ -219,12 +226,17 @@ def test_files_of_strangers_are_refused_in_a_line(tmp_path: Path) -> None:
         ("- 1", "keys"),
         ("a: &x [1]\nb: *x", "aliases"),
         ("{", "YAML|camera"),
+        ("name: !!int", "camera"),
+        ("name: !!bool x", "camera"),
     ):
         path.write_text(content)
         with pytest.raises(ValueError, match=word):
             Camera.load(path)
     with pytest.raises(FileNotFoundError):
         DictionaryISP.from_pretrained(tmp_path / "other.yaml")
+    path.write_text(yaml.safe_dump({**SHEET, "tone": "nikn like"}))
+    with pytest.raises(ValueError, match=r"mine\.yaml: .*nikon like"):
+        DictionaryISP.from_pretrained(path)
     tone = {**SHEET, "tone": "nikn like"}
     with pytest.raises(ValueError, match="nikon like"):
         RawAugment(Camera(**tone))

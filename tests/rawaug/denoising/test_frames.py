@@ -324,7 +324,7 @@ def test_wrong_wishes_are_refused_before_anything_is_written(
         (["--classical", "Wavelet", "--denoiser", "rawaug-small"], "give one or the other"),
         (["--classical", "Wavelet", "--linear"], "a filter takes no --denoiser, --self-ensemble or --linear"),
         (["--preview", tmp_path / "b.gif"], "the preview is a .jpg or .png"),
-        (["--preview", tmp_path], "exists"),
+        (["--preview", tmp_path], "is a folder"),
         (["--denoiser", identity, "--strength", "1.5"], "strength must be between 0 and 1, got 1.5"),
         (["--denoiser", identity, "--linear"], "does not demosaic; use rawaug-joint"),
         (["--denoiser", joint], "demosaics too, to a linear DNG; add --linear"),
