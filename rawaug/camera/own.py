@@ -502,7 +502,7 @@ def _are_gains(values: Tensor) -> bool:
     return bool(((values >= 1 / _MOST_GAIN) & (values <= _MOST_GAIN)).all())
 
 
-def _numbers(value: Any) -> Iterator[Real]:
+def _numbers(value: Any) -> Iterator[Any]:
     """Yield the numbers in plain values, keys included."""
     if isinstance(value, dict):
         value = [*value, *value.values()]

@@ -24,6 +24,7 @@ MATLAB files are read by :mod:`rawaug.data.mat`, metadata parsed by :mod:`rawaug
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -39,7 +40,7 @@ from rawaug.bayer import CFA
 from rawaug.data.mat import MAX_BYTES, read_array, read_value, require_size, variables
 from rawaug.data.mosaic_metadata import KINDS, Metadata, complete_metadata, format_value, levels, parse_metadata
 from rawaug.errors import extra
-from rawaug.files import replacing, require_file
+from rawaug.files import replacing, require_file, write_bytes
 from rawaug.io import RawFrame, read_raw
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import MAX_PIXELS, read_plane
@@ -151,8 +152,9 @@ def write_tiff(file: Path, image: Tensor, stated: Mapping[str, Any]) -> None:
     if len(image) == 3:
         pixels, photometric = image.permute(1, 2, 0).numpy(), "rgb"
     description = json.dumps(stated, sort_keys=True)
-    with replacing(file) as partial:
-        tifffile.imwrite(partial, pixels, photometric=photometric, description=description, metadata=None)
+    content = io.BytesIO()
+    tifffile.imwrite(content, pixels, photometric=photometric, description=description, metadata=None)
+    write_bytes(content.getbuffer(), file)
 
 
 def _read_png(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
