@@ -10,6 +10,7 @@ import ctypes
 import io
 import json
 import os
+import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -49,6 +50,9 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 NETWORKS = ("benchmark", "denoise", "evaluate", "run")
 """These commands run networks. They take huge pages and keep them, as page faults took a third of their time."""
 
+_OWN = {*COMMANDS, "data", "completion"}
+"""Commands of other packages have none of these names."""
+
 app = App(
     name="rawaug",
     help="Train and evaluate RAW denoisers and camera ISPs.",
@@ -65,9 +69,6 @@ data.command(
 )
 for _name, _summary in COMMANDS.items():
     app.command(f"rawaug.commands.{_name}:run", name=_name, help=_summary)
-_PLUGINS = entry_points(group="rawaug.commands")
-for _point in _PLUGINS:
-    app.command(_point.value, name=_point.name)
 
 
 @app.command
@@ -129,14 +130,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = _command_at(words)
     if words[command : command + 1] and words[command] in NETWORKS:
         _keep_memory()
-    if not words or words[0] in ("-h", "--help"):
-        for point in _PLUGINS:  # only these are imported, for the first lines of their docstrings
-            with suppress(ImportError, AttributeError):
-                app[point.name]
     if words[command : command + 1] == ["run"] and {"-h", "--help"} & set(words[command + 2 :]):  # a recipe's keys
         words = [*words[: command + 2], "--keys"]
 
     try:
+        _add_plugins(words[command : command + 1])
         app.meta(words, exit_on_error=False, print_error=False)
         return 0
     except BrokenPipeError:  # the reader has closed the pipe, as with `| head`
@@ -154,6 +152,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     print(f"rawaug: {escape(text)}", file=sys.stderr)
     return BAD_INPUT
+
+
+def _add_plugins(names: Sequence[str]) -> None:
+    """Add the commands of other packages: the one of this name, or all, where there is none or help is asked for.
+
+    Raises:
+        ValueError: if the one of this name cannot be loaded; of all, one that cannot be is named and left out.
+    """
+    lists_all = not names or names[0] in ("-h", "--help", "completion")
+    for point in entry_points(group="rawaug.commands"):
+        if not lists_all and point.name not in names:
+            continue
+        if point.name in _OWN or not re.fullmatch(r"[a-z][a-z0-9-]*", point.name):
+            print(
+                f"rawaug: {escape(point.value)} is ignored: a command cannot be called {point.name!r}", file=sys.stderr
+            )
+            continue
+
+        try:
+            function = point.load()
+        except (Exception, SystemExit) as error:  # whatever that module does
+            reason = " ".join(f"{type(error).__name__} {error}".split())
+            text = f"the command {point.name} of another package, {point.value}, cannot be loaded: {reason}"
+            if not lists_all:
+                raise ValueError(text) from None
+            print(f"rawaug: {escape(text)}", file=sys.stderr)
+            continue
+
+        if point.name not in app:
+            app.command(function, name=point.name)
 
 
 def _command_at(words: Sequence[str]) -> int:

@@ -234,8 +234,11 @@ class Registry(Mapping[str, Any]):
         point = self._entry_points[name]
         try:
             return point.load()
-        except (ImportError, AttributeError) as error:
-            raise ValueError(f"{self.kind} {name!r}: the entry point {point.value} cannot be loaded: {error}") from None
+        except (Exception, SystemExit) as error:  # whatever that module does
+            reason = " ".join(str(error).split())
+            raise ValueError(
+                f"{self.kind} {name!r}: the entry point {point.value} cannot be loaded: {reason}"
+            ) from None
 
 
 def _path(thing: Any) -> str:

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from rawaug.commands import YAML, require_results
 from rawaug.evaluation.comparison import Comparison
+from rawaug.registry import require_between
 from rawaug.tasks.base import task_of
 
 
@@ -13,8 +14,8 @@ def run(
     *denoisers: str,
     data: str = "real:test",
     bin: int = 1,
-    count: int = 6,
-    crop: int = 384,
+    count: int | None = None,
+    crop: int | None = None,
     noise: Annotated[str | list[str] | tuple[float, float] | dict[str, Any] | None, YAML] = None,
     iso: list[float] | None = None,
     seed: int = 0,
@@ -34,8 +35,9 @@ def run(
             or pictures:DIR, for which the denoisers are rawaug-srgb, a .safetensors of pictures (FFDNet's weights too)
             or a filter, with @15 behind it if told a level of 15/255.
         bin: average this many sites of a colour in both directions, to reduce the frames' own noise.
-        count: number of frames.
-        crop: side of the middle of each frame that is used, in pixels of the mosaic.
+        count: number of frames, 6 by default; of pictures, all.
+        crop: side of the middle of each frame that is used, in pixels of the mosaic, 384 by default; of pictures, the
+            whole.
         noise: noise in place of the four strengths: a preset, a measured camera, [shot_var, read_var], an ISP's file, a
             camera's .yaml sheet, or a law of your own as {name: MeasuredNoise, levels: ...}.
         iso: ISO values of that camera or law, one column for each.
@@ -48,4 +50,8 @@ def run(
     require_results(json, report, overwrite, [*denoisers, data])
 
     comparison = Comparison(denoisers, data, bin, count, crop, noise, iso, seed, device, json, report)
+    for option, value in (("count", count), ("crop", crop)):
+        if value is not None:
+            require_between(f"--{option}", value, 1, 2**20)
+
     task_of(data).benchmark(comparison)

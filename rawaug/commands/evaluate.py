@@ -116,11 +116,12 @@ def evaluate_isp(evaluation: Evaluation, as_shot: bool = False, tone: str | None
         evaluation.views > 1
         or evaluation.noise is not None
         or evaluation.bin != 1
+        or evaluation.seed
         or evaluation.classical
         or evaluation.report
     )
     if for_denoisers:
-        options = "--self-ensemble, --views, --noise, --bin, --classical and --report"
+        options = "--self-ensemble, --views, --noise, --seed, --bin, --classical and --report"
         raise ValueError(f"{evaluation.denoiser}: is an ISP; {options} are for denoisers")
 
     file = find_weights(evaluation.denoiser)

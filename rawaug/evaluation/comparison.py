@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rawaug.data import open_pairs
-from rawaug.data.pairs import Binned, SomePairs
+from rawaug.data.pairs import Binned, Middles, SomePairs
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.pictures import PictureDenoiser
@@ -34,6 +34,9 @@ from rawaug.files import write_json
 _ALWAYS = "NonLocalMeans"
 """The filter that is in every table, as are the shipped denoisers of mosaics."""
 
+_FRAMES, _CROP = 6, 384
+"""Of RAW this many frames are used, and middles of this side in pixels of the mosaic."""
+
 _ON_PAGE = 4
 """Largest number of frames on the page."""
 
@@ -46,8 +49,8 @@ class Comparison:
         denoisers: names or files.
         data: clean frames, or real pairs of pictures, by a path or ``kind:path``.
         bin: the factor by which the frames are binned.
-        count: number of frames.
-        crop: side of the middles that are used, in pixels of the mosaic.
+        count: number of frames; None for 6, and of pictures all.
+        crop: side of the middles that are used, in pixels; None for 384, and of pictures the whole.
         noise: noise instead of the four strengths; None for these.
         iso: ISO values of the camera that ``noise`` names.
         seed: seed of the noise.
@@ -59,8 +62,8 @@ class Comparison:
     denoisers: Sequence[str]
     data: str
     bin: int = 1
-    count: int = 6
-    crop: int = 384
+    count: int | None = None
+    crop: int | None = None
     noise: Any = None
     iso: list[float] | None = None
     seed: int = 0
@@ -71,19 +74,21 @@ class Comparison:
 
 def compare_raw(comparison: Comparison) -> None:
     """Compare denoisers of RAW on the same frozen noise; print the tables, and write them as JSON and as a page."""
+    count, crop = comparison.count or _FRAMES, comparison.crop or _CROP
+    comparison = replace(comparison, count=count, crop=crop)
     strengths = strengths_of(comparison.noise, comparison.iso)
     denoisers = _open_denoisers(comparison)
 
     pairs = open_pairs(comparison.data, split="test")
-    pairs = SomePairs(pairs, range(len(pairs))[: comparison.count])
-    frames = Binned(Measured(pairs, comparison.count), comparison.bin)
-    cases = trials(frames, comparison.crop, comparison.seed, strengths)
+    pairs = SomePairs(pairs, range(len(pairs))[:count])
+    frames = Binned(Measured(pairs, count), comparison.bin)
+    cases = trials(frames, crop, comparison.seed, strengths)
 
     noise = noise_note(cases, strengths, comparison.seed)
     facts = {
         "data": comparison.data,
         "bin": comparison.bin,
-        "crop": comparison.crop,
+        "crop": crop,
         "seed": comparison.seed,
         "noise": noise,
     }
@@ -103,12 +108,29 @@ def compare_raw(comparison: Comparison) -> None:
 
 
 def compare_pictures(comparison: Comparison) -> None:
-    """Compare denoisers of pictures; print the table, and write it as JSON."""
+    """Compare denoisers of pictures; print the table, and write it as JSON.
+
+    Raises:
+        ValueError: if a setting is not the default that has no meaning for pictures.
+    """
+    usual = Comparison(comparison.denoisers, comparison.data)
+    for key in ("bin", "noise", "iso", "seed", "report"):
+        if getattr(comparison, key) != getattr(usual, key):
+            raise ValueError(f"{comparison.data}: has developed pictures; --{key} is for RAW")
+
     denoisers = [PictureDenoiser.of(spec, comparison.device) for spec in comparison.denoisers]
-    result = picture_scores(denoisers, open_picture_pairs(comparison.data))
+    pairs: Sequence[Any] = open_picture_pairs(comparison.data)
+    facts: dict[str, Any] = {"data": comparison.data}
+    if comparison.count is not None:
+        pairs = SomePairs(pairs, range(len(pairs))[: comparison.count])
+    if comparison.crop is not None:
+        pairs = Middles(pairs, comparison.crop)
+        facts["crop"] = comparison.crop
+
+    result = picture_scores(denoisers, pairs)
     print_pictures(comparison.data, result)
     if comparison.json:
-        write_json({"data": comparison.data, **result}, comparison.json)
+        write_json({**facts, **result}, comparison.json)
 
 
 def _open_denoisers(comparison: Comparison) -> list[RawDenoiser]:

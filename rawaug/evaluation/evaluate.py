@@ -142,8 +142,11 @@ def evaluate_pictures(evaluation: Evaluation) -> dict[str, Any]:
 
     ``plain`` holds the result with the default number of views, if more are requested.
     """
-    if evaluation.noise is not None or evaluation.bin != 1 or evaluation.report:
-        raise ValueError(f"{evaluation.data}: has developed pictures; --noise, --bin and --report are for RAW")
+    names = PairSettings(noisy=evaluation.settings.noisy, clean=evaluation.settings.clean)
+    if evaluation.noise is not None or evaluation.bin != 1 or evaluation.seed or evaluation.report:
+        raise ValueError(f"{evaluation.data}: has developed pictures; --noise, --bin, --seed and --report are for RAW")
+    if evaluation.settings != names:
+        raise ValueError(f"{evaluation.data}: has developed pictures; a CFA and levels are for RAW")
 
     plain = PictureDenoiser.of(evaluation.denoiser, evaluation.device)
     filters = [PictureDenoiser.of(spec) for spec in evaluation.classical]

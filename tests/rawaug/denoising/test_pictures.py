@@ -13,6 +13,7 @@ from torch import Tensor
 
 import denoisers
 from rawaug import bayer
+from rawaug.cli import main
 from rawaug.commands.denoise import run as denoise
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
@@ -20,6 +21,7 @@ from rawaug.denoising.files import denoise_folder
 from rawaug.denoising.picture_levels import estimate_level
 from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.denoising.sources import PictureFiles, kind_of
+from rawaug.evaluation.comparison import Comparison, compare_pictures
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, register
 from rawaug.io.pictures import read_picture, write_picture
 from rawaug.plugin.finishing import blur
@@ -175,6 +177,25 @@ def test_pairs_of_pictures_are_scored_as_published_and_registered(tmp_path: Path
         open_picture_pairs("cc16:x")
     with pytest.raises(FileNotFoundError, match="no such folder"):
         open_picture_pairs("polyu:nowhere")
+
+
+def test_a_benchmark_of_pictures_crops_and_counts_and_refuses_what_is_for_raw(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        write_picture(tmp_path / f"{name}_real.png", noisy())
+        write_picture(tmp_path / f"{name}_mean.png", smooth())
+    command = ["benchmark", "NonLocalMeans@10", "--data", f"cc15:{tmp_path}"]
+    scores = {}
+    for options in ((), ("--count", "2", "--crop", "32")):
+        file = tmp_path / f"{len(options)}.json"
+        assert main([*command, *options, "--json", str(file)]) == 0
+        scores[options] = json.loads(file.read_text())
+    whole, cropped = scores.values()
+    assert (whole["pictures"], cropped["pictures"], cropped["crop"]) == (3, 2, 32)
+    assert whole["rows"]["noisy input"] != cropped["rows"]["noisy input"]
+    of_raw: dict[str, Any] = {"bin": 2, "noise": "upi", "iso": [100.0], "seed": 1, "report": "r.html"}
+    for key, value in of_raw.items():
+        with pytest.raises(ValueError, match=f"--{key} is for RAW"):
+            compare_pictures(replace(Comparison(["NonLocalMeans@10"], f"cc15:{tmp_path}"), **{key: value}))
 
 
 def test_a_cmyk_picture_is_refused_in_one_line(tmp_path: Path) -> None:
