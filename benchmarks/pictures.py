@@ -111,7 +111,7 @@ def _known_reason(image: Any) -> str:
     if image.info.get("icc_profile"):
         return "Pillow applies the profile in 8 bits"
     if image.info.get("gamma"):
-        return "a gamma is stated, which neither applies"
+        return "a gamma is stated, which Pillow does not apply"
     if "transparency" in image.info or image.mode in ("RGBA", "LA", "PA"):
         return "alpha"
     return ""

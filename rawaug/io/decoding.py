@@ -3,7 +3,7 @@
 OpenImageIO reads most formats. Four kinds go to other libraries. BMP goes to Pillow, since OpenImageIO mixes up its run
 lengths and bit fields. So does a JPEG with a gain map ("Ultra HDR", as Android phones write it), which OpenImageIO
 renders in linear light; Pillow gives the picture that every viewer shows. HEIC and AVIF, which it does not know, go to
-libheif and Pillow. TIFF in lossless JPEG of 16 bits, which it decodes to black, goes to tifffile.
+libheif and Pillow. Kinds of TIFF that it decodes to something else go to tifffile (:mod:`rawaug.io.tiff_pictures`).
 
 Everything else in a header is read here too, byte for byte, since OpenImageIO takes the orientation from XMP even if
 EXIF says otherwise, and does not see an EXIF chunk after the pixels of a PNG.
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,11 +21,12 @@ import numpy as np
 
 from rawaug.errors import extra, how_to_install
 from rawaug.files import require_file
+from rawaug.io.bitmaps import is_rle4, unpack_rle4
 from rawaug.io.colour import Colour, colour_of_numbers, require_sdr
 from rawaug.io.content import content_of_opened, reads_avif, reads_heic
-from rawaug.io.directories import COMPRESSION, DamagedTags, TiffFile
-from rawaug.io.headers import Headers, headers_of_opened, png_fault
+from rawaug.io.headers import ICC_TAG, Headers, headers_of_opened, png_fault
 from rawaug.io.isolated import damage_as_os_error
+from rawaug.io.tiff_pictures import TiffKind, kind_of_tiff, meaning_of, reader_of
 
 MAX_PIXELS = 2**26
 """A picture has at most this many pixels by default: 8192 x 8192."""
@@ -37,8 +39,6 @@ _WITH_ASSOCIATED_ALPHA = ("TIFF", "OpenEXR")
 _UPRIGHT = ("JPEG XL", "HEIC", "JPEG 2000")
 """Decoders of these formats turn pictures upright, whatever EXIF says."""
 _FLOATS = ("half", "float", "double")
-_BITS = 258
-_JPEG_IN_TIFF = 7
 
 
 class Decoded(NamedTuple):
@@ -61,6 +61,10 @@ class Decoded(NamedTuple):
     colour: Colour
     orientation: int
     headers: Headers
+
+
+class _Refused(ValueError):
+    """A file that is whole but not accepted."""
 
 
 def decode(path: Path, max_pixels: int = MAX_PIXELS, coarse: bool = False) -> Decoded:
@@ -106,8 +110,15 @@ def _decode(path: Path, name: str, max_pixels: int, coarse: bool, headers: Heade
         return _decode_heif(path, name, max_pixels, headers)
     if name == "BMP":
         return _decode_with_pillow(path, "BMP", max_pixels, headers)
-    if name == "TIFF" and _is_jpeg_of_many_bits(path):
-        return _decode_with_tifffile(path, max_pixels, headers)
+    if name == "TIFF":
+        with path.open("rb") as file:
+            kind = kind_of_tiff(file)
+        if kind is not None and reader_of(kind, path) == "tifffile":
+            return _decode_with_tifffile(path, max_pixels, headers, kind)
+    if name == "PSD":
+        _require_rgb_in_psd(path)
+    if name == "JPEG 2000":
+        _require_plain_components(path)
     return _decode_with_oiio(path, name, max_pixels, coarse, headers)
 
 
@@ -127,7 +138,7 @@ def require_size(path: Path, height: int, width: int, channels: int, max_pixels:
     size = f"{height} x {width} pixels"
     if pixels <= max_pixels:
         size += f" of {channels} channels"
-    raise ValueError(f"{path}: declares {size}, above the limit of {max_pixels}; split it, or raise max_pixels")
+    raise _Refused(f"{path}: declares {size}, above the limit of {max_pixels}; split it, or raise max_pixels")
 
 
 # -- OpenImageIO -------------------------------------------------------------------------------------------------------
@@ -275,16 +286,14 @@ def _decode_with_pillow(path: Path, name: str, max_pixels: int, headers: Headers
 
     with _pillow_damage(path), Image.open(path, formats=(name,)) as image:
         require_size(path, image.height, image.width, len(image.getbands()), max_pixels)
+        if name == "BMP" and is_rle4(path):
+            image = Image.open(BytesIO(unpack_rle4(path)), formats=(name,))
         return _of_pillow(image, path, name, headers)
 
 
 def _pillow_damage(path: Path) -> Any:
     """Turn Pillow's errors into an OSError that names the file, except ours."""
     return damage_as_os_error(path, "cannot be read as a picture", _Refused)
-
-
-class _Refused(ValueError):
-    """A file that is whole but not accepted."""
 
 
 def _of_pillow(image: Any, path: Path, name: str, headers: Headers, orientation: int | None = None) -> Decoded:
@@ -370,30 +379,64 @@ def _without_prefix(exif: bytes | None) -> bytes | None:
     return exif.removeprefix(b"Exif\0\0")
 
 
-def _is_jpeg_of_many_bits(path: Path) -> bool:
-    """Tell whether a TIFF holds lossless JPEG of more than 8 bits."""
-    with path.open("rb") as file:
-        try:
-            tiff = TiffFile(file)
-            first = tiff.directory(tiff.first)
-            return tiff.number(first, COMPRESSION) == _JPEG_IN_TIFF and tiff.number(first, _BITS) > 8
-        except DamagedTags:
-            return False
-
-
-def _decode_with_tifffile(path: Path, max_pixels: int, headers: Headers) -> Decoded:
+def _decode_with_tifffile(path: Path, max_pixels: int, headers: Headers, kind: TiffKind) -> Decoded:
     with extra("raw"):
         import tifffile
 
     with _pillow_damage(path), warnings.catch_warnings(), tifffile.TiffFile(path) as tiff:
         page = tiff.pages[0]
         require_size(path, page.imagelength, page.imagewidth, page.samplesperpixel, max_pixels)
-        if page.bitspersample != 16 or page.samplesperpixel not in (1, 3) or page.photometric not in (1, 2, 6):
-            kind = f"{page.bitspersample} bits, {page.samplesperpixel} channels"
-            raise _Refused(f"{path}: is a TIFF in JPEG of {kind}, which is not read; save it as PNG or plain TIFF")
-        pixels = page.asarray()
-        profile = page.tags.valueof(34675)
+        codes = page.asarray()
+        if kind.planes == 2:
+            codes = np.moveaxis(codes, 0, -1)
+        codes = codes.reshape(page.imagelength, page.imagewidth, -1)
+        profile = page.tags.valueof(ICC_TAG)
 
-    pixels = pixels.reshape(*pixels.shape[:2], -1)
+    colours, alpha = _split_alpha(meaning_of(codes, kind), bool(kind.extra))
     colour = headers.colour or Colour(profile)
-    return Decoded(pixels, None, False, "TIFF", colour, headers.orientation or 1, headers)
+    return Decoded(colours, alpha, kind.extra == (1,), "TIFF", colour, headers.orientation or 1, headers)
+
+
+_PSD_MODES = {4: "CMYK", 7: "multichannel", 8: "duotone", 9: "CIELAB"}
+"""These modes of PSD are no RGB. OpenImageIO converts the first without its profile and takes the second for RGB."""
+
+
+def _require_rgb_in_psd(path: Path) -> None:
+    with path.open("rb") as file:
+        head = file.read(26)
+    mode = int.from_bytes(head[24:26], "big")
+    if mode in _PSD_MODES:
+        raise ValueError(f"{path}: is {_PSD_MODES[mode]} in PSD; convert it to sRGB first")
+
+
+_ENUMERATED_SPACES = (16, 17)
+"""JPEG 2000's numbers of sRGB and of grey in sRGB's transfer function."""
+_JP2_SPACES = {12: "CMYK", 14: "CIELAB", 18: "sYCC"}
+
+
+def _require_plain_components(path: Path) -> None:
+    """Raise ValueError for JPEG 2000 whose components are signed, subsampled or unlike, a palette, or no RGB."""
+    with path.open("rb") as file:
+        head = file.read(_MOST_OF_JP2_HEADER)
+
+    colour = head.find(b"colr")
+    if colour >= 0 and head[colour + 4 : colour + 5] == b"\1":
+        space = int.from_bytes(head[colour + 7 : colour + 11], "big")
+        if space not in _ENUMERATED_SPACES:
+            name = _JP2_SPACES.get(space, f"colour space {space}")
+            raise ValueError(f"{path}: is {name} in JPEG 2000; convert it to sRGB first")
+
+    size = head.find(b"\xff\x4f\xff\x51")
+    if size < 0 or size + 42 > len(head):
+        return
+    count = int.from_bytes(head[size + 40 : size + 42], "big")
+    components = {head[place : place + 3] for place in range(size + 42, size + 42 + 3 * count, 3)}
+    depths = {component[:1] for component in components}
+    is_signed = any(depth >= b"\x80" for depth in depths)
+    if is_signed or len(components) > 1 or not components <= {depth + b"\1\1" for depth in depths}:
+        raise ValueError(f"{path}: is JPEG 2000 of signed, subsampled or unlike components; save it as PNG")
+    if b"pclr" in head[:size]:
+        raise ValueError(f"{path}: is JPEG 2000 with a palette; save it as PNG")
+
+
+_MOST_OF_JP2_HEADER = 2**20

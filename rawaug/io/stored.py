@@ -19,7 +19,7 @@ from torch import Tensor
 from rawaug.errors import extra
 from rawaug.files import write_bytes
 from rawaug.io.decoding import MAX_PIXELS, decode
-from rawaug.io.directories import DamagedTags, TiffFile
+from rawaug.io.directories import TiffFile
 from rawaug.io.headers import webp_chunks
 from rawaug.io.metadata import (
     Metadata,
@@ -85,8 +85,6 @@ def read_stored(path: str | Path, max_pixels: int = MAX_PIXELS) -> StoredPicture
     picture = decode(path, max_pixels)
     if picture.colour.is_linear:
         raise ValueError(f"{path}: is {picture.format} and holds linear light; save it as a developed picture")
-    if picture.format == "TIFF":
-        _require_one_page(path)
 
     colours, alpha = picture.colours, picture.alpha
     if colours.dtype.kind == "f":
@@ -273,23 +271,3 @@ def _compression(metadata: Metadata) -> str | None:
         tiff = TiffFile(file)
         number = tiff.number(tiff.directory(tiff.first), 259, 1)
     return _TIFF_COMPRESSIONS.get(number, "deflate")
-
-
-def _require_one_page(path: Path) -> None:
-    """Raise ValueError if a TIFF has several pictures, of which only the first would be denoised."""
-    with path.open("rb") as file:
-        try:
-            tiff = TiffFile(file)
-            places: list[int] = []
-            place = tiff.first
-            pages = 0
-            while place and place not in places and len(places) < 64:
-                places.append(place)
-                directory = tiff.directory(place)
-                kind = tiff.number(directory, 254)
-                pages += not kind & 5  # neither a thumbnail nor a mask
-                place = directory.following
-        except DamagedTags:
-            return
-    if pages > 1:
-        raise ValueError(f"{path}: is a TIFF of {pages} pages; save each as a file of its own")
