@@ -30,7 +30,7 @@ from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
 _TILE = 256
 """A tile has this many cells of RAW."""
 
-_LINE = _TILE + 2
+_LINE = _TILE + 16
 """A line of every second pixel has this many places: those of a tile, and a margin."""
 
 _NOISE_TILE = 512
@@ -339,37 +339,110 @@ def _light(srgb, b, i, pixels, scale, table, codes, curves, nodes, shares, first
             _through_curve(srgb[b, c, i, pixels], scale, curves[b], nodes, shares, out[:, c, first:])
 
 
-@compile_part
-def _blur_down(above, over, upper, lower, under, below, a, b, c, out):  # type: ignore[no-untyped-def]
-    """Blur two rows, between two above and two below, down the columns, to ``out`` and from ``6 * _LINE`` on."""
-    for j in range(len(upper)):
-        out[j] = a * upper[j] + b * (over[j] + lower[j]) + c * (above[j] + under[j])
-        out[6 * _LINE + j] = a * lower[j] + b * (upper[j] + under[j]) + c * (over[j] + below[j])
+@intrinsic
+def _blur_down(context, lines, above, over, upper, lower, under, below, a, b, c, out, one, other):  # type: ignore[no-untyped-def]
+    """Blur 16 places of two rows, between two above and two below, down the columns; all are places in ``lines``."""
+    signature = types.void(lines, above, over, upper, lower, under, below, a, b, c, out, one, other)
+    return signature, _emit_blur_down
 
 
-@compile_part
-def _blur_along(even, odd, a, b, c, n, out):  # type: ignore[no-untyped-def]
-    """Blur n cells of a row with a margin of a cell along itself: even pixels to ``out``, odd ones half-way on."""
-    for j in range(n):
-        out[j] = a * even[j + 1] + b * (odd[j] + odd[j + 1]) + c * (even[j] + even[j + 2])
-        out[3 * _TILE + j] = a * odd[j + 1] + b * (even[j + 1] + even[j + 2]) + c * (odd[j] + odd[j + 2])
+def _emit_blur_down(context, build, signature: Signature, values):  # type: ignore[no-untyped-def]
+    lines, *rows, a, b, c, out, one, other = values
+    code = _Vectors(context, build, 16)
+    above, over, upper, lower, under, below = [code.load(signature.args[0], lines, row) for row in rows]
+    taps = [code.spread(tap) for tap in (a, b, c)]
+    code.store(code.weigh(taps, upper, over, lower, above, under), signature.args[10], out, one)
+    code.store(code.weigh(taps, lower, upper, under, over, below), signature.args[10], out, other)
+    return context.get_dummy_value()
+
+
+@intrinsic
+def _blur_along(context, row, even, odd, a, b, c, out, evens, odds):  # type: ignore[no-untyped-def]
+    """Blur 16 cells along a row, whose cells begin a place before ``even`` and ``odd``, for the pixel to the left."""
+    return types.void(row, even, odd, a, b, c, out, evens, odds), _emit_blur_along
+
+
+def _emit_blur_along(context, build, signature: Signature, values):  # type: ignore[no-untyped-def]
+    row, even, odd, a, b, c, out, evens, odds = values
+    code = _Vectors(context, build, 16)
+    shifted = []
+    for place in (even, odd):
+        first = code.load(signature.args[0], row, place)
+        second = code.load(signature.args[0], row, build.add(place, ir.Constant(place.type, 16)))
+        shifted.append([code.window(first, second, shift) for shift in range(3)])
+
+    (even_before, even_here, even_after), (odd_before, odd_here, odd_after) = shifted
+    taps = [code.spread(tap) for tap in (a, b, c)]
+    even_light = code.weigh(taps, even_here, odd_before, odd_here, even_before, even_after)
+    odd_light = code.weigh(taps, odd_here, even_here, even_after, odd_before, odd_after)
+    code.store(even_light, signature.args[6], out, evens)
+    code.store(odd_light, signature.args[6], out, odds)
+    return context.get_dummy_value()
+
+
+class _Vectors:
+    """Emits code on vectors of float32."""
+
+    def __init__(self, context, build, lanes):  # type: ignore[no-untyped-def]
+        self.context, self.build, self.lanes = context, build, lanes
+        self.type = ir.VectorType(ir.FloatType(), lanes)
+
+    def address(self, kind, array, place):  # type: ignore[no-untyped-def]
+        data = make_array(kind)(self.context, self.build, array).data
+        return self.build.bitcast(self.build.gep(data, [place]), self.type.as_pointer())
+
+    def load(self, kind, array, place):  # type: ignore[no-untyped-def]
+        return self.build.load(self.address(kind, array, place), align=4)
+
+    def store(self, vector, kind, array, place):  # type: ignore[no-untyped-def]
+        self.build.store(vector, self.address(kind, array, place), align=4)
+
+    def window(self, first, second, shift):  # type: ignore[no-untyped-def]
+        """The lanes from ``shift`` on of two vectors in a row."""
+        index = ir.IntType(32)
+        lanes = ir.Constant(ir.VectorType(index, self.lanes), [shift + lane for lane in range(self.lanes)])
+        return self.build.shuffle_vector(first, second, lanes)
+
+    def spread(self, scalar):  # type: ignore[no-untyped-def]
+        index = ir.IntType(32)
+        undefined = ir.Constant(self.type, ir.Undefined)
+        vector = self.build.insert_element(undefined, scalar, ir.Constant(index, 0))
+        return self.build.shuffle_vector(
+            vector, undefined, ir.Constant(ir.VectorType(index, self.lanes), [0] * self.lanes)
+        )
+
+    def weigh(self, taps, here, before, after, far_before, far_after):  # type: ignore[no-untyped-def]
+        """Compute a here + b (before + after) + c (far before + far after)."""
+        flags, build = ("contract",), self.build
+        near = build.fmul(taps[1], build.fadd(before, after, flags=flags), flags=flags)
+        far = build.fmul(taps[2], build.fadd(far_before, far_after, flags=flags), flags=flags)
+        return build.fadd(build.fadd(build.fmul(taps[0], here, flags=flags), near, flags=flags), far, flags=flags)
 
 
 @compile_part
 def _blur(lines, i, end, taps, n, columns, x2):  # type: ignore[no-untyped-def]
     """Blur n cells of rows i and i + 1; ``lines`` hold the six rows about them, and ``end`` is the last row."""
     a, b, c = taps[0], taps[1], taps[2]
-    _blur_down(
-        lines[max(i - 2, 0) % 6].reshape(-1), lines[max(i - 1, 0) % 6].reshape(-1), lines[i % 6].reshape(-1),
-        lines[(i + 1) % 6].reshape(-1), lines[min(i + 2, end) % 6].reshape(-1), lines[min(i + 3, end) % 6].reshape(-1),
-        a, b, c, columns,
-    )  # fmt: skip
+    width = lines.shape[3]
+    size = np.int64(6) * width
+    above, over, upper = max(i - 2, 0) % 6 * size, max(i - 1, 0) % 6 * size, i % 6 * size
+    lower, under, below = (i + 1) % 6 * size, min(i + 2, end) % 6 * size, min(i + 3, end) % 6 * size
+    flat_lines, flat = lines.reshape(-1), x2.reshape(-1)
 
-    width, flat = lines.shape[3], x2.reshape(-1)
-    for row in range(2):
-        for channel in range(3):
-            even = columns[6 * _LINE * row + width * channel :]
-            _blur_along(even, even[3 * width :], a, b, c, n, flat[(6 * row + channel) * _TILE :])
+    for channel in range(3):
+        for p in range(2):
+            first = np.int64((3 * p + channel) * width)
+            for j in range(0, width, 16):
+                at, out = first + j, np.int64(p * _LINE + j)
+                _blur_down(
+                    flat_lines, above + at, over + at, upper + at, lower + at, under + at, below + at, a, b, c,
+                    columns, out, out + 2 * _LINE,
+                )  # fmt: skip
+
+        for row in range(2):
+            even, out = np.int64(2 * row * _LINE), np.int64((6 * row + channel) * _TILE)
+            for j in range(0, n, 16):
+                _blur_along(columns, even + j, even + _LINE + j, a, b, c, flat, out + j, out + 3 * _TILE + j)
 
 
 @compile_loop
@@ -384,8 +457,9 @@ def _raw_rows(  # type: ignore[no-untyped-def]
 
     # Six rows of light of each tile are kept, with a cell more on either side, for the blur.
     tiles = -(-width // _TILE)
-    lines = np.zeros((tiles, 6, 2, 3, min(width, _TILE) + 2), np.float32)
-    columns, latest = np.empty(12 * _LINE, np.float32), -1
+    # They are as long as whole vectors of 16, of which the last begins within the margin.
+    lines = np.zeros((tiles, 6, 2, 3, (min(width, _TILE) + 2 + 15) // 16 * 16), np.float32)
+    columns, latest = np.zeros(4 * _LINE + 32, np.float32), -1
 
     for row in range(start, stop):
         b, k = divmod(row, height)
@@ -405,10 +479,11 @@ def _raw_rows(  # type: ignore[no-untyped-def]
                 for i in range(latest + 1, min(2 * k + 4, 2 * height)):
                     line, pixels = lines[tile, i % 6], slice(2 * left, 2 * right)
                     _light(srgb, b, i, pixels, scale, table, codes, curves, nodes, shares, left - first + 1, line)
-                    if first == 0:
-                        line[:, :, 0] = line[:1, :, 1]
-                    if last == width:
-                        line[:, :, n + 1] = line[1:, :, n]
+                    for c in range(3):  # the picture's edge is repeated outwards
+                        if first == 0:
+                            line[0, c, 0] = line[1, c, 0] = line[0, c, 1]
+                        if last == width:
+                            line[0, c, n + 1] = line[1, c, n + 1] = line[1, c, n]
                 _blur(lines[tile], 2 * k, 2 * height - 1, taps[b], n, columns, x2)
 
             for s in range(len(sites)):
