@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from rawaug.commands import YAML, require_results
 from rawaug.evaluation.comparison import Comparison
+from rawaug.files import require_output
 from rawaug.registry import require_between
 from rawaug.tasks.base import task_of
 
@@ -22,6 +23,8 @@ def run(
     device: str = "cpu",
     json: str | None = None,
     report: str | None = None,
+    table: str | None = None,
+    figure: str | None = None,
     overwrite: bool = False,
 ) -> None:
     """Compare denoisers on the same frozen noise over clean references.
@@ -45,11 +48,18 @@ def run(
         device: device for networks: cpu, cuda, ...
         json: write the result as JSON to this file.
         report: write an HTML page with tables and crops to this file.
-        overwrite: replace these two files if they exist.
+        table: write the table of known levels for a paper to this file, as LaTeX with booktabs: means over frames with
+            their standard errors, bold where paired differences leave no doubt.
+        figure: draw crops of some frames at 100 % into this file, .pdf or .png.
+        overwrite: replace these files if they exist.
     """
-    require_results(json, report, overwrite, [*denoisers, data])
+    inputs = [*denoisers, data]
+    require_results(json, report, overwrite, inputs)
+    for path, extensions in ((table, (".tex",)), (figure, (".pdf", ".png"))):
+        if path is not None:
+            require_output(path, overwrite, extensions, inputs)
 
-    comparison = Comparison(denoisers, data, bin, count, crop, noise, iso, seed, device, json, report)
+    comparison = Comparison(denoisers, data, bin, count, crop, noise, iso, seed, device, json, report, table, figure)
     for option, value in (("count", count), ("crop", crop)):
         if value is not None:
             require_between(f"--{option}", value, 1, 2**20)

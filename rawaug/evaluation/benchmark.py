@@ -10,6 +10,7 @@ own. The hash of all noisy inputs says whether the figures of two people can be 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from statistics import fmean
@@ -26,6 +27,7 @@ from rawaug.evaluation.figures import Panels, panels_of
 from rawaug.evaluation.scores import METRICS, NOISY, Row, group_rows, score, summary
 from rawaug.evaluation.tables import join_figures
 from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise, raw_trial
+from rawaug.evaluation.verdict import paired_interval
 from rawaug.files import digest
 from rawaug.noise import (
     FixedLevels,
@@ -58,6 +60,9 @@ _SENSOR: dict[str, Any] = {
 
 _OF_SENSORS = ("phone", "strong")
 """The strengths at which real sensors are simulated."""
+
+_TILE = 510
+"""Operations are counted on this many pixels a side: a pattern that is moved by a pixel needs no larger tile."""
 
 _CONDITIONS = TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensors as they are"
 """What the denoisers are told, or how the sensor behaves; each has a table."""
@@ -173,7 +178,8 @@ def benchmark(denoisers: Sequence[RawDenoiser], cases: Sequence[Trial]) -> dict[
 
     Returns:
         ``frames``, ``hash``, and ``rows`` by name: ``gmac`` and ``seconds`` per mosaic megapixel, and ``scores`` by
-        condition and strength, means of :data:`rawaug.evaluation.scores.METRICS`.
+        condition and strength, means of :data:`rawaug.evaluation.scores.METRICS` and, in ``images``, the scores of each
+        frame.
     """
     strengths = _strengths_in(cases)
     rows_by_name = group_rows(score([NOISY, *denoisers], cases, "benchmark"))
@@ -213,6 +219,7 @@ def _by_condition(rows: Sequence[Row], strengths: Sequence[str]) -> dict[str, di
                 if key in means:
                     figures[key] = means[key]
             figures["frames"] = len(cell)
+            figures["images"] = means["images"]
             scores.setdefault(condition, {})[strength] = figures
 
     return scores
@@ -240,17 +247,53 @@ def noise_note(cases: Sequence[Trial], strengths: Iterable[str], seed: int) -> s
 
 
 def _gmac(denoiser: RawDenoiser, trial: Trial) -> float | None:
-    """Count the multiplications that PyTorch computes, in 10^9 a megapixel of the mosaic; None if there are none."""
-    with FlopCounterMode(display=False) as counter:
-        denoiser(trial.input)
+    """Count the multiplications that PyTorch computes, in 10^9 a megapixel of the mosaic; None if there are none.
 
-    return round(counter.get_total_flops() / 2e3 / trial.noisy.numel(), 2) or None
+    They are counted on a whole tile, as on a user's frame: a smaller crop is padded, which costs up to twice as much.
+    """
+    image = trial.noisy
+    repeats = [math.ceil(_TILE / 2 / side) for side in image.shape[-2:]]
+    tile = image.repeat(1, 1, *repeats)[..., : _TILE // 2, : _TILE // 2]
+    with FlopCounterMode(display=False) as counter:
+        denoiser(Noisy.of(tile, trial.levels or (1e-3, 1e-6), trial.cfa))
+
+    return round(counter.get_total_flops() / 2e3 / tile.numel(), 2) or None
+
+
+def ranking(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line for each strength: by how much the best denoiser leads the next one, frame by frame."""
+    for strength in result["rows"]["noisy input"]["scores"][TOLD]:
+        means = {}
+        for name, row in result["rows"].items():
+            scores = row["scores"][TOLD][strength]
+            if "psnr" in scores:
+                means[name] = scores["psnr"]
+        if len(means) < 2:
+            continue
+
+        first, second = sorted(means, key=lambda name: -means[name])[:2]
+        gains = paired_gains(result, first, second, strength)
+        line = f"{strength}: {first} against {second}: {fmean(gains):+.2f} dB"
+        if len(gains) > 1:
+            low, high = paired_interval(gains)
+            line += f" (between {low:+.2f} and {high:+.2f})"
+        ahead = sum(gain > 0 for gain in gains)
+        yield f"{line}, ahead in {ahead} of {count_of(len(gains), 'frame')}"
+
+
+def paired_gains(result: Mapping[str, Any], first: str, second: str, strength: str, key: str = "psnr") -> list[float]:
+    """Subtract the scores of ``second`` from those of ``first``, frame by frame, where both have one; levels told."""
+    of_first, of_second = (result["rows"][name]["scores"][TOLD][strength]["images"] for name in (first, second))
+    gains = []
+    for image, other in zip(of_first, of_second, strict=True):
+        if key in image and key in other:
+            gains.append(image[key] - other[key])
+    return gains
 
 
 def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str, list[str]]]]:
     """Yield title, columns and cells by denoiser of each condition's table; heads say how many could be estimated."""
     count = len(result["frames"])
-    frames = count_of(count, "frame")
 
     for condition in _CONDITIONS:
         of_input = result["rows"]["noisy input"]["scores"][condition]
@@ -274,7 +317,7 @@ def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str
                 cells[name].append(_format_cost(row["gmac"]))
                 cells[name].append(_format_cost(row["seconds"]))
 
-        yield f"{condition}: PSNR of RAW / sRGB in dB, {frames}", head, cells
+        yield f"{condition}: PSNR of RAW / sRGB in dB", head, cells
 
 
 def _format_cost(value: float | None) -> str:

@@ -12,6 +12,7 @@ from rawaug.data.pairs import Binned, Middles, SomePairs
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.pictures import PictureDenoiser
+from rawaug.errors import count_of
 from rawaug.evaluation.benchmark import (
     TOLD,
     benchmark,
@@ -19,17 +20,19 @@ from rawaug.evaluation.benchmark import (
     crops,
     display_strength,
     noise_note,
+    ranking,
     strengths_of,
     tables,
     trials,
 )
 from rawaug.evaluation.evaluate import denoiser_of
-from rawaug.evaluation.figures import plot_costs
-from rawaug.evaluation.page import Figure, Page
+from rawaug.evaluation.figures import plot_costs, save_picture
+from rawaug.evaluation.page import Figure, Page, command_line
 from rawaug.evaluation.picture_trials import picture_scores, print_pictures
+from rawaug.evaluation.table_files import benchmark_table
 from rawaug.evaluation.tables import print_cells
 from rawaug.evaluation.trials import Measured, Trial, own_noise_note
-from rawaug.files import write_json
+from rawaug.files import write_json, write_text
 
 _ALWAYS = "NonLocalMeans"
 """The filter that is in every table, as are the shipped denoisers of mosaics."""
@@ -57,6 +60,8 @@ class Comparison:
         device: device on which networks run.
         json: file to write the result to; None for none.
         report: page to write tables and crops to; None for none.
+        table: LaTeX file to write the table of known levels to; None for none.
+        figure: file to draw crops of some frames into, .pdf or .png; None for none.
     """
 
     denoisers: Sequence[str]
@@ -70,6 +75,8 @@ class Comparison:
     device: str = "cpu"
     json: str | None = None
     report: str | None = None
+    table: str | None = None
+    figure: str | None = None
 
 
 def compare_raw(comparison: Comparison) -> None:
@@ -97,11 +104,18 @@ def compare_raw(comparison: Comparison) -> None:
     for title, head, cells in tables(result):
         print_cells(title, ["denoiser", *head], cells)
 
+    for line in ranking(result):
+        print(line)
     notes = _notes_of(result)
     print("\n".join([*notes, noise]))
 
     if comparison.json:
         write_json(result, comparison.json)
+    if comparison.table:
+        write_text(benchmark_table(result, command_line()), comparison.table)
+        print(f"table: {comparison.table}")
+    if comparison.figure:
+        print(f"figure: {save_picture(list(crops(denoisers, cases, _ON_PAGE)), Path(comparison.figure))}")
     if comparison.report:
         page = _page_of(comparison, result, denoisers, cases, notes)
         print(f"page: {page.write(Path(comparison.report), settings_of(comparison))}")
@@ -154,7 +168,8 @@ def _notes_of(result: dict[str, Any]) -> list[str]:
         for strength, scores in row["scores"][TOLD].items():
             summaries[f"{name} ({strength})"] = scores
 
-    notes = ["GMAC and seconds are per megapixel of the mosaic; sRGB scores are after one fixed development."]
+    frames = count_of(len(result["frames"]), "frame")
+    notes = [f"{frames}; GMAC and seconds are per megapixel of the mosaic; sRGB scores follow one fixed development."]
     note = own_noise_note(summaries)
     if note:
         notes.append(note)
@@ -190,6 +205,6 @@ def _page_of(
 def settings_of(comparison: Comparison) -> dict[str, Any]:
     """The settings at the end of the page."""
     settings = asdict(comparison)
-    for key in ("device", "json", "report"):
+    for key in ("device", "json", "report", "table", "figure"):
         del settings[key]
     return settings

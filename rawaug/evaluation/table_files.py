@@ -1,19 +1,23 @@
 r"""The tables of a page as separate files: CSV for a spreadsheet or a script, LaTeX for a paper.
 
-``report.html`` has ``report_scores.csv`` and ``report_scores.tex`` beside it, and so on for each of its tables. The
-LaTeX needs no package; the best figures are bold.
+``report.html`` has ``report_scores.csv`` and ``report_scores.tex`` beside it, and so on for each of its tables. Their
+LaTeX needs no package; the best figures are bold. The table of a benchmark for a paper needs the package booktabs.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean, stdev
 from typing import Any
 
-from rawaug.errors import escape
+from rawaug.errors import count_of, escape
+from rawaug.evaluation.benchmark import TOLD, paired_gains
+from rawaug.evaluation.verdict import paired_interval
 from rawaug.files import write_text
 
 _ESCAPES = {
@@ -118,3 +122,55 @@ def _line(cells: Sequence[str]) -> str:
 
 def _escape_latex(text: str) -> str:
     return escape(text).translate(_LATEX)
+
+
+def benchmark_table(result: Mapping[str, Any], command: str) -> str:
+    """Format a benchmark at known levels as a LaTeX ``tabular`` with booktabs, RAW and sRGB in columns of their own.
+
+    A cell is the mean PSNR over frames and its standard error. It is bold if the paired difference to every other row,
+    frame by frame, has an interval above zero.
+
+    Args:
+        result: the result of :func:`rawaug.evaluation.benchmark.benchmark`.
+        command: the command line that made it, for a comment.
+    """
+    rows = result["rows"]
+    strengths = list(rows["noisy input"]["scores"][TOLD])
+    columns = [(strength, key) for strength in strengths for key in ("psnr", "psnr_srgb")]
+
+    lines = [f"% {command}", f"% hash of the noisy input: {result['hash']}; PSNR in dB, mean and standard error over"]
+    lines += [f"% {count_of(len(result['frames']), 'frame')}; bold: ahead of every other row by paired differences"]
+    lines += [rf"\begin{{tabular}}{{l{'r' * len(columns)}}}", r"\toprule"]
+    heads, rules = [""], []
+    for number, strength in enumerate(strengths):
+        heads.append(rf"\multicolumn{{2}}{{c}}{{{_escape_latex(strength)}}}")
+        rules.append(rf"\cmidrule(lr){{{2 * number + 2}-{2 * number + 3}}}")
+    lines += [" & ".join(heads) + r" \\", " ".join(rules)]
+    lines += [_line(["PSNR, dB", *["RAW", "sRGB"] * len(strengths)]), r"\midrule"]
+
+    for name, row in rows.items():
+        cells = [_escape_latex(name)]
+        for strength, key in columns:
+            values = [image[key] for image in row["scores"][TOLD][strength]["images"] if key in image]
+            text = ""
+            if values:
+                text = f"{fmean(values):.2f}"
+            if len(values) > 1:
+                text += rf" $\pm$ {stdev(values) / math.sqrt(len(values)):.2f}"
+            if text and _leads(result, name, strength, key):
+                text = rf"\textbf{{{text}}}"
+            cells.append(text)
+        lines.append(" & ".join(cells) + r" \\")
+
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+def _leads(result: Mapping[str, Any], name: str, strength: str, key: str) -> bool:
+    """Tell whether a row is ahead of every other one beyond the spread of paired differences."""
+    for other in result["rows"]:
+        if other == name:
+            continue
+        gains = paired_gains(result, name, other, strength, key)
+        if not gains or paired_interval(gains)[0] <= 0:
+            return False
+    return True

@@ -6,14 +6,18 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
+from typing import Any
 
 import pytest
 import torch
 
+from rawaug import RawDenoiser
 from rawaug.bayer import CFA, pack
 from rawaug.cli import main
 from rawaug.data import open_pairs
-from rawaug.evaluation.benchmark import ESTIMATED, STRENGTHS, TOLD, hash_of, strengths_of, trials
+from rawaug.evaluation.benchmark import ESTIMATED, STRENGTHS, TOLD, benchmark, hash_of, ranking, strengths_of, trials
+from rawaug.evaluation.table_files import benchmark_table
 from rawaug.evaluation.trials import trial_of
 from rawaug.noise import FixedLevels, NoiseEstimate, estimate_noise, noise_model
 
@@ -29,6 +33,7 @@ def test_the_function_of_the_docs_is_compared(
     (tmp_path / "mine_of_docs.py").write_text(snippet)
     monkeypatch.chdir(tmp_path)
     command = ["benchmark", "mine_of_docs:blur", "--data", "tiny:test", "--count", "1", "--crop", "64"]
+    command += ["--table", "b.tex"]
     assert main([*command, "--noise", "[7e-3, 1.8e-4]", "--json", "b.json", "--report", "b.html"]) == 0
     result = json.loads(Path("b.json").read_text())
     rows = result["rows"]
@@ -42,6 +47,7 @@ def test_the_function_of_the_docs_is_compared(
     assert result["hash"] in printed and noise in printed
     assert page.index("The noise is synthetic") < page.index("<h2>")
     assert all(shown in page for shown in ("mine_of_docs:blur", "PSNR over GMAC"))
+    assert "noisy input" in Path("b.tex").read_text() and r"\toprule" in Path("b.tex").read_text()
     assert "rawaug-joint" not in rows and main(["benchmark", "rawaug-joint"]) == 2
     assert "rawaug-joint: demosaics, too; rawaug run demosaic" in capsys.readouterr().err
 
@@ -85,3 +91,35 @@ def test_noise_of_the_callers_is_that_of_evaluate() -> None:
     assert torch.equal(told.noisy, evaluated.noisy) and torch.allclose(told.variance, evaluated.variance)
     with pytest.raises(ValueError, match=r"iso: .*camera"):
         strengths_of(isos=[100])
+
+
+def result_of(**scores: list[float]) -> dict[str, Any]:
+    """A benchmark's result at one strength, of these PSNR by frame."""
+    rows = {}
+    for name, values in {"noisy input": [20.0] * 6, **scores}.items():
+        images = [{"psnr": value, "psnr_srgb": value - 10.0} for value in values]
+        cell = {"psnr": fmean(values), "psnr_srgb": fmean(values) - 10.0, "images": images, "frames": len(values)}
+        rows[name.replace("_", " ")] = {"scores": {TOLD: {"phone": cell}}}
+    return {"rows": rows, "frames": [f"frame {k}" for k in range(6)], "hash": "01234567"}
+
+
+def test_only_a_lead_beyond_the_spread_of_frames_is_bold_in_a_paper() -> None:
+    frames = [38.0, 45.0, 41.0, 50.0, 36.0, 43.0]
+    clear = result_of(mine=[psnr + 0.5 + k / 100 for k, psnr in enumerate(frames)], theirs=frames)
+    assert re.search(
+        r"^mine & \\textbf\{42\.\d\d \$\\pm\$ 2\.\d\d\} & \\textbf", benchmark_table(clear, "cmd"), re.MULTILINE
+    )
+    (line,) = ranking(clear)
+    assert line.startswith("phone: mine against theirs: +0.5") and line.endswith("ahead in 6 of 6 frames")
+
+    open_ = result_of(mine=[psnr + (2.0 if k else -8.0) for k, psnr in enumerate(frames)], theirs=frames)
+    assert "textbf" not in benchmark_table(open_, "cmd")
+
+
+def test_operations_are_those_of_a_whole_tile_whatever_the_crop() -> None:
+    small = RawDenoiser.of("rawaug-small")
+    costs = []
+    for crop in (32, 96):
+        cases = trials([open_pairs("demo:test")[0].middle(96)], crop, strengths={"strong": FixedLevels(7e-3, 1.8e-4)})
+        costs.append(benchmark([small], cases)["rows"]["rawaug-small"]["gmac"])
+    assert costs[0] == costs[1] == pytest.approx(12.4, abs=0.1)
