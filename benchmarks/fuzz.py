@@ -45,11 +45,11 @@ from rawaug.data.published import read_packed
 from rawaug.data.sidd_scenes import colour_of, mosaic_of
 from rawaug.evaluation.tables import print_rows
 from rawaug.experiment.recipe import kind_of, read_recipe, settings_of
+from rawaug.experiment.settings import Recipe
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng
 from rawaug.io.isolated import isolated
 from rawaug.plugin.params import load_params
 from rawaug.seeding import derive_seed
-from rawaug.tasks.settings import Recipe
 from rawaug.training.state import first_network
 
 WAITING_SECONDS = 240

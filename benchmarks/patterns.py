@@ -27,10 +27,9 @@ from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import compare, to_domain
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial
+from rawaug.experiment.full_colour import libraw_demosaic, mosaic_trial
 from rawaug.noise import noise_model
 from rawaug.progress import progress
-from rawaug.tasks.full_colour import libraw_demosaic
-from rawaug.tasks.mosaic import mosaic_trial
 
 STRENGTHS = (0.5, 1.0, 1.5)
 

@@ -27,11 +27,11 @@ from denoisers.network import DENOISERS
 from rawaug.data import demo_pairs, demo_pictures
 from rawaug.data.pairs import DATASETS, PICTURES, Pair
 from rawaug.experiment.recipe import EXPERIMENTS
+from rawaug.experiment.task import TASKS
 from rawaug.isp.stages import STAGES
 from rawaug.noise.models import NOISE
 from rawaug.paper.baselines.base import BASELINES
 from rawaug.registry import Registry
-from rawaug.tasks.base import TASKS
 from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.losses import LOSSES
 

@@ -40,10 +40,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "evaluation": CAMERA | {"plugin", "data", "io", "denoising"},
     "training": CAMERA | {"plugin", "data", "io", "denoising", "evaluation"},
     "explore": CAMERA | {"plugin", "data", "io", "denoising", "evaluation"},
-    "tasks": PRODUCT,
-    "commands": PRODUCT | {"explore", "tasks", "experiment"},
-    "experiment": PRODUCT | {"tasks"},
-    "paper": PRODUCT | {"experiment", "tasks"},
+    "commands": PRODUCT | {"explore", "experiment"},
+    "experiment": PRODUCT,
+    "paper": PRODUCT | {"experiment"},
     "cli": BASE | {"commands", "experiment", "paper"},
     "__main__": {"cli"},
 }

@@ -15,7 +15,7 @@ from torch import Tensor
 import denoisers
 from rawaug.cli import main
 from rawaug.experiment.recipe import find_recipe, kind_of, read_recipe
-from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
+from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.estimators import Supervised
 
 FOLDER = Path(__file__).parents[1] / "recipes"

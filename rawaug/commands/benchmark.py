@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 from rawaug.commands import YAML, require_results
-from rawaug.evaluation.comparison import Comparison
+from rawaug.data.picture_pairs import is_picture_pairs
+from rawaug.evaluation.comparison import Comparison, compare_pictures, compare_raw
 from rawaug.files import require_output
 from rawaug.registry import require_between
-from rawaug.tasks.base import task_of
 
 
 def run(
@@ -64,4 +64,7 @@ def run(
         if value is not None:
             require_between(f"--{option}", value, 1, 2**20)
 
-    task_of(data).benchmark(comparison)
+    if is_picture_pairs(data):
+        compare_pictures(comparison)
+    else:
+        compare_raw(comparison)

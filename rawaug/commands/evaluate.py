@@ -10,8 +10,9 @@ from rawaug.commands import OPTIONS, YAML, require_results
 from rawaug.data import open_pairs
 from rawaug.data.folders import Readable
 from rawaug.data.pair_folder import PairSettings
+from rawaug.data.picture_pairs import is_picture_pairs
 from rawaug.denoising.denoiser import require_classical
-from rawaug.evaluation.evaluate import Evaluation, require_finite
+from rawaug.evaluation.evaluate import Evaluation, evaluate_pictures, evaluate_raw, require_finite
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import Row, require_numbers, summary
 from rawaug.evaluation.tables import print_scores
@@ -20,7 +21,6 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseSpec
 from rawaug.progress import progress
 from rawaug.registry import Spec
-from rawaug.tasks.base import task_of
 
 
 def run(
@@ -88,8 +88,10 @@ def run(
         result = evaluate_isp(evaluation, as_shot, tone)
     elif as_shot or tone is not None:
         raise ValueError(f"{weights}: is a denoiser; --as-shot and --tone are for ISPs")
+    elif is_picture_pairs(data):
+        result = evaluate_pictures(evaluation)
     else:
-        result = task_of(data).evaluate(evaluation)
+        result = evaluate_raw(evaluation)
     require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
     return result
 

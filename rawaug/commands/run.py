@@ -19,10 +19,10 @@ from rich.text import Text
 
 from rawaug.commands import value_of
 from rawaug.experiment import run as experiment
-from rawaug.experiment.inputs import use_all_pairs
+from rawaug.experiment.data import use_all_pairs
 from rawaug.experiment.recipe import find_recipe, kind_of, read_recipe, recipe_list, settings_of
+from rawaug.experiment.settings import Recipe
 from rawaug.registry import suggest
-from rawaug.tasks.settings import Recipe
 
 SHARED = ("channels", "variance_map", "deviation", "domain")
 """All networks share these settings."""

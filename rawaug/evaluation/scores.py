@@ -94,6 +94,11 @@ class Row(NamedTuple):
     levels_from_clean: bool = False
     seconds: float = 0.0
 
+    @property
+    def table(self) -> str:
+        """The name of the trial's table."""
+        return ", ".join(filter(None, [self.condition, self.strength]))
+
 
 def score(denoisers: Sequence[Denoiser], trials: Iterable[Trial], label: str = "") -> Iterator[Row]:
     """Score every denoiser on every trial, with one trial in memory at a time.

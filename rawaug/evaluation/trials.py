@@ -80,9 +80,24 @@ class Trial:
     levels_from_clean: bool = False
 
     @property
+    def table(self) -> str:
+        """The name of the table that its scores belong to; it is "" if there is only one."""
+        return ", ".join(filter(None, [self.condition, self.strength]))
+
+    @property
     def input(self) -> Noisy:
         """The input for a denoiser of this kind of image."""
         return Noisy(self.noisy, self.variance, self.levels, self.cfa)
+
+    def takes(self, denoiser: Any) -> bool:
+        """Tell whether a denoiser, as in :mod:`rawaug.evaluation.scores`, takes this kind of image and its pattern."""
+        kind = "raw"
+        if self.domain == "srgb":
+            kind = "srgb"
+
+        takes_pattern = getattr(denoiser, "takes_pattern", None)
+        in_pattern = takes_pattern is None or bool(takes_pattern(self.cfa))
+        return in_pattern and denoiser.takes in ("", kind, *self.inputs)
 
     def input_for(self, denoiser: Any) -> Noisy:
         """The input for this denoiser: a denoiser of RAW gets the RAW that a picture was developed from."""

@@ -7,9 +7,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from rawaug.experiment.task import TASKS
 from rawaug.files import read_yaml
 from rawaug.registry import Registry, suggest
-from rawaug.tasks.base import TASKS
 
 EXPERIMENTS = Registry("experiment", "rawaug.experiments", "rawaug.paper")
 """This maps the name in a recipe's key ``experiment`` to an experiment, except for tasks.

@@ -1,37 +1,54 @@
-"""The stages of a recipe in turn: fit the ISP, train every arm, score it, report.
+"""A recipe from the file to the table: fit the ISP, train every arm, score it, report.
 
-Each stage leaves a file in ``OUT/NAME``. A stage whose file was made with the same settings is skipped, so that a
-stopped run resumes.
+Each stage leaves a file in ``OUT/NAME`` with a hash of everything that it depends on, and is left out if that file is
+there already (:func:`rawaug.files.cached`), so that a stopped run resumes.
 """
 
 from __future__ import annotations
 
+import copy
 import io
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, redirect_stdout
-from dataclasses import replace
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
+import denoisers
 from denoisers.classical import FILTERS
 from denoisers.files import find_denoiser
-from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures
-from rawaug.denoising.denoiser import require_classical
-from rawaug.evaluation.trials import added_noise_note, training_noise_note
+from denoisers.network import Denoiser
+from rawaug.bayer import CFA
+from rawaug.data.folders import reports
+from rawaug.data.opening import picture_stamp
+from rawaug.data.pairs import Pair, stamps
+from rawaug.denoising.denoiser import RawDenoiser, require_classical
+from rawaug.evaluation.figures import panels_of
+from rawaug.evaluation.scores import Row, group_rows, score, summary
+from rawaug.evaluation.trials import Trial, added_noise_note, training_noise_note
+from rawaug.experiment.data import name_given_pairs, open_frames, read_frames, require_usable
 from rawaug.experiment.folder import claim, require_free
-from rawaug.experiment.inputs import Inputs, name_given_pairs, open_inputs, require_usable
 from rawaug.experiment.recipe import EXPERIMENTS
-from rawaug.experiment.report import Report, say, write_report
-from rawaug.experiment.stages import Camera, Experiment, Results, fit_isp, is_leader, score_arm, train_arm
-from rawaug.files import LOCK, locked
-from rawaug.noise import noise_model
-from rawaug.registry import Spec, split_spec
-from rawaug.tasks.base import TASKS
-from rawaug.tasks.settings import Recipe
+from rawaug.experiment.report import say, write_report, write_results
+from rawaug.experiment.settings import Recipe
+from rawaug.experiment.task import TASKS, Task
+from rawaug.files import LOCK, cached, fingerprint, locked, sha256
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import NoiseModel, camera_law, noise_model
+from rawaug.progress import progress
+from rawaug.registry import Spec, spec_label, split_spec
+from rawaug.training.camera_fit import fit
 from rawaug.training.estimators import ESTIMATORS
-from rawaug.training.launch import require_trainable
-from rawaug.training.noisy_frames import drop_clean, faintness_note
-from rawaug.training.state import first_network, start_of
+from rawaug.training.launch import is_leader, require_trainable
+from rawaug.training.loop import train
+from rawaug.training.noisy_frames import faintness_note, noisy_frame
+from rawaug.training.state import first_network
+
+Results = dict[str, Any]
+"""It has, by arm, summaries ``plain`` and ``self_ensemble`` for each seed; several tables come first."""
 
 
 def run(
@@ -57,118 +74,100 @@ def run(
         By arm, one entry for each seed: the summaries ``plain`` and ``self_ensemble``. If a task has several tables, by
         pattern or level, each of these has such results.
     """
-    frames = {}
-    if pairs is not None:
-        frames["pairs"] = pairs
-    if validation is not None:
-        frames["validation"] = validation
-    if test is not None:
-        frames["test"] = test
-
-    experiment = prepare(recipe, overwrite, frames)
+    given = {}
+    for part, sequence in (("pairs", pairs), ("validation", validation), ("test", test)):
+        if sequence is not None:
+            given[part] = sequence
+    recipe = name_given_pairs(recipe, given)
     leads = is_leader()
 
-    with ExitStack() as stack:
-        if leads:
-            stack.enter_context(locked(experiment.folder / LOCK))
-            claim(experiment.recipe, overwrite)
-
-        report = Report(experiment)
-        camera: Camera | None = None
-        for seed in experiment.seeds:
-            isp = fit_isp(experiment, seed)
-            if camera is None:
-                camera = Camera.of(experiment, isp)
-                report.noise_note = warn_of_noise(camera)
-            else:
-                camera = camera.with_isp(isp)
-
-            for arm in experiment.recipe.arms:
-                network = train_arm(experiment, camera, arm, seed)
-                if leads:
-                    report.add(arm, network, score_arm(experiment, camera, arm, seed, network))
-
-        if leads and camera is not None:
-            write_report(report, camera)
-
-        return report.results
-
-
-def prepare(recipe: Recipe, overwrite: bool, frames: dict[str, Sequence[Pair]]) -> Experiment:
-    """Prepare an experiment: open or try everything that could be missing or wrong, before anything is fitted."""
-    recipe = name_given_pairs(recipe, frames)
+    # Prepare: whatever could be missing or wrong is found before anything is fitted.
     folder = require_free(recipe, overwrite)
     require_trainable(recipe.device, recipe.devices, recipe.train.precision, recipe.train.logger)
-
-    isp = None
+    finished_isp = None
     if recipe.isp_source is not None:
-        isp = recipe.isp_source.load()
+        finished_isp = recipe.isp_source.load()
 
-    task = TASKS[recipe.kind](recipe)
-    classical = find_classical(recipe.classical, shown=is_leader())
+    classical = find_classical(recipe.classical, shown=leads)
+    task: Task = TASKS[recipe.kind](replace(recipe, classical=classical))
     if recipe.noise != "camera":
         noise_model(recipe.noise_at_iso)
+    require_networks(recipe)
+    baselines = open_baselines(recipe)
 
-    estimators = {}
-    starts = {}
-    for label, arm in recipe.arms.items():
-        config = recipe.network(label)
-        network = first_network(config, seed=0)
-        estimators[label] = ESTIMATORS.make(arm.estimator)
-        estimators[label].require(network)
-        task.require_network(network, config.start or type(network).__name__)
-        starts[label] = start_of(config)
-
-    baselines = [find_denoiser(name) for name in recipe.baselines]
-    methods = task.open_methods(classical, baselines)
-
-    inputs = open_inputs(recipe, frames, task)
-    say(*inputs.lines(recipe))
-    inputs, unreadable = inputs.read()
+    frames, listing = open_frames(recipe, given)
+    say(*listing)
+    frames, unreadable = read_frames(recipe, frames)
     say(*unreadable)
-    inputs = _hide_clean_frames(recipe, inputs)
-    require_usable(recipe, inputs.pairs, inputs.validation)
+    require_usable(recipe, frames["pairs"], frames["validation"])
 
-    return Experiment(recipe, task, folder, isp, inputs, unreadable, classical, methods, estimators, starts)
+    networks: dict[str, Any] = {}
+    tables: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    with ExitStack() as stack:
+        if leads:
+            stack.enter_context(locked(folder / LOCK))
+            claim(recipe, overwrite)
+
+        for seed in recipe.all_seeds:
+            # Fit the ISP. If it has measured the noise, frames and trials have this noise; else they stay.
+            isp = finished_isp or fit_isp(recipe, frames["pairs"], folder / f"seed{seed}" / "isp.safetensors", seed)
+            if seed == recipe.seed or recipe.noise == "camera":
+                noise = noise_model(recipe.noise_at_iso, info=isp.info)
+                real = as_trained(recipe, frames["pairs"], isp)
+                watched = as_trained(recipe, frames["validation"], isp)
+                trials = task.test(frames["test"], isp, noise)
+                noisy_rows: dict[str, list[Row]] = {}
+            if seed == recipe.seed:
+                training_note = warn_of_noise(recipe, frames["pairs"], real, trials, noise)
+
+            validation_trials: dict[CFA, Sequence[Trial]] = {}
+            for arm in recipe.arms:
+                # Train.
+                arm_folder = folder / f"seed{seed}" / arm
+                arm_isp = change_cfa(isp, find_pattern(recipe, arm, isp))
+                if arm_isp.cfa not in validation_trials:
+                    validation_trials[arm_isp.cfa] = task.validation(watched, frames["pictures"], arm_isp, noise)
+                samples = validation_trials[arm_isp.cfa]
+                network = train_arm(task, arm, seed, frames, real, samples, arm_isp, noise, arm_folder)
+
+                # Score.
+                if not leads:
+                    continue
+                if not noisy_rows:
+                    noisy_rows = group_rows(score([task.input], trials), "table")
+                networks[arm] = task.denoiser(arm, network, arm_isp.cfa)
+                scores = score_arm(task, arm, seed, network, arm_isp.cfa, trials, noisy_rows, frames, arm_folder)
+                for table, summaries in scores.items():
+                    tables.setdefault(table, {}).setdefault(arm, []).append(summaries)
+
+        if not leads:
+            return {arm: [] for arm in recipe.arms}
+
+        # Score what the arms are compared with; what there is by then is in results.json.
+        others: dict[str, dict[str, Any]] = {table: {} for table in tables}
+        write_results(recipe, folder, tables, others, frames["test"], unreadable)
+        samples = next(iter(validation_trials.values()))
+        compared = {table: [*task.filters(table, samples), *baselines] for table in tables}
+        others |= score_others(compared, trials, noisy_rows)
+        results = write_results(recipe, folder, tables, others, frames["test"], unreadable)
+
+        # Report: the page shows the first filter, the baselines and the arms.
+        hidden = {spec_label(spec) for spec in classical[1:]}
+        panels = []
+        for trial in task.shown(trials):
+            shown = [denoiser for denoiser in compared[trial.table] if denoiser.name not in hidden]
+            shown = [denoiser for denoiser in (*shown, *networks.values()) if trial.takes(denoiser)]
+            panels.append(panels_of(shown, trial, task.input))
+
+        notes = [*reports(frames["pictures"]), *unreadable]
+        write_report(recipe, folder, frames, tables, others, compared, panels, training_note, notes)
+        return results
 
 
-def _hide_clean_frames(recipe: Recipe, inputs: Inputs) -> Inputs:
-    """Keep the inputs in memory; if no arm sees clean frames, only the test knows any from here on."""
-    pairs = list(inputs.pairs)
-    validation = inputs.validation
-    if recipe.self_supervised:
-        pairs = list(map(drop_clean, pairs))
-        validation = list(map(drop_clean, validation))
-
-    pictures = inputs.pictures
-    if recipe.data.pictures == OWN_PICTURES:
-        pictures = PairPictures(pairs)
-
-    return replace(inputs, pairs=pairs, validation=validation, pictures=pictures)
+# -- prepare -----------------------------------------------------------------------------------------------------------
 
 
-def warn_of_noise(camera: Camera) -> str:
-    """Print notes on the frames' own noise; return the one on training frames, which is empty if there is none."""
-    if not is_leader():
-        return ""
-
-    recipe, inputs = camera.experiment.recipe, camera.experiment.inputs
-    arms = []
-    for name, arm in recipe.arms.items():
-        if arm.sees_clean and arm.augmented < 1.0:
-            arms.append(name)
-
-    training_note = training_noise_note(inputs.pairs, camera.noise, arms)
-    notes = [added_noise_note(camera.trials), training_note]
-    if recipe.self_supervised:
-        notes.append(faintness_note(camera.pairs))
-    for note in filter(None, notes):
-        say(f"note: {note}")
-
-    return training_note
-
-
-def find_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
+def find_classical(specs: Sequence[Spec], shown: bool = True) -> list[Any]:
     """Find a recipe's classical denoisers, without BM3D if its wheel is missing; if ``shown``, that is printed.
 
     Raises:
@@ -186,6 +185,288 @@ def find_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
 
     require_classical(installed)
     return installed
+
+
+def require_networks(recipe: Recipe) -> None:
+    """Raise ValueError if a network does not suit its start, its estimator or the recipe's target."""
+    upscale = 1
+    if recipe.target == "rgb":
+        upscale = 2
+
+    for label, arm in recipe.arms.items():
+        config = recipe.network(label)
+        network = first_network(config, seed=0)
+        ESTIMATORS.make(arm.estimator).require(network)
+        if network.upscale != upscale:
+            gives = "no full colour"
+            if network.upscale > 1:
+                gives = "full colour: rawaug run demosaic trains it"
+            raise ValueError(f"denoiser: {config.start or type(network).__name__} gives {gives}; take another network")
+
+
+def open_baselines(recipe: Recipe) -> list[RawDenoiser]:
+    """Open the trained denoisers to compare with; raise ValueError if one of them also demosaics."""
+    baselines = []
+    for file in map(find_denoiser, recipe.baselines):
+        baselines.append(RawDenoiser.of(file, recipe.device, name=file.stem).require_mosaic())
+
+    return baselines
+
+
+def as_trained(recipe: Recipe, pairs: Sequence[Any], isp: DictionaryISP) -> Sequence[Any]:
+    """Return the pairs, or a noisy frame of each if no arm sees clean ones; the ISP may have measured their levels."""
+    if not recipe.self_supervised:
+        return pairs
+
+    return [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
+
+
+def warn_of_noise(
+    recipe: Recipe, pairs: Sequence[Pair], real: Sequence[Any], trials: Iterable[Trial], noise: NoiseModel
+) -> str:
+    """Print notes on the frames' own noise; return the one on training frames, which is empty if there is none.
+
+    Args:
+        recipe: the recipe.
+        pairs: the real training frames.
+        real: the same, as :func:`as_trained` gives them.
+        trials: the test frames with their noise.
+        noise: the noise that is added to clean RAW.
+    """
+    if not is_leader():
+        return ""
+
+    arms = []
+    for name, arm in recipe.arms.items():
+        if arm.sees_clean and arm.augmented < 1.0:
+            arms.append(name)
+
+    training_note = training_noise_note(pairs, noise, arms)
+    notes = [added_noise_note(trials), training_note]
+    if recipe.self_supervised:
+        notes.append(faintness_note(real))
+    for note in filter(None, notes):
+        say(f"note: {note}")
+
+    return training_note
+
+
+# -- fit, train --------------------------------------------------------------------------------------------------------
+
+
+def fit_isp(recipe: Recipe, pairs: Sequence[Pair], file: Path, seed: int) -> DictionaryISP:
+    """Fit the ISP to the few pairs, or read it if it was fitted to them before; its hash is ``info["key"]``."""
+    measures_noise = recipe.noise == "camera"
+    settings = {**asdict(recipe.fit), "seed": seed}
+    inputs = "isp", settings, stamps(pairs), measures_noise, recipe.self_supervised
+
+    def make() -> DictionaryISP:
+        noise: Literal["on", "off"] = "off"
+        if measures_noise:
+            noise = "on"
+
+        isp = fit(pairs, noise=noise, **settings)
+        isp.info["key"] = fingerprint(inputs)
+        return isp
+
+    def read(path: Path) -> tuple[DictionaryISP, str | None]:
+        isp = DictionaryISP.from_pretrained(path)
+        return isp, isp.info.get("key")
+
+    def write(isp: DictionaryISP, path: Path, key: str) -> None:
+        isp.save(path)
+
+    return cached(file, inputs, make, read, write, done="already fitted" if is_leader() else "")
+
+
+def find_pattern(recipe: Recipe, arm: str, isp: DictionaryISP) -> CFA:
+    """Find the CFA that an arm is trained for: that of the weights that it starts from, else the ISP's."""
+    if recipe.full_colour:
+        return CFA.RGGB  # the truth is mosaicked anew
+
+    start = recipe.network(arm).start
+    if start is None:
+        return isp.cfa
+
+    _, info = denoisers.load(find_denoiser(start))
+    return CFA(info.get("cfa", "RGGB"))
+
+
+def change_cfa(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
+    """Put the ISP of a camera behind a CFA: return itself, or a copy if it had another CFA."""
+    if isp.cfa == cfa:
+        return isp
+
+    other = copy.deepcopy(isp)
+    other.configure(cfa=str(cfa))
+    return other
+
+
+def train_arm(
+    task: Task,
+    arm: str,
+    seed: int,
+    frames: dict[str, Any],
+    real: Sequence[Any],
+    validation: Sequence[Trial],
+    isp: DictionaryISP,
+    noise: NoiseModel,
+    folder: Path,
+) -> Denoiser:
+    """Train the network of an arm, or read it if it has been trained on the same before.
+
+    Args:
+        task: the task.
+        arm: name of the arm.
+        seed: seed of the training.
+        frames: the data of the run, see :func:`rawaug.experiment.data.open_frames`.
+        real: its pairs, as :func:`as_trained` gives them.
+        validation: the frozen samples that choose the weights.
+        isp: the ISP in the CFA of the arm.
+        noise: the noise that is added to clean RAW.
+        folder: gets the weights, the checkpoint and the log.
+    """
+    recipe = task.recipe
+    settings, config = recipe.arms[arm], recipe.network(arm)
+    estimator = ESTIMATORS.make(settings.estimator)
+    pictures = {"pictures": frames["pictures"], "own": real, "noise": real, "more": frames["more"]}[settings.source]
+
+    info = {
+        "cfa": str(isp.cfa),
+        "noise": recipe.noise_at_iso,
+        "steps": recipe.loop(arm).steps,
+        "seed": seed,
+        "arm": arm,
+        "real_pairs": [pair.name for pair in frames["pairs"]],
+        "pictures": recipe.data.pictures,
+    }
+    if recipe.noise == "camera":
+        info["noise"] = camera_law(isp.info["noise"]).spec()
+    if settings.estimator != "supervised":
+        info["estimator"] = settings.estimator
+    if config.start is not None:
+        info["start"] = config.start
+        info["start_sha256"] = sha256(find_denoiser(config.start))
+
+    inputs = {
+        "settings": recipe.weights_settings(arm),
+        "seed": seed,
+        "isp": isp.info["key"],
+        "pairs": stamps(frames["pairs"]),
+        "more": stamps(frames["more"]) if settings.source == "more" else [],
+        "pictures": picture_stamp(recipe.data.pictures),
+        "validation": stamps(frames["validation"]),
+        "start": info.get("start_sha256"),
+        "estimator": estimator.revision,
+    }
+
+    def make() -> Denoiser:
+        return train(
+            task.stream(arm, real, pictures, isp, noise, seed),
+            validation,
+            config,
+            recipe.loop(arm),
+            folder,
+            seed,
+            device=recipe.device,
+            devices=recipe.devices,
+            label=f"seed {seed}, {arm}",
+            estimator=estimator,
+            choose=bool(frames["validation"]),
+            key=fingerprint(inputs),
+        )
+
+    def read(path: Path) -> tuple[Denoiser, str | None]:
+        network, stored = denoisers.load(path)
+        return network, stored.get("key")
+
+    def write(network: Denoiser, path: Path, key: str) -> None:
+        if is_leader():
+            denoisers.save(network, path, {"key": key, **info})
+            (folder / "last.pt").unlink(missing_ok=True)
+
+    path = folder / "denoiser.safetensors"
+    return cached(path, inputs, make, read, write, done="already trained" if is_leader() else "")
+
+
+# -- score -------------------------------------------------------------------------------------------------------------
+
+
+def score_arm(
+    task: Task,
+    arm: str,
+    seed: int,
+    network: Denoiser,
+    cfa: CFA,
+    trials: Sequence[Trial],
+    noisy_rows: dict[str, list[Row]],
+    frames: dict[str, Any],
+    folder: Path,
+) -> dict[str, dict[str, Any]]:
+    """Compute the summaries of an arm by table and kind, ``plain`` and ``self_ensemble``, or read those of before.
+
+    Args:
+        task: the task.
+        arm: name of the arm.
+        seed: seed of its training.
+        network: its network.
+        cfa: the pattern that the network is trained for.
+        trials: the test frames with their noise.
+        noisy_rows: the scores of the noisy input, by table.
+        frames: the data of the run, see :func:`rawaug.experiment.data.open_frames`.
+        folder: has the weights, and gets ``plain.json`` and ``self_ensemble.json``.
+    """
+    recipe = task.recipe
+    weights = sha256(folder / "denoiser.safetensors")
+    inputs = weights, stamps(frames["test"]), recipe.scores_settings()
+
+    kinds = {"plain": 1}
+    if recipe.self_ensemble:
+        kinds["self_ensemble"] = recipe.views
+
+    summaries: dict[str, dict[str, Any]] = {}
+    for kind, views in kinds.items():
+        denoiser = task.denoiser(arm, network, cfa, views)
+        label = f"{arm}, seed {seed}, {kind}"
+        make = partial(score_tables, denoiser, trials, noisy_rows, label)
+        scores = cached(folder / f"{kind}.json", [kind, *inputs], make, done="already evaluated")
+        for table, scores_of_table in scores["tables"].items():
+            summaries.setdefault(table, {})[kind] = scores_of_table
+
+    return summaries
+
+
+def score_tables(
+    denoiser: Any, trials: Iterable[Trial], noisy_rows: dict[str, list[Row]], label: str
+) -> dict[str, dict[str, Any]]:
+    """Compute the summaries of a denoiser by table; tables whose images it does not take are left out."""
+    taken = (trial for trial in trials if trial.takes(denoiser))
+    rows = group_rows(score([denoiser], taken, f"evaluate {label}"), "table")
+    tables = {table: summary(of_table, noisy_rows[table]) for table, of_table in rows.items()}
+    for table, scores in tables.items():
+        print(f"evaluated {', '.join(filter(None, [label, table]))}: {scores.get('psnr', math.nan):.2f} dB")
+
+    return {"tables": tables}
+
+
+def score_others(
+    compared: dict[str, list[Any]], trials: Sequence[Trial], noisy_rows: dict[str, list[Row]]
+) -> dict[str, dict[str, Any]]:
+    """Score the denoisers that arms are compared with, by table and name, with one trial in memory at a time."""
+    rows: dict[str, list[Row]] = {table: [] for table in compared}
+    for trial in progress(trials, label="other denoisers", unit="image"):
+        rows[trial.table] += score(list(filter(trial.takes, compared[trial.table])), [trial])
+
+    others: dict[str, dict[str, Any]] = {}
+    for table, of_table in rows.items():
+        others[table] = {}
+        for name, of_one in group_rows(of_table).items():
+            others[table][name] = summary(of_one, noisy_rows[table])
+
+    return others
+
+
+# -- kinds of experiment -----------------------------------------------------------------------------------------------
 
 
 def run_kind(kind: str, settings: Any, overwrite: bool = False) -> Any:
@@ -208,7 +489,8 @@ def dry_run(kind: str, settings: Any, overwrite: bool = False) -> None:
     if kind in TASKS:
         if settings.isp_source is not None:
             settings.isp_source.load()  # a mistyped name is refused before any data are opened
-        print("\n".join(open_inputs(settings, {}).lines(settings)))
+        _, listing = open_frames(settings, {})
+        print("\n".join(listing))
 
     with TemporaryDirectory() as elsewhere, redirect_stdout(io.StringIO()) as output:
         run_kind(kind, replace(settings.shortest(), out=elsewhere))

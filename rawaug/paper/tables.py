@@ -20,12 +20,12 @@ from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.folder import claim, require_free
 from rawaug.experiment.recipe import EXPERIMENTS
 from rawaug.experiment.run import find_classical, run
+from rawaug.experiment.settings import Recipe
 from rawaug.files import write_json
 from rawaug.paper import published
 from rawaug.paper.ablation import SPACES, Ablation, ablate
 from rawaug.paper.ablation import TITLES as STAGES
 from rawaug.paper.reconstruction import Comparison, compare
-from rawaug.tasks.settings import Recipe
 
 PARTS = ("table1", "table2_nikon", "table2_canon", "table3", "few", "unsupervised", "ablation")
 TITLES = {

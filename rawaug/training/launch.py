@@ -34,6 +34,14 @@ def require_trainable(device: str, devices: int, precision: str, logger: str | N
         raise ValueError(f"train.precision: {' '.join(str(error).split())}") from None
 
 
+def is_leader() -> bool:
+    """Tell whether this is the training process, among several, that writes and evaluates."""
+    with extra("train"):
+        from lightning_fabric.utilities.rank_zero import rank_zero_only
+
+    return getattr(rank_zero_only, "rank", 0) == 0
+
+
 def make_loggers(kind: str | None, folder: Path, label: str) -> list[Any]:
     """Make the loggers of Fabric that ``train.logger`` names.
 

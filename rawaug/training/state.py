@@ -11,7 +11,7 @@ import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,31 +19,9 @@ from torch import Tensor
 import denoisers
 from denoisers.files import find_denoiser
 from denoisers.network import Denoiser
-from rawaug.bayer import CFA
-from rawaug.files import sha256, write_bytes
+from rawaug.files import write_bytes
 from rawaug.seeding import derive_seed
 from rawaug.training.config import DenoiserConfig, TrainConfig
-
-
-class Start(NamedTuple):
-    """The hash of the file that a training continues from, and the CFA that its network is for."""
-
-    sha256: str
-    cfa: CFA
-
-
-def start_of(config: DenoiserConfig) -> Start | None:
-    """Look up the weights that ``config.start`` names; return None if the training starts from random ones.
-
-    Raises:
-        FileNotFoundError: if there are no such weights.
-    """
-    if config.start is None:
-        return None
-
-    path = find_denoiser(config.start)
-    _, info = denoisers.load(path)
-    return Start(sha256(path), CFA(info.get("cfa", "RGGB")))
 
 
 def first_network(config: DenoiserConfig, seed: int) -> Denoiser:

@@ -60,8 +60,8 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
     with monkeypatch.context() as patch:
         patch.setattr("rawaug.denoising.denoiser.denoisers.SelfEnsemble", no_views)
         assert "killed before" in refused(*command, "--quiet")
-    plain = json.loads((place / "evaluation.json").read_text())
-    assert plain["plain"]["psnr"] > 20 and "self_ensemble" not in plain  # written as it came
+    plain = json.loads((place / "plain.json").read_text())
+    assert plain["tables"][""]["psnr"] > 20 and not (place / "self_ensemble.json").exists()  # written as it came
     assert main([*command, "--self-ensemble", "false"]) == 0
     listed = capsys.readouterr().out.strip().splitlines()
     results = json.loads((tmp_path / "fewshot" / "results.json").read_text())["results"]
@@ -74,8 +74,8 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
     assert main(command) == 0
     text = capsys.readouterr().out
     assert text.count("already trained") == 2 and "evaluated real, seed 0, self_ensemble: " in text
-    scores = json.loads((place / "evaluation.json").read_text())
-    assert scores["plain"] == plain["plain"] and scores["self_ensemble"]["psnr"] > 20
+    assert json.loads((place / "plain.json").read_text()) == plain
+    assert json.loads((place / "self_ensemble.json").read_text())["tables"][""]["psnr"] > 20
     other = [*command, "--train.learning-rate", "0.002"]
     said = refused(*other)  # other settings are another run
     assert "holds a run with other settings (train.learning_rate 0.0007, now 0.002); give this run another" in said

@@ -6,10 +6,10 @@ import pytest
 
 from denoisers.classical import FILTERS
 from rawaug.data.pairs import DATASETS
+from rawaug.experiment.settings import ArmConfig
 from rawaug.noise import EldNoise, SensorNoise, noise_model
 from rawaug.paper.baselines.base import BASELINES
 from rawaug.registry import Registry, split_spec
-from rawaug.tasks.settings import ArmConfig
 from rawaug.training.estimators import ESTIMATORS, R2R, Noisier
 from rawaug.training.losses import LOSSES
 

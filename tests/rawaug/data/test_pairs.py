@@ -22,8 +22,8 @@ from rawaug.data.pairs import (
     stamps,
 )
 from rawaug.data.selection import one_a_phone, select_pairs, whole_scenes
-from rawaug.experiment.inputs import open_inputs
-from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
+from rawaug.experiment.data import open_frames
+from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
 
 
 def pair(**changes: Any) -> Pair:
@@ -64,9 +64,10 @@ def test_a_recipe_augments_the_pictures_of_the_pairs_that_it_trains_on() -> None
     pairs, test = demo_pairs("train", count=3), demo_pairs("test", count=1)
     data = DataConfig(count=2, pictures="pairs", validation=None)
     recipe = Recipe(data=data, arms={"ours": ArmConfig(augmented=0.5)})
-    plan = open_inputs(recipe, {"pairs": pairs, "test": test})
-    assert isinstance(plan.pictures, PairPictures) and len(plan.pictures) == 2 == len(plan.pictures[:])
-    assert torch.equal(plan.pictures[1], pairs[1].srgb)
+    frames, _ = open_frames(recipe, {"pairs": pairs, "test": test})
+    pictures = frames["pictures"]
+    assert isinstance(pictures, PairPictures) and len(pictures) == 2 == len(pictures[:])
+    assert torch.equal(pictures[1], pairs[1].srgb)
     with pytest.raises(ValueError, match=r"data\.pictures: .*pairs"):
         replace(data, pairs=None)
 

@@ -19,9 +19,9 @@ from denoisers.published import BiasFreeDnCNN
 from rawaug.bayer import CFA, pack, unpack
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.evaluation.evaluate import denoiser_of
+from rawaug.experiment.full_colour import RgbRecipe
 from rawaug.experiment.run import run
-from rawaug.tasks.rgb import RgbRecipe
-from rawaug.tasks.settings import ArmConfig, DataConfig
+from rawaug.experiment.settings import ArmConfig, DataConfig
 from rawaug.training.config import DenoiserConfig
 
 LEVELS = (1.8e-3, 1.2e-5)

@@ -14,13 +14,13 @@ from rawaug.cli import main
 from rawaug.commands.run import with_values
 from rawaug.experiment import run as experiment
 from rawaug.experiment.recipe import EXPERIMENTS, find_recipe, kind_of, kinds, read_recipe, settings_of
+from rawaug.experiment.settings import ArmConfig, DataConfig, ISPSource, Recipe
+from rawaug.experiment.task import TASKS
 from rawaug.isp.fit.samples import BLOCK
 from rawaug.paper.baselines import BASELINES
 from rawaug.paper.methods import FAMILIES, ROWS
 from rawaug.paper.reconstruction import Comparison
 from rawaug.plugin.draw import Draw
-from rawaug.tasks.base import TASKS
-from rawaug.tasks.settings import ArmConfig, DataConfig, ISPSource, Recipe
 from rawaug.training.config import TrainConfig, Weighing
 
 FOLDER = find_recipe("fewshot").parent
@@ -42,7 +42,7 @@ def test_every_kind_has_settings_that_name_it() -> None:
     assert set(TASKS) == {"raw", "rgb", "mosaic", "srgb"}
     assert set(EXPERIMENTS) == {"reconstruction", "ablation", "paper"}
     for name in TASKS:
-        assert settings_of(name).kind == name and TASKS[name].__module__ == f"rawaug.tasks.{name}"
+        assert settings_of(name).kind == name and TASKS[name].settings is settings_of(name)
     for name in ("reconstruction", "ablation"):
         assert settings_of(name)().name == name
 

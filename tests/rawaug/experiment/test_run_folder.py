@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from rawaug.experiment.folder import STAMP, claim, require_free
+from rawaug.experiment.settings import ArmConfig, Recipe
 from rawaug.paper.ablation import Ablation, ablate
-from rawaug.tasks.settings import ArmConfig, Recipe
 from rawaug.training.config import TrainConfig
 
 

@@ -18,9 +18,7 @@ from rawaug.data import demo_pairs
 from rawaug.evaluation.verdict import verdict
 from rawaug.experiment import report
 from rawaug.experiment import run as experiment
-from rawaug.tasks.raw import RawTask
-from rawaug.tasks.settings import ArmConfig
-from rawaug.tasks.srgb import SrgbTask
+from rawaug.experiment.settings import ArmConfig
 from rawaug.training.noisy_frames import NoisyFrame, faintness_note, noise_of
 
 
@@ -51,12 +49,12 @@ def test_a_filter_or_nothing_is_used_as_the_verdict_says() -> None:
     assert usage(results, {})[-1] == "to use: nothing, the frames are best as they are"
 
 
-def test_the_command_can_be_pasted_whatever_a_run_is_called() -> None:
+@pytest.mark.parametrize("target", ["raw", "srgb"])
+def test_the_command_can_be_pasted_whatever_a_run_is_called(target: str) -> None:
     path = Path("my run; touch PWNED") / "denoiser.safetensors"
-    recipe: Any = SimpleNamespace(untouched=["a b.safetensors"], classical=[], baselines=["a b.safetensors"])
-    for task in (RawTask(recipe), SrgbTask(recipe)):
-        assert shlex.split(task.command_of_weights(path))[-1] == str(path)
-        assert shlex.split(task.command_of_method("a b"))[-1] == "a b.safetensors"
+    recipe: Any = SimpleNamespace(classical=[], baselines=["a b.safetensors"], target=target)
+    assert shlex.split(report.weights_command(recipe, path))[-1] == str(path)
+    assert shlex.split(report.method_command(recipe, "a b"))[-1] == "a b.safetensors"
 
 
 def usage(results: Any, others: Any) -> list[str]:
@@ -64,14 +62,10 @@ def usage(results: Any, others: Any) -> list[str]:
         arms={"mine": ArmConfig()},
         baselines=["rawaug-small"],
         classical=[{"name": "Wavelet", "settings": {"strength": 0.5}}],
+        all_seeds=range(len(results["mine"])),
+        target="raw",
     )
-    experiment: Any = SimpleNamespace(
-        arm_folder=lambda arm, seed: Path("runs") / f"seed{seed}" / arm,
-        seeds=range(len(results["mine"])),
-        recipe=recipe,
-        task=RawTask(recipe),
-    )
-    return report.usage(experiment, {"": results}, {"": verdict(results, others)})
+    return report.usage(recipe, Path("runs"), {"": results}, {"": verdict(results, others).use})
 
 
 @pytest.fixture

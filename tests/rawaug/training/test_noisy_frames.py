@@ -14,12 +14,13 @@ from rawaug.bayer import CFA, noise_variance
 from rawaug.data import demo_pairs, demo_photographs
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.trials import Trial
+from rawaug.experiment.raw import RawTask
+from rawaug.experiment.run import as_trained
+from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, SensorNoise, noise_model
 from rawaug.plugin.augment import RawAugment
-from rawaug.tasks.raw import RawTask
-from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.estimators import R2R, Noise2Noise, Noisier, NoisyCrop, SelfSupervised
 from rawaug.training.loop import train, validate
@@ -101,9 +102,9 @@ def test_a_self_supervised_recipe_never_meets_a_clean_frame(pictures: list[torch
     def seen(pairs: list[Pair]) -> list[torch.Tensor]:
         known = [drop_clean(pair) for pair in pairs]
         task = RawTask(recipe)
-        frames = task.training_frames(known, isp)
+        frames = as_trained(recipe, known, isp)
         stream = task.stream("r2r", frames, pictures, isp, noise, seed=0)
-        watched = task.validation_trials(frames, pictures, isp, noise)
+        watched = task.validation(frames, pictures, isp, noise)
         assert watched[0].develop is None
         return [*stream[0], *stream[1], watched[0].noisy, watched[0].clean, watched[0].variance]
 
@@ -187,7 +188,7 @@ def test_without_validation_pairs_pictures_are_watched(pictures: list[torch.Tens
         arms={"convex": ArmConfig(1.0)},
         train=TrainConfig(crop=32),
     )
-    samples = RawTask(recipe).validation_trials([], pictures, DictionaryISP(), noise_model(LEVELS))
+    samples = RawTask(recipe).validation([], pictures, DictionaryISP(), noise_model(LEVELS))
     assert len(samples) == 16 and samples[0].noisy.shape == (1, 4, 16, 16)
 
 

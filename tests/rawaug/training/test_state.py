@@ -12,12 +12,13 @@ from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.trials import trial_of
-from rawaug.experiment.stages import change_cfa
+from rawaug.experiment.run import change_cfa, find_pattern
+from rawaug.experiment.settings import ArmConfig, Recipe
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.state import TrainingState, first_network, start_of
+from rawaug.training.state import TrainingState, first_network
 
 
 @pytest.fixture
@@ -36,9 +37,9 @@ def test_a_start_gives_its_weights_and_its_architecture(weights: Path) -> None:
         model = first_network(config, seed=0)
         assert model.training
         assert all(torch.equal(value, expected[key]) for key, value in model.state_dict().items())
-    start = start_of(agreeing)
-    assert start is not None and start.cfa == CFA.GBRG and len(start.sha256) == 64
-    assert start_of(DenoiserConfig()) is None
+    started = Recipe(arms={"on": ArmConfig(denoiser=agreeing), "anew": ArmConfig()})
+    isp = DictionaryISP(ISPConfig(cfa="BGGR"))
+    assert (find_pattern(started, "on", isp), find_pattern(started, "anew", isp)) == (CFA.GBRG, CFA.BGGR)
 
 
 def test_another_architecture_is_refused_in_one_line(weights: Path) -> None:

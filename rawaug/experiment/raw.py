@@ -4,38 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from torch import nn
 
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Pair, PairPictures
+from rawaug.data.pairs import PairPictures
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.trials import Trial, make_trials, trial_of
+from rawaug.experiment.task import TASKS, Task
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
-from rawaug.registry import Spec
 from rawaug.seeding import derive_seed
-from rawaug.tasks.base import TASKS, Task
 from rawaug.training.crops import WATCHED, OwnPictureCrops, PictureCrops, RealCrops, Source, freeze_samples
 from rawaug.training.estimators import ESTIMATORS, SelfSupervised
-from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, noisy_frame, r2r_trials
+from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, r2r_trials
 from rawaug.training.stream import TrainingStream
 
 
 @TASKS.register("raw")
 class RawTask(Task):
     """Denoisers of RAW in one of Bayer's patterns, trained with clean targets or on noisy frames alone."""
-
-    def training_frames(self, pairs: Sequence[Pair], isp: DictionaryISP) -> Sequence[Any]:
-        """Return the pairs, or a :class:`NoisyFrame` of each if no arm sees clean ones."""
-        if not self.recipe.self_supervised:
-            return pairs
-
-        return [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
 
     def stream(
         self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
@@ -83,7 +74,7 @@ class RawTask(Task):
             return OwnPictureCrops(pictures.pairs, augment, crop)
         return PictureCrops(RawPairs(pictures, augment, crop, zoom=settings.zoom))
 
-    def validation_trials(
+    def validation(
         self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
     ) -> Sequence[Trial]:
         """Take frames with frozen noise, or as r2r pairs if no arm sees clean ones; without any, pictures as RAW."""
@@ -97,21 +88,10 @@ class RawTask(Task):
 
         return freeze_samples(PictureCrops(RawPairs(pictures, augment, self.recipe.train.crop)), "validation")
 
-    def test_trials(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
+    def test(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
         """Take the frames with captured or frozen noise, in the pattern of the ISP."""
         return make_trials(frames, lambda pair: trial_of(pair, noise, isp.cfa))
 
-    def denoiser(self, name: str, network: nn.Module, pattern: CFA, views: int = 1) -> RawDenoiser:
+    def denoiser(self, name: str, network: nn.Module, cfa: CFA, views: int = 1) -> RawDenoiser:
         """Make a denoiser of the network, in tiles, for its own pattern."""
-        return RawDenoiser.of(network, self.recipe.device, name=name, cfa=pattern, views=views, checked=False)
-
-    def open_methods(self, classical: Sequence[Spec], baselines: Sequence[Path]) -> list[RawDenoiser]:
-        """Open filters and trained denoisers of mosaics."""
-        denoisers = []
-        for spec in classical:
-            denoisers.append(RawDenoiser.of(spec).require_mosaic())
-        for file in baselines:
-            denoiser = RawDenoiser.of(file, self.recipe.device, name=file.stem)
-            denoisers.append(denoiser.require_mosaic())
-
-        return denoisers
+        return RawDenoiser.of(network, self.recipe.device, name=name, cfa=cfa, views=views, checked=False)

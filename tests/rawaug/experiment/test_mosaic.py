@@ -18,12 +18,11 @@ from rawaug.data import demo_pairs
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import NOISY, score
+from rawaug.experiment.full_colour import MosaicRecipe, full_colour, libraw_demosaic, mosaic_trial, planes_trial
+from rawaug.experiment.settings import ArmConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.seeding import keyed_generator
-from rawaug.tasks.full_colour import full_colour, libraw_demosaic
-from rawaug.tasks.mosaic import MosaicRecipe, mosaic_trial, planes_trial
-from rawaug.tasks.settings import ArmConfig
 from rawaug.training.crops import MosaicCrops
 
 

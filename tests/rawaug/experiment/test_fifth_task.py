@@ -15,10 +15,11 @@ BURST = '''
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+from rawaug.evaluation.trials import make_trials, trial_of
 from rawaug.noise import noise_model
-from rawaug.tasks.base import TASKS
-from rawaug.tasks.raw import RawTask
-from rawaug.tasks.settings import Recipe
+from rawaug.experiment.task import TASKS
+from rawaug.experiment.raw import RawTask
+from rawaug.experiment.settings import Recipe
 
 
 @dataclass
@@ -48,18 +49,15 @@ class BurstTask(RawTask):
     def stream(self, arm, frames, pictures, isp, noise, seed):
         return super().stream(arm, frames, pictures, isp, self.noise, seed)
 
-    def validation_trials(self, frames, pictures, isp, noise):
-        return super().validation_trials(frames, pictures, isp, self.noise)
+    def validation(self, frames, pictures, isp, noise):
+        return super().validation(frames, pictures, isp, self.noise)
 
-    def test_trials(self, frames, isp, noise):
-        clean = [replace(pair, noisy=None, shot_var=None, read_var=None) for pair in frames]
-        return super().test_trials(clean, isp, self.noise)
+    def test(self, frames, isp, noise):
+        def make(pair):
+            clean = replace(pair, noisy=None, shot_var=None, read_var=None)
+            return trial_of(clean, self.noise, isp.cfa, condition=f"{self.recipe.shots} shots")
 
-    def group(self, trial):
-        return f"{self.recipe.shots} shots"
-
-    def samples_key(self):
-        return (self.recipe.shots,)
+        return make_trials(frames, make)
 '''
 
 RECIPE = """

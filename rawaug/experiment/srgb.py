@@ -11,7 +11,6 @@ are developed afterwards. Real pairs are those of :mod:`rawaug.data.picture_pair
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,19 +23,17 @@ from torch import Tensor, nn
 
 from denoisers.files import DEFAULT
 from rawaug import bayer
-from rawaug.bayer import CFA, noise_variance
+from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.data.picture_pairs import PicturePair, is_picture_pairs
+from rawaug.data.picture_pairs import PicturePair
 from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser
 from rawaug.denoising.pictures import PictureDenoiser
-from rawaug.evaluation.comparison import compare_pictures
-from rawaug.evaluation.evaluate import evaluate_pictures
-from rawaug.evaluation.figures import Panels, crops_at_100, panels_of
 from rawaug.evaluation.picture_trials import picture_trials
 from rawaug.evaluation.scores import score
 from rawaug.evaluation.trials import Trial
+from rawaug.experiment.settings import Recipe
+from rawaug.experiment.task import TASKS, Task
 from rawaug.io import RawFrame, develop, write_dng
-from rawaug.io.pictures import write_picture
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import RawAugment
@@ -45,8 +42,6 @@ from rawaug.plugin.targets import Target
 from rawaug.progress import progress
 from rawaug.registry import Spec, spec_label, split_spec
 from rawaug.seeding import derive_seed, keyed_generator
-from rawaug.tasks.base import TASKS, Task
-from rawaug.tasks.settings import Recipe
 from rawaug.training.crops import PictureCrops
 from rawaug.training.srgb_noise import noise_on_srgb
 from rawaug.training.srgb_samples import NoisyPictures, SrgbSamples
@@ -80,7 +75,13 @@ class SrgbRecipe(Recipe):
     target: ClassVar[Target] = "srgb"
     from_pictures: ClassVar[bool] = True
     baselines: list[str] = field(default_factory=lambda: [DEFAULT])
+    self_ensemble: bool = False
     levels: list[tuple[float, float]] = field(default_factory=lambda: [(5e-4, 1e-6), (2e-3, 1e-5), (8e-3, 1e-4)])
+
+    @property
+    def noise_in_test(self) -> None:
+        """None, since the noise is that of each table's level."""
+        return None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -108,17 +109,6 @@ class SrgbTask(Task):
     """Denoisers of developed pictures."""
 
     settings = SrgbRecipe
-    compared_in = "developed sRGB"
-    synthetic = "developed pictures with noise"
-    developed = True
-    ensembles = False
-    evaluate = staticmethod(evaluate_pictures)
-    benchmark = staticmethod(compare_pictures)
-
-    @classmethod
-    def reads(cls, data: str) -> bool:
-        """Tell whether the test set is of developed pictures."""
-        return is_picture_pairs(data)
 
     def stream(
         self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
@@ -138,90 +128,31 @@ class SrgbTask(Task):
         samples = SrgbSamples(camera, on_pictures, settings.srgb_share, settings.noise_level)
         return TrainingStream(None, samples, train.batch, 1.0, derive_seed(seed, "stream"))
 
-    def validation_trials(
+    def validation(
         self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
     ) -> Sequence[Trial]:
         """Take the frames at every level, developed."""
         return srgb_trials(frames, self.recipe.levels, "develop validation")
 
-    def test_trials(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
+    def test(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
         """Take the frames at every level, developed."""
         return srgb_trials(frames, self.recipe.levels, "develop test")
 
-    def validation_key(self) -> Any:
-        """Return the levels."""
-        return self.recipe.levels
-
-    def trials_key(self) -> Sequence[Any]:
-        """Return the levels."""
-        return (self.recipe.levels,)
-
-    def test_noise(self) -> Any:
-        """Return None, since the noise is that of each table's level."""
-        return None
-
-    def denoiser(self, name: str, network: nn.Module, pattern: CFA, views: int = 1) -> PictureDenoiser:
+    def denoiser(self, name: str, network: nn.Module, cfa: CFA, views: int = 1) -> PictureDenoiser:
         """Make a denoiser of the network, in tiles; one that reads a level estimates it."""
-        return PictureDenoiser.of(network, self.recipe.device, name=name, views=1, checked=False)
+        return PictureDenoiser.of(network, self.recipe.device, name=name, views=views, checked=False)
 
-    def open_methods(self, classical: Sequence[Spec], baselines: Sequence[Path]) -> list[Any]:
-        """Open the baselines, which are denoisers of RAW; filters are made for each level, see :meth:`methods_for`."""
-        return [RawDenoiser.of(name, self.recipe.device).require_mosaic() for name in self.recipe.baselines]
+    def filters(self, table: str, validation: Sequence[Trial]) -> list[PictureDenoiser]:
+        """Make the filters, each at its best strength on the validation frames of this level."""
+        same_level = [trial for trial in validation if trial.table == table]
+        return [best_filter(spec, same_level or validation) for spec in self.recipe.classical]
 
-    def group(self, trial: Any) -> str:
-        """Return the level."""
-        return str(trial.strength)
-
-    def methods_for(self, group: str, methods: Sequence[Any], validation: Sequence[Any]) -> list[Any]:
-        """Choose the filters, each at its best strength on validation frames of this level, and the baselines."""
-        same_level = [trial for trial in validation if trial.strength == group]
-        denoisers: list[Any] = []
-        for spec in self.recipe.classical:
-            denoisers.append(best_filter(spec, same_level or validation))
-        if group != REAL:
-            denoisers += methods
-
-        return denoisers
-
-    def panels(self, methods: Any, trials: Sequence[Trial]) -> list[Panels]:
-        """Show the first frame of each level."""
-        panels = []
-        for group, of_group in methods.items():
-            first = next(trial for trial in trials if trial.strength == group)
-            panels.append(panels_of(of_group, first))
-
-        return panels
-
-    def save_picture(self, panels: Sequence[Panels], path: Path) -> Path:
-        """Write crops at 100 %, a level in each row."""
-        write_picture(path, crops_at_100(panels))
-        return path
-
-    def command_of_weights(self, path: Path) -> str:
-        """Write the command that denoises pictures with the weights of an arm."""
-        return f"rawaug denoise IN.jpg OUT.jpg --denoiser {shlex.quote(str(path))}"
-
-    def command_of_method(self, name: str) -> str:
-        """Write the command that denoises pictures with a filter, or RAW with a baseline."""
-        method = name.partition(", ")[0]
-        for baseline in self.recipe.baselines:
-            if method == Path(baseline).stem:
-                return f"rawaug denoise IN.dng OUT.dng --denoiser {shlex.quote(baseline)}"
-
-        for spec in self.recipe.classical:
-            if method == spec_label(spec):
-                return f"rawaug denoise IN.jpg OUT.jpg --denoiser {shlex.quote(split_spec(spec)[0])}"
-
-        return ""
-
-    def notes(self, test: Sequence[Any]) -> dict[str, Any]:
-        """Return the mean variance of the test frames' own noise in RAW, if it is known."""
-        own = {}
-        for pair in test:
-            if pair.own_noise is not None:
-                own[pair.name] = noise_variance(pair.raw, *pair.own_noise).mean().item()
-
-        return {"own_noise": own}
+    def shown(self, trials: Sequence[Trial]) -> list[Trial]:
+        """Choose the first frame of each level."""
+        first: dict[str, Trial] = {}
+        for trial in trials:
+            first.setdefault(trial.table, trial)
+        return list(first.values())
 
 
 def _level_name(levels: Levels) -> str:

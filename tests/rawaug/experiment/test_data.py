@@ -14,10 +14,10 @@ from rawaug.bayer import bin_mosaic
 from rawaug.cli import main
 from rawaug.data import Pair, demo_pairs
 from rawaug.data.pairs import names_of, stamps
-from rawaug.experiment.inputs import name_given_pairs, open_inputs, require_usable, use_all_pairs
+from rawaug.experiment.data import name_given_pairs, open_frames, read_frames, require_usable, use_all_pairs
 from rawaug.experiment.recipe import find_recipe, read_recipe, recipe_list, shipped_recipes
+from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
 from rawaug.io import write_picture
-from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.config import TrainConfig
 
 ARMS = {"real": ArmConfig()}
@@ -50,8 +50,9 @@ def data(tmp_path: Path) -> DataConfig:
     return DataConfig(count=2, test=f"pairs:{test}", pictures=str(tmp_path / "pictures"))
 
 
-def plan_of(recipe: Recipe, **given: Any) -> Any:
-    return open_inputs(name_given_pairs(recipe, given), given)
+def opened(recipe: Recipe, **given: Any) -> dict[str, Any]:
+    frames, _ = open_frames(name_given_pairs(recipe, given), given)
+    return frames
 
 
 def test_own_pairs_are_all_used_and_a_part_of_them_is_held_out(own: Path, data: DataConfig) -> None:
@@ -70,9 +71,9 @@ def test_own_pairs_are_all_used_and_a_part_of_them_is_held_out(own: Path, data: 
     assert use_all_pairs(elsewhere, read_recipe(find_recipe("sidd/fewshot")), {"data.pairs"}) == elsewhere
 
     recipe = use_all_pairs(mine, content, {"data.pairs"})
-    plan = plan_of(recipe)
-    assert names_of(plan.pairs) == [f"shot{k}" for k in range(6)] and names_of(plan.validation) == ["shot6"]
-    train, validate, test, pictures, isp = plan.lines(recipe)
+    frames, lines = open_frames(recipe, {})
+    assert names_of(frames["pairs"]) == [f"shot{k}" for k in range(6)] and names_of(frames["validation"]) == ["shot6"]
+    train, validate, test, pictures, isp = lines
     assert train.startswith(f"train     6 of 7 of pairs:{own}: shot0,")
     assert validate == f"validate  1 of 7 of pairs:{own}, held out: shot6"
     assert test.endswith("test: a, b") and "2 of " in pictures and isp.endswith("fitted to 6 frames")
@@ -80,25 +81,25 @@ def test_own_pairs_are_all_used_and_a_part_of_them_is_held_out(own: Path, data: 
 
 def test_damaged_frames_are_named_and_the_rest_is_used(own: Path, data: DataConfig, tmp_path: Path) -> None:
     recipe = Recipe(arms=ARMS, data=replace(data, pairs=f"pairs:{own}", count=None, validation="auto"))
-    whole, none = plan_of(recipe).read()
-    assert none == [] and names_of(whole.pairs) == [f"shot{k}" for k in range(6)]
-    assert stamps(whole.test) == stamps(plan_of(recipe).test)
+    whole, none = read_frames(recipe, opened(recipe))
+    assert none == [] and names_of(whole["pairs"]) == [f"shot{k}" for k in range(6)]
+    assert stamps(whole["test"]) == stamps(opened(recipe)["test"])
     (own / "shot1.npz").write_bytes(b"damaged")
     (tmp_path / "test" / "b.npz").write_bytes((tmp_path / "test" / "b.npz").read_bytes()[:300])
-    read, lines = plan_of(recipe).read()
-    assert names_of(read.pairs) == ["shot0", "shot2", "shot3", "shot4", "shot5"] and names_of(read.test) == ["a"]
+    read, lines = read_frames(recipe, opened(recipe))
+    assert names_of(read["pairs"]) == ["shot0", "shot2", "shot3", "shot4", "shot5"] and names_of(read["test"]) == ["a"]
     assert lines[0] == "left out of data.pairs: 1 of 6 frames, unreadable" and "shot1.npz" in lines[1]
     assert lines[2] == "left out of data.test: 1 of 2 frames, unreadable" and "b.npz" in lines[3] and len(lines) == 4
     (own / "shot6.npz").write_bytes(b"damaged")  # all that is held out
     with pytest.raises(ValueError, match="shot6"):
-        plan_of(recipe).read()
+        read_frames(recipe, opened(recipe))
 
 
 def test_limits_of_reading_are_keys_of_data(data: DataConfig, tmp_path: Path) -> None:
-    assert len(plan_of(Recipe(arms=ARMS, data=data, train=TrainConfig(crop=16))).pictures[0]) == 3
+    assert len(opened(Recipe(arms=ARMS, data=data, train=TrainConfig(crop=16)))["pictures"][0]) == 3
     small = Recipe(arms=ARMS, data=replace(data, max_pixels=1000), train=TrainConfig(crop=16))
     with pytest.raises(ValueError, match="pixels"):
-        plan_of(small).pictures[0]
+        opened(small)["pictures"][0]
     with pytest.raises(ValueError, match=r"data\.max_pixels"):
         DataConfig(max_pixels=0)
 
@@ -106,35 +107,38 @@ def test_limits_of_reading_are_keys_of_data(data: DataConfig, tmp_path: Path) ->
 def test_pairs_from_python_are_divided_and_seen_by_their_content(data: DataConfig) -> None:
     pairs, test = demo_pairs("train"), demo_pairs("test", count=2)
     recipe = Recipe(arms=ARMS, data=replace(data, count=None, test_count=1, validation_crop=None, test_crop=None))
-    plan = plan_of(recipe, pairs=pairs, test=test)
-    assert list(plan.pairs) == pairs[:4] and list(plan.validation) == pairs[4:] and list(plan.test) == test[:1]
+    frames = opened(recipe, pairs=pairs, test=test)
+    assert list(frames["pairs"]) == pairs[:4] and list(frames["validation"]) == pairs[4:]
+    assert list(frames["test"]) == test[:1]
     other = replace(pairs[4], raw=pairs[4].raw * 0.5)
-    changed = plan_of(recipe, pairs=[*pairs[:4], other], test=test)
-    assert stamps(plan.validation) != stamps(changed.validation) and stamps(plan.pairs) == stamps(changed.pairs)
-    single = plan_of(recipe, pairs=pairs[:1])
-    assert len(single.pairs) == 1 and not single.validation, "nothing is held out"
-    assert "final weights are kept" in single.lines(recipe)[1]
+    changed = opened(recipe, pairs=[*pairs[:4], other], test=test)
+    assert stamps(frames["validation"]) != stamps(changed["validation"])
+    assert stamps(frames["pairs"]) == stamps(changed["pairs"])
+    single = opened(recipe, pairs=pairs[:1])
+    assert len(single["pairs"]) == 1 and not single["validation"], "nothing is held out"
+    _, lines = open_frames(name_given_pairs(recipe, {"pairs": pairs[:1]}), {"pairs": pairs[:1]})
+    assert "final weights are kept" in lines[1]
     with pytest.raises(ValueError, match=r"data\.test: .*train_00_astronaut"):
-        plan_of(recipe, pairs=pairs, test=pairs[:1])
-    assert names_of(plan_of(recipe, pairs=pairs, validation=test[1:], test=test[:1]).pairs) == names_of(pairs)
+        opened(recipe, pairs=pairs, test=pairs[:1])
+    assert names_of(opened(recipe, pairs=pairs, validation=test[1:], test=test[:1])["pairs"]) == names_of(pairs)
 
 
 def test_validation_and_test_frames_are_binned_and_cropped_and_training_frames_are_not(data: DataConfig) -> None:
     shots = {split: demo_pairs(split, count=1) for split in ("train", "validation", "test")}
     given = {"pairs": shots["train"], "validation": shots["validation"], "test": shots["test"]}
     recipe = Recipe(arms=ARMS, data=replace(data, bin=4, validation_crop=None, test_crop=32))
-    plan = plan_of(recipe, **given)
+    frames = opened(recipe, **given)
     (watched,) = shots["validation"]
-    assert torch.equal(plan.validation[0].raw, bin_mosaic(watched.raw, watched.cfa, 4))
-    assert plan.test[0].raw.shape == (1, 32, 32) and plan.pairs[0] is shots["train"][0]
+    assert torch.equal(frames["validation"][0].raw, bin_mosaic(watched.raw, watched.cfa, 4))
+    assert frames["test"][0].raw.shape == (1, 32, 32) and frames["pairs"][0] is shots["train"][0]
 
 
 def test_two_folders_may_use_the_same_names(own: Path, data: DataConfig, tmp_path: Path) -> None:
     more = write_pairs(tmp_path / "more", ["shot0"])
     mine = replace(data, pairs=f"pairs:{own}", validation="auto", test=f"pairs:{more}")
-    assert names_of(plan_of(Recipe(arms=ARMS, data=mine)).test) == ["shot0"]
+    assert names_of(opened(Recipe(arms=ARMS, data=mine))["test"]) == ["shot0"]
     with pytest.raises(ValueError, match="pairs"):
-        plan_of(Recipe(arms=ARMS, data=replace(mine, test=f"pairs:{own}")))
+        opened(Recipe(arms=ARMS, data=replace(mine, test=f"pairs:{own}")))
 
 
 def test_what_frames_lack_is_found_before_anything_is_fitted() -> None:

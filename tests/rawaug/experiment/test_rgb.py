@@ -17,15 +17,14 @@ from rawaug.bayer import CFA
 from rawaug.data import demo_pictures
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.scores import compare
-from rawaug.experiment.inputs import open_inputs
+from rawaug.experiment.data import open_frames
+from rawaug.experiment.full_colour import RgbRecipe, demosaic, full_colour, rgb_trial
 from rawaug.experiment.run import run
 from rawaug.experiment.run import run as train_denoiser
+from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
 from rawaug.io.pictures import decode_srgb
 from rawaug.metrics import psnr
 from rawaug.noise import noise_model
-from rawaug.tasks.full_colour import demosaic, full_colour, rgb_trial
-from rawaug.tasks.rgb import RgbRecipe
-from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.config import DenoiserConfig, TrainConfig
 
 NOISE = noise_model((1e-3, 1e-5))
@@ -58,7 +57,8 @@ def test_the_truth_of_a_grey_scene_is_grey(cfa: CFA, factor: int) -> None:
     grey = F.avg_pool2d(F.interpolate(light, size=(642, 898), mode="bicubic"), 3, stride=1)[0]
     pair = Pair("grey", torch.zeros(3, 640, 896, dtype=torch.uint8), grey, cfa)
     recipe = small(Path(), data=DataConfig(pairs=None, validation=None, test_crop=None, bin=factor))
-    truth = full_colour(open_inputs(recipe, {"test": [pair]}).test[0])
+    frames, _ = open_frames(recipe, {"test": [pair]})
+    truth = full_colour(frames["test"][0])
     red, green, blue = truth[..., 8:-8, 8:-8].unbind(1)
     assert red.std() > 0.04
     assert min(psnr(red[None], blue[None]).item(), psnr(red[None], green[None]).item()) > 50

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator
@@ -18,13 +18,19 @@ from rawaug.noise import noise_model
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.targets import Srgb, Target
 from rawaug.registry import require_between, split_spec
-from rawaug.training.config import MOST, DenoiserConfig, TrainConfig, Weighing
+from rawaug.training.config import MOST, SAME_WEIGHTS, DenoiserConfig, TrainConfig, Weighing
 from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.srgb_noise import noise_on_srgb
 from rawaug.training.srgb_samples import Conditioning
 
 _SHORT_CROP = 256
 """A dry run uses the middles of frames, of this side in pixels."""
+
+_NOT_OF_WEIGHTS = (
+    *("name", "out", "device", "devices", "seed", "seeds", "steps", "arms", "isp", "fit"),
+    *("views", "self_ensemble", "classical", "baselines"),
+)
+"""No weights depend on these keys, or they do so through the arm, the seed and the ISP."""
 
 HELD_OUT = "auto"
 """``data.validation`` has this value for a part of ``data.pairs``."""
@@ -236,7 +242,7 @@ class ArmConfig:
 
 @dataclass
 class Recipe:
-    """A whole experiment on RAW. Other tasks have more keys, see :mod:`rawaug.tasks`.
+    """A whole experiment on RAW. Other tasks have more keys, see :mod:`rawaug.experiment`.
 
     Args:
         name: of the output folder within ``out``.
@@ -271,6 +277,12 @@ class Recipe:
 
     from_pictures: ClassVar[bool] = False
     """This says whether arms can train on nothing but pictures, with clean targets."""
+
+    full_colour: ClassVar[bool] = False
+    """This says whether frames are binned so that the four sites of a cell make a pixel of full colour."""
+
+    scoring: ClassVar[tuple[str, ...]] = ()
+    """No weights depend on these further keys, but scores do."""
 
     name: str = "experiment"
     data: DataConfig = field(default_factory=DataConfig)
@@ -371,6 +383,42 @@ class Recipe:
             return self.noise
 
         return {"name": self.noise, "settings": {"iso": self.isp_source.iso}}
+
+    @property
+    def noise_in_test(self) -> Any:
+        """The noise of test frames without a capture; None if their tables say it."""
+        return self.noise_at_iso
+
+    @property
+    def all_seeds(self) -> range:
+        """The seeds of the runs."""
+        return range(self.seed, self.seed + self.seeds)
+
+    def weights_settings(self, arm: str) -> dict[str, Any]:
+        """Collect the keys that the weights of an arm depend on, for it and for no other."""
+        settings = asdict(self)
+        for key in (*_NOT_OF_WEIGHTS, *self.scoring):
+            del settings[key]
+
+        data, loop = settings["data"], asdict(self.loop(arm))
+        irrelevant = {"memory_mb", "test", "test_count", "test_crop"}
+        if self.data.validation is None:
+            irrelevant |= {"validation_count", "validation_crop", "bin"}
+            del loop["validate_every"]
+
+        settings["data"] = {key: data[key] for key in data.keys() - irrelevant}
+        settings["train"] = {key: loop[key] for key in loop.keys() - SAME_WEIGHTS}
+        settings["denoiser"] = asdict(self.network(arm))
+        settings["arm"] = asdict(self.arms[arm])
+        return settings | {"draw": asdict(self.draw), "noise": self.noise_at_iso}
+
+    def scores_settings(self) -> dict[str, Any]:
+        """Collect the keys that scores depend on besides the weights."""
+        settings = {key: getattr(self, key) for key in ("views", *self.scoring)}
+        for key in ("test", "test_count", "test_crop", "bin"):
+            settings[key] = getattr(self.data, key)
+
+        return settings
 
     def network(self, arm: str) -> DenoiserConfig:
         """Return the network of an arm: its own, or else the recipe's."""

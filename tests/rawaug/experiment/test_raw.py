@@ -7,11 +7,11 @@ import torch
 
 from rawaug.commands.run import with_values
 from rawaug.data import demo_pairs, demo_pictures
+from rawaug.experiment.raw import RawTask
+from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.plugin.targets import Srgb, Target
-from rawaug.tasks.raw import RawTask
-from rawaug.tasks.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.config import TrainConfig
 
 
@@ -30,7 +30,7 @@ def test_other_targets_are_trained_and_watched_on(aim: Target, noisy: tuple[int,
     one, other = (task.stream(arm, [], pictures, isp, noise, 0)[0] for arm in recipe.arms)
     assert one.noisy.shape == one.variance.shape == noisy and one.clean.shape == clean
     assert torch.equal(one.noisy, other.noisy) == (aim == "rgb"), "through JPEG, if any"
-    watched = task.validation_trials([], pictures, isp, noise)[0]
+    watched = task.validation([], pictures, isp, noise)[0]
     assert watched.noisy.shape == (1, *noisy) and watched.clean.shape == (1, *clean)
 
 
