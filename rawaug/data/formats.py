@@ -258,7 +258,7 @@ _SHAPES = "a mosaic (H, W), or packed RAW (4, h, w) or (h, w, 4)"
 
 
 def _packed(file: Path, numbers: Tensor, cfa: CFA) -> Tensor:
-    """Pack a mosaic ``(H, W)`` or ``(1, H, W)``, or packed RAW with planes first or last, as RAW ``(4, h, w)``.
+    """Pack a mosaic ``(H, W)``, ``(1, H, W)`` or ``(H, W, 1)``, or packed RAW of either order, as RAW ``(4, h, w)``.
 
     Planes are last if the last axis has 4 elements and the first does not.
     """
@@ -268,6 +268,8 @@ def _packed(file: Path, numbers: Tensor, cfa: CFA) -> Tensor:
         return numbers.permute(2, 0, 1)
     if numbers.ndim == 3 and numbers.shape[0] == 1:
         numbers = numbers[0]
+    elif numbers.ndim == 3 and numbers.shape[-1] == 1:
+        numbers = numbers[..., 0]
     if numbers.ndim != 2 or min(numbers.shape) < 2:
         raise ValueError(f"{file}: has shape {tuple(numbers.shape)}; use {_SHAPES}")
 

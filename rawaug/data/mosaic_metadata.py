@@ -81,7 +81,10 @@ def _cfa(value: Any) -> CFA:
     names = np.ravel(value)
     if len(names) != 1:
         raise ValueError(f"{len(names)} names; use one of {', '.join(CFA)}")
-    return CFA(str(names[0]).strip().upper())
+    name = names[0]
+    if isinstance(name, bytes):  # as MATLAB and h5py give text
+        name = name.decode("ascii")
+    return CFA(str(name).strip().upper())
 
 
 def _matrix(value: Any) -> Tensor:

@@ -12,6 +12,7 @@ EXIF says otherwise, and does not see an EXIF chunk after the pixels of a PNG.
 from __future__ import annotations
 
 import os
+import tempfile
 import warnings
 from io import BytesIO
 from pathlib import Path
@@ -24,7 +25,7 @@ from rawaug.files import require_file
 from rawaug.io.bitmaps import is_rle4, unpack_rle4
 from rawaug.io.colour import Colour, colour_of_numbers, require_sdr
 from rawaug.io.content import content_of_opened, reads_avif, reads_heic
-from rawaug.io.headers import ICC_TAG, Headers, headers_of_opened, png_fault
+from rawaug.io.headers import ICC_TAG, Headers, headers_of_opened, mend_jpeg_header, png_fault
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.tiff_pictures import TiffKind, kind_of_tiff, meaning_of, reader_of
 
@@ -91,7 +92,7 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, coarse: bool = False) -> De
     if headers.animated:
         raise ValueError(f"{path}: is an animation; save a single frame")
     if headers.unread:
-        raise ValueError(f"{path}: {headers.unread}; save it as sRGB")
+        raise ValueError(f"{path}: {headers.unread}; convert it to sRGB")
     if headers.colour is not None:
         require_sdr(headers.colour, path)
 
@@ -115,11 +116,42 @@ def _decode(path: Path, name: str, max_pixels: int, coarse: bool, headers: Heade
             kind = kind_of_tiff(file)
         if kind is not None and reader_of(kind, path) == "tifffile":
             return _decode_with_tifffile(path, max_pixels, headers, kind)
+    if name == "PNM":
+        _require_no_pam(path)
     if name == "PSD":
         _require_rgb_in_psd(path)
     if name == "JPEG 2000":
         _require_plain_components(path)
+    if name == "JPEG":
+        return _decode_jpeg(path, max_pixels, coarse, headers)
     return _decode_with_oiio(path, name, max_pixels, coarse, headers)
+
+
+def _require_no_pam(path: Path) -> None:
+    with path.open("rb") as file:
+        if file.read(2) == b"P7":
+            raise ValueError(f"{path}: is PAM, which is not read; convert it to PNM or PNG (pamtopnm, ImageMagick)")
+
+
+_HARMLESS = ("unknown JFIF revision", "extraneous bytes before marker")
+"""libjpeg warns of these, OpenImageIO takes the warnings for errors, and every viewer shows the picture."""
+
+
+def _decode_jpeg(path: Path, max_pixels: int, coarse: bool, headers: Headers) -> Decoded:
+    """Decode a JPEG, whose header is written anew if only that is odd, so that damage of its pixels is still told."""
+    try:
+        return _decode_with_oiio(path, "JPEG", max_pixels, coarse, headers)
+    except OSError as error:
+        if not any(warning in str(error) for warning in _HARMLESS):
+            raise
+
+    with tempfile.TemporaryDirectory() as folder:
+        mended = Path(folder) / "mended.jpg"
+        mended.write_bytes(mend_jpeg_header(path))
+        try:
+            return _decode_with_oiio(mended, "JPEG", max_pixels, coarse, headers)
+        except OSError as error:
+            raise OSError(str(error).replace(str(mended), str(path))) from None
 
 
 def require_utf8(path: Path) -> None:

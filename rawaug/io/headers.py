@@ -28,6 +28,7 @@ XMP_TAG, ICC_TAG = 700, 34675
 _MOST_CHUNKS = 2**20
 _MOST_BYTES = 2**26
 _PIECE = 2**20
+_MOST_STRAY_BYTES = 1024
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 ICC_PREFIX = b"ICC_PROFILE\0"
 _COLOR_SPACE, _INTEROPERABILITY_INDEX = 40961, 1
@@ -114,7 +115,9 @@ def jpeg_segments(file: BinaryIO) -> Iterator[Segment]:
     file.seek(2)
     while True:
         head = file.read(4)
-        while len(head) == 4 and head[1] == 0xFF:  # bytes of 255 may fill the space before a marker
+        for _ in range(_MOST_STRAY_BYTES):  # as every decoder does, whatever stands before a marker is passed over
+            if len(head) < 4 or (head[0] == 0xFF and head[1] not in (0x00, 0xFF)):
+                break
             head = head[1:] + file.read(1)
         if len(head) < 4 or head[0] != 0xFF or head[1] in (_START_OF_SCAN, _END_OF_IMAGE):
             return
@@ -124,6 +127,18 @@ def jpeg_segments(file: BinaryIO) -> Iterator[Segment]:
         if len(data) < length or length < 0:
             return
         yield Segment(head[1], data)
+
+
+def mend_jpeg_header(path: Path) -> bytes:
+    """Give a JPEG without stray bytes between the segments of its header, and with a version of JFIF that exists."""
+    with path.open("rb") as file:
+        header = b"\xff\xd8"
+        for marker, data in jpeg_segments(file):
+            if data.startswith(b"JFIF\0") and len(data) > 6:
+                data = data[:5] + b"\1\2" + data[7:]
+            header += struct.pack(">BBH", 0xFF, marker, len(data) + 2) + data
+        file.seek(-4, 1)  # jpeg_segments has read the marker of the scan
+        return header + file.read()
 
 
 def _of_jpeg(file: BinaryIO) -> Headers:
@@ -460,7 +475,7 @@ def _of_jpeg_xl(file: BinaryIO) -> Headers:
     file.seek(0)
     if file.read(2) == b"\xff\x0a":
         file.seek(0)
-        return Headers(animated=_is_animated_codestream(file.read(64)))
+        return _of_codestream(file.read(_MOST_OF_CODESTREAM))
 
     exif, xmp, codestream = None, None, b""
     for box in boxes(file, 0, file.seek(0, 2)):
@@ -471,8 +486,11 @@ def _of_jpeg_xl(file: BinaryIO) -> Headers:
         elif box.name == b"xml ":
             xmp = file.read(size)
         elif box.name in (b"jxlc", b"jxlp") and not codestream:
-            codestream = file.read(64)[4 if box.name == b"jxlp" else 0 :]
-    return Headers(exif, xmp, animated=_is_animated_codestream(codestream))
+            codestream = file.read(_MOST_OF_CODESTREAM)[4 if box.name == b"jxlp" else 0 :]
+    return _of_codestream(codestream)._replace(exif=exif, xmp=xmp)
+
+
+_MOST_OF_CODESTREAM = 1024
 
 
 class _Bits:
@@ -493,22 +511,67 @@ class _Bits:
         """Pass over a number that is written in one of four widths."""
         self.take(widths[self.take(2)])
 
+    def number(self, *forms: tuple[int, int]) -> int:
+        """Read a number that is written as one of four offsets and widths."""
+        offset, width = forms[self.take(2)]
+        return offset + self.take(width)
 
-def _is_animated_codestream(data: bytes) -> bool:
+
+def _of_codestream(data: bytes) -> Headers:
+    """Read whether a codestream is an animation, or has a black channel, which makes it CMYK."""
     if not data.startswith(b"\xff\x0a"):
-        return False
+        return Headers()
     bits = _Bits(data[2:])
     _pass_size(bits)
     all_default = bits.take(1)
-    if all_default or not bits.take(1):
-        return False
+    if all_default:
+        return Headers()
 
-    bits.take(3)  # orientation
-    if bits.take(1):
-        _pass_size(bits)
-    if bits.take(1):
-        _pass_preview_size(bits)
-    return bool(bits.take(1))
+    if bits.take(1):  # more fields
+        bits.take(3)  # orientation
+        if bits.take(1):
+            _pass_size(bits)
+        if bits.take(1):
+            _pass_preview_size(bits)
+        if bits.take(1):
+            return Headers(animated=True)
+
+    _pass_bit_depth(bits)
+    bits.take(1)  # whether 16 bits are enough
+    count = bits.number((0, 0), (1, 0), (2, 4), (1, 12))
+    try:
+        if any(_extra_channel(bits) == _BLACK for _ in range(count)):
+            return Headers(unread="is CMYK in JPEG XL")
+    except ValueError:  # long names; the decoder knows the channels
+        pass
+    return Headers()
+
+
+_ALPHA, _SPOT, _BLACK, _CFA = 0, 2, 4, 5
+
+
+def _extra_channel(bits: _Bits) -> int:
+    """Read what a further channel is."""
+    if bits.take(1):  # all is as usual
+        return _ALPHA
+    kind = bits.number((0, 0), (1, 0), (2, 4), (18, 6))
+    _pass_bit_depth(bits)
+    bits.choose(0, 0, 0, 3)  # subsampling
+    bits.take(8 * bits.number((0, 0), (0, 4), (16, 5), (48, 10)))  # name
+    if kind == _ALPHA:
+        bits.take(1)
+    elif kind == _SPOT:
+        bits.take(4 * 16)
+    elif kind == _CFA:
+        bits.choose(0, 2, 4, 8)
+    return kind
+
+
+def _pass_bit_depth(bits: _Bits) -> None:
+    is_floating = bits.take(1)
+    bits.choose(0, 0, 0, 6)
+    if is_floating:
+        bits.take(4)
 
 
 def _pass_size(bits: _Bits) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 from pathlib import Path
 
@@ -10,13 +11,14 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from PIL import Image
 
 from benchmarks.matrices import HEIGHT, RAMPS, WIDTH, TiffKind, outcome, read_here, tiff_kinds, write_tiff
 from rawaug.io import read_picture
+from rawaug.io.headers import headers_of_opened
 from rawaug.io.stored import read_stored, write_stored
 
 KINDS = [kind for kind in tiff_kinds() if kind.compression != 5 and (kind.order == "<" or kind.predictor > 1)]
-UNREAD_BITS = (32,)
 
 
 @pytest.mark.parametrize("photometric", [0, 1, 2, 3])
@@ -111,3 +113,56 @@ def test_jpeg_2000_of_one_depth_is_read_and_others_are_refused(bits: int, tmp_pa
         (tmp_path / "b.jp2").write_bytes(data)
         with pytest.raises(ValueError, match=r"b\.jp2: .*JPEG 2000"):
             read_picture(tmp_path / "b.jp2")
+
+
+def jpeg() -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(np.rint(255 * RAMPS).astype(np.uint8)).save(file, "JPEG", quality=95)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("oddity", ["JFIF 2.01", "two stray bytes"])
+def test_jpegs_that_every_viewer_shows_are_read_and_damage_in_them_is_told(oddity: str, tmp_path: Path) -> None:
+    plain = jpeg()
+    odd = bytearray(plain)
+    if oddity == "JFIF 2.01":
+        place = plain.index(b"JFIF\0") + 5
+        odd[place : place + 2] = b"\2\1"
+    else:
+        odd[plain.index(b"\xff\xdb") : plain.index(b"\xff\xdb")] = b"\0\0"
+    (tmp_path / "plain.jpg").write_bytes(plain)
+    (tmp_path / "odd.jpg").write_bytes(odd)
+    assert torch.equal(read_picture(tmp_path / "odd.jpg"), read_picture(tmp_path / "plain.jpg"))
+    (tmp_path / "cut.jpg").write_bytes(odd[: len(odd) * 2 // 3])
+    with pytest.raises(OSError, match=rf"^{tmp_path}/cut\.jpg: .*JPEG"):
+        read_picture(tmp_path / "cut.jpg")
+
+
+def test_pam_says_what_to_do(tmp_path: Path) -> None:
+    head = b"P7\nWIDTH 2\nHEIGHT 2\nDEPTH 3\nMAXVAL 255\nTUPLTYPE RGB\nENDHDR\n"
+    (tmp_path / "a.pam").write_bytes(head + bytes(12))
+    with pytest.raises(ValueError, match=r"a\.pam: is PAM.*convert"):
+        read_picture(tmp_path / "a.pam")
+
+
+def codestream(*fields: tuple[int, int]) -> bytes:
+    """The first bits of a JPEG XL of 32 x 32, by values and widths, the lowest bit first."""
+    value, place = 0, 0
+    for number, width in ((1, 1), (3, 5), (1, 3), *fields):
+        value |= number << place
+        place += width
+    return b"\xff\x0a" + value.to_bytes(place // 8 + 8, "little")
+
+
+def test_a_jpeg_xl_with_a_black_channel_is_cmyk(tmp_path: Path) -> None:
+    usual = [(0, 1), (0, 1), (0, 1), (0, 2), (1, 1)]  # not all default, no more fields, 8 bits, 16 bits are enough
+    alpha, black = [(1, 1)], [(0, 1), (2, 2), (2, 4), (0, 3), (0, 2), (0, 2)]
+    two = [(2, 2), (0, 4)]
+    for fields in ([(0, 2)], [(1, 2), *alpha]):
+        assert headers_of_opened(io.BytesIO(codestream(*usual, *fields)), "JPEG XL").unread == ""
+    for fields in ([(1, 2), *black], [*two, *black, *alpha], [*two, *alpha, *black]):
+        headers = headers_of_opened(io.BytesIO(codestream(*usual, *fields)), "JPEG XL")
+        assert headers.unread.startswith("is CMYK")
+    (tmp_path / "a.jxl").write_bytes(codestream(*usual, (1, 2), *black))
+    with pytest.raises(ValueError, match=r"a\.jxl: is CMYK"):
+        read_picture(tmp_path / "a.jxl")
