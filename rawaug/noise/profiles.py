@@ -2,11 +2,16 @@ r"""Noise profiles of 374 cameras by ISO, var = a y + b, as measured by darktabl
 
 Their red and blue figures contain a white balance, so the green ones serve all channels. darktable measures after
 demosaicing, which averages noise. For four cameras that ELD measured on the mosaic, darktable's profiles are too low by
-7.2 to 11.4 in shot variance and 2.2 to 16 in read variance (:data:`SPREAD`). All profiles are multiplied by the
-geometric means, :data:`SHOT_ON_MOSAIC` and :data:`READ_ON_MOSAIC`; the median shot_var at ISO 100 is then 2.8e-5, a
-full well of 36,000 electrons. A fifth camera supports the first factor: frames of a Nikon D5000 at ISO 200 measure 2.6
-to 3.2e-5, and its profile gives 3.09e-5. ``any camera`` draws the two factors independently, log-uniformly over the
-spread. Rows whose green variance is not positive are left out.
+7.2 to 11.4 in shot variance and 2.2 to 16 in read variance. All profiles are multiplied by the geometric means,
+:data:`SHOT_ON_MOSAIC` and :data:`READ_ON_MOSAIC`; the median shot_var at ISO 100 is then 2.8e-5, a full well of 36,000
+electrons. A fifth camera supports the first factor: frames of a Nikon D5000 at ISO 200 measure 2.6 to 3.2e-5, and its
+profile gives 3.09e-5. A sixth, Raspberry Pi's IMX477, has 6.0, below the others; all six make :data:`SPREAD`. ``any
+camera`` draws the two factors independently, log-uniformly over the spread. Rows whose green variance is not positive
+are left out.
+
+Raspberry Pi's tuning file (libcamera, src/ipa/rpi/vc4/data/imx477.json) states the standard deviation over the root of
+the signal above black at gain 1, in numbers of 16 bits: 2.767. With white 65535 and black 4096, shot_var is 2.767^2 /
+61439 = 1.25e-4, which is 6.0 times the profile at ISO 100.
 """
 
 from __future__ import annotations
@@ -31,8 +36,8 @@ SHOT_ON_MOSAIC = 8.6
 READ_ON_MOSAIC = 6.2
 """Ratio of the read variance on the mosaic to that of a profile."""
 
-SPREAD = ((7.2 / SHOT_ON_MOSAIC, 11.4 / SHOT_ON_MOSAIC), (2.2 / READ_ON_MOSAIC, 16.0 / READ_ON_MOSAIC))
-"""Limits of a camera's shot_var and read_var, relative to those of its profile."""
+SPREAD = ((6.0 / SHOT_ON_MOSAIC, 11.4 / SHOT_ON_MOSAIC), (2.2 / READ_ON_MOSAIC, 16.0 / READ_ON_MOSAIC))
+"""Limits of a camera's shot_var and read_var, relative to those of its profile: those of six cameras."""
 
 _ROUNDING = 1e-9
 """Largest difference between logarithms that count as one ISO."""

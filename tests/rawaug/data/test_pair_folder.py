@@ -273,7 +273,7 @@ def test_a_kind_that_is_not_read_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("axis", [0, 2])
 def test_one_plane_may_have_an_axis_of_its_own_and_a_pattern_may_be_bytes(tmp_path: Path, axis: int) -> None:
     numbers = np.random.default_rng(0).integers(64, 1000, (16, 24), np.uint16)
-    arrays = {"noisy": np.expand_dims(numbers, axis), "clean": numbers}
-    np.savez(tmp_path / "a.npz", cfa=b"GRBG", black=64, white=1023, **arrays)
+    noisy = np.expand_dims(numbers, axis)
+    np.savez(tmp_path / "a.npz", noisy=noisy, clean=numbers, cfa=b"GRBG", black=64, white=1023)
     pair = open_pairs(f"pairs:{tmp_path}")[0]
     assert pair.cfa == CFA.GRBG and pair.noisy is not None and torch.equal(pair.noisy, pair.raw)

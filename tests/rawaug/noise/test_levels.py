@@ -256,13 +256,16 @@ def test_any_camera_draws_how_far_its_levels_are_known() -> None:
 
 
 def test_a_profile_says_how_far_its_levels_are_known() -> None:
-    """The four cameras' own ratios of 7.2 to 11.4 and 2.2 to 16; a fifth camera, measured, is within the ends."""
+    """Six cameras' own ratios of 6.0 to 11.4 and 2.2 to 16; the fifth and the sixth are within the ends."""
     ends = profile_ends("Sony ILCE-7M3")
     assert [row.iso for row in ends] == [100.0 * 2**k for k in range(11)]
-    assert ends[0].shot_var == pytest.approx((1.392e-6 * 7.2, 1.392e-6 * 11.4), rel=1e-4)
+    assert ends[0].shot_var == pytest.approx((1.392e-6 * 6.0, 1.392e-6 * 11.4), rel=1e-4)
     assert ends[0].read_var == pytest.approx((7.017e-11 * 2.2, 7.017e-11 * 16), rel=1e-4)
     at_200 = float(ProfileLevels("Nikon D5000", iso=200).sample(1, generator())[0])
     assert at_200 * SPREAD[0][0] <= 2.6e-5 and at_200 * SPREAD[0][1] >= 3.2e-5
+    at_gain_1 = float(ProfileLevels("Raspberrypi RP_imx477", iso=100).sample(1, generator())[0])
+    of_tuning_file = 2.767**2 / (65535 - 4096)  # of the standard deviation over the root of the signal, in 16 bits
+    assert at_gain_1 * SPREAD[0][0] <= of_tuning_file == pytest.approx(1.25e-4, rel=0.01)
     with pytest.raises(ValueError, match="is not listed"):
         profile_ends("Nikon D75O")
 
