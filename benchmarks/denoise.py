@@ -24,7 +24,7 @@ from denoisers.files import DEFAULT
 from rawaug import bayer
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.denoising.files import denoise_file
-from rawaug.denoising.sources import RawFiles
+from rawaug.denoising.raw_files import RawFiles
 from rawaug.io import write_dng
 
 
@@ -69,7 +69,7 @@ def command(noisy: Tensor, denoiser: str, device: torch.device, repeats: int) ->
     with tempfile.TemporaryDirectory() as folder:
         source, out = Path(folder, "noisy.dng"), Path(folder, "denoised.dng")
         write_dng(source, shot)
-        runs = [denoise_file(source, out, RawFiles(method), overwrite=True).seconds for _ in range(1 + repeats)]
+        runs = [denoise_file(source, out, RawFiles(method), overwrite=True)[1].seconds for _ in range(1 + repeats)]
     return {"seconds": min(runs[1:]), "Mpix/s": noisy.numel() / min(runs[1:]) / 1e6}
 
 

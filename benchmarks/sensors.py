@@ -22,8 +22,8 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pairs import centre
-from rawaug.denoising.corrections import Corrections
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
+from rawaug.denoising.raw_files import balance_greens
 from rawaug.evaluation.scores import Denoiser, NoisyInput
 from rawaug.evaluation.tables import print_rows
 from rawaug.io import RawFrame
@@ -44,9 +44,9 @@ SENSORS: dict[str, dict[str, Any]] = {
 }
 GREENS: dict[str, dict[str, Any]] = {
     "whole frames": {},
-    "whole frames, balanced": {"correct": Corrections()},
+    "whole frames, balanced": {"balance": True},
     "greens differ by 1 %": {"green_imbalance": 0.01},
-    "greens differ by 1 %, balanced": {"green_imbalance": 0.01, "correct": Corrections()},
+    "greens differ by 1 %, balanced": {"green_imbalance": 0.01, "balance": True},
 }
 WEAK = ((2e-5, 1e-8), (1.6e-4, 1e-7), (6e-4, 1e-6))
 BRIGHT = ((2e-3, 1e-5), (1e-2, 1e-4))
@@ -57,16 +57,16 @@ Shots = Sequence[tuple[str, Tensor]]
 
 
 def noisy_shots(
-    shots: Shots, levels: tuple[float, float], told: float = 1.0, correct: Corrections | None = None, **sensor: Any
+    shots: Shots, levels: tuple[float, float], told: float = 1.0, balance: bool = False, **sensor: Any
 ) -> Iterator[tuple[Tensor, Noisy]]:
     """Clean RAW, and noisy RAW with the levels that a denoiser is told, a frame; keyed by the frame's name."""
     noise = SensorNoise(levels, **sensor)
     for name, clean in shots:
         params = noise.sample(1, keyed_generator(0, "sensors", name))
         noisy = noise.apply(clean, params)
-        if correct is not None:
+        if balance:
             frame = RawFrame(bayer.unpack(noisy, CFA.RGGB)[0], CFA.RGGB)
-            noisy = bayer.pack(correct(frame)[0].mosaic[None], CFA.RGGB)
+            noisy = bayer.pack(balance_greens(frame)[0].mosaic[None], CFA.RGGB)
         yield clean, Noisy.of(noisy, (told * levels[0], told * levels[1]), CFA.RGGB)
 
 

@@ -13,8 +13,8 @@ from rawaug.version import __version__
 if TYPE_CHECKING:
     from rawaug.bayer import CFA as CFA
     from rawaug.camera.own import Camera as Camera
+    from rawaug.denoising.denoise import denoise as denoise
     from rawaug.denoising.denoiser import RawDenoiser as RawDenoiser
-    from rawaug.denoising.frames import denoise as denoise
     from rawaug.isp.config import ISPConfig as ISPConfig
     from rawaug.isp.config import ISPParams as ISPParams
     from rawaug.isp.config import ISPResult as ISPResult
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 _PUBLIC = {
     "rawaug.bayer": ("CFA",),
     "rawaug.denoising.denoiser": ("RawDenoiser",),
-    "rawaug.denoising.frames": ("denoise",),
+    "rawaug.denoising.denoise": ("denoise",),
     "rawaug.isp.config": ("ISPConfig", "ISPParams", "ISPResult"),
     "rawaug.isp.model": ("DictionaryISP",),
     "rawaug.camera.own": ("Camera",),

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from importlib.metadata import entry_points
 from importlib.util import module_from_spec, spec_from_file_location
+from inspect import signature
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -150,8 +151,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
         return 130
 
-    print(f"rawaug: {escape(text)}", file=sys.stderr)
+    print(f"rawaug: {escape(_in_options(text, words[command : command + 1]))}", file=sys.stderr)
     return BAD_INPUT
+
+
+def _in_options(text: str, names: Sequence[str]) -> str:
+    """Write the arguments of functions that a message names as options of the command; only here are they known."""
+    module = sys.modules.get(f"rawaug.commands.{names[0]}") if names else None
+    if module is None:
+        return text
+
+    from rawaug.commands import as_options
+
+    return as_options(text, signature(module.run).parameters)
 
 
 def _add_plugins(names: Sequence[str]) -> None:

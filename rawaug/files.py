@@ -254,7 +254,7 @@ def require_output(
         if path.resolve() == Path(file).resolve() or (path.exists() and Path(file).exists() and path.samefile(file)):
             raise ValueError(f"{path}: is the input file; give another name")
     if path.exists() and not overwrite:
-        raise ValueError(f"{path}: exists; give another name, or --overwrite to replace it")
+        raise ValueError(f"{path}: exists; give another name, or overwrite=True to replace it")
 
     require_folder(path.absolute().parent, path)
     return path

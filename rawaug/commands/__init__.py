@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from typing import Any
 
 from cyclopts import Parameter
 
 from rawaug.files import require_output, yaml_value
+from rawaug.registry import Spec
 
 OPTIONS = Parameter(name="*")
 """The fields of a dataclass become options of their own."""
@@ -33,3 +35,46 @@ def value_of(text: str) -> Any:
 
 YAML = Parameter(converter=lambda _, tokens: value_of(tokens[0].value), n_tokens=1, json_list=False, metavar="VALUE")
 """One argument may be a name, a list as ``[1e-3, 1e-5]``, or ``{name: ..., settings: {...}}``."""
+
+
+def network_or_filter(denoiser: str | None, classical: Spec | None, *of_networks: bool) -> Any:
+    """Return what ``--denoiser`` or ``--classical`` names; ValueError if both do, or a filter has options of networks.
+
+    ``of_networks`` tells whether options are set that only a network takes: the self-ensemble and ``--linear``.
+    """
+    if classical is None:
+        return denoiser
+    if denoiser is not None or any(of_networks):
+        raise ValueError("classical=: a filter takes no denoiser=, self_ensemble= or linear=; give one or the other")
+    return classical
+
+
+_ARGUMENT = re.compile(r"""\b([a-z_]+)=(True\b|"[^"]*"|\([^)]*\)|[\w./:~-]*)""")
+
+
+def as_options(text: str, arguments: Iterable[str]) -> str:
+    """Write the arguments of Python that a message names as options of the command line.
+
+    Args:
+        text: a message, with arguments as ``noise="estimate"``, ``overwrite=True`` or ``linear=``.
+        arguments: the names of the command's arguments; others are left as they are.
+
+    Example:
+        >>> as_options('pass noise="estimate" or noise=(a, b), and overwrite=True', ["noise", "overwrite"])
+        "pass --noise estimate or --noise '[a, b]', and --overwrite"
+    """
+    names = set(arguments)
+
+    def replace(match: re.Match[str]) -> str:
+        name, value = match.groups()
+        if name not in names:
+            return match[0]
+
+        option = f"--{name.replace('_', '-')}"
+        if value in ("", "True"):
+            return option
+        if value.startswith("("):
+            value = f"'[{value[1:-1]}]'"
+        return f"{option} {value.strip(chr(34))}"
+
+    return _ARGUMENT.sub(replace, text)

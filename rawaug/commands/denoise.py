@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any
 
-from rawaug.commands import YAML, require_results
-from rawaug.denoising.corrections import Correction
+from rawaug.commands import YAML, as_options, network_or_filter, require_results
+from rawaug.denoising.denoise import files_for
 from rawaug.denoising.files import DenoisedFolder, denoise_file, denoise_folder
-from rawaug.denoising.sources import Options, kind_of
+from rawaug.denoising.raw_files import Greens
 from rawaug.errors import count_of, escape
 from rawaug.files import write_json
 from rawaug.registry import Spec
@@ -26,7 +27,7 @@ def run(
     strength: float = 1.0,
     linear: bool = False,
     self_ensemble: bool = False,
-    greens: Correction = "auto",
+    greens: Greens = "auto",
     device: str = "auto",
     preview: str | None = None,
     json: str | None = None,
@@ -58,9 +59,18 @@ def run(
         json: write what was done to each file to this file: noise levels and corrections of RAW, and seconds.
         overwrite: replace existing results.
     """
-    options = Options(denoiser, classical, noise, strength, linear, self_ensemble, greens, device)
+    spec = network_or_filter(denoiser, classical, self_ensemble, linear)
     require_results(json, None, overwrite, [source])
-    kind = kind_of(source).of(source, options)
+    kind = files_for(
+        source,
+        spec,
+        noise=noise,
+        strength=strength,
+        linear=linear,
+        self_ensemble=self_ensemble,
+        greens=greens,
+        device=device,
+    )
 
     if Path(source).is_dir():
         if Path(out).suffix.lower() in kind.formats and not Path(out).is_dir():
@@ -68,7 +78,8 @@ def run(
             raise ValueError(f"{out}: {source} is a folder, and so is its output; give a name without {extension}")
         result = denoise_folder(source, out, kind, previews=preview, overwrite=overwrite)
     else:
-        result = DenoisedFolder([denoise_file(source, out, kind, preview=preview, overwrite=overwrite)])
+        _, done = denoise_file(source, out, kind, preview=preview, overwrite=overwrite)
+        result = DenoisedFolder([done])
 
     if json is not None:
         write_json({"files": [asdict(done) for done in result.files], "broken": result.broken}, json)
@@ -85,4 +96,4 @@ def print_denoised(result: DenoisedFolder[Any]) -> None:
         files = count_of(len(result.files), "file")
         print(f"Denoised {files}; {result.existing} already existed, {len(result.broken)} failed.")
     for line in (*result.broken.values(), *result.left_out, *result.remarks):
-        print(escape(line))
+        print(as_options(escape(line), signature(run).parameters))

@@ -13,12 +13,11 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from rawaug.commands import YAML
+from rawaug.commands import YAML, network_or_filter
 from rawaug.data.dnd import Dnd, write_dnd_submission
 from rawaug.data.sidd_benchmark import SiddBenchmark, write_submission
 from rawaug.data.sidd_blocks import BLOCKS
 from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.denoising.sources import Options
 from rawaug.files import require_output
 from rawaug.io import RawFrame
 from rawaug.noise import estimate_noise
@@ -60,9 +59,9 @@ def run(
     else:
         require_output(out, overwrite, (".csv",))
 
-    options = Options(denoiser, classical, self_ensemble=self_ensemble)
-    spec = RawDenoiser.default if options.spec is None else options.spec
-    method = RawDenoiser.of(spec, device, "auto", **options.changes).require_mosaic()
+    spec = network_or_filter(denoiser, classical, self_ensemble) or RawDenoiser.default
+    views = 8 if self_ensemble else 1
+    method = RawDenoiser.of(spec, device, "auto", views=views).require_mosaic()
     if kind == "dnd":
         submit_dnd(path, out, method)
     else:

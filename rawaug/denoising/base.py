@@ -30,10 +30,10 @@ from rawaug.progress import progress
 from rawaug.registry import suggest
 
 Levels = tuple[float, float]
-"""These are the levels of noise: (shot_var, read_var)."""
+"""Levels of noise: (shot_var, read_var)."""
 CPU = torch.device("cpu")
 IMAGES: dict[Image, str] = {"raw": "RAW", "srgb": "developed pictures"}
-"""Messages call the kinds of image by these names."""
+"""The names of the kinds of image in messages."""
 
 
 class Noisy(NamedTuple):
@@ -79,13 +79,13 @@ class ImageDenoiser(ABC):
     """
 
     takes: ClassVar[Image]
-    """It takes this kind of image."""
+    """The kind of image that it takes."""
 
     default: ClassVar[str]
-    """This is the shipped denoiser if none is named."""
+    """The shipped denoiser if none is named."""
 
     files: ClassVar[str]
-    """Messages say that these files of networks can be named."""
+    """The files of networks that can be named, for messages."""
 
     name: str
     network: nn.Module | None = field(default=None, repr=False)

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 import denoisers
 from denoisers.classical import FILTERS, Stabilised
-from denoisers.files import DEFAULT, JOINT, find_denoiser, list_shipped
+from denoisers.files import DEFAULT, find_denoiser, list_shipped
 from denoisers.mosaic import BayerAdapter, MosaicDRUNet, denoise_mosaic
 from denoisers.network import DENOISERS
 from denoisers.onnx import STRIDE, OnnxNetwork
@@ -38,9 +38,9 @@ from rawaug.io import RawFrame
 from rawaug.registry import Spec, spec_label, split_spec
 
 Model = Callable[[Tensor, Tensor | None], Tensor]
-"""It is ``model(noisy, variance) -> denoised``, each ``(B, 4, h, w)``, perhaps with a ``stride`` and an ``upscale``."""
+"""``model(noisy, variance) -> denoised``, each ``(B, 4, h, w)``, perhaps with a ``stride`` and an ``upscale``."""
 FILTER_TILES = (512, 32)
-"""A filter's tiles have this side and overlap, in packed pixels; the filters reach 8 pixels, and BM3D reaches 20."""
+"""The side and overlap of a filter's tiles, in packed pixels; the filters reach 8 pixels, and BM3D reaches 20."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +78,7 @@ class RawDenoiser(ImageDenoiser):
     default: ClassVar[str] = DEFAULT
     files: ClassVar[str] = "a .safetensors or an .onnx"
     demosaics: ClassVar[bool] = False
-    """This says whether the result is linear camera RGB instead of a mosaic."""
+    """Whether the result is linear camera RGB instead of a mosaic."""
 
     model: Callable[[Levels | None], Model] = field(repr=False)
     cfa: CFA | None = None
@@ -88,7 +88,7 @@ class RawDenoiser(ImageDenoiser):
         if self.views not in (1, 4, 8):
             raise ValueError(f"views must be 1, 4 or 8, got {self.views!r}")
         if not 0.0 <= self.strength <= 1.0:
-            raise ValueError(f"strength must be between 0 and 1, got {self.strength}; --noise takes higher levels")
+            raise ValueError(f"strength must be between 0 and 1, got {self.strength}; noise= takes higher levels")
 
     @classmethod
     def _resolve(cls, spec: Any, name: str | None) -> RawDenoiser:
@@ -107,17 +107,6 @@ class RawDenoiser(ImageDenoiser):
     def require_mosaic(self) -> RawDenoiser:
         """Return this denoiser; raise ValueError if it gives full colour, which cannot be compared with a mosaic."""
         return self
-
-    def require_linear(self, linear: bool) -> None:
-        """Raise ValueError if full colour is wanted and this denoiser gives a mosaic, or the other way round."""
-        if linear:
-            raise ValueError(f"--linear: {self.name} denoises the mosaic and does not demosaic; use {JOINT}")
-
-    def require_preview(self, preview: Path) -> None:
-        """Raise ValueError if LibRaw cannot develop the results to previews as it does a mosaic."""
-
-    def require_grey(self, name: str) -> None:
-        """Raise ValueError if the monochrome frame of this name cannot be denoised as a mosaic."""
 
     @torch.inference_mode()
     def __call__(self, noisy: Noisy) -> Tensor:
@@ -152,7 +141,7 @@ class RawDenoiser(ImageDenoiser):
         return tuple(packed.shape)
 
     def _of_mosaic(self, noisy: Noisy) -> Tensor:
-        advice = "give --denoiser rawaug-xtrans, or weights of rawaug run any"
+        advice = "use rawaug-xtrans, or weights of rawaug run any"
         raise ValueError(f"{self.name}: is for Bayer mosaics, not {noisy.cfa}; {advice}")
 
     def _run(self, run: Model, image: Tensor, variance: Tensor | None, expected: Sequence[int]) -> Tensor:
@@ -226,24 +215,11 @@ class JointDenoiser(RawDenoiser):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.strength != 1.0:
-            raise ValueError("--strength does not support --linear: the noisy frame has no full colour to mix in")
+            raise ValueError(f"{self.name}: takes no strength=; the noisy frame has no full colour to mix in")
 
     def require_mosaic(self) -> RawDenoiser:
         """Raise ValueError, since its results cannot be compared with a mosaic."""
         raise ValueError(f"{self.name}: demosaics, too; rawaug run demosaic --denoiser.start {self.name} scores it")
-
-    def require_linear(self, linear: bool) -> None:
-        """Raise ValueError if a mosaic is wanted."""
-        if not linear:
-            raise ValueError(f"--denoiser {self.name}: demosaics too, to a linear DNG; add --linear")
-
-    def require_preview(self, preview: Path) -> None:
-        """Raise ValueError, since LibRaw has nothing to demosaic."""
-        raise ValueError(f"--preview {preview}: --linear does not support it; open the linear DNG in a RAW developer")
-
-    def require_grey(self, name: str) -> None:
-        """Raise ValueError, since a monochrome frame has no colours to find."""
-        raise ValueError(f"{name}: is monochrome; there is nothing to demosaic, omit --linear")
 
     def _result_shape(self, packed: Tensor) -> tuple[int, ...]:
         height, width = packed.shape[-2:]

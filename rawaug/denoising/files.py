@@ -6,18 +6,106 @@ cannot be read, or whose decoder crashes or hangs, is named and counted, and the
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Generic
+from typing import Any, ClassVar, Generic, TypeVar
 
 from rawaug.denoising.levels import UnknownNoise
-from rawaug.denoising.sources import PREVIEWS, Files, T
 from rawaug.errors import count_of
 from rawaug.files import one_at_a_time, require_file, require_folder, require_output, require_same_settings
+from rawaug.io import RawFrame
+from rawaug.io.content import Listing, list_files
 from rawaug.progress import progress
 
+PREVIEWS = (".jpg", ".jpeg", ".png")
+"""The extensions of previews of RAW files."""
+
 SETTINGS = "denoise.json"
-"""This file in a folder of results says how they were made."""
+"""The file in a folder of results that says how they were made."""
+
+
+T = TypeVar("T")
+
+
+class Files(ABC, Generic[T]):
+    """One kind of files."""
+
+    what: ClassVar[str]
+    """The noun for a file of this kind."""
+
+    formats: ClassVar[tuple[str, ...]]
+    """The extensions of results."""
+
+    format_advice: ClassVar[str]
+    """The advice about another extension."""
+
+    others: ClassVar[str]
+    """What a file of a folder is that is of no kind."""
+
+    @property
+    def settings(self) -> dict[str, Any] | None:
+        """Return what the results depend on, as JSON; None if a folder's results may be of several settings."""
+        return None
+
+    @abstractmethod
+    def extensions(self) -> tuple[str, ...]:
+        """Return the extensions of the files of a folder that are of this kind."""
+
+    def listing(self, folder: Path) -> Listing:
+        """List the files of a folder that are of this kind; raise ValueError if there is none."""
+        extensions = self.extensions()
+        listing = list_files(folder, extensions, self.others)
+        self._advise(listing)
+        if not listing.files:
+            contents = "; ".join(listing.lines()) or f"supported extensions are {', '.join(extensions)}"
+            raise ValueError(f"{folder}: contains no {self.what} file; {contents}")
+        return listing
+
+    @abstractmethod
+    def _advise(self, listing: Listing) -> None:
+        """Say what to do with files that are left out, if this kind knows better."""
+
+    def remarks(self, files: Sequence[Path]) -> list[str]:
+        """Write lines on the results of these files of a folder."""
+        return []
+
+    @abstractmethod
+    def target(self, file: Path) -> Path:
+        """Name the result of a file; both paths are relative to their folders."""
+
+    @abstractmethod
+    def require_preview(self, preview: Path) -> None:
+        """Raise ValueError if this kind writes no previews."""
+
+    def write_preview(self, result: Path, preview: Path) -> None:
+        """Write a picture of a result that is there already."""
+        raise NotImplementedError(f"{self.what}: has no previews")
+
+    @abstractmethod
+    def denoise(
+        self, source: Path | RawFrame, out: Path | None = None, preview: Path | None = None, isolate: bool = False
+    ) -> tuple[Any, T]:
+        """Read, denoise and write a file.
+
+        Args:
+            source: the file, or a frame in memory where this kind is of RAW.
+            out: the result; None writes none.
+            preview: a picture of the result to write as well.
+            isolate: read the file in a helper process, which a damaged file may end.
+
+        Returns:
+            The image, and what was done.
+
+        Raises:
+            UnknownNoise: if other files may show the noise levels of this one.
+            OSError, ValueError: if it cannot be read, denoised or written.
+        """
+
+    def informed_by(self, results: Sequence[T]) -> Files[T] | None:
+        """Return this kind with what the results tell about files of unknown noise, or None if they tell nothing."""
+        return None
 
 
 @dataclass
@@ -41,39 +129,38 @@ class DenoisedFolder(Generic[T]):
 
 def denoise_file(
     source: str | Path,
-    out: str | Path,
+    out: str | Path | None,
     kind: Files[T],
     *,
     preview: str | Path | None = None,
     overwrite: bool = False,
-) -> T:
+) -> tuple[Any, T]:
     """Denoise one file.
 
     Args:
         source: the file.
-        out: the result; its folder is created.
+        out: the result; its folder is created. None writes none.
         kind: how files of this kind are denoised.
         preview: a .jpg or .png of the result of a RAW file as LibRaw develops it.
         overwrite: replace ``out`` and ``preview`` if they exist.
 
     Returns:
-        What was done.
+        The denoised image, and what was done.
 
     Raises:
         FileNotFoundError, OSError: if a file is missing or cannot be read or written.
         ValueError: if the source cannot be denoised, or ``out`` has another extension, is the source itself, or already
             exists.
     """
-    source, out = Path(source), Path(out)
+    source = Path(source)
     require_file(source, f"{kind.what} file")
-    require_output(out, overwrite, kind.formats, [source], kind.format_advice)
-
-    if preview is None:
-        return kind.denoise(source, out)
-
-    preview = Path(preview)
-    require_output(preview, overwrite, PREVIEWS, [source], "the preview is a .jpg or .png")
-    kind.require_preview(preview)
+    if out is not None:
+        out = require_output(out, overwrite, kind.formats, [source], kind.format_advice)
+    if preview is not None:
+        if out is None:
+            raise ValueError("preview= shows a result that is written; give out=")
+        preview = require_output(preview, overwrite, PREVIEWS, [source], "the preview is a .jpg or .png")
+        kind.require_preview(preview)
     return kind.denoise(source, out, preview)
 
 
@@ -114,6 +201,7 @@ def denoise_folder(
 
     result: DenoisedFolder[T] = DenoisedFolder(left_out=listing.lines())
     unknown = []
+    denoised: list[Path] = []
     for file in progress(listing.files, label="denoise", unit="file", leave=True):
         target, preview = targets[file], previews_of.get(file)
         if target.exists() and not overwrite:
@@ -123,7 +211,9 @@ def denoise_folder(
             continue
 
         try:
-            result.files.append(kind.denoise(file, target, preview, isolate=True))
+            _, done = kind.denoise(file, target, preview, isolate=True)
+            result.files.append(done)
+            denoised.append(file)
         except UnknownNoise as error:
             unknown.append(file)
             result.broken[str(file)] = f"noise unknown: {_with_name(error, file)}"
@@ -135,10 +225,11 @@ def denoise_folder(
     if informed is not None:
         for file in unknown:
             try:
-                done = informed.denoise(file, targets[file], previews_of.get(file), isolate=True)
+                _, done = informed.denoise(file, targets[file], previews_of.get(file), isolate=True)
             except UnknownNoise:
                 continue
             result.files.append(done)
+            denoised.append(file)
             del result.broken[str(file)]
 
     if len(result.broken) == len(targets):
@@ -146,7 +237,7 @@ def denoise_folder(
             f"{source}: none of its {count_of(len(targets), 'file')} can be denoised; {min(result.broken.values())}"
         )
 
-    result.remarks = kind.remarks([done.source for done in result.files])
+    result.remarks = kind.remarks(denoised)
     return result
 
 
@@ -182,7 +273,7 @@ def _preview_targets(
     folder = Path(previews)
     kind.require_preview(folder)
     if folder.suffix.lower() in PREVIEWS and not folder.is_dir():
-        raise ValueError(f"--preview {folder}: the source is a folder, and so are its previews; give a folder")
+        raise ValueError(f"preview={folder}: the source is a folder, and so are its previews; give a folder")
     _require_outside(folder, source)
     require_folder(folder)
 

@@ -28,19 +28,20 @@ from rawaug.noise.profiles import ProfileLevels
 from rawaug.seeding import keyed_generator
 
 Shots = Mapping[tuple[str, float | None], tuple[float, float]]
-"""These are levels by camera and ISO."""
+"""Levels by camera and ISO."""
 Noise = str | Sequence[float] | MeasuredLevels | Shots
-"""It is ``"auto"``, ``"profile"`` (the tag), ``"estimate"``, a measured camera's name or law (at the file's ISO), two
-variances, or the levels of other files."""
+"""Where levels come from: ``"auto"``, ``"profile"`` (the tag), ``"estimate"``, a measured camera's name or law (at the
+file's ISO), ``"camera"`` (the law that the denoiser was trained for), an ISP's file or a camera's sheet, two variances,
+or the levels of other files."""
 
 LOOSE = 0.9
-"""A reliable estimate has at least this R^2."""
+"""The least R^2 of a reliable estimate."""
 DISAGREE = 1.75
 """``auto`` takes the estimate if its variance at the mean signal differs from the tag's by this ratio or more.
 
 On frames whose noise is known, the estimate is right within 1.24; a denoiser that is given half the variance leaves
 most of the noise."""
-_BY_HAND = "--noise '[shot_var, read_var]'"
+_BY_HAND = "noise=(shot_var, read_var)"
 
 
 class UnknownNoise(ValueError):
@@ -92,7 +93,7 @@ def _profile(frame: RawFrame) -> tuple[float, float, str]:
     if frame.noise_profile is not None:
         return *frame.noise_profile, "profile"
     reason = "; ".join(frame.remarks) or "has no NoiseProfile tag"
-    raise UnknownNoise(f"{frame.name}: {reason}; pass --noise estimate or {_BY_HAND}")
+    raise UnknownNoise(f'{frame.name}: {reason}; pass noise="estimate" or {_BY_HAND}')
 
 
 def _estimate(frame: RawFrame) -> tuple[float, float, str]:
@@ -153,7 +154,7 @@ def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:
     try:
         return law.at(frame.iso)
     except ValueError as error:
-        raise UnknownNoise(f"{frame.name}: {error}; pass --noise estimate or {_BY_HAND}") from None
+        raise UnknownNoise(f'{frame.name}: {error}; pass noise="estimate" or {_BY_HAND}') from None
 
 
 def _of_other_files(levels: Shots, frame: RawFrame) -> tuple[float, float, str]:

@@ -90,7 +90,7 @@ def test_an_output_replaces_nothing_unasked_and_an_input_never(tmp_path: Path) -
     (tmp_path / "link.png").symlink_to(photograph)
     (tmp_path / "copy.png").hardlink_to(photograph)
 
-    with pytest.raises(ValueError, match="exists; give another name, or --overwrite"):
+    with pytest.raises(ValueError, match="exists; give another name, or overwrite=True"):
         require_output(photograph)
     require_output(photograph, overwrite=True)
     for name in ("a.png", "link.png", "copy.png"):

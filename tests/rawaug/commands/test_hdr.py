@@ -59,7 +59,7 @@ def test_the_command_writes_the_merged_picture(tmp_path: Path, capsys: pytest.Ca
     assert (read_picture(out) / 255.0 - merged).abs().max() <= 0.51 / 255
     alone, brighter = (hdr([dark], exposure=stops, isp="universal-small").mean() for stops in (0.0, 1.0))
     assert brighter > 1.2 * alone
-    with pytest.raises(ValueError, match="--overwrite"):
+    with pytest.raises(ValueError, match="overwrite=True"):
         hdr_command([dark], out=str(out))
     with pytest.raises(ValueError, match="is the input"):
         hdr_command([str(dark)], out=str(dark), overwrite=True)

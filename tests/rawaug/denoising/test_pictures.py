@@ -12,15 +12,17 @@ import torch
 from torch import Tensor
 
 import denoisers
+import rawaug
 from rawaug import bayer
 from rawaug.cli import main
 from rawaug.commands.denoise import run as denoise
 from rawaug.data.picture_pairs import open_picture_pairs
+from rawaug.denoising.denoise import files_for
 from rawaug.denoising.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.files import denoise_folder
+from rawaug.denoising.picture_files import PictureFiles
 from rawaug.denoising.picture_levels import estimate_level
 from rawaug.denoising.pictures import PictureDenoiser
-from rawaug.denoising.sources import PictureFiles, kind_of
 from rawaug.evaluation.comparison import Comparison, compare_pictures
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, register
 from rawaug.io.pictures import read_picture, write_picture
@@ -149,16 +151,16 @@ def test_files_and_folders_of_pictures(tmp_path: Path, capsys: pytest.CaptureFix
     (tmp_path / "in").mkdir()
     write_picture(tmp_path / "in" / "a.png", noisy())
     (tmp_path / "in" / "b.jpg").write_bytes(b"not a picture")
-    assert kind_of(tmp_path / "in") is PictureFiles
+    assert isinstance(files_for(tmp_path / "in"), PictureFiles)
     denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "a.png"))
     assert "noise of" in capsys.readouterr().out
     assert error(read_picture(tmp_path / "a.png") / 255.0) < 0.5 * error(noisy())
     result = denoise_folder(tmp_path / "in", tmp_path / "out", PictureFiles(PictureDenoiser.of("rawaug-srgb@5")))
-    assert [one.out.name for one in result.files] == ["a.png"]
+    assert [one.out and one.out.name for one in result.files] == ["a.png"]
     assert list(result.broken) == [str(tmp_path / "in" / "b.jpg")]
     with pytest.raises(ValueError, match="exists"):
         denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "a.png"))
-    with pytest.raises(ValueError, match=r"developed picture.*--linear"):
+    with pytest.raises(ValueError, match=r"developed picture.*linear="):
         denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "c.png"), linear=True)
 
 
@@ -238,3 +240,13 @@ def test_filters_and_the_list_of_what_was_done_are_for_pictures_too(tmp_path: Pa
     (done,) = json.loads((tmp_path / "done.json").read_text())["files"]
     assert done["deviation"] > 1.0 and done["out"].endswith("b.png")
     assert error(read_picture(tmp_path / "b.png") / 255.0) < error(noisy())
+
+
+def test_python_takes_the_same_path_as_the_command(tmp_path: Path) -> None:
+    picture = (torch.rand(3, 40, 48, generator=torch.Generator().manual_seed(0)) * 255).byte()
+    write_picture(tmp_path / "a.png", picture.float() / 255.0)
+    denoise(str(tmp_path / "a.png"), str(tmp_path / "b.png"), denoiser="NonLocalMeans@10")
+    srgb = rawaug.denoise(tmp_path / "a.png", denoiser="NonLocalMeans@10")
+    assert torch.equal((255.0 * srgb).round().byte(), read_picture(tmp_path / "b.png"))
+    with pytest.raises(ValueError, match="noise= is for RAW"):
+        rawaug.denoise(tmp_path / "a.png", noise="estimate")

@@ -150,7 +150,7 @@ def test_denoise_takes_the_law_at_the_files_iso(noisy_pair: Pair, tmp_path: Path
     assert find_levels(frame, stored) == (8e-4, 1e-5, "camera")
     with pytest.raises(ValueError, match="noise"):
         find_levels(replace(frame, camera="Other"), stored)
-    with pytest.raises(ValueError, match="--noise"):
+    with pytest.raises(ValueError, match="noise="):
         find_levels(replace(frame, iso=800), stored)
     with pytest.raises(ValueError, match=r"rawaug-small: .*camera"):
         load_noise("camera", RawDenoiser.of("rawaug-small"))

@@ -1,0 +1,130 @@
+"""One path for everything that is denoised: RAW frames, files and folders, and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rawaug.denoising.files import Files, denoise_file
+from rawaug.denoising.levels import Noise
+from rawaug.denoising.picture_files import PictureFiles
+from rawaug.denoising.raw_files import Greens, RawFiles
+from rawaug.files import files_below, require_output
+from rawaug.io import RawFrame
+from rawaug.io.content import ALL_PICTURE_EXTENSIONS, RAW_EXTENSIONS, content_of
+
+
+def denoise(
+    source: str | Path | RawFrame,
+    out: str | Path | None = None,
+    *,
+    denoiser: Any = None,
+    noise: Noise = "auto",
+    strength: float = 1.0,
+    linear: bool = False,
+    self_ensemble: bool = False,
+    greens: Greens = "auto",
+    device: str = "auto",
+    preview: str | Path | None = None,
+    overwrite: bool = False,
+) -> Any:
+    """Denoise a RAW file, a frame or a picture, as ``rawaug denoise`` does.
+
+    Args:
+        source: a RAW file of any kind that :func:`rawaug.io.read_raw` reads, monochrome ones too, a frame, or a
+            developed picture.
+        out: a DNG or a picture to write as well; None writes none.
+        denoiser: whatever :meth:`rawaug.RawDenoiser.of` takes: a shipped name, a file, a filter by its name, a network,
+            a function, ...; by default the shipped one for the frame's pattern, or for pictures.
+        noise: where the noise levels of RAW come from, see :data:`rawaug.denoising.levels.Noise`.
+        strength: 1 removes the noise, 0.7 leaves 30% of it, 0 changes nothing; for pictures, a factor on the estimated
+            level of the noise.
+        linear: also demosaic RAW, to linear camera RGB.
+        self_ensemble: average eight views, at eight times the cost.
+        greens: ``"keep"`` leaves the two greens of a Bayer sensor that differ as they are.
+        device: where a network runs: auto, cpu, cuda, cuda:1, mps.
+        preview: a .jpg or .png of the result of RAW to write as well, developed by LibRaw.
+        overwrite: replace ``out`` and ``preview`` if they exist.
+
+    Returns:
+        The frame with a denoised mosaic, float32 ``(1, H, W)``, black 0 and white 1, whose ``noise_profile`` says what
+        noise is left; with ``linear``, camera RGB ``(3, H, W)``; of a picture, sRGB ``(3, H, W)`` in [0, 1].
+
+    Raises:
+        FileNotFoundError, OSError: if a file is missing or cannot be read or written.
+        ValueError: if the noise is unknown, there is no such denoiser, or a setting does not fit the source.
+
+    Example:
+        >>> frame = rawaug.denoise("in.dng", "out.dng", denoiser="rawaug-base")  # doctest: +SKIP
+        >>> srgb = rawaug.denoise("in.jpg")  # doctest: +SKIP
+    """
+    files = files_for(
+        source,
+        denoiser,
+        noise=noise,
+        strength=strength,
+        linear=linear,
+        self_ensemble=self_ensemble,
+        greens=greens,
+        device=device,
+    )
+    if not isinstance(source, RawFrame):
+        image, _ = denoise_file(source, out, files, preview=preview, overwrite=overwrite)
+        return image
+
+    if out is not None:
+        out = require_output(out, overwrite, files.formats, advice=files.format_advice)
+    image, _ = files.denoise(source, out)
+    return image
+
+
+def files_for(
+    source: str | Path | RawFrame,
+    denoiser: Any = None,
+    *,
+    noise: Noise = "auto",
+    strength: float = 1.0,
+    linear: bool = False,
+    self_ensemble: bool = False,
+    greens: Greens = "auto",
+    device: str = "auto",
+) -> Files[Any]:
+    """Say how the files of a source are denoised: by its content; a folder is of pictures if it has no RAW file.
+
+    The arguments are those of :func:`denoise`.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is a file of no kind, or a setting does not fit it.
+    """
+    if _is_raw(source):
+        return RawFiles(
+            denoiser,
+            noise=noise,
+            strength=strength,
+            linear=linear,
+            self_ensemble=self_ensemble,
+            greens=greens,
+            device=device,
+        )
+
+    for argument, is_set in (("linear", linear), ("greens", greens != "auto"), ("noise", noise != "auto")):
+        if is_set:
+            raise ValueError(f"{source}: is a developed picture; {argument}= is for RAW")
+    return PictureFiles(denoiser, strength=strength, self_ensemble=self_ensemble, device=device)
+
+
+def _is_raw(source: str | Path | RawFrame) -> bool:
+    if isinstance(source, RawFrame):
+        return True
+
+    path = Path(source)
+    if path.is_dir():
+        extensions = {file.suffix.lower() for file in files_below(path)}
+        has_pictures = not extensions.isdisjoint(ALL_PICTURE_EXTENSIONS)
+        return not has_pictures or not extensions.isdisjoint(RAW_EXTENSIONS)
+
+    kind = content_of(path).kind
+    if kind not in ("raw", "picture"):
+        raise ValueError(f"{path}: is neither camera RAW nor a picture of a known format; check that it is complete")
+    return kind == "raw"

@@ -1,0 +1,319 @@
+r"""RAW files and frames, which are denoised to DNGs and frames.
+
+    y' = y + s (f(y, shot_var max(y, 0) + read_var) - y)
+
+This is done on the mosaic as the sensor gave it, before any gain map. The result has the source's levels, colour, lens
+corrections, orientation and EXIF; it differs by noise, and by the two greens of a Bayer sensor, which are made to agree
+where smooth places show that they clearly differ (:mod:`rawaug.bayer.greens`). Its noise profile is removed along with
+the noise, so that a RAW developer does not smooth once more. With a strength s below 1, (1 - s)^2 of the noise's
+variance is left, and the noise profile says so. A network that also demosaics gives camera RGB.
+
+A monochrome frame is denoised as the mosaic of a grey scene, which it is.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from statistics import fmean
+from typing import Any, Literal, get_args
+
+from torch import Tensor
+
+from denoisers.files import JOINT
+from rawaug import bayer
+from rawaug.bayer import CFA, GreenDifference
+from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.denoising.files import Files
+from rawaug.denoising.levels import Noise, as_json, find_levels, load_noise
+from rawaug.errors import escape
+from rawaug.io import RawFrame, read_raw, write_dng, write_picture
+from rawaug.io.content import RAW_EXTENSIONS, Listing
+from rawaug.io.dng import LINEAR_WHITE, cell_of_planes
+from rawaug.io.isolated import isolated
+from rawaug.io.raw import MONOCHROME, develop
+
+OTHER_PATTERNS = "rawaug-xtrans"
+"""The denoiser of X-Trans and Quad-Bayer frames if none is named."""
+
+Greens = Literal["auto", "keep"]
+"""Whether greens that clearly differ are made to agree, or kept as they are."""
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """The correction of a frame's greens.
+
+    Attributes:
+        greens: by how much the two greens differ; None if that cannot be measured.
+        balanced: whether the difference was taken out.
+    """
+
+    greens: GreenDifference | None = None
+    balanced: bool = False
+
+    def __str__(self) -> str:
+        if self.greens is None or not self.balanced:
+            return ""
+        return f", greens differed by {self.greens.share:.2%} +- {self.greens.error:.2%}, balanced"
+
+
+@dataclass(frozen=True)
+class Denoised:
+    """What was done to a RAW file.
+
+    Attributes:
+        source, out: the files; None for a frame in memory, or if nothing was written.
+        shot_var, read_var: the noise levels that the denoiser was given; 0 if it needs none.
+        noise_source: where the levels come from.
+        below_zero: the share of sites whose result was below the digital number 0.
+        seconds: the time for reading, denoising and writing.
+        camera, iso: the source's camera and ISO.
+        corrected: errors of the sensor that were taken out.
+    """
+
+    source: Path | None
+    out: Path | None
+    shot_var: float
+    read_var: float
+    noise_source: str
+    below_zero: float
+    seconds: float
+    camera: str
+    iso: float | None
+    corrected: Corrected
+
+    def __str__(self) -> str:
+        levels = f"shot_var {self.shot_var:.3g}, read_var {self.read_var:.3g} ({self.noise_source})"
+        line = f"{escape(self.out)}: {levels}{self.corrected}, {self.seconds:.1f} s"
+        if self.below_zero:
+            line += f"; {self.below_zero:.2%} below digital number 0, written as 0"
+        return line
+
+
+class RawFiles(Files[Denoised]):
+    """RAW files and frames, with the denoiser of their pattern and the noise levels of each.
+
+    Args:
+        denoiser: whatever :meth:`rawaug.RawDenoiser.of` takes; None for the shipped one of each frame's pattern.
+        noise: where the noise levels come from, see :data:`rawaug.denoising.levels.Noise`.
+        strength: 1 removes the noise, 0.7 leaves 30% of it, 0 changes nothing.
+        linear: whether the result is demosaiced, too.
+        self_ensemble: whether eight views are averaged.
+        greens: ``"keep"`` leaves greens that differ.
+        device: where a network runs: auto, cpu, cuda, ...
+
+    Raises:
+        FileNotFoundError: if a file is missing.
+        ValueError: if there is no such denoiser, or a setting does not fit it.
+
+    Example:
+        >>> denoise_file("in.dng", "out.dng", RawFiles("rawaug-base", noise="estimate"))  # doctest: +SKIP
+    """
+
+    what = "RAW"
+    formats = (".dng",)
+    format_advice = "the output is a DNG; give a name ending in .dng"
+    others = "neither RAW nor a picture that is known"
+
+    def __init__(
+        self,
+        denoiser: Any = None,
+        *,
+        noise: Noise = "auto",
+        strength: float = 1.0,
+        linear: bool = False,
+        self_ensemble: bool = False,
+        greens: Greens = "auto",
+        device: str = "auto",
+    ) -> None:
+        if greens not in get_args(Greens):
+            raise ValueError(f"greens: {greens!r} is unknown; use one of {', '.join(get_args(Greens))}")
+
+        changes: dict[str, Any] = {}
+        if strength != 1.0:
+            changes["strength"] = strength
+        if self_ensemble:
+            changes["views"] = 8
+        self._options: dict[str, Any] = {"device": device, "precision": "auto", **changes}
+        self._by_pattern = denoiser is None and not linear
+
+        if denoiser is None:
+            denoiser = JOINT if linear else RawDenoiser.default
+        if not isinstance(denoiser, RawDenoiser) or changes or device != "auto":
+            denoiser = RawDenoiser.of(denoiser, **self._options)
+        self.denoiser: RawDenoiser = denoiser
+
+        if linear and not denoiser.demosaics:
+            raise ValueError(f"{denoiser.name}: denoises the mosaic; linear=True demosaics, too, use {JOINT}")
+        if denoiser.demosaics and not linear:
+            raise ValueError(f"{denoiser.name}: demosaics too, to a linear DNG; add linear=True")
+        self.greens = greens
+        self.noise = load_noise(noise, denoiser)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Everything that the results depend on, as JSON."""
+        settings = dict(self.denoiser.settings)
+        if settings:
+            settings["self_ensemble"] = self.denoiser.views > 1
+        settings["noise"] = as_json(self.noise)
+
+        if self.greens != "auto":
+            settings["greens"] = self.greens
+        if self.denoiser.strength != 1.0:
+            settings["strength"] = self.denoiser.strength
+        return settings
+
+    @cached_property
+    def _of_other_patterns(self) -> RawDenoiser:
+        return RawDenoiser.of(OTHER_PATTERNS, **self._options)
+
+    def denoiser_for(self, cfa: str) -> RawDenoiser:
+        """The denoiser of frames of a pattern: the one that was named, or the shipped one of this pattern."""
+        if self._by_pattern and cfa not in (*CFA.__members__, MONOCHROME):
+            return self._of_other_patterns
+        return self.denoiser
+
+    def denoise(
+        self,
+        source: Path | RawFrame,
+        out: Path | None = None,
+        preview: Path | None = None,
+        isolate: bool = False,
+    ) -> tuple[RawFrame | Tensor, Denoised]:
+        """Denoise a RAW file or a frame; see :meth:`rawaug.denoising.files.Files.denoise`.
+
+        Returns:
+            The frame with the denoised mosaic ``(1, H, W)`` and the noise that is left, or linear camera RGB
+            ``(3, H, W)``; and what was done.
+        """
+        start = time.perf_counter()
+        file = None if isinstance(source, RawFrame) else source
+        frame: RawFrame
+        if isinstance(source, RawFrame):
+            frame = source
+        elif isolate:
+            frame = isolated(read_raw, source, True)
+        else:
+            frame = read_raw(source, monochrome=True)
+
+        # The denoiser of this pattern; greens that agree; a monochrome frame as the mosaic of a grey scene.
+        denoiser = self.denoiser_for(frame.cfa)
+        corrected = Corrected()
+        if denoiser.strength > 0:
+            frame, corrected = balance_greens(frame, self.greens)
+        mosaic = frame
+        if frame.cfa == MONOCHROME:
+            if denoiser.demosaics:
+                raise ValueError(f"{frame.name}: is monochrome; there is nothing to demosaic, omit linear=True")
+            mosaic = replace(frame, cfa=CFA.RGGB)
+
+        # The levels of its noise.
+        levels, noise_source = None, "not needed"
+        if denoiser.reads_levels:
+            shot_var, read_var, noise_source = find_levels(mosaic, self.noise)
+            levels = shot_var, read_var
+
+        # The result: full colour, or a mosaic that digital numbers can hold, with the noise that is left.
+        image = denoiser.frame(mosaic, levels)
+        rgb = None
+        if denoiser.demosaics:
+            rgb = image
+            below_zero = (image < -0.5 / LINEAR_WHITE).float().mean().item()
+        else:
+            below_zero = clip_below_zero(image, frame)
+            left = (1.0 - denoiser.strength) ** 2
+            profile = levels or frame.noise_profile
+            if profile is not None:
+                profile = (left * profile[0], left * profile[1]) if left else None
+            frame = replace(frame, mosaic=image, noise_profile=profile)
+
+        if out is not None:
+            write_dng(out, frame, file, rgb=rgb)
+        seconds = time.perf_counter() - start
+        if out is not None and preview is not None:
+            self.write_preview(out, preview)
+
+        shot_var, read_var = levels or (0.0, 0.0)
+        done = Denoised(
+            file, out, shot_var, read_var, noise_source, below_zero, seconds, frame.camera, frame.iso, corrected
+        )
+        return (frame if rgb is None else rgb), done
+
+    # -- files of a folder ---------------------------------------------------------------------------------------------
+
+    def extensions(self) -> tuple[str, ...]:
+        return RAW_EXTENSIONS
+
+    def _advise(self, listing: Listing) -> None:
+        if "RAW file" in listing.left_out:
+            listing.left_out["RAW file"].advice = "there is no decoder for these kinds of RAW"
+
+    def target(self, file: Path) -> Path:
+        return file.with_suffix(".dng")
+
+    def require_preview(self, preview: Path) -> None:
+        if self.denoiser.demosaics:
+            advice = "open the linear DNG in a RAW developer"
+            raise ValueError(f"preview={preview}: linear=True does not support it; {advice}")
+
+    def write_preview(self, result: Path, preview: Path) -> None:
+        upright = read_raw(result, monochrome=True).upright_view
+        write_picture(preview, bayer.turn(develop(result), upright))
+
+    def informed_by(self, results: Sequence[Denoised]) -> RawFiles | None:
+        if self.noise != "auto":
+            return None
+
+        by_shot: dict[tuple[str, float | None], list[Denoised]] = {}
+        for done in results:
+            if done.iso is not None:
+                by_shot.setdefault((done.camera, done.iso), []).append(done)
+
+        levels = {}
+        for shot, files in by_shot.items():
+            shot_var = fmean(done.shot_var for done in files)
+            read_var = fmean(done.read_var for done in files)
+            levels[shot] = shot_var, read_var
+
+        informed = copy(self)
+        informed.noise = levels
+        return informed
+
+
+def balance_greens(frame: RawFrame, greens: Greens = "auto") -> tuple[RawFrame, Corrected]:
+    """Make the two greens of a Bayer frame agree if they clearly differ, and say what was done."""
+    if frame.cfa not in CFA.__members__:
+        return frame, Corrected()
+
+    difference = bayer.measure_greens(frame.mosaic, frame.cfa)
+    if difference is None or not difference.significant or greens == "keep":
+        return frame, Corrected(difference)
+    mosaic = bayer.balance_greens(frame.mosaic, frame.cfa, difference)
+    return replace(frame, mosaic=mosaic), Corrected(difference, balanced=True)
+
+
+def clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
+    """Clip, in place, what a digital number cannot hold; return the share of clipped sites."""
+    if frame.floating:
+        return 0.0
+
+    cell = cell_of_planes(frame.cfa)
+    size = len(cell)
+
+    below = 0
+    for i, j in product(range(size), repeat=2):
+        plane = mosaic[0, i::size, j::size]
+        black = frame.black[cell[i, j]]
+        step = 1.0 / (frame.white - black)
+        lowest = -black / (frame.white - black)
+        below += int((plane < lowest - 0.5 * step).sum())
+        plane.clamp_(min=lowest)
+
+    return below / mosaic.numel()
