@@ -7,7 +7,7 @@ number of workers or on the order in which samples are asked for.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
@@ -22,6 +22,30 @@ def derive_seed(*keys: int | str) -> int:
 def keyed_generator(*keys: int | str, device: torch.device | str = "cpu") -> torch.Generator:
     """Make a ``torch.Generator`` on ``device`` that is seeded by :func:`derive_seed`."""
     return torch.Generator(device).manual_seed(derive_seed(*keys))
+
+
+Generators = torch.Generator | Sequence[torch.Generator]
+"""One generator for all samples of a batch, or one for each."""
+
+
+def draw_rows(generators: Generators, batch: int, draw: Callable[[torch.Generator, int], torch.Tensor]) -> torch.Tensor:
+    """Draw the rows of a batch from one generator; or from one each, as every sample alone would be drawn.
+
+    Example:
+        >>> alone = [torch.Generator().manual_seed(seed) for seed in (1, 2)]
+        >>> draw_rows(alone, 2, lambda generator, rows: torch.rand(rows, 3, generator=generator)).shape
+        torch.Size([2, 3])
+    """
+    if isinstance(generators, torch.Generator):
+        return draw(generators, batch)
+    return torch.cat([draw(generator, 1) for generator in generators])
+
+
+def take_generators(generators: Generators, rows: Iterable[int]) -> Generators:
+    """The generators of some rows of a batch."""
+    if isinstance(generators, torch.Generator):
+        return generators
+    return [generators[row] for row in rows]
 
 
 def rank_key() -> tuple[int, ...]:

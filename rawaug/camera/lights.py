@@ -23,7 +23,7 @@ and beyond the outermost light its figures stay constant.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rawaug.registry import suggest
+from rawaug.seeding import Generators, draw_rows
 
 Array = NDArray[np.float64]
 """The type of lights, which are a few numbers a batch on the CPU: NumPy's calls cost a fifth of PyTorch's."""
@@ -140,17 +141,28 @@ def white_point(xy: Array | tuple[float, float]) -> Tensor:
     return torch.from_numpy(_white_point(np.asarray(xy, dtype=np.float64)))
 
 
-def sample_lights(batch: int, generator: torch.Generator, lights: LightRange = _ALL_LIGHTS) -> Array:
-    """Draw white points ``(batch, 3)``, XYZ with Y = 1; if both loci are defined, each is used equally often."""
+def sample_lights(batch: int, generator: Generators, lights: LightRange = _ALL_LIGHTS) -> Array:
+    """Draw white points ``(batch, 3)``, XYZ with Y = 1; if both loci are defined, each is used equally often.
+
+    Args:
+        batch: number of lights.
+        generator: a generator on the CPU, or one for each light.
+        lights: the range to draw from.
+    """
     kelvin, lamps, among, by_day = lights
-    uniform = torch.rand(batch, 4, generator=generator, dtype=torch.float64).numpy()
-    duv = _DUV_SPREAD * torch.randn(batch, generator=generator, dtype=torch.float64).numpy()
+
+    def numbers(draw: Callable[..., torch.Tensor], *shape: int) -> Array:
+        rows = draw_rows(generator, batch, lambda g, rows: draw(rows, *shape, generator=g, dtype=torch.float64))
+        return np.asarray(rows.numpy())
+
+    uniform = numbers(torch.rand, 4)
+    duv = _DUV_SPREAD * numbers(torch.randn)
 
     temperature = 1.0 / (1 / kelvin[1] + (1 / kelvin[0] - 1 / kelvin[1]) * uniform[:, 0])
     on_daylight = uniform[:, 1] < 0.5
     if by_day:
-        sunny = torch.rand(batch, generator=generator, dtype=torch.float64).numpy() < by_day
-        mired = torch.normal(*_DAYLIGHT_MIRED, (batch,), generator=generator, dtype=torch.float64).numpy()
+        sunny = numbers(torch.rand) < by_day
+        mired = _DAYLIGHT_MIRED[0] + _DAYLIGHT_MIRED[1] * numbers(torch.randn)
         temperature = np.where(sunny, (1e6 / mired.clip(1.0)).clip(*kelvin), temperature)
         on_daylight |= sunny
     on_daylight &= temperature >= _DAYLIGHT_FROM

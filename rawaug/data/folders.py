@@ -29,7 +29,7 @@ from rawaug.files import files_in
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
 from rawaug.io.content import PICTURE_EXTENSIONS as PICTURE_EXTENSIONS
 from rawaug.io.content import list_pictures
-from rawaug.io.pictures import MAX_PIXELS, recode_jpeg
+from rawaug.io.pictures import MAX_PIXELS, read_crop, recode_jpeg
 from rawaug.io.raw import RAW_EXTENSIONS
 
 _JPEG_SUFFIXES = (".jpg", ".JPG", ".jpeg", ".JPEG")
@@ -82,6 +82,28 @@ class PictureFolder(Dataset[Tensor]):
         return len(self._names)
 
     def __getitem__(self, index: int) -> Tensor:
+        return self._give(index, self.read)
+
+    def read_part(self, index: int, choose: Callable[[int, int], tuple[int, int, int, int]]) -> Tensor:
+        """Read a part of a picture, by :func:`rawaug.io.pictures.read_crop`: a JPEG no further than its last row.
+
+        Args:
+            index: of the picture.
+            choose: a function from the height and width of the picture to the top, left, rows and columns of the part.
+                It is asked again if another file stands in for a damaged one.
+        """
+
+        def read(candidate: int) -> Tensor:
+            def choose_if_large(height: int, width: int) -> tuple[int, int, int, int]:
+                self._require_size(candidate, height, width)
+                return choose(height, width)
+
+            return read_crop(self._path(candidate), choose_if_large, self.max_pixels)
+
+        return self._give(index, read)
+
+    def _give(self, index: int, read: Callable[[int], Tensor]) -> Tensor:
+        """Read a file, or the next one that can be used."""
         first = range(len(self))[index]
         if self._bad[first]:
             self._require_few_bad(last=first)
@@ -89,7 +111,7 @@ class PictureFolder(Dataset[Tensor]):
         for candidate in self._from(first):
             if self._bad[candidate]:
                 continue
-            picture = self._attempt(candidate)
+            picture = self._attempt(candidate, read)
             if picture is not None:
                 return picture
         raise AssertionError("the share of skipped files is checked before the last one is")
@@ -116,10 +138,12 @@ class PictureFolder(Dataset[Tensor]):
     def read(self, index: int) -> Tensor:
         """Read the picture of one file, not replaced by another; OSError or ValueError if it cannot be used."""
         picture = read_picture(self._path(index), self.max_pixels)
-        if min(picture.shape[1:]) < self.min_side:
-            size = f"{picture.shape[1]} x {picture.shape[2]}"
-            raise ValueError(f"{self._path(index)}: is {size}, smaller than min_side {self.min_side}")
+        self._require_size(index, *picture.shape[1:])
         return picture
+
+    def _require_size(self, index: int, height: int, width: int) -> None:
+        if min(height, width) < self.min_side:
+            raise ValueError(f"{self._path(index)}: is {height} x {width}, smaller than min_side {self.min_side}")
 
     @property
     def skipped(self) -> dict[Path, str]:
@@ -152,10 +176,10 @@ class PictureFolder(Dataset[Tensor]):
             head = f"{escape(self.path)}: {len(skipped)} of {pictures} skipped"
         return "\n".join([head, *map(escape, skipped.values()), *self.left_out])
 
-    def _attempt(self, index: int) -> Tensor | None:
+    def _attempt(self, index: int, read: Callable[[int], Tensor]) -> Tensor | None:
         """Read a picture; return None if the file is damaged, and mark it."""
         try:
-            return self.read(index)
+            return read(index)
         except (OSError, ValueError) as error:
             self._reasons[index] = str(error)
             _log.warning("skipped: %s", escape(error))

@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import tempfile
 import warnings
+from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,6 +41,7 @@ _WITH_ASSOCIATED_ALPHA = ("TIFF", "OpenEXR")
 _UPRIGHT = ("JPEG XL", "HEIC", "JPEG 2000")
 """Decoders of these formats turn pictures upright, whatever EXIF says."""
 _FLOATS = ("half", "float", "double")
+_END_OF_JPEG = b"\xff\xd9"
 
 
 class Decoded(NamedTuple):
@@ -266,6 +268,49 @@ def _colour_of_spec(spec: Any, name: str, headers: Headers) -> Colour:
 
     chromaticities = spec.getattribute("chromaticities")
     return colour_of_numbers(chromaticities, 1.0)
+
+
+def decode_part(
+    path: Path, choose: Callable[[int, int], tuple[int, int, int, int]], max_pixels: int = MAX_PIXELS
+) -> np.ndarray | None:
+    """Decode a JPEG no further than the last row of a part, to the numbers that :func:`decode` gives.
+
+    Args:
+        path: the file.
+        choose: a function from the height and width of the picture to the top, left, rows and columns of the part.
+        max_pixels: larger pictures are refused before anything is decoded.
+
+    Returns:
+        The part ``(rows, columns, 3)``, uint8. None if the file is no upright sRGB JPEG of 8 bits, these rows or those
+        above are damaged, or it does not end as a JPEG does (so a truncated one is found out whichever part is read):
+        then :func:`decode` decides.
+    """
+    require_utf8(path)
+    with path.open("rb") as file:
+        if content_of_opened(file, path).format != "JPEG":
+            return None
+        headers = headers_of_opened(file, "JPEG")
+        file.seek(-len(_END_OF_JPEG), os.SEEK_END)
+        if file.read() != _END_OF_JPEG or headers.animated or headers.unread:
+            return None
+
+    source = load_oiio().ImageInput.open(str(path))
+    if source is None:
+        return None
+    spec = source.spec()
+    is_plain = str(spec.format) == "uint8" and spec.nchannels == 3 and _colour_of_spec(spec, "JPEG", headers).is_srgb
+    is_upright = (headers.orientation or spec.get_int_attribute("Orientation", 1)) == 1
+    if not is_plain or not is_upright or spec.height * spec.width > max_pixels:
+        source.close()
+        return None
+
+    top, left, rows, columns = choose(spec.height, spec.width)
+    pixels = source.read_scanlines(top, top + rows, 0, 0, 3, load_oiio().UINT8)
+    fault = reason(source)
+    source.close()
+    if pixels is None or fault:
+        return None
+    return np.asarray(pixels).reshape(rows, spec.width, 3)[:, left : left + columns]
 
 
 def _split_alpha(pixels: np.ndarray, has_alpha: bool) -> tuple[np.ndarray, np.ndarray | None]:

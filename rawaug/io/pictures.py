@@ -13,6 +13,7 @@ by numbers or by EXIF, is converted by :mod:`rawaug.io.colour`. Pictures that ar
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from rawaug.files import replacing, require_file, write_bytes
 from rawaug.io.colour import SRGB, to_srgb
 from rawaug.io.content import content_of
 from rawaug.io.decoding import MAX_PIXELS as MAX_PIXELS
-from rawaug.io.decoding import Decoded, decode, load_oiio, reason
+from rawaug.io.decoding import Decoded, decode, decode_part, load_oiio, reason
 from rawaug.io.decoding import require_utf8 as require_utf8
 from rawaug.io.directories import EXIF, DamagedTags, TiffFile
 from rawaug.io.metadata import read_exif
@@ -85,6 +86,33 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
     if view:
         planes = turn(planes, view).contiguous()
     return planes
+
+
+def read_crop(
+    path: str | Path, choose: Callable[[int, int], tuple[int, int, int, int]], max_pixels: int = MAX_PIXELS
+) -> Tensor:
+    """Read a part of a file's picture, the same numbers as :func:`read_picture` gives there.
+
+    A JPEG is decoded no further than the last row of the part, if it is upright sRGB and complete; of any other file
+    the whole picture is read.
+
+    Args:
+        path: the file.
+        choose: a function from the height and width of the picture to the top, left, rows and columns of the part.
+        max_pixels: as for :func:`read_picture`, whose errors are raised.
+
+    Returns:
+        uint8 ``(3, rows, columns)``.
+    """
+    path = Path(path)
+    require_file(path, "picture file")
+    part = decode_part(path, choose, max_pixels)
+    if part is not None:
+        return torch.from_numpy(np.ascontiguousarray(part.transpose(2, 0, 1)))
+
+    whole = read_picture(path, max_pixels)
+    top, left, rows, columns = choose(*whole.shape[1:])
+    return whole[:, top : top + rows, left : left + columns].clone()
 
 
 def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:

@@ -28,6 +28,7 @@ from torch import Tensor, nn
 from rawaug.camera.lights import XYZ_TO_SRGB, Array, LightRange, sample_lights
 from rawaug.camera.matrices import camera_from_srgb, daylight_gains
 from rawaug.isp.config import ISPParams
+from rawaug.seeding import Generators, draw_rows, take_generators
 
 PLAUSIBLE_GAINS = (0.4, 6.0)
 """Range of red and blue gains over green that are kept; a D65 matrix says nothing about light that needs more."""
@@ -168,36 +169,44 @@ def project_to_simplex(weights: Tensor) -> Tensor:
     return (weights - threshold).clamp_min(0.0)
 
 
-def perturb(weights: Tensor, strength: float, generator: torch.Generator) -> Tensor:
+def perturb(weights: Tensor, strength: float, generator: Generators) -> Tensor:
     """Augment weights ``(B, N)``: add ``strength * N(0, I)`` and project them back to the simplex."""
-    noise = torch.randn(weights.shape, generator=generator, device=generator.device, dtype=torch.float32)
+    atoms = weights.shape[1]
+    noise = draw_rows(
+        generator,
+        len(weights),
+        lambda g, rows: torch.randn(rows, atoms, generator=g, device=g.device, dtype=torch.float32),
+    )
     return project_to_simplex(weights + strength * noise.to(weights))
 
 
-def convex_weights(batch: int, atoms: int, generator: torch.Generator) -> Tensor:
+def convex_weights(batch: int, atoms: int, generator: Generators) -> Tensor:
     """Draw weights ``(batch, atoms)`` uniformly from the simplex: augmentation without encoders."""
     # Normalised exponentials follow the flat Dirichlet distribution. They do not fill the hull evenly: with more atoms,
     # more of the mixtures are near its middle.
-    uniform = torch.rand(batch, atoms, generator=generator, device=generator.device, dtype=torch.float32)
+    uniform = draw_rows(
+        generator, batch, lambda g, rows: torch.rand(rows, atoms, generator=g, device=g.device, dtype=torch.float32)
+    )
     exponential = -torch.log1p(-uniform)
     return exponential / exponential.sum(dim=1, keepdim=True)
 
 
-def sparse_shares(batch: int, atoms: int, mixed: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def sparse_shares(batch: int, atoms: int, mixed: int, generator: Generators) -> tuple[Tensor, Tensor]:
     """Draw a few atoms for each picture, with replacement, and their Dirichlet(1/2) shares.
 
     Args:
         batch: number of pictures B.
         atoms: number of atoms to draw from.
         mixed: number of atoms to draw for each picture.
-        generator: a generator on the CPU.
+        generator: a generator on the CPU, or one for each picture.
 
     Returns:
         Indices and float64 shares, both ``(batch, mixed)``.
     """
     # Squares of normals, divided by their sum, crowd the corners and edges of a hull.
-    indices = torch.randint(atoms, (batch, mixed), generator=generator)
-    squares = torch.randn(batch, mixed, generator=generator, dtype=torch.float64) ** 2
+    indices = draw_rows(generator, batch, lambda g, rows: torch.randint(atoms, (rows, mixed), generator=g))
+    normals = draw_rows(generator, batch, lambda g, rows: torch.randn(rows, mixed, generator=g, dtype=torch.float64))
+    squares = normals**2
     return indices, squares / squares.sum(dim=1, keepdim=True)
 
 
@@ -243,8 +252,8 @@ class CameraSampler:
         self.responses = _as_array(cameras.responses())
         self.tone_atoms, self.lights, self.consistent = tone_atoms, lights, consistent
 
-    def sample(self, batch: int, generator: torch.Generator, device: torch.device | str = "cpu") -> ISPParams:
-        """Draw the settings of ``batch`` pictures from a generator on the CPU, as tensors on ``device``.
+    def sample(self, batch: int, generator: Generators, device: torch.device | str = "cpu") -> ISPParams:
+        """Draw the settings of ``batch`` pictures from a generator on the CPU, or one each, as tensors on ``device``.
 
         Their gain weights are ``(batch, 0)``, as the gains follow from the light.
         """
@@ -253,7 +262,7 @@ class CameraSampler:
             _, balance = self._cameras_in_light(batch, generator)
 
         colour_weights = torch.from_numpy(weights).to(device, torch.float32)
-        matrices = torch.from_numpy((weights @ self.atoms).reshape(-1, 3, 3)).to(device, torch.float32)
+        matrices = torch.from_numpy(_row_by_row(weights, self.atoms).reshape(-1, 3, 3)).to(device, torch.float32)
         gains = torch.from_numpy(balance / balance.min(axis=1, keepdims=True)).to(device, torch.float32)
 
         tones = none = gains[:, :0]
@@ -262,14 +271,15 @@ class CameraSampler:
             tones = shares.new_zeros(batch, self.tone_atoms).scatter_add_(1, atoms, shares).to(gains)
         return ISPParams(colour_weights, none, matrices, gains, tones)
 
-    def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Array, Array]:
+    def _cameras_in_light(self, batch: int, generator: Generators) -> tuple[Array, Array]:
         """Draw weights ``(B, N)`` and balances ``(B, 3)``, and repeat the draw if the gains are implausible."""
         weights, balance = np.empty((batch, self.known.shape[1])), np.empty((batch, 3))
         rest = np.arange(batch)
         for _ in range(_ROUNDS):
-            cameras, shares = sparse_shares(len(rest), len(self.known), CAMERAS_MIXED, generator)
-            mixtures = np.einsum("bm,bmn->bn", shares.numpy(), self.known[cameras.numpy()])
-            light = sample_lights(len(rest), generator, self.lights)
+            drawn_by = take_generators(generator, rest)
+            cameras, shares = sparse_shares(len(rest), len(self.known), CAMERAS_MIXED, drawn_by)
+            mixtures = (shares.numpy()[..., None] * self.known[cameras.numpy()]).sum(axis=1)
+            light = sample_lights(len(rest), drawn_by, self.lights)
             weights[rest] = mixtures
             balance[rest] = self.balance(mixtures, light)
 
@@ -282,9 +292,14 @@ class CameraSampler:
     def balance(self, weights: Array, light: Array) -> Array:
         """Compute the white balance ``(B, 3)``, green 1, of mixtures ``(B, N)`` in light of white points ``(B, 3)``."""
         linear = light @ XYZ_TO_SRGB.numpy().T
-        matrices = (weights @ self.atoms).reshape(-1, 3, 3)
-        response = weights @ self.responses * np.einsum("bij,bj->bi", matrices, linear)
+        matrices = _row_by_row(weights, self.atoms).reshape(-1, 3, 3)
+        response = _row_by_row(weights, self.responses) * (matrices * linear[:, None]).sum(axis=2)
         return np.asarray(response[:, 1:2] / response)
+
+
+def _row_by_row(rows: Array, matrix: Array) -> Array:
+    """Multiply rows ``(B, N)`` by a matrix, with the same bits however many there are, which BLAS does not promise."""
+    return np.concatenate([rows[number : number + 1] @ matrix for number in range(len(rows))])
 
 
 def _as_array(tensor: Tensor) -> Array:

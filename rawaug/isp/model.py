@@ -30,6 +30,7 @@ from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weight
 from rawaug.isp.own_sampler import OwnCameraSampler
 from rawaug.isp.staged import StagedISP, Tone, thumbnail
 from rawaug.registry import suggest
+from rawaug.seeding import Generators
 
 _ADVICE = "fit or copy it again"
 _INFINITE = ("colour.spread",)
@@ -73,8 +74,8 @@ class DictionaryISP(StagedISP):
             tone_weights = self.typical_tones().expand(len(matrix), -1)
         return ISPParams(colour_weights, gain_weights, matrix, gains, tone_weights)
 
-    def draw_setting(self, batch: int, generator: torch.Generator) -> ISPParams:
-        """Draw the settings of ``batch`` pictures from a generator on the CPU, without looking at the pictures.
+    def draw_setting(self, batch: int, generator: Generators) -> ISPParams:
+        """Draw the settings of ``batch`` pictures from a generator on the CPU, or one each, without looking at them.
 
         If the atoms are published cameras, it draws a camera in a light, else mixtures of atoms with uniform weights.
         """

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from rawaug.camera.lights import (
     ILLUMINANTS,
@@ -25,6 +24,7 @@ from rawaug.isp.dictionary import (
     CameraSampler,
     sparse_shares,
 )
+from rawaug.seeding import Generators, take_generators
 
 _ROUNDS = 100
 
@@ -76,12 +76,13 @@ class OwnCameraSampler(CameraSampler):
 
         super().__init__(atoms, tone_atoms, lights, consistent)
 
-    def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Array, Array]:
+    def _cameras_in_light(self, batch: int, generator: Generators) -> tuple[Array, Array]:
         weights, balance = np.empty((batch, len(self._from_xyz))), np.empty((batch, 3))
         rest = np.arange(batch)
         for _ in range(_ROUNDS):
-            cameras, shares = sparse_shares(len(rest), len(self._mireds), CAMERAS_MIXED, generator)
-            light = self._lights(len(rest), generator)
+            drawn_by = take_generators(generator, rest)
+            cameras, shares = sparse_shares(len(rest), len(self._mireds), CAMERAS_MIXED, drawn_by)
+            light = self._lights(len(rest), drawn_by)
             weights[rest] = self._weights(cameras.numpy(), shares.numpy(), light)
             balance[rest] = self.balance(weights[rest], light)
 
@@ -93,7 +94,7 @@ class OwnCameraSampler(CameraSampler):
         limits = f"{self._lowest:g} to {self._highest:g}"
         raise ValueError(f"no light of {self.lights.kelvin} K gives these cameras gains within {limits}")
 
-    def _lights(self, batch: int, generator: torch.Generator) -> Array:
+    def _lights(self, batch: int, generator: Generators) -> Array:
         if self._exact is not None:
             return np.broadcast_to(self._exact, (batch, 3))
         return sample_lights(batch, generator, self.lights)

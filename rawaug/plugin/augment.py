@@ -230,14 +230,41 @@ class RawAugment(PairMaker):
 
         with _float32(batch):
             setting = self.settings.sample(batch, generator, chosen)
-            noise = self.noise.sample(len(batch), generator)
-            extras: dict[str, Tensor] = {}
-            if self.srgb is not None:
-                extras |= self.srgb.sample(len(batch), generator)
-            if self.burst is not None:
-                extras |= self.burst.sample(len(batch), generator)
-            extras |= self.settings.sample_blur(len(batch), generator)
-        return AugmentParams(setting, noise, crop, extras)
+            return AugmentParams(setting, *self._draw_noise(len(batch), generator, crop))
+
+    def _draw_noise(
+        self, batch: int, generator: torch.Generator, crop: Tensor
+    ) -> tuple[dict[str, Tensor], Tensor, dict[str, Tensor]]:
+        """Draw what follows after the camera settings: the noise, and what the target needs."""
+        noise = self.noise.sample(batch, generator)
+        extras: dict[str, Tensor] = {}
+        if self.srgb is not None:
+            extras |= self.srgb.sample(batch, generator)
+        if self.burst is not None:
+            extras |= self.burst.sample(batch, generator)
+        extras |= self.settings.sample_blur(batch, generator)
+        return noise, crop, extras
+
+    @eager
+    @torch.no_grad()
+    def sample_each(
+        self,
+        batch: Tensor,
+        generators: Sequence[torch.Generator],
+        crops: Tensor,
+        chosen: Sequence[ISPParams | None],
+    ) -> AugmentParams:
+        """Draw the parameters of each picture from a generator of its own, published cameras in one pass."""
+        if not self.settings.takes_rows:
+            return super().sample_each(batch, generators, crops, chosen)
+
+        self._require_here(batch)
+        with _float32(batch):
+            settings = self.settings.sample(batch, generators).map(lambda tensor: tensor.split(1))
+            parts = []
+            for setting, generator, crop in zip(zip(*settings, strict=True), generators, crops.split(1), strict=True):
+                parts.append(AugmentParams(ISPParams(*setting), *self._draw_noise(1, generator, crop)))
+        return AugmentParams.concatenate(parts)
 
     def apply_params(self, batch: Tensor, params: AugmentParams) -> RawPair:
         """Make the pairs of pictures ``(B, 3, H, W)`` that the parameters describe."""
@@ -429,6 +456,11 @@ class RawAugment(PairMaker):
     def cfa(self) -> str:
         """The pattern of the RAW, such as ``"RGGB"`` or ``"XTRANS"``."""
         return str(self.isp.cfa) if self.pattern is None else self.pattern.name
+
+    @property
+    def is_row_exact(self) -> bool:
+        """Whether the pairs of a batch have the bits that each has alone: RAW has, a development is off by rounding."""
+        return self.srgb is None
 
     def mosaic(self, raw: Tensor) -> Tensor:
         """Unpack RAW of a pair ``(..., 4, H/2, W/2)`` to a mosaic ``(..., 1, H, W)``; others already are one."""

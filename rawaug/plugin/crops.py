@@ -37,12 +37,16 @@ def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
 
 
 def draw_crop(
-    picture: Tensor, size: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
+    frame: tuple[int, int],
+    size: tuple[int, int] | None,
+    turns: bool,
+    generator: torch.Generator,
+    zoom: float = 1.0,
 ) -> Tensor:
     """Draw where a picture is cropped and how the crop is turned, as :class:`AugmentParams` keeps it.
 
     Args:
-        picture: ``(3, H, W)`` with even sides.
+        frame: height and width of the picture, even.
         size: height and width of the crop; None for the whole picture.
         turns: whether to draw flips and, for a square, quarter turns.
         generator: a generator on the CPU.
@@ -51,7 +55,7 @@ def draw_crop(
     Returns:
         ``(5,)`` top, left, H, W, view; with a zoom ``(6,)``, where the last is the number of rows before enlarging.
     """
-    height, width = picture.shape[-2:]
+    height, width = frame
     region = size or (height, width)
 
     if size and zoom > 1.0:
@@ -59,7 +63,7 @@ def draw_crop(
         rows = size[0]
         if share >= 0.5:
             rows = math.ceil(size[0] / 2 * zoom**-exponent) * 2
-        smaller = draw_crop(picture, _region(size, rows), turns, generator)
+        smaller = draw_crop(frame, _region(size, rows), turns, generator)
         return torch.cat([smaller, torch.tensor([rows])])
 
     corner = bayer.RandomCrop(region).sample(height, width, generator)
@@ -89,8 +93,45 @@ def draw_patch(
         The patch ``(3, *size)``, uint8 or float32, and its crop ``(5,)`` or ``(6,)``.
     """
     whole = trim_to_even(to_rgb_tensor(picture, bgr))
-    place = draw_crop(whole, size, turns, generator, zoom)
+    place = draw_crop((whole.shape[-2], whole.shape[-1]), size, turns, generator, zoom)
     return cut_patch(whole, place, size), place
+
+
+def read_patch(
+    pictures: Any,
+    index: int,
+    size: tuple[int, int],
+    turns: bool,
+    generator: torch.Generator,
+    zoom: float = 1.0,
+    bgr: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Draw a crop of a picture before it is read, and read no more of it than the crop needs.
+
+    Args:
+        pictures: a dataset with ``read_part``, such as :class:`rawaug.data.PictureFolder`.
+        index: of the picture.
+        size, turns, generator, zoom, bgr: as for :func:`draw_patch`, which draws the same crop.
+    """
+    start = generator.get_state()
+    place = torch.zeros(0, dtype=torch.int64)
+    fault: ValueError | None = None
+
+    def choose(height: int, width: int) -> tuple[int, int, int, int]:
+        nonlocal place, fault
+        generator.set_state(start)  # another file may stand in for one that turns out to be damaged
+        try:
+            place = draw_crop((height // 2 * 2, width // 2 * 2), size, turns, generator, zoom)
+        except ValueError as error:  # the crop is at fault, not the file
+            fault = error
+            return 0, 0, 2, 2
+        top, left, _, _, _, rows = (*place.tolist(), 0)[:6]
+        return top, left, *_region(size, rows)
+
+    region = pictures.read_part(index, choose)
+    if fault is not None:
+        raise fault
+    return _turn(region.flip(-3) if bgr else region, place, size), place
 
 
 def cut_patch(picture: Tensor, crop: Tensor, size: tuple[int, int] | None) -> Tensor:
@@ -99,16 +140,18 @@ def cut_patch(picture: Tensor, crop: Tensor, size: tuple[int, int] | None) -> Te
     Raises:
         ValueError: if the crop was drawn for a picture of another size.
     """
-    top, left, height, width, view, rows = (*crop.tolist(), 0)[:6]
+    top, left, height, width, _, rows = (*crop.tolist(), 0)[:6]
     if picture.shape[-2:] != (height, width):
         raise ValueError(f"the parameters belong to a picture of {height} x {width}, got {tuple(picture.shape[-2:])}")
-    if size is None:
-        return bayer.turn(bayer.crop(picture, top, left, height, width), view).contiguous()
+    region = (height, width) if size is None else _region(size, rows)
+    return _turn(bayer.crop(picture, top, left, *region), crop, size)
 
-    patch = bayer.crop(picture, top, left, *_region(size, rows))
-    if patch.shape[-2:] != size:
-        patch = enlarge(patch, size)
-    return bayer.turn(patch, view).contiguous()
+
+def _turn(region: Tensor, crop: Tensor, size: tuple[int, int] | None) -> Tensor:
+    """Enlarge a region of a picture to the size of the crop, and turn it as the drawn crop says."""
+    if size is not None and region.shape[-2:] != size:
+        region = enlarge(region, size)
+    return bayer.turn(region, int(crop[4])).contiguous()
 
 
 def _region(size: tuple[int, int], rows: int) -> tuple[int, int]:

@@ -22,12 +22,13 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from rawaug.camera.own import Camera
 from rawaug.errors import count_of
+from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.crops import crop_size
+from rawaug.plugin.crops import crop_size, read_patch
 from rawaug.plugin.maker import PairMaker
 from rawaug.plugin.params import AugmentParams, Keys, RawPair, pair_form
-from rawaug.plugin.pictures import find_picture, get_picture, replace_picture
+from rawaug.plugin.pictures import Where, find_picture, get_picture, replace_picture
 from rawaug.plugin.resume import Passes, Visits
 from rawaug.seeding import keyed_generator
 
@@ -149,20 +150,6 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
 
     def _generator(self, *key: int | str) -> torch.Generator:
         return keyed_generator(self.seed, "pairs", *key)
-
-    def _make_pair(self, sample: Any, name: int | str, generator: torch.Generator) -> Any:
-        where = find_picture(sample, self.key)
-        picture = get_picture(sample, where)
-
-        try:
-            patch, place = self.augment.draw_patch(picture, self.crop, self.turns, generator, self.zoom, self.bgr)
-            chosen = self.augment.look(picture, self.bgr)
-            batch = self.augment.make_pair(patch[None], generator, place[None], chosen)
-        except ValueError as error:
-            raise ValueError(f"picture {name}: {error}") from error
-
-        pair = batch.map(lambda tensor: tensor[0])
-        return replace_picture(sample, where, self.form(pair, self._name_of(name)))
 
     def _name_of(self, number: int | str) -> str:
         """The name of a picture: the name of its file if the dataset knows it, else its number."""
@@ -321,17 +308,21 @@ class RawPairs(_Pairs[Sample]):
         return Visits(len(dataset))
 
     def __getitem__(self, index: int) -> Sample:
-        number, length = operator.index(index), len(self)
-        if not -length <= number < length:  # an IndexError ends iteration, too
-            raise IndexError(f"there is no pair {number}: the dataset has {count_of(length, 'picture')}")
-
-        number %= length
-        return self.draw(number, self._generator(*self._epochs.key(number)))
+        return self.__getitems__([index])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
-        """Make the pairs of a batch, as a DataLoader asks for them."""
-        self._epochs.fetch(len(indices))
-        return [self[index] for index in indices]
+        """Make the pairs of a batch, as a DataLoader asks for them: the same bits as one by one, and faster."""
+        length = len(self)
+        numbers = []
+        for index in indices:
+            number = operator.index(index)
+            if not -length <= number < length:  # an IndexError ends iteration, too
+                raise IndexError(f"there is no pair {number}: the dataset has {count_of(length, 'picture')}")
+            numbers.append(number % length)
+
+        self._epochs.fetch(len(numbers))
+        generators = [self._generator(*self._epochs.key(number)) for number in numbers]
+        return self._draw_samples(numbers, generators)
 
     def draw(self, index: int, generator: torch.Generator) -> Sample:
         """Draw the pair of picture ``index`` from a generator on the CPU; no epoch is counted.
@@ -339,26 +330,84 @@ class RawPairs(_Pairs[Sample]):
         Returns:
             The dataset's sample with the pair, without the leading B, in place of the picture.
         """
-        sample: Sample = self._make_pair(self.dataset[index], index, generator)
-        return sample
+        return self._draw_samples([index], [generator])[0]
 
     def draw_batch(self, indices: Sequence[int], generators: Sequence[torch.Generator]) -> RawPair:
-        """Draw the same pairs as :meth:`draw`, bit for bit, but as one batch, which is faster for small crops.
+        """Draw the same pairs as :meth:`draw`, bit for bit, but as one batch.
 
         Args:
             indices: B indices of a dataset whose samples are pictures alone; ``crop`` must be set.
             generators: one generator for each index.
         """
-        parameters, patches = [], []
-        for index, generator in zip(indices, generators, strict=True):
-            picture = self.dataset[index]
-            patch, place = self.augment.draw_patch(picture, self.crop, self.turns, generator, self.zoom, self.bgr)
-            patches.append(patch[None])
-            chosen = self.augment.look(picture, self.bgr)
-            parameters.append(self.augment.sample(patch[None], generator, place[None], chosen))
-
-        pair: RawPair = self.augment.apply(torch.cat(patches), AugmentParams.concatenate(parameters))
+        _, patches, places, chosen = self._cut(indices, generators)
+        batch = torch.stack(patches)
+        params = self.augment.sample_each(batch, generators, torch.stack(places), chosen)
+        pair: RawPair = self.augment.apply(batch, params)
         return pair
+
+    def _draw_samples(self, indices: Sequence[int], generators: Sequence[torch.Generator]) -> list[Sample]:
+        samples, patches, places, chosen = self._cut(indices, generators)
+
+        groups = [range(len(patches))]
+        if not self.augment.is_row_exact or len({(patch.shape, patch.dtype) for patch in patches}) > 1:
+            groups = [range(number, number + 1) for number in range(len(patches))]
+
+        finished: list[Any] = []
+        for group in groups:
+            batch = torch.stack([patches[number] for number in group])
+            crops = torch.stack([places[number] for number in group])
+            drawn_by, of_group = [generators[number] for number in group], [chosen[number] for number in group]
+            try:
+                pairs = self.augment.apply(batch, self.augment.sample_each(batch, drawn_by, crops, of_group))
+            except ValueError as error:
+                names = ", ".join(str(indices[number]) for number in group)
+                raise ValueError(f"picture {names}: {error}") from error
+
+            for place, number in enumerate(group):
+                pair = pairs.map(lambda tensor, place=place: tensor[place])
+                form = self.form(pair, self._name_of(indices[number]))
+                finished.append(replace_picture(*samples[number], form))
+        return finished
+
+    def _cut(
+        self, indices: Sequence[int], generators: Sequence[torch.Generator]
+    ) -> tuple[list[tuple[Any, Where]], list[Tensor], list[Tensor], list[ISPParams | None]]:
+        """Draw a crop of each picture and cut it out.
+
+        Returns:
+            The samples and where their pictures are, the patches ``(3, h, w)``, their places ``(5,)``, and the settings
+            ``(1, ...)`` that were chosen for the whole pictures.
+        """
+        samples: list[tuple[Any, Where]] = []
+        patches, places, settings = [], [], []
+        for index, generator in zip(indices, generators, strict=True):
+            sample: Any = None
+            where: Where = None
+            chosen: ISPParams | None = None
+            try:
+                if self._reads_parts and self.crop is not None:
+                    cut = read_patch(self.dataset, index, self.crop, self.turns, generator, self.zoom, self.bgr)
+                else:
+                    sample = self.dataset[index]
+                    where = find_picture(sample, self.key)
+                    picture = get_picture(sample, where)
+                    cut = self.augment.draw_patch(picture, self.crop, self.turns, generator, self.zoom, self.bgr)
+                    chosen = self.augment.look(picture, self.bgr)
+            except ValueError as error:
+                raise ValueError(f"picture {index}: {error}") from error
+
+            samples.append((sample, where))
+            patches.append(cut[0])
+            places.append(cut[1])
+            settings.append(chosen)
+        return samples, patches, places, settings
+
+    @property
+    def _reads_parts(self) -> bool:
+        """Whether only the crops of pictures have to be read: nothing is chosen by what whole pictures show."""
+        if not hasattr(self.dataset, "read_part") or not isinstance(self.augment, RawAugment):
+            return False
+        return not self.augment.settings.looks
 
     def replay(self, index: int, params: AugmentParams) -> RawPair:
         """Make the pair of picture ``index`` again from its parameters, without the leading B, whatever the seed is.
@@ -463,6 +512,20 @@ class RawPairStream(_Pairs[Any], IterableDataset[Any]):
             yield pair
 
         self._epochs.end()
+
+    def _make_pair(self, sample: Any, name: int | str, generator: torch.Generator) -> Any:
+        where = find_picture(sample, self.key)
+        picture = get_picture(sample, where)
+
+        try:
+            patch, place = self.augment.draw_patch(picture, self.crop, self.turns, generator, self.zoom, self.bgr)
+            chosen = self.augment.look(picture, self.bgr)
+            batch = self.augment.make_pair(patch[None], generator, place[None], chosen)
+        except ValueError as error:
+            raise ValueError(f"picture {name}: {error}") from error
+
+        pair = batch.map(lambda tensor: tensor[0])
+        return replace_picture(sample, where, self.form(pair, self._name_of(name)))
 
     def _read_identity(self, sample: Any) -> int | str:
         try:

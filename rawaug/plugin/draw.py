@@ -24,6 +24,7 @@ from rawaug.isp.dictionary import EXPOSURE, perturb
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
 from rawaug.registry import suggest
+from rawaug.seeding import Generators, draw_rows
 
 _FAR = sys.float_info.max
 """The largest finite number."""
@@ -146,12 +147,12 @@ class SettingSampler:
         """Choose the settings of whole pictures ``(B, 3, H, W)``, before any draw."""
         return self.baked.choose(srgb)
 
-    def sample(self, srgb: Tensor, generator: torch.Generator, chosen: ISPParams | None = None) -> ISPParams:
+    def sample(self, srgb: Tensor, generator: Generators, chosen: ISPParams | None = None) -> ISPParams:
         """Draw the settings of pictures, exposure included.
 
         Args:
             srgb: ``(B, 3, H, W)``.
-            generator: a generator on the CPU.
+            generator: a generator on the CPU, or one for each picture if the sampler :attr:`takes_rows`.
             chosen: settings of B pictures, or a single one for all, to use where the sampling looks at the pictures;
                 by default those of :meth:`choose`.
         """
@@ -160,7 +161,8 @@ class SettingSampler:
             return setting
 
         low, high = self.exposure
-        stops = low + (high - low) * torch.rand(len(srgb), 1, generator=generator, dtype=torch.float32)
+        uniform = draw_rows(generator, len(srgb), lambda g, rows: torch.rand(rows, 1, generator=g, dtype=torch.float32))
+        stops = low + (high - low) * uniform
         return setting._replace(gains=setting.gains * torch.exp2(-stops).to(setting.gains))
 
     def sample_blur(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
@@ -170,7 +172,12 @@ class SettingSampler:
             return {}
         return {"blur": low + (high - low) * torch.rand(batch, generator=generator, dtype=torch.float32)}
 
-    def _sample_at_exposure_0(self, srgb: Tensor, generator: torch.Generator, chosen: ISPParams | None) -> ISPParams:
+    @property
+    def takes_rows(self) -> bool:
+        """Whether settings may be drawn from a generator for each picture, with the bits of each alone."""
+        return self._cameras is not None and self.draw.sampling in ("convex", "independent")
+
+    def _sample_at_exposure_0(self, srgb: Tensor, generator: Generators, chosen: ISPParams | None) -> ISPParams:
         if self.draw.sampling in ("perturb", "chosen"):
             if chosen is None:
                 chosen = self.choose(srgb)
@@ -186,7 +193,7 @@ class SettingSampler:
             return setting
         return setting._replace(tone_weights=self._tone.to(setting.tone_weights).expand_as(setting.tone_weights))
 
-    def _perturb(self, setting: ISPParams, generator: torch.Generator) -> ISPParams:
+    def _perturb(self, setting: ISPParams, generator: Generators) -> ISPParams:
         weights = []
         for atoms in (setting.colour_weights, setting.gain_weights, setting.tone_weights):
             if atoms.shape[1]:

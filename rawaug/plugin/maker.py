@@ -47,6 +47,11 @@ class PairMaker(nn.Module, ABC):
     def device(self) -> torch.device:
         """The device that pairs are made on."""
 
+    @property
+    def is_row_exact(self) -> bool:
+        """Whether the pairs of a batch have the bits that each has alone."""
+        return True
+
     @abstractmethod
     def open_folder(self, path: str | Path, size: tuple[int, int] | None) -> Any:
         """Open the inputs of a folder, or of ``kind:path``, as a Dataset; ``size`` is the size of the crops."""
@@ -127,6 +132,26 @@ class PairMaker(nn.Module, ABC):
         if self.is_single(inputs):
             return params.map(_first)
         return params
+
+    @eager
+    @torch.no_grad()
+    def sample_each(
+        self,
+        batch: Tensor,
+        generators: Sequence[torch.Generator],
+        crops: Tensor,
+        chosen: Sequence[ISPParams | None],
+    ) -> AugmentParams:
+        """Draw the parameters of each input from a generator of its own: the same numbers as of each alone.
+
+        Args:
+            batch: ``(B, C, H, W)``.
+            generators: B generators on the CPU.
+            crops: ``(B, 5)``, as for :meth:`sample`.
+            chosen: what :meth:`look` chose for each of the whole inputs.
+        """
+        inputs = zip(batch.split(1), generators, crops.split(1), chosen, strict=True)
+        return AugmentParams.concatenate([self.draw_params(*each) for each in inputs])
 
     @eager
     @torch.no_grad()

@@ -308,3 +308,57 @@ def test_a_pair_has_the_name_of_the_file_that_it_was_made_of(augment: RawAugment
     (tmp_path / "b.png").write_bytes(b"broken")
     pairs = RawPairs(PictureFolder(tmp_path, allowed_share=0.5), augment, crop=8, fields=("name",))
     assert [Path(name).name for (name,) in (pairs[0], pairs[1], pairs[2])] == ["a.png", "c.png", "c.png"]
+
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "cameras": {},
+    "any camera": {"noise": "any camera"},
+    "one's own": {"camera": ["Nikon D750", "Canon EOS 5D"], "target": "rgb"},
+    "developed": {"target": rawaug.Srgb(jpeg=(40, 90), finish=True)},
+    "burst": {"burst": rawaug.Burst(2)},
+    "pattern": {"cfa": "XTRANS", "draw": rawaug.Draw(sampling="independent")},
+}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_batch_has_the_bits_of_each_sample_alone(name: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    pictures = list(torch.randint(256, (5, 3, 48, 64), generator=generator, dtype=torch.uint8))
+    pictures.append(torch.rand(3, 48, 64, generator=generator))  # another type
+    augment = rawaug.RawAugment.from_pretrained("universal", **SETTINGS[name])
+    pairs = RawPairs(pictures, augment, crop=24, zoom=1.5).freeze()
+    for numbers in (range(5), range(3, 6)):
+        for number, pair in zip(numbers, pairs.__getitems__(list(numbers)), strict=True):
+            alone = pairs[number]
+            assert torch.equal(pair.noisy, alone.noisy) and torch.equal(pair.clean, alone.clean)
+            assert torch.equal(pair.params.isp.gains, alone.params.isp.gains)
+
+
+@pytest.mark.parametrize("sampling", ["convex", "chosen"])
+def test_a_folder_is_read_no_further_than_a_crop_to_the_same_pairs(tmp_path: Path, sampling: Any) -> None:
+    for number in range(4):
+        array = torch.randint(256, (60 + number, 80, 3), generator=torch.Generator().manual_seed(number))
+        image = Image.fromarray(array.to(torch.uint8).numpy())
+        exif = Image.Exif()
+        exif[274] = 6 if number == 3 else 1  # on its side
+        image.save(tmp_path / f"{number}.jpg", quality=90, exif=exif)
+    folder = PictureFolder(tmp_path)
+    augment = rawaug.RawAugment.from_pretrained("phones", draw=rawaug.Draw(sampling=sampling))
+    parts = RawPairs(folder, augment, crop=32, zoom=2.0).freeze()
+    whole = RawPairs([folder[number] for number in range(4)], augment, crop=32, zoom=2.0).freeze()
+    assert all(torch.equal(parts[number].noisy, whole[number].noisy) for number in range(4))
+    assert torch.equal(parts.replay(1, parts[1].params).noisy, parts[1].noisy)
+
+
+def test_a_truncated_picture_is_found_whichever_part_is_read(augment: RawAugment, tmp_path: Path) -> None:
+    noise = torch.randint(256, (64, 64, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
+    for name in ("a.jpg", "b.jpg"):
+        Image.fromarray(noise.numpy()).save(tmp_path / name)
+    content = (tmp_path / "b.jpg").read_bytes()
+    (tmp_path / "b.jpg").write_bytes(content[: len(content) * 9 // 10])
+    folder = PictureFolder(tmp_path, allowed_share=0.5)
+    top = folder.read_part(1, lambda height, width: (0, 0, 2, 4))
+    assert list(folder.skipped) == [tmp_path / "b.jpg"] and torch.equal(top, folder[0][:, :2, :4])
+    with pytest.raises(ValueError, match="crop"):  # the crop's fault, not the files'
+        RawPairs(folder, augment, crop=66)[0]
+    assert len(folder.skipped) == 1
