@@ -1,4 +1,4 @@
-r"""Noise profiles of 374 cameras by ISO, var = a y + b, as measured by darktable.
+r"""Noise profiles of 369 cameras by ISO, var = a y + b, as measured by darktable.
 
 Their red and blue figures contain a white balance, so the green ones serve all channels. darktable measures after
 demosaicing, which averages noise. For four cameras that ELD measured on the mosaic, darktable's profiles are too low by

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -189,3 +190,31 @@ def test_what_cannot_be_drawn_is_refused() -> None:
     green_only.set_cameras(torch.tensor([[[0.01, 0, 0], [0, 1.0, 0], [0, 0, 0.01]]]), torch.ones(1, 1))
     with pytest.raises(ValueError, match="gains within"):
         CameraSampler(green_only, 0, LightRange()).sample(1, generator())
+
+
+def test_a_camera_that_is_drawn_again_brings_its_own_gains(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gains that are implausible are drawn again, camera and light together, not the light alone."""
+    cameras = DictionaryISP.from_pretrained("universal-small").colour
+    assert isinstance(cameras, CameraDictionary)
+    sampler = CameraSampler(cameras, 0, LightRange((2800.0, 7500.0), lamps=0.0))
+
+    rounds: list[np.ndarray] = []
+
+    def plausible_at_last(balance: np.ndarray) -> np.ndarray:
+        rounds.append(balance)
+        return np.full(len(balance), len(rounds) > 2)
+
+    mixtures: list[np.ndarray] = []
+    balance = sampler.balance
+
+    def recorded(weights: np.ndarray, light: np.ndarray) -> np.ndarray:
+        mixtures.append(weights)
+        return balance(weights, light)
+
+    monkeypatch.setattr("rawaug.isp.dictionary.is_plausible", plausible_at_last)
+    monkeypatch.setattr(sampler, "balance", recorded)
+    setting = sampler.sample(5, torch.Generator().manual_seed(0))
+    assert len(mixtures) == 3 and not np.allclose(mixtures[0], mixtures[2])
+    assert np.allclose(setting.colour_weights.numpy(), mixtures[2], atol=1e-6)
+    gains = setting.gains.numpy()
+    assert np.allclose(gains / gains[:, 1:2], rounds[2], rtol=1e-5)

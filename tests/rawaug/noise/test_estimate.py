@@ -75,6 +75,17 @@ def test_textured_and_clipped_frames_give_both_levels_within_5_percent(shot: flo
     assert estimate.r2 > 0.98
 
 
+def test_a_large_flat_chart_gives_the_variance_within_half_a_percent() -> None:
+    """The statistics of blocks are unbiased: a scale that is off by a percent or two shows on enough of them."""
+    steps = torch.linspace(0.05, 0.85, 16).repeat_interleave(128)
+    chart = steps.expand(1, 4, 1024, 2048).contiguous()
+    noise = ShotReadNoise(FixedLevels(2e-3, 1e-5))
+    noisy = noise.apply(chart, noise.sample(1, torch.Generator().manual_seed(0)))
+    estimate = estimate_noise(unpack(noisy, CFA.RGGB)[0], CFA.RGGB)
+    at_middle = 0.45 * estimate.shot_var + estimate.read_var
+    assert at_middle == pytest.approx(0.45 * 2e-3 + 1e-5, rel=0.005)
+
+
 def test_banding_and_defects_do_not_count() -> None:
     estimate = estimate_noise(shoot(scene(0), 1e-3, 1e-5, 0, row_var=5e-6, dead=5e-4, hot=5e-4), "GRBG")
     assert estimate.shot_var == pytest.approx(1e-3, rel=0.05)

@@ -12,7 +12,7 @@ from torch import Tensor
 from rawaug.plugin import finishing
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.finishing import Finish, blur, box_mean
-from rawaug.plugin.targets import Srgb
+from rawaug.plugin.targets import Srgb, compress_jpeg
 
 SIDE = 96
 
@@ -188,3 +188,13 @@ def test_ranges_out_of_order_are_refused() -> None:
         Finish(radius=(1.0, 0.5))
     with pytest.raises(ValueError, match=r"finish: .*unfinished"):
         Finish(unfinished=1.5)
+
+
+def test_chroma_is_halved_in_those_pictures_that_say_so() -> None:
+    """4:2:0 shares its chroma among four pixels; 4:4:4 keeps red and green columns of one pixel apart."""
+    stripes = torch.zeros(3, 32, 32)
+    stripes[0, :, ::2], stripes[1, :, 1::2] = 0.8, 0.4
+    quality, halved = torch.tensor([98, 98, 98]), torch.tensor([True, False, True])
+    coded = compress_jpeg(stripes.expand(3, -1, -1, -1), quality, halved)
+    chroma = (coded[:, 0] - coded[:, 1]).diff(dim=-1).abs().mean(dim=(1, 2))
+    assert chroma[1] > 1.0 and chroma[0] < 0.5 and chroma[2] < 0.5
