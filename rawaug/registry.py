@@ -19,7 +19,9 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from importlib import import_module
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_type_hints
+
+from annotated_types import Interval
 
 T = TypeVar("T")
 
@@ -123,6 +125,36 @@ def require_between(key: str, value: object, least: float, most: float) -> None:
 
     if not is_valid:
         raise ValueError(f"{key} must be a {noun} from {least} to {most}, got {value!r:.100}")
+
+
+def list_bounds(settings: type[Any]) -> dict[str, Interval]:
+    """List the bounds of the fields of a dataclass, as ``Annotated[int, Interval(ge=1, le=9)]`` states them.
+
+    Pydantic checks them in files and on the command line.
+    """
+    bounds = {}
+    for name, hint in get_type_hints(settings, include_extras=True).items():
+        for part in (hint, *get_args(hint)):  # one of the types may be None
+            for detail in getattr(part, "__metadata__", ()):
+                if isinstance(detail, Interval):
+                    bounds[name] = detail
+    return bounds
+
+
+def require_bounds(settings: Any, above: str = "") -> None:
+    """Refuse a number in a dataclass that is out of the bounds of its field.
+
+    Args:
+        settings: an instance of the dataclass.
+        above: what precedes the names of fields in messages, such as ``"train."``.
+
+    Raises:
+        ValueError: as :func:`require_between` does; None has no bounds.
+    """
+    for name, bounds in list_bounds(type(settings)).items():
+        value = getattr(settings, name)
+        if value is not None:
+            require_between(f"{above}{name}", value, bounds.ge, bounds.le)  # type: ignore[arg-type]
 
 
 def suggest(name: object, known: Iterable[str]) -> str:

@@ -9,6 +9,7 @@ from copy import deepcopy
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
+from annotated_types import Interval
 from cyclopts import Parameter
 from docstring_parser import parse
 from pydantic import TypeAdapter, ValidationError
@@ -22,10 +23,13 @@ from rawaug.experiment import run as experiment
 from rawaug.experiment.data import use_all_pairs
 from rawaug.experiment.recipe import find_recipe, kind_of, read_recipe, recipe_list, settings_of
 from rawaug.experiment.settings import Recipe
-from rawaug.registry import suggest
+from rawaug.registry import list_bounds, suggest
 
 SHARED = ("channels", "variance_map", "deviation", "domain")
 """All networks share these settings."""
+
+_LARGE = 2**31
+"""Numbers beyond this are allowed, but nobody means them."""
 
 Options = list[tuple[str, Any]]
 """These are the dotted keys of the command line with their values, in their order."""
@@ -230,6 +234,7 @@ def keys_of(settings: type[Any], above: str = "") -> Iterator[Key]:
         for parameter in parse(base.__doc__ or "").params:
             meanings[parameter.arg_name] = parameter.description or ""
 
+    bounds = list_bounds(settings)
     for field in fields(settings):
         part, by_name = _part(hints[field.name])
         name = f"{above}{field.name}"
@@ -239,11 +244,27 @@ def keys_of(settings: type[Any], above: str = "") -> Iterator[Key]:
             if field.default_factory is not MISSING:
                 default = field.default_factory()
             names = field.metadata.get("registry", ())
-            listed = f" One of {', '.join(names)}." if names else ""
-            yield Key(name, default, meanings.get(field.name, "") + listed)
+            meaning = meanings.get(field.name, "")
+            if names:
+                meaning += f" One of {', '.join(names)}."
+            if field.name in bounds:
+                meaning += describe_bounds(bounds[field.name])
+            yield Key(name, default, meaning)
 
         if part is not None:
             yield from keys_of(part, f"{name}.NAME." if by_name else f"{name}.")
+
+
+def describe_bounds(bounds: Interval) -> str:
+    """Write the bounds of a number as a sentence; those that only keep memory from being filled are left out."""
+    least: Any = bounds.ge
+    most: Any = bounds.le
+    if least < -_LARGE:
+        return ""
+    if most >= _LARGE:
+        return f" At least {least}."
+
+    return f" From {least} to {most}."
 
 
 def print_keys(settings: type[Any], content: Mapping[str, Any]) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Annotated, Any, ClassVar, Literal
 
+from annotated_types import Interval
 from pydantic import BeforeValidator
 
 from rawaug.data.pair_folder import PairSettings
@@ -17,8 +18,8 @@ from rawaug.kernels.runtime import find_device
 from rawaug.noise import noise_model
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.targets import Srgb, Target
-from rawaug.registry import require_between, split_spec
-from rawaug.training.config import MOST, SAME_WEIGHTS, DenoiserConfig, TrainConfig, Weighing
+from rawaug.registry import require_bounds, split_spec
+from rawaug.training.config import MOST, SAME_WEIGHTS, Count, DenoiserConfig, TrainConfig, Weighing
 from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.srgb_noise import noise_on_srgb
 from rawaug.training.srgb_samples import Conditioning
@@ -42,12 +43,6 @@ _DEMO = "demo:"
 """The names of the built-in, simulated frames begin with this."""
 
 _PAIRS = "pairs:"
-_BOUNDS: dict[str, tuple[float, float]] = {
-    **dict.fromkeys(("count", "validation_count", "test_count"), (1, MOST)),
-    **dict.fromkeys(("crop", "validation_crop", "test_crop"), (32, MOST)),
-    "bin": (1, 16),
-    "max_pixels": (4, 2**40),
-}
 
 
 def _require_noise_form(value: Any) -> Any:
@@ -56,6 +51,12 @@ def _require_noise_form(value: Any) -> Any:
         noise_model(value)
     return value
 
+
+Share = Annotated[float, Interval(ge=0.0, le=1.0)]
+"""A share of samples."""
+
+Side = Annotated[int, Interval(ge=32, le=MOST)]
+"""The side of the middle of a frame, in pixels."""
 
 NoiseSetting = Annotated[tuple[float, float] | str | list[str] | dict[str, Any], BeforeValidator(_require_noise_form)]
 """This is the noise of a recipe, as :func:`rawaug.noise.noise_model` takes it."""
@@ -90,25 +91,22 @@ class DataConfig(PairSettings):
     """
 
     pairs: str | None = "demo:train"
-    count: int | None = None
+    count: Count | None = None
     select: str | list[str] = "first"
-    crop: int | None = None
+    crop: Side | None = None
     pictures: str | list[str] = "demo:"
     memory_mb: int = 0
-    max_pixels: int | None = None
+    max_pixels: Annotated[int, Interval(ge=4, le=2**40)] | None = None
     validation: str | None = _USUAL
-    validation_count: int | None = None
-    validation_crop: int | None = 512
+    validation_count: Count | None = None
+    validation_crop: Side | None = 512
     test: str = "demo:test"
-    test_count: int | None = None
-    test_crop: int | None = 1024
-    bin: int = 1
+    test_count: Count | None = None
+    test_crop: Side | None = 1024
+    bin: Annotated[int, Interval(ge=1, le=16)] = 1
 
     def __post_init__(self) -> None:
-        for key, (least, most) in _BOUNDS.items():
-            if getattr(self, key) is not None:
-                require_between(f"data.{key}", getattr(self, key), least, most)
-
+        require_bounds(self, "data.")
         if self.validation == _USUAL:
             self.validation = "demo:validation"
             if self.pairs is not None and not self.pairs.startswith(_DEMO):
@@ -207,27 +205,23 @@ class ArmConfig:
             all.
     """
 
-    augmented: float = 0.0
+    augmented: Share = 0.0
     source: Literal["pictures", "own", "noise", "more"] = "pictures"
-    batch: int | None = None
+    batch: Count | None = None
     draw: Draw | None = None
     srgb: Srgb | None = None
     zoom: float = 1.0
     srgb_noise: str | dict[str, Any] | None = None
-    srgb_share: float = 1.0
+    srgb_share: Share = 1.0
     noise_level: Conditioning | None = None
     estimator: str | dict[str, Any] = "supervised"
     denoiser: DenoiserConfig | None = None
     learning_rate: float | None = None
     weigh: Weighing | None = None
-    steps: int | None = None
+    steps: Count | None = None
 
     def __post_init__(self) -> None:
-        for key in ("augmented", "srgb_share"):
-            require_between(key, getattr(self, key), 0.0, 1.0)
-        for key in ("steps", "batch"):
-            if getattr(self, key) is not None:
-                require_between(key, getattr(self, key), 1, MOST)
+        require_bounds(self)
         try:
             ESTIMATORS.make(self.estimator)
         except ValueError as error:
@@ -296,9 +290,9 @@ class Recipe:
     views: Literal[4, 8] = 8
     baselines: list[str] = field(default_factory=list)
     self_ensemble: bool = True
-    steps: int | None = None
-    seed: int = 0
-    seeds: int = 1
+    steps: Count | None = None
+    seed: Annotated[int, Interval(ge=-(2**63), le=2**62)] = 0
+    seeds: Annotated[int, Interval(ge=1, le=1000)] = 1
     device: str = "auto"
     devices: int = 1
     out: str = "runs"
@@ -306,8 +300,7 @@ class Recipe:
     def __post_init__(self) -> None:
         if not self.arms:
             raise ValueError("arms: a recipe needs at least one arm")
-        require_between("seed", self.seed, -(2**63), 2**62)
-        require_between("seeds", self.seeds, 1, 1000)
+        require_bounds(self)
 
         if self.steps is not None:
             self.train = replace(self.train, steps=self.steps)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from annotated_types import Interval
 
 from denoisers.network import DENOISERS
 from rawaug.files import fingerprint
-from rawaug.registry import require_between
+from rawaug.registry import require_bounds
 from rawaug.training.losses import LOSSES
 
 MOST = 2**31
@@ -15,6 +17,9 @@ MOST = 2**31
 
 VALIDATIONS = 5
 """A short training has this many validations, which are the points of its curves."""
+
+Count = Annotated[int, Interval(ge=1, le=MOST)]
+"""A number of steps, samples, frames or processes."""
 
 Weighing = Literal["linear", "normalised", "stabilised", "mixed", "relative"]
 """The loss weighs light and shade in one of these ways; :mod:`rawaug.training.weighing` has the formulas."""
@@ -70,41 +75,35 @@ class TrainConfig:
         logger: where loss and validation are logged besides ``log.csv``: tensorboard, wandb or csv; null for nowhere.
     """
 
-    steps: int = 1500
-    batch: int = 8
-    crop: int = 64
-    learning_rate: float = 7e-4
-    warmup: int = 50
+    steps: Count = 1500
+    batch: Count = 8
+    crop: Annotated[int, Interval(ge=8, le=MOST)] = 64
+    learning_rate: Annotated[float, Interval(ge=0.0, le=float(MOST))] = 7e-4
+    warmup: Annotated[int, Interval(ge=0, le=MOST)] = 50
     schedule: Literal["cosine", "step"] = "cosine"
-    halve_every: int = 20000
+    halve_every: Count = 20000
     loss: str | dict[str, Any] = "l1"
     weigh: Weighing = "linear"
     ema: float = 0.99
     start_share: float = 0.0
-    clip_norm: float = 0.1
-    validate_every: int = 100
-    checkpoint_every: int = 200
-    workers: int = 0
+    clip_norm: Annotated[float, Interval(ge=0.0, le=float(MOST))] = 0.1
+    validate_every: Count = 100
+    checkpoint_every: Count = 200
+    workers: Annotated[int, Interval(ge=0, le=MOST)] = 0
     precision: str = "32-true"
     channels_last: bool = True
     compile: bool = False
     logger: Literal["tensorboard", "wandb", "csv"] | None = None
 
     def __post_init__(self) -> None:
-        for key in ("steps", "batch", "halve_every", "validate_every", "checkpoint_every"):
-            require_between(f"train.{key}", getattr(self, key), 1, MOST)
-        for key in ("crop", "warmup", "workers"):
-            require_between(f"train.{key}", getattr(self, key), 0, MOST)
-        for key in ("learning_rate", "clip_norm"):
-            require_between(f"train.{key}", getattr(self, key), 0.0, float(MOST))
-
+        require_bounds(self, "train.")
         try:
             LOSSES.make(self.loss)
         except ValueError as error:
             raise ValueError(f"train.loss: {error}") from None
 
-        if self.crop < 8 or self.crop % 2:
-            raise ValueError(f"train.crop must be even and at least 8, got {self.crop}")
+        if self.crop % 2:
+            raise ValueError(f"train.crop must be even, got {self.crop}")
         if not 0.0 <= self.ema < 1.0:
             raise ValueError(f"train.ema must be in [0, 1), got {self.ema}")
         if not 0.0 <= self.start_share < 1.0:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Interval
 
 from rawaug.data.pairs import Sample
 from rawaug.isp.functional import as_float
 from rawaug.plugin.crops import crop_size, draw_patch
-from rawaug.registry import require_between
+from rawaug.registry import require_between, require_bounds
 from rawaug.training.crops import PictureCrops
 from rawaug.training.srgb_noise import SrgbNoise
 
@@ -55,14 +56,13 @@ class Conditioning:
         factor: largest factor by which the wrong level is off, up or down, drawn by its logarithm.
     """
 
-    unknown: float = 0.35
-    exact: float = 0.4
-    factor: float = 1.6
+    unknown: Annotated[float, Interval(ge=0.0, le=1.0)] = 0.35
+    exact: Annotated[float, Interval(ge=0.0, le=1.0)] = 0.4
+    factor: Annotated[float, Interval(ge=1.0, le=10.0)] = 1.6
 
     def __post_init__(self) -> None:
-        require_between("noise_level.unknown", self.unknown, 0.0, 1.0)
+        require_bounds(self, "noise_level.")
         require_between("noise_level.exact", self.exact, 0.0, 1.0 - self.unknown)
-        require_between("noise_level.factor", self.factor, 1.0, 10.0)
 
     def sample(self, generator: torch.Generator) -> float:
         """Draw what the deviation is multiplied by: 0 for unknown, 1, or a factor."""

@@ -178,6 +178,9 @@ def test_recipes_are_listed_and_explained_with_their_own_values(capsys: pytest.C
         shown = capsys.readouterr().out
         assert value in shown and "--train.learning-rate" in shown and "--arms.NAME.augmented" in shown
         assert ":class:" not in shown
+        words = " ".join(shown.split())
+        for bounds in ("At least 1.", "From 1 to 1000.", "From 0.0 to 1.0.", "From 1 to 16."):
+            assert bounds in words
 
 
 def test_an_arm_has_a_rate_and_a_weighing_of_its_own_and_at_most_its_own_steps() -> None:

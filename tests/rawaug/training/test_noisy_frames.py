@@ -116,7 +116,9 @@ def test_frames_as_shot_need_measured_levels() -> None:
     assert drop_clean(pair) is pair
     with pytest.raises(ValueError, match=r"train_00_astronaut: .*levels"):
         noisy_frame(pair, None)
-    assert noisy_frame(pair, {"shot_var": 1e-3, "read_var": 1e-5, "r2": 1.0}).read_var == 1e-5
+    levels = [{"shot_var": 1e-3, "read_var": 1e-5}]
+    law = {"name": "MeasuredNoise", "settings": {"camera": "Maker Model", "levels": levels}}
+    assert noisy_frame(pair, law).read_var == 1e-5
 
 
 def test_of_pictures_the_signal_is_known(pictures: list[torch.Tensor], augment: RawAugment) -> None:
