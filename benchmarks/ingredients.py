@@ -37,7 +37,7 @@ from denoisers.drunet import DRUNet, ResidualUNet, Size
 from denoisers.layers import PACKED
 from denoisers.network import DENOISERS, Shared
 from rawaug.data import open_pictures
-from rawaug.data.folders import Cached
+from rawaug.data.frames import Cached
 from rawaug.evaluation.benchmark import STRENGTHS, TOLD
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial

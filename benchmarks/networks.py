@@ -27,7 +27,7 @@ import rawaug
 from benchmarks.measure import arguments, fastest, finish, show, start
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
-from rawaug.data.folders import Cached
+from rawaug.data.frames import Cached
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import group_rows, score

@@ -22,7 +22,8 @@ from denoisers import NonLocalMeans, anscombe
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
-from rawaug.data.pairs import Binned, Middles, Pair
+from rawaug.data.frames import as_frames
+from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import compare, to_domain
 from rawaug.evaluation.tables import print_rows
@@ -86,8 +87,8 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--noise", default="cycleisp_sidd")
     args = parser.parse_args(argv)
     figures = start(args)
-    frames: Any = Binned(open_pairs(args.data), args.bin, together=True)
-    pairs = Middles(frames, 256) if args.quick else frames
+    frames: Any = as_frames(open_pairs(args.data)).binned(args.bin, together=True)
+    pairs = as_frames(frames).middles(256) if args.quick else frames
     networks, noise = [RawDenoiser.of(name) for name in args.denoisers], noise_model(args.noise)
     for cfa in args.patterns:
         rows: dict[str, list[tuple[float, float]]] = {}

@@ -19,12 +19,12 @@ from typing import Any
 import torch
 
 from benchmarks.measure import parser
-from rawaug.data import Binned, open_pairs
+from rawaug.data import open_pairs
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.benchmark import REAL, TOLD, strengths_of, trials
 from rawaug.evaluation.scores import NOISY, score
 from rawaug.evaluation.tables import print_rows
-from rawaug.evaluation.trials import Measured, Trial
+from rawaug.evaluation.trials import Trial, measure_own_noise
 from rawaug.progress import progress
 
 Scores = dict[str, Any]
@@ -56,7 +56,7 @@ def frozen_trials(spec: str, crop: int) -> list[Trial]:
     """The middles of all frames of a set, such as ``FOLDER@4``, under every condition and strength."""
     data, _, factor = spec.partition("@")
     pairs = open_pairs(data, split="test")
-    frames = Binned(Measured(pairs, len(pairs)), int(factor or 1))
+    frames = measure_own_noise(pairs, len(pairs)).binned(int(factor or 1))
     return trials(frames, crop, strengths=strengths_of())
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from denoisers.files import FOLDER
 from rawaug.commands import OPTIONS, YAML, require_results
 from rawaug.data import open_pairs
-from rawaug.data.folders import Readable
+from rawaug.data.frames import Readable
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.picture_pairs import is_picture_pairs
 from rawaug.denoising.denoiser import require_classical

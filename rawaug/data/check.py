@@ -21,9 +21,10 @@ from torch import Tensor
 from rawaug.data.dnd import Dnd
 from rawaug.data.folders import PictureFolder
 from rawaug.data.formats import READABLE
+from rawaug.data.frames import Lazy
 from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
-from rawaug.data.pairs import DATASETS, PICTURES, Lazy, Pair
+from rawaug.data.pairs import DATASETS, PICTURES, Pair
 from rawaug.data.picture_pairs import PicturePair
 from rawaug.data.published import RAWIR_FOLDERS, Rawir, Zurich
 from rawaug.data.sidd import SiddFrames

@@ -20,8 +20,9 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.data.development import gains_from_neutral, srgb_from_camera
+from rawaug.data.frames import Lazy
 from rawaug.data.mat import read_array, read_value, to_raw
-from rawaug.data.pairs import DATASETS, Lazy, Pair
+from rawaug.data.pairs import DATASETS, Pair
 from rawaug.files import write_bytes
 from rawaug.io import RawFrame
 

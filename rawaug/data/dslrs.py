@@ -23,7 +23,8 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, mosaic
-from rawaug.data.pairs import DATASETS, LazyPairs, Pair
+from rawaug.data.frames import Frames
+from rawaug.data.pairs import DATASETS, Pair
 from rawaug.data.scenes import camera_in_light, draw_window, scene_files
 from rawaug.io import RawFrame
 from rawaug.io.dng import write_dng
@@ -82,7 +83,7 @@ CAMERAS = {
 }
 
 
-class DslrFrames(LazyPairs):
+class DslrFrames(Frames):
     """The frames of one camera, 512 x 768: 96 for training, 12 for validation, 24 for test.
 
     Args:

@@ -23,7 +23,8 @@ from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset
 
 from rawaug.bayer import turn_back
-from rawaug.data.pairs import LazyPairs, Pair, SomePairs, centre
+from rawaug.data.frames import Frames
+from rawaug.data.pairs import Pair, centre
 from rawaug.errors import count_of, escape
 from rawaug.files import files_in
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
@@ -220,126 +221,7 @@ def reports(pictures: Any) -> list[str]:
     return lines
 
 
-class Cached(Dataset[T]):
-    """A cache for a dataset; each worker has its own.
-
-    Args:
-        pictures: the dataset.
-        megabytes: the size of the cache; items that do not fit are read and made anew on every access.
-        make: a function from a picture to an item; by default items are the pictures.
-    """
-
-    def __init__(self, pictures: Sequence[T] | Any, megabytes: int, make: Callable[[Any], T] | None = None) -> None:
-        self.pictures = pictures
-        self.make = make
-        self._free_bytes = megabytes * 2**20
-        self._cache: dict[int, T] = {}
-
-    def __len__(self) -> int:
-        return len(self.pictures)
-
-    def __getitem__(self, index: int) -> T:
-        if index in self._cache:
-            return self._cache[index]
-
-        picture = self.pictures[index]
-        item: T = picture if self.make is None else self.make(picture)
-        size = _bytes_of(item)
-        if size <= self._free_bytes:
-            self._free_bytes -= size
-            self._cache[index] = item
-        return item
-
-
-def _bytes_of(item: Any) -> int:
-    """The memory of a tensor, or of the tensors among the attributes of an object."""
-    if isinstance(item, Tensor):
-        return item.nbytes
-
-    size = 0
-    for value in vars(item).values():
-        if isinstance(value, Tensor):
-            size += value.nbytes
-    return size
-
-
-class Kept(SomePairs):
-    """Pairs that are read once; up to ``megabytes`` of them stay in memory."""
-
-    def __init__(self, pairs: Sequence[Pair], megabytes: int = 1024) -> None:
-        super().__init__(pairs)
-        self._cached_pairs: Cached[Pair] = Cached(self.pairs, megabytes)
-
-    def read(self, index: int) -> Pair:
-        return self._cached_pairs[index]
-
-
-class Readable(Sequence[Pair]):
-    """Pairs that skip unreadable ones and record the reasons; ValueError on iteration if all are unreadable."""
-
-    def __init__(self, pairs: Sequence[Pair]) -> None:
-        self.pairs = pairs
-        self.broken: dict[int, str] = {}
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def __getitem__(self, index: Any) -> Any:
-        return self.pairs[index]
-
-    def __iter__(self) -> Iterator[Pair]:
-        for index in range(len(self.pairs)):
-            pair = self.attempt(index, self.pairs.__getitem__)
-            if pair is not None:
-                yield pair
-
-        if self.broken and len(self.broken) == len(self.pairs):
-            raise ValueError(f"none of the {count_of(len(self.pairs), 'frame')} can be read; {self.reasons()[0]}")
-
-    def attempt(self, index: int, read: Callable[[int], T]) -> T | None:
-        """Return ``read(index)``, or None if this pair cannot be read."""
-        if index in self.broken:
-            return None
-        try:
-            return read(index)
-        except (OSError, ValueError) as error:
-            self.broken[index] = " ".join(str(error).split())
-            return None
-
-    def reasons(self) -> list[str]:
-        """Why pairs cannot be read, in the order of the pairs."""
-        return [self.broken[index] for index in sorted(self.broken)]
-
-    def kept(self) -> Sequence[Pair]:
-        """The pairs without those that were unreadable so far; the original sequence if there are none."""
-        if not self.broken:
-            return self.pairs
-
-        readable = [index for index in range(len(self.pairs)) if index not in self.broken]
-        return SomePairs(self.pairs, readable)
-
-
-def left_out(pairs: Readable, of: str) -> list[str]:
-    """Make lines to print about skipped pairs: their number, then each reason; empty if none was skipped."""
-    reasons = pairs.reasons()
-    if not reasons:
-        return []
-
-    frames = count_of(len(pairs), "frame")
-    return [f"left out of {escape(of)}: {len(reasons)} of {frames}, unreadable", *map(escape, reasons)]
-
-
-def skip_broken(pairs: Sequence[Pair], of: str) -> Iterator[Pair]:
-    """Iterate over the readable pairs; afterwards, print the skipped ones."""
-    readable = pairs if isinstance(pairs, Readable) else Readable(pairs)
-    yield from readable
-
-    lines = left_out(readable, of)
-    if lines:
-        print("\n".join(lines))
-
-
-class RawFolder(LazyPairs):
+class RawFolder(Frames):
     """The RAW files of a folder and its subfolders, sorted by path; or one file; or a list of both.
 
     A pair's sRGB is the JPEG of the same stem beside the RAW file, if there is one whose size is the mosaic's within

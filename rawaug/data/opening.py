@@ -11,8 +11,9 @@ from typing import Any
 from torch.utils.data import ConcatDataset
 
 from rawaug.data.folders import PictureFolder, RawFolder
+from rawaug.data.frames import OWN_PICTURES, Frames, as_frames
 from rawaug.data.pair_folder import require_no_pairs
-from rawaug.data.pairs import DATASETS, OWN_PICTURES, PICTURES, Binned, LazyPairs, Pair
+from rawaug.data.pairs import DATASETS, PICTURES, Pair
 from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
 from rawaug.files import fingerprint
 from rawaug.io.content import list_pictures
@@ -58,7 +59,7 @@ def open_pairs(
         4
     """
     if bin != 1:
-        return Binned(open_pairs(spec, split, as_clean, max_pixels, developed=developed, **settings), bin)
+        return as_frames(open_pairs(spec, split, as_clean, max_pixels, developed=developed, **settings)).binned(bin)
 
     settings = {key: value for key, value in settings.items() if value is not None}
     if not isinstance(spec, (str, Path)):
@@ -81,7 +82,7 @@ def open_pairs(
     if settings:
         settings = check_settings(f"{kind}:", reader, settings, given=("path", "split"))
     pairs: Sequence[Pair] = reader(path, split_of_spec or split, **settings)
-    if max_pixels is not None and isinstance(pairs, LazyPairs):
+    if max_pixels is not None and isinstance(pairs, Frames):
         pairs.max_pixels = max_pixels
     return pairs
 
@@ -94,7 +95,7 @@ def names_dataset(spec: str | Path) -> bool:
 
 def _as_they_are(pairs: Sequence[Pair], settings: Mapping[str, Any]) -> Sequence[Pair]:
     _require_none(settings, "a sequence of pairs")
-    if isinstance(pairs, LazyPairs):
+    if isinstance(pairs, Frames):
         return pairs
     is_valid = isinstance(pairs, Sequence) and len(pairs) > 0 and all(isinstance(pair, Pair) for pair in pairs)
     if not is_valid:

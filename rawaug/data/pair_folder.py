@@ -19,8 +19,9 @@ from rawaug.bayer import CFA
 from rawaug.data.development import UNKNOWN_COLOUR, develop_pair
 from rawaug.data.folders import RawFolder
 from rawaug.data.formats import READABLE, TWO_IN_ONE, read_mosaic
+from rawaug.data.frames import Frames
 from rawaug.data.mosaic_metadata import parse_metadata
-from rawaug.data.pairs import DATASETS, LazyPairs, Pair
+from rawaug.data.pairs import DATASETS, Pair
 from rawaug.files import files_below
 
 NOISY, CLEAN = "*_noisy.*", "*_clean.*"
@@ -64,7 +65,7 @@ class PairFiles(NamedTuple):
 
 
 @DATASETS.register("pairs")
-class PairFolder(LazyPairs):
+class PairFolder(Frames):
     """The noisy/clean pairs of a folder and its subfolders, sorted by path; or those of one noisy (or two-in-one) file.
 
     The sRGB picture of a pair is the clean frame, developed without a tone curve. Where no file states white balance

@@ -1,18 +1,10 @@
-"""RAW-sRGB pairs, and lazy sequences of pairs.
-
-A frame is identified by the resolved paths of its files, or by its name if it has no files. So a recipe can check,
-without reading any frames, that it does not score those that it trains on. Datasets that describe their frames have
-``labels``.
-"""
+"""RAW-sRGB pairs: one shot, RAW and sRGB, with what is known of its camera and its noise."""
 
 from __future__ import annotations
 
-import os
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar, overload
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -20,9 +12,8 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, bin_mosaic, bin_mosaic_variance, crop_to_cfa, to_bayer
 from rawaug.data.noise_levels import measure_levels
-from rawaug.files import digest
 from rawaug.io import RawFrame
-from rawaug.io.pictures import MAX_PIXELS, decode_srgb, encode_srgb
+from rawaug.io.pictures import decode_srgb, encode_srgb
 from rawaug.registry import Registry
 
 T = TypeVar("T")
@@ -248,206 +239,6 @@ class Sample(NamedTuple):
     variance: Tensor
 
 
-class FrameLabel(NamedTuple):
-    """The scene that a frame shows, the phone that took it, and its ISO."""
-
-    scene: str
-    phone: str
-    iso: int
-
-
-class Lazy(Sequence[T], ABC, Generic[T]):
-    """A sequence of named items that are read on access; the last one stays in memory."""
-
-    def __init__(self, names: Sequence[str]) -> None:
-        self.names = list(names)
-        self._last: tuple[int, T] | None = None
-
-    @abstractmethod
-    def read(self, index: int) -> T:
-        """Read the item at ``index`` in [0, len)."""
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    @overload
-    def __getitem__(self, index: int) -> T: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[T]: ...
-
-    def __getitem__(self, index: int | slice) -> T | list[T]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
-
-        index = range(len(self))[index]
-        if self._last is None or self._last[0] != index:
-            self._last = index, self.read(index)
-        return self._last[1]
-
-
-class LazyPairs(Lazy[Pair]):
-    """Pairs that are read on access."""
-
-    max_pixels: int = MAX_PIXELS
-    """Maximum number of pixels of sRGB pictures and of mosaics in PNG files."""
-    labels: Sequence[FrameLabel] = ()
-    """The labels of the frames, if the dataset knows them without reading a frame."""
-    rendering: str = "sRGB of the pairs"
-    """What has rendered the sRGB of registered pairs."""
-
-    def frame(self, index: int) -> RawFrame:
-        """Read the captured mosaic of a pair, the noisy one if there is one, without its picture."""
-        pair = self[index]
-        mosaic = pair.noisy
-        if mosaic is None:
-            mosaic = pair.raw
-
-        return RawFrame(mosaic, pair.cfa, camera=pair.camera, iso=pair.iso)
-
-    def files_of(self, index: int) -> Sequence[Path]:
-        """The files that identify a pair; empty if its name identifies it."""
-        return ()
-
-    def stamp(self, index: int) -> str:
-        """Identify the content of a pair by the path, size and modification time of its files, or by its name."""
-        parts = []
-        for file in self.files_of(index):
-            status = file.stat()
-            parts.append(f"{os.path.realpath(file)} {status.st_size} {status.st_mtime_ns}")
-        if not parts:
-            return self.names[index]
-        return " ".join(parts)
-
-
-_STAMP_STEP = 4099
-"""Step between the values of an image that identify it; a prime, so that no row or column is favoured."""
-
-
-class _InMemory(LazyPairs):
-    def __init__(self, pairs: Sequence[Pair]) -> None:
-        self.pairs = pairs
-        super().__init__([pair.name for pair in pairs])
-
-    def read(self, index: int) -> Pair:
-        return self.pairs[index]
-
-    def stamp(self, index: int) -> str:
-        pair = self.pairs[index]
-        parts = [repr((pair.name, pair.camera, pair.cfa, pair.white_balance, pair.raw.shape)).encode()]
-        for image in (pair.srgb, pair.raw, pair.noisy):
-            if image is not None:
-                sites = image.flatten()[::_STAMP_STEP]
-                parts.append(sites.numpy().tobytes())
-        return digest(*parts)[:16]
-
-
-def lazy(pairs: Sequence[Pair]) -> LazyPairs:
-    """Return the pairs as a sequence with names and files, which are available without reading a pair."""
-    if isinstance(pairs, LazyPairs):
-        return pairs
-    return _InMemory(pairs)
-
-
-def names_of(pairs: Sequence[Pair]) -> list[str]:
-    return lazy(pairs).names
-
-
-def stamps(pairs: Sequence[Pair]) -> list[str]:
-    """Compute a fingerprint for each frame; no file is read."""
-    frames = lazy(pairs)
-    return [frames.stamp(index) for index in range(len(frames))]
-
-
-def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
-    """Find a frame that both hold, by its path or name; None if they share none."""
-    return min(_identities(lazy(first)) & _identities(lazy(second)), default=None)
-
-
-def _identities(pairs: LazyPairs) -> set[str]:
-    identities: set[str] = set()
-    for index, name in enumerate(pairs.names):
-        files = pairs.files_of(index)
-        identities.update(map(os.path.realpath, files))
-        if not files:
-            identities.add(name)
-    return identities
-
-
 def require_split(kind: str, split: str, splits: Iterable[str]) -> None:
     if split not in splits:
         raise ValueError(f"{kind}: no split {split}; use one of {', '.join(splits)}")
-
-
-class SomePairs(LazyPairs):
-    """Some pairs of a sequence, by index; all of them by default."""
-
-    def __init__(self, pairs: Sequence[Pair], indices: Iterable[int] | None = None) -> None:
-        if indices is None:
-            indices = range(len(pairs))
-        self.pairs = lazy(pairs)
-        self.indices = list(indices)
-        super().__init__([self.pairs.names[index] for index in self.indices])
-
-        if self.pairs.labels:
-            self.labels = [self.pairs.labels[index] for index in self.indices]
-
-    def read(self, index: int) -> Pair:
-        return self.pairs[self.indices[index]]
-
-    def files_of(self, index: int) -> Sequence[Path]:
-        return self.pairs.files_of(self.indices[index])
-
-    def stamp(self, index: int) -> str:
-        return self.pairs.stamp(self.indices[index])
-
-
-class Middles(SomePairs):
-    """The middle ``crop x crop`` of each pair."""
-
-    def __init__(self, pairs: Sequence[Pair], crop: int) -> None:
-        super().__init__(pairs)
-        self.crop = crop
-
-    def read(self, index: int) -> Pair:
-        return super().read(index).middle(self.crop)
-
-
-class Binned(SomePairs):
-    """All pairs of a sequence, binned by :meth:`Pair.binned`: references with less noise of their own.
-
-    Example:
-        >>> from rawaug.data import demo_pairs
-        >>> Binned(demo_pairs("test", count=1), 4)[0].raw.shape
-        torch.Size([1, 72, 112])
-    """
-
-    def __init__(self, pairs: Sequence[Pair], factor: int, together: bool = False) -> None:
-        if factor < 1:
-            raise ValueError(f"bin must be at least 1, got {factor}")
-        super().__init__(pairs)
-        self.factor, self.together = factor, together
-
-    def read(self, index: int) -> Pair:
-        return super().read(index).binned(self.factor, self.together)
-
-    def stamp(self, index: int) -> str:
-        stamp = f"{super().stamp(index)} binned by {self.factor}"
-        if self.together:
-            stamp += ", around one centre"
-        return stamp
-
-
-OWN_PICTURES = "pairs"
-"""The value of ``data.pictures`` for augmenting the pictures of a recipe's own pairs."""
-
-
-class PairPictures(Lazy[Tensor]):
-    """The pictures of pairs, uint8 ``(3, H, W)``; a pair is read on access to its picture."""
-
-    def __init__(self, pairs: Sequence[Pair]) -> None:
-        self.pairs = pairs
-        super().__init__(names_of(pairs))
-
-    def read(self, index: int) -> Tensor:
-        return self.pairs[index].srgb

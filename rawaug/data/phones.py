@@ -32,7 +32,8 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, demosaic, mosaic
-from rawaug.data.pairs import DATASETS, LazyPairs, Pair
+from rawaug.data.frames import Frames
+from rawaug.data.pairs import DATASETS, Pair
 from rawaug.data.scenes import camera_in_light, draw_window, scene_files
 from rawaug.data.sidd_scenes import HELD_BACK, PHONES, label_of
 from rawaug.io import encode_srgb
@@ -247,7 +248,7 @@ class _Instance(NamedTuple):
     file: Path
 
 
-class PhoneFrames(LazyPairs):
+class PhoneFrames(Frames):
     """The frames of a split, 512 x 512: 320 for training, 40 for validation and 40 for test.
 
     Training has two frames of each of its 160 instances. Validation has one frame of each of SIDD's 40 held-back

@@ -19,9 +19,10 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from rawaug.data.frames import Frames
 from rawaug.data.mat import read_array
 from rawaug.data.pair_folder import clean_pattern, pairs_by_pattern
-from rawaug.data.pairs import DATASETS, LazyPairs, centre
+from rawaug.data.pairs import DATASETS, centre
 from rawaug.data.sidd_scenes import find_file
 from rawaug.files import files_below
 from rawaug.io.pictures import read_picture
@@ -57,7 +58,7 @@ class PicturePair:
         return self
 
 
-class PicturePairs(LazyPairs):
+class PicturePairs(Frames):
     """Pairs of developed pictures, read on access: the base class of readers registered in :data:`DATASETS`.
 
     Args:

@@ -29,7 +29,8 @@ from rawaug.bayer import CFA, unpack
 from rawaug.data.development import develop_mosaic, develop_pair
 from rawaug.data.folders import RawFolder
 from rawaug.data.formats import read_npz
-from rawaug.data.pairs import DATASETS, LazyPairs, Pair, require_split
+from rawaug.data.frames import Frames
+from rawaug.data.pairs import DATASETS, Pair, require_split
 from rawaug.files import files_below, files_in, require_file
 from rawaug.io import read_picture, read_raw
 from rawaug.io.isolated import damage_as_os_error
@@ -96,7 +97,7 @@ RAWIR_FOLDERS = {"train": "train", "validation": "val", "test": "test"}
 
 
 @DATASETS.register("rawir")
-class Rawir(LazyPairs):
+class Rawir(Frames):
     """The pairs below a folder, in RGGB.
 
     A folder with subfolders ``train``, ``val`` or ``test`` has the pairs of a split in its subfolder. ``white`` is in
@@ -204,7 +205,7 @@ _BITS = 10
 
 
 @DATASETS.register("zurich")
-class Zurich(LazyPairs):
+class Zurich(Frames):
     """The pairs of a split, sorted by number; PNGs of 8 bits hold a quarter of the digital numbers."""
 
     def __init__(self, path: str | Path, split: str = "train") -> None:
@@ -251,7 +252,7 @@ _UNCLIPPED = 0.9
 
 
 @DATASETS.register("rawbench")
-class RawBench(LazyPairs):
+class RawBench(Frames):
     """Shots of a Sony A7C II, ``Scene_0001/Scene_0001_ISO3200_1.ARW``, and their mean at ISO 100 in ``gt`` beside them.
 
     The shots of a scene differ only in ISO. The clean frame is scaled to the exposure of the noisy frame, by the ratio
@@ -306,7 +307,7 @@ REAL_BLACK, REAL_WHITE = 512, 16383
 
 
 @DATASETS.register("real")
-class RealFrames(LazyPairs):
+class RealFrames(Frames):
     """The frames of a split, such as ``real:train``; ``own_noise`` of a pair is the noise of its reference."""
 
     def __init__(self, path: str = "", split: str = "test") -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rawaug.data.pairs import FrameLabel, Pair, lazy, names_of
+from rawaug.data.frames import FrameLabel, as_frames
+from rawaug.data.pairs import Pair
 from rawaug.errors import count_of
 
 
@@ -16,14 +17,14 @@ def select_pairs(
     ``select`` is a method (``first``, ``scenes`` or ``phones``) or a list of names.
     """
     if not isinstance(select, str):
-        return _indices_of_names(names_of(pairs)[:available], select)[:count]
+        return _indices_of_names(as_frames(pairs).names[:available], select)[:count]
     if select == "first":
         return list(range(available)[:count])
 
     methods = {"scenes": whole_scenes, "phones": one_a_phone}
     if select not in methods:
         raise ValueError(f"data.select {select!r} is unknown; use first, {', '.join(methods)} or a list of names")
-    labels = lazy(pairs).labels
+    labels = as_frames(pairs).labels
     if not labels:
         raise ValueError(f"data.select: {select} needs frames with labels, such as sidd:; use first or names")
 

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from rawaug.bayer import turn_back
 from rawaug.data.development import develop_pair
+from rawaug.data.frames import Frames
 from rawaug.data.noise_levels import measure_levels
-from rawaug.data.pairs import DATASETS, LazyPairs, Pair
+from rawaug.data.pairs import DATASETS, Pair
 from rawaug.data.sidd_blocks import SiddBlocks
 from rawaug.data.sidd_scenes import (
     HELD_BACK,
@@ -31,7 +32,7 @@ from rawaug.data.sidd_scenes import (
 from rawaug.io import read_picture
 
 
-class SiddFrames(LazyPairs):
+class SiddFrames(Frames):
     """The full frames below a folder: SIDD Small or Medium in RAW, with the sRGB set if it is there.
 
     Noise levels come from ``noise_level_functions.csv``, or are measured against the clean frame if that file is

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from rawaug.data.pairs import Lazy
+from rawaug.data.frames import Lazy
 from rawaug.data.sidd_blocks import BLOCKS, Once, block_names, blocks_of_scenes
 from rawaug.data.sidd_scenes import HELD_BACK, find_file, noise_level_functions, phone_of
 from rawaug.files import replacing

@@ -21,9 +21,10 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.development import UNKNOWN_COLOUR, develop_pair
+from rawaug.data.frames import Frames
 from rawaug.data.mat import read_array, to_raw
 from rawaug.data.noise_levels import measure_noise
-from rawaug.data.pairs import DATASETS, LazyPairs, Pair
+from rawaug.data.pairs import DATASETS, Pair
 from rawaug.data.sidd_scenes import (
     HELD_BACK,
     Colour,
@@ -101,7 +102,7 @@ class _Frame(NamedTuple):
     colour: Colour | None = None
 
 
-class _Blocks(LazyPairs):
+class _Blocks(Frames):
     """Blocks that are all read on the first access; what the blocks of a frame share is cached for the last frame."""
 
     def __init__(self, path: Path, frames: Sequence[str]) -> None:

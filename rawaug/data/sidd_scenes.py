@@ -18,8 +18,8 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.data.development import gains_from_neutral, srgb_from_camera
+from rawaug.data.frames import FrameLabel
 from rawaug.data.mat import read_array, read_value, to_raw
-from rawaug.data.pairs import FrameLabel
 from rawaug.files import files_below, require_file
 from rawaug.io.pictures import view_of_orientation
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rawaug.data import open_pairs
-from rawaug.data.pairs import Binned, Middles, SomePairs
+from rawaug.data.frames import as_frames
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.pictures import PictureDenoiser
@@ -31,7 +31,7 @@ from rawaug.evaluation.page import Figure, Page, command_line
 from rawaug.evaluation.picture_trials import picture_scores, print_pictures
 from rawaug.evaluation.table_files import benchmark_table
 from rawaug.evaluation.tables import print_cells
-from rawaug.evaluation.trials import Measured, Trial, own_noise_note
+from rawaug.evaluation.trials import Trial, measure_own_noise, own_noise_note
 from rawaug.files import write_json, write_text
 
 _ALWAYS = "NonLocalMeans"
@@ -87,8 +87,8 @@ def compare_raw(comparison: Comparison) -> None:
     denoisers = _open_denoisers(comparison)
 
     pairs = open_pairs(comparison.data, split="test")
-    pairs = SomePairs(pairs, range(len(pairs))[:count])
-    frames = Binned(Measured(pairs, count), comparison.bin)
+    pairs = as_frames(pairs).some(range(len(pairs))[:count])
+    frames = measure_own_noise(pairs, count).binned(comparison.bin)
     cases = trials(frames, crop, comparison.seed, strengths)
 
     noise = noise_note(cases, strengths, comparison.seed)
@@ -136,9 +136,9 @@ def compare_pictures(comparison: Comparison) -> None:
     pairs: Sequence[Any] = open_picture_pairs(comparison.data)
     facts: dict[str, Any] = {"data": comparison.data}
     if comparison.count is not None:
-        pairs = SomePairs(pairs, range(len(pairs))[: comparison.count])
+        pairs = as_frames(pairs).some(range(len(pairs))[: comparison.count])
     if comparison.crop is not None:
-        pairs = Middles(pairs, comparison.crop)
+        pairs = as_frames(pairs).middles(comparison.crop)
         facts["crop"] = comparison.crop
 
     result = picture_scores(denoisers, pairs)

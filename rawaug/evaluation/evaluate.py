@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from rawaug.data import open_pairs
-from rawaug.data.folders import Kept, Readable
+from rawaug.data.frames import Readable
 from rawaug.data.pair_folder import PairSettings
-from rawaug.data.pairs import Binned
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import RawDenoiser, denoiser_file
 from rawaug.denoising.pictures import PictureDenoiser
@@ -22,7 +21,7 @@ from rawaug.evaluation.page import Page, select_for_page
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, print_pictures
 from rawaug.evaluation.scores import NOISY, Row, group_rows, score, summary
 from rawaug.evaluation.tables import print_scores
-from rawaug.evaluation.trials import Measured, Trial, make_trials, own_noise_note, trial_of
+from rawaug.evaluation.trials import Trial, make_trials, measure_own_noise, own_noise_note, trial_of
 from rawaug.files import sha256, write_json
 from rawaug.noise import NoiseSpec, noise_model
 from rawaug.registry import Spec
@@ -90,10 +89,10 @@ def evaluate_raw(evaluation: Evaluation) -> dict[str, Any]:
     model = noise_model(noise, info=denoiser.info)
 
     pairs = open_pairs(evaluation.data, split="test", **vars(evaluation.settings))
-    frames = Readable(Kept(Binned(Measured(pairs), evaluation.bin)))
+    frames = Readable(measure_own_noise(pairs).binned(evaluation.bin).kept())
     for _ in frames:
         pass  # finds the pairs that cannot be read
-    trials = make_trials(frames.kept(), lambda pair: trial_of(pair, model, denoiser.cfa, evaluation.seed))
+    trials = make_trials(frames.readable(), lambda pair: trial_of(pair, model, denoiser.cfa, evaluation.seed))
 
     facts = evaluation.facts("denoiser", denoiser_file(evaluation.denoiser))
     unreadable = {}

@@ -22,8 +22,8 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA, crop_to_cfa, noise_variance
 from rawaug.data.development import develop_packed, exposure_of
-from rawaug.data.folders import Cached
-from rawaug.data.pairs import Pair, SomePairs
+from rawaug.data.frames import Cached, Frames, as_frames
+from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import Levels, Noisy
 from rawaug.evaluation.verdict import CLEANER_TEST
 from rawaug.noise import NoiseModel, own_noise
@@ -205,23 +205,12 @@ _SHOWN = 4
 """Maximum number of methods that a line names."""
 
 
-class Measured(SomePairs):
-    """Whole references whose own noise is measured as they are read, unless they state it.
+def measure_own_noise(pairs: Sequence[Pair], most: int = _MOST_MEASURED) -> Frames:
+    """Measure the own noise of whole references as they are read, unless they state it.
 
     Only ``most`` of them are measured, evenly spaced, since each takes seconds.
     """
-
-    def __init__(self, pairs: Sequence[Pair], most: int = _MOST_MEASURED) -> None:
-        super().__init__(pairs)
-        self.measured = set(evenly_spaced(len(pairs), most))
-
-    def read(self, index: int) -> Pair:
-        """Read the reference at ``index``, with its own noise if it is one of those that are measured."""
-        pair = super().read(index)
-        if index not in self.measured:
-            return pair
-
-        return pair.with_own_noise(own_noise)
+    return as_frames(pairs).map(lambda pair: pair.with_own_noise(own_noise), only=evenly_spaced(len(pairs), most))
 
 
 def own_noise_note(summaries: Mapping[str, Mapping[str, Any]]) -> str:

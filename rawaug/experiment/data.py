@@ -7,11 +7,11 @@ from dataclasses import replace
 from typing import Any
 
 from rawaug.data import open_pairs, open_pictures
-from rawaug.data.folders import Cached, Kept, Readable, left_out
-from rawaug.data.pairs import OWN_PICTURES, Binned, Middles, Pair, PairPictures, SomePairs, names_of, shared_frame
+from rawaug.data.frames import OWN_PICTURES, Cached, PairPictures, Readable, as_frames, left_out, shared_frame
+from rawaug.data.pairs import Pair
 from rawaug.data.selection import select_pairs
 from rawaug.errors import count_of
-from rawaug.evaluation.trials import Measured
+from rawaug.evaluation.trials import measure_own_noise
 from rawaug.experiment.settings import HELD_OUT, DataConfig, Recipe
 from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.noisy_frames import drop_clean, noise_of
@@ -37,7 +37,7 @@ def _listing(frames: Sequence[Pair], available: int, source: Any, most: int = _N
         source: name of the dataset.
         most: largest number of frames that are named.
     """
-    names = names_of(frames)
+    names = as_frames(frames).names
     text = ", ".join(names[:most])
     if len(names) > most:
         text += f" and {len(names) - most} more"
@@ -74,13 +74,13 @@ def open_frames(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> tuple[di
     held_out = isinstance(source, str) and source == HELD_OUT
     if held_out:
         count -= _number_held_out(len(every))
-    pairs: Sequence[Pair] = SomePairs(every, select_pairs(every, count, data.count, data.select))
+    pairs: Sequence[Pair] = as_frames(every).some(select_pairs(every, count, data.count, data.select))
     if data.crop is not None:
-        pairs = Middles(pairs, data.crop)
+        pairs = as_frames(pairs).middles(data.crop)
 
     validation: Sequence[Any]
     if held_out:
-        validation = SomePairs(every, range(count, len(every)))
+        validation = as_frames(every).some(range(count, len(every)))
         of_validation = len(every)
     else:
         validation = _open_pairs(recipe, source, "validation", clean)
@@ -95,7 +95,7 @@ def open_frames(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> tuple[di
 
     frames = {
         "pairs": pairs,
-        "more": Kept(SomePairs(every, range(count)), megabytes=2048),
+        "more": as_frames(every).some(range(count)).kept(megabytes=2048),
         "validation": _prepare(recipe, validation, "validation"),
         "test": _prepare(recipe, test, "test"),
         "pictures": pictures,
@@ -148,15 +148,15 @@ def _prepare(recipe: Recipe, frames: Sequence[Any], part: str) -> Sequence[Any]:
     if part == "test":
         count, crop = data.test_count, data.test_crop
 
-    frames = SomePairs(frames, range(len(frames))[:count])
+    frames = as_frames(frames).some(range(len(frames))[:count])
     if part == "test":
-        frames = Measured(frames)
+        frames = measure_own_noise(frames)
     if data.bin > 1 or recipe.full_colour:
-        frames = Binned(frames, data.bin, recipe.full_colour)
+        frames = as_frames(frames).binned(data.bin, recipe.full_colour)
     if crop is not None:
-        frames = Middles(frames, crop)
+        frames = as_frames(frames).middles(crop)
 
-    return Kept(frames)
+    return as_frames(frames).kept()
 
 
 def _number_held_out(available: int) -> int:
@@ -187,7 +187,7 @@ def read_frames(recipe: Recipe, frames: dict[str, Any]) -> tuple[dict[str, Any],
             pass
 
     lines = left_out(pairs, "data.pairs") + left_out(validation, "data.validation") + left_out(test, "data.test")
-    kept: Sequence[Any] = validation.kept()
+    kept: Sequence[Any] = validation.readable()
     if recipe.self_supervised:
         readable_pairs = list(map(drop_clean, readable_pairs))
         kept = list(map(drop_clean, kept))
@@ -196,7 +196,7 @@ def read_frames(recipe: Recipe, frames: dict[str, Any]) -> tuple[dict[str, Any],
     if recipe.data.pictures == OWN_PICTURES:
         pictures = PairPictures(readable_pairs)
 
-    read = {"pairs": readable_pairs, "validation": kept, "test": test.kept(), "pictures": pictures}
+    read = {"pairs": readable_pairs, "validation": kept, "test": test.readable(), "pictures": pictures}
     return {**frames, **read}, lines
 
 

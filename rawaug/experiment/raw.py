@@ -9,7 +9,7 @@ from typing import Any
 from torch import nn
 
 from rawaug.bayer import CFA
-from rawaug.data.pairs import PairPictures
+from rawaug.data.frames import PairPictures
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.trials import Trial, make_trials, trial_of
 from rawaug.experiment.task import TASKS, Task

@@ -23,8 +23,9 @@ from denoisers.files import find_denoiser
 from denoisers.network import Denoiser
 from rawaug.bayer import CFA
 from rawaug.data.folders import reports
+from rawaug.data.frames import as_frames
 from rawaug.data.opening import picture_stamp
-from rawaug.data.pairs import Pair, stamps
+from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser, require_classical
 from rawaug.evaluation.figures import panels_of
 from rawaug.evaluation.scores import Row, group_rows, score, summary
@@ -258,7 +259,7 @@ def fit_isp(recipe: Recipe, pairs: Sequence[Pair], file: Path, seed: int) -> Dic
     """Fit the ISP to the few pairs, or read it if it was fitted to them before; its hash is ``info["key"]``."""
     measures_noise = recipe.noise == "camera"
     settings = {**asdict(recipe.fit), "seed": seed}
-    inputs = "isp", settings, stamps(pairs), measures_noise, recipe.self_supervised
+    inputs = "isp", settings, as_frames(pairs).stamps(), measures_noise, recipe.self_supervised
 
     def make() -> DictionaryISP:
         noise: Literal["on", "off"] = "off"
@@ -352,10 +353,10 @@ def train_arm(
         "settings": recipe.weights_settings(arm),
         "seed": seed,
         "isp": isp.info["key"],
-        "pairs": stamps(frames["pairs"]),
-        "more": stamps(frames["more"]) if settings.source == "more" else [],
+        "pairs": as_frames(frames["pairs"]).stamps(),
+        "more": as_frames(frames["more"]).stamps() if settings.source == "more" else [],
         "pictures": picture_stamp(recipe.data.pictures),
-        "validation": stamps(frames["validation"]),
+        "validation": as_frames(frames["validation"]).stamps(),
         "start": info.get("start_sha256"),
         "estimator": estimator.revision,
     }
@@ -418,7 +419,7 @@ def score_arm(
     """
     recipe = task.recipe
     weights = sha256(folder / "denoiser.safetensors")
-    inputs = weights, stamps(frames["test"]), recipe.scores_settings()
+    inputs = weights, as_frames(frames["test"]).stamps(), recipe.scores_settings()
 
     kinds = {"plain": 1}
     if recipe.self_ensemble:

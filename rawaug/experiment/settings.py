@@ -9,8 +9,9 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Interval
 from pydantic import BeforeValidator
 
+from rawaug.data.frames import OWN_PICTURES
 from rawaug.data.pair_folder import PairSettings
-from rawaug.data.pairs import OWN_PICTURES, Pair
+from rawaug.data.pairs import Pair
 from rawaug.files import find_weights, fingerprint, require_folder_name, sha256
 from rawaug.isp.fit import FitConfig
 from rawaug.isp.model import DictionaryISP, restrict_to_cameras

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.data import open_pairs
-from rawaug.data.folders import skip_broken
+from rawaug.data.frames import skip_broken
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.figures import new_figure, save_figure
 from rawaug.evaluation.psnr_r import psnr_r

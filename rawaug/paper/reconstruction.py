@@ -20,8 +20,8 @@ import torch
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
-from rawaug.data.folders import Readable, skip_broken
-from rawaug.data.pairs import Pair, SomePairs, centre, names_of, shared_frame
+from rawaug.data.frames import Readable, as_frames, shared_frame, skip_broken
+from rawaug.data.pairs import Pair, centre
 from rawaug.data.selection import select_pairs
 from rawaug.errors import count_of
 from rawaug.evaluation.tables import mean_and_spread, print_rows
@@ -273,7 +273,7 @@ class ComparisonRun:
 
     def _row(self, folds: Sequence[dict[str, Any]], row: str) -> dict[str, Any]:
         """Compute the figures of one row of a family."""
-        names = names_of(self.scored)
+        names = as_frames(self.scored).names
         values = self._by_seed([fold["rows"][row] for fold in folds])
         worst, best = [], []
         for of_seed in values:
@@ -327,7 +327,7 @@ class ComparisonRun:
             facts.append("balanced")
 
         relation = "on" if settings.test else "without"
-        name = names_of(self.scored)[frame]
+        name = as_frames(self.scored).names[frame]
         path = self._path(f"{family}-{relation}-{name}-seed{seed}")
 
         def measure() -> dict[str, Any]:
@@ -391,7 +391,7 @@ class ComparisonRun:
         """List the settings and frames that a fit depends on."""
         settings = self.settings
         size = settings.sizes.get(family)
-        frames = (settings.noise, settings.data, names_of(self.pairs), settings.test)
+        frames = (settings.noise, settings.data, as_frames(self.pairs).names, settings.test)
         return (family, size, asdict(self._training(seed)), asdict(self.fit), *frames)
 
     def _path(self, stem: str) -> Path:
@@ -405,8 +405,8 @@ def means_of(by_seed: Sequence[Sequence[float]]) -> list[float]:
 
 def _training_frames(settings: Comparison, every: Sequence[Pair]) -> list[Pair]:
     """Select the frames, all of one pattern, and registered if a method needs that."""
-    selection = SomePairs(every, select_pairs(every, len(every), settings.count, settings.select))
-    names = names_of(selection)
+    selection = as_frames(every).some(select_pairs(every, len(every), settings.count, settings.select))
+    names = as_frames(selection).names
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"data: several frames are named {name}; rename the files")
@@ -439,11 +439,11 @@ def _training_frames(settings: Comparison, every: Sequence[Pair]) -> list[Pair]:
 def _test_frames(settings: Comparison, every: Sequence[Pair]) -> Sequence[Pair]:
     """Find the frames of ``test`` that can be read, none of which is in the data."""
     test = open_pairs(str(settings.test), split="test")
-    readable = Readable(SomePairs(test, range(len(test))[: settings.test_count]))
+    readable = Readable(as_frames(test).some(range(len(test))[: settings.test_count]))
     for _ in skip_broken(readable, "test"):
         pass  # each frame is read once, so a damaged one is found before anything is fitted
 
-    scored = readable.kept()
+    scored = readable.readable()
     shared = shared_frame(scored, every)
     if shared is not None:
         raise ValueError(f"test: {shared} is also in data; score on unseen frames")

@@ -14,9 +14,9 @@ from typing import Any, Literal
 
 from rawaug.camera.own import Camera, as_camera
 from rawaug.data import RawFolder, open_pairs
-from rawaug.data.folders import Kept, Readable, left_out
+from rawaug.data.frames import Frames, Readable, as_frames, left_out, shared_frame
 from rawaug.data.opening import names_dataset
-from rawaug.data.pairs import LazyPairs, Pair, lazy, shared_frame
+from rawaug.data.pairs import Pair
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
@@ -143,7 +143,7 @@ def _measure_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -
         return str(error)
 
 
-def rendering_of(pairs: LazyPairs, frames: int, registered: int) -> str:
+def rendering_of(pairs: Frames, frames: int, registered: int) -> str:
     """Name the renderings that were fitted, whose tone curve and colours the ISP undoes.
 
     Registered pairs are not JPEGs of the camera.
@@ -157,7 +157,7 @@ class _Watch:
     """Measures PSNR_r of held-out frames, which are decoded once, on a few patches of each."""
 
     def __init__(self, pairs: Sequence[Pair]) -> None:
-        self.pairs = Readable(Kept(pairs))
+        self.pairs = Readable(as_frames(pairs).kept())
         self.scores: list[dict[str, float]] = []
 
     def __call__(self, isp: DictionaryISP) -> str:
@@ -174,7 +174,7 @@ class _Watch:
 
 def _open_pairs(
     source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool, mosaics: Mapping[str, Any]
-) -> LazyPairs:
+) -> Frames:
     if isinstance(source, (str, Path)):
         source = [source]
     if not hasattr(source, "__getitem__") or not len(source):
@@ -186,10 +186,10 @@ def _open_pairs(
         raise ValueError(f"a fit takes files, folders or Pairs, got {type(source[0]).__name__}; see docs/fit.md")
     if mosaics:
         raise ValueError(f"{', '.join(mosaics)} can only be given for pairs:PATH; each Pair has its own")
-    return lazy(source)  # type: ignore[arg-type]
+    return as_frames(source)  # type: ignore[arg-type]
 
 
-def _open_named(source: Sequence[str | Path], camera_jpeg: bool, mosaics: Mapping[str, Any]) -> LazyPairs:
+def _open_named(source: Sequence[str | Path], camera_jpeg: bool, mosaics: Mapping[str, Any]) -> Frames:
     """Open files and folders as one folder, or a single dataset."""
     for item in source:
         pairs = open_pairs(str(item), split="train", as_clean=False, **mosaics)
@@ -197,6 +197,6 @@ def _open_named(source: Sequence[str | Path], camera_jpeg: bool, mosaics: Mappin
             continue
         if len(source) > 1:
             raise ValueError(f"{item}: a kind:path dataset cannot be combined with other files; give it alone")
-        return lazy(pairs)
+        return as_frames(pairs)
 
     return RawFolder(map(str, source), camera_jpeg=camera_jpeg)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, crop_to_cfa
 from rawaug.data import RawFolder
-from rawaug.data.folders import Readable
-from rawaug.data.pairs import Pair, lazy
+from rawaug.data.frames import Readable, as_frames
+from rawaug.data.pairs import Pair
 from rawaug.errors import count_of
 from rawaug.io import RawFrame
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_dark_noise, estimate_noise, plot_noise
@@ -125,9 +125,9 @@ def _read_frames(pairs: Sequence[Pair]) -> list[RawFrame]:
 
     read: Callable[[int], RawFrame | None]
     if isinstance(pairs, Readable):
-        read = partial(pairs.attempt, read=lazy(pairs.pairs).frame)
+        read = partial(pairs.attempt, read=as_frames(pairs.pairs).frame)
     else:
-        read = lazy(pairs).frame
+        read = as_frames(pairs).frame
 
     frames = []
     for index in indices:

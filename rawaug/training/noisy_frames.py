@@ -27,7 +27,8 @@ from denoisers.classical import NonLocalMeans, Stabilised
 from rawaug import bayer
 from rawaug.bayer import CFA, crop_to_cfa
 from rawaug.data.development import develop_packed
-from rawaug.data.pairs import Lazy, Pair
+from rawaug.data.frames import Lazy
+from rawaug.data.pairs import Pair
 from rawaug.evaluation.trials import Trial
 from rawaug.noise import ShotReadModel, camera_law
 from rawaug.plugin.augment import RawAugment

@@ -11,7 +11,8 @@ from PIL import Image
 
 from rawaug.data import Shapes, dead_leaves, open_pictures
 from rawaug.data.drawn import KINDS
-from rawaug.data.folders import Cached, reports
+from rawaug.data.folders import reports
+from rawaug.data.frames import Cached
 
 BLACK, WHITE = torch.zeros(3, 72, 72, dtype=torch.uint8), torch.full((3, 72, 72), 255, dtype=torch.uint8)
 

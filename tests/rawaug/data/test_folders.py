@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader
 
 from rawaug.bayer import CFA, turn
 from rawaug.data import PictureFolder, RawFolder, open_pairs, open_pictures
-from rawaug.data.folders import Cached, Readable
+from rawaug.data.frames import Cached, Readable
 from rawaug.data.pair_folder import require_no_pairs
 from rawaug.io import develop, read_raw, write_picture
 

@@ -10,17 +10,10 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA, bin_mosaic, bin_mosaic_variance, mosaic
-from rawaug.data import Binned, demo_pairs, open_pairs
-from rawaug.data.folders import Readable
+from rawaug.data import demo_pairs, open_pairs
+from rawaug.data.frames import FrameLabel, Frames, PairPictures, Readable, as_frames, shared_frame
 from rawaug.data.noise_levels import measure_noise
-from rawaug.data.pairs import (
-    FrameLabel,
-    LazyPairs,
-    Pair,
-    PairPictures,
-    shared_frame,
-    stamps,
-)
+from rawaug.data.pairs import Pair
 from rawaug.data.selection import one_a_phone, select_pairs, whole_scenes
 from rawaug.experiment.data import open_frames
 from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
@@ -76,7 +69,7 @@ PHONES = ("GP", "IP", "S6")
 LABELS = [FrameLabel(f"{scene:03d}", phone, iso) for scene in (1, 2) for phone in PHONES for iso in (100, 400, 1600)]
 
 
-class Shots(LazyPairs):
+class Shots(Frames):
     """Eighteen tiny frames of two scenes by three phones; notes which were read."""
 
     def __init__(self) -> None:
@@ -196,14 +189,14 @@ def test_noise_falls_by_the_number_of_sites() -> None:
 
 def test_pairs_are_opened_binned() -> None:
     whole, binned = open_pairs("demo:test"), open_pairs("demo:test", bin=4)
-    assert isinstance(binned, Binned) and binned.names == [pair.name for pair in whole]
+    assert as_frames(binned).names == [pair.name for pair in whole]
     pair = binned[0]
     assert pair.raw.shape == (1, 72, 112) and pair.srgb.shape == (3, 72, 112) and pair.cfa == whole[0].cfa
     assert pair.raw.mean().item() == pytest.approx(whole[0].raw.mean().item(), rel=1e-3)
-    assert shared_frame(whole, binned) is not None and stamps(whole) != stamps(binned)
+    assert shared_frame(whole, binned) is not None and as_frames(whole).stamps() != as_frames(binned).stamps()
     readable = Readable(binned)
     readable.broken[0] = "damaged"
-    assert readable.kept()[0].raw.shape == (1, 72, 112)
+    assert readable.readable()[0].raw.shape == (1, 72, 112)
     with pytest.raises(ValueError, match=r"^bin"):
         open_pairs("demo:test", bin=0)
     with pytest.raises(ValueError, match="binned"):

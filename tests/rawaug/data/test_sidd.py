@@ -19,13 +19,7 @@ from rawaug.bayer import CFA, mosaic, pack, turn
 from rawaug.cli import main
 from rawaug.commands.evaluate import run as evaluate
 from rawaug.commands.submit import submit
-from rawaug.data import (
-    SiddBenchmark,
-    check,
-    open_pairs,
-    sidd_blocks,
-    write_submission,
-)
+from rawaug.data import SiddBenchmark, check, open_pairs, sidd_blocks, write_submission
 from rawaug.data.mat import read_array
 from rawaug.data.sidd import SiddFrames
 from rawaug.data.sidd_blocks import SiddBlocks, SiddPlusBlocks

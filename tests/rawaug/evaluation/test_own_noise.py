@@ -12,12 +12,20 @@ import torch.nn.functional as F
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Binned, Middles, Pair
+from rawaug.data.frames import as_frames
+from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.figures import panels_of
 from rawaug.evaluation.scores import Row, score, summary
 from rawaug.evaluation.tables import PLAIN, table_of
-from rawaug.evaluation.trials import Measured, Trial, added_noise_note, own_noise_note, training_noise_note, trial_of
+from rawaug.evaluation.trials import (
+    Trial,
+    added_noise_note,
+    measure_own_noise,
+    own_noise_note,
+    training_noise_note,
+    trial_of,
+)
 from rawaug.noise import noise_model
 
 SHOT, READ = 1e-4, 2e-6
@@ -40,8 +48,8 @@ def reference() -> Pair:
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_a_perfect_denoiser_is_left_with_the_references_own_noise(reference: Pair, factor: int) -> None:
     noise = noise_model((1e-2, 1e-4))
-    trial = trial_of(Middles(Binned(Measured([reference]), factor), 256)[0], noise)
-    middle = Middles(Binned([replace(reference, raw=scene())], factor), 256)[0]
+    trial = trial_of(measure_own_noise([reference]).binned(factor).middles(256)[0], noise)
+    middle = as_frames([replace(reference, raw=scene())]).binned(factor).middles(256)[0]
     truth = bayer.pack(middle.raw[None], CFA.GRBG)
     result = summary(score([RawDenoiser.of(lambda noisy: truth)], [trial]))
     assert result["own_noise"] == result["images"][0]["own_noise"] == pytest.approx(1.0, rel=0.1)
@@ -69,7 +77,7 @@ def test_a_score_that_keeps_noise_is_not_the_best_of_a_table() -> None:
 
 
 def test_the_clean_picture_states_its_own_noise(reference: Pair) -> None:
-    trial = trial_of(Measured([reference])[0].middle(64), noise_model((1e-2, 1e-4)))
+    trial = trial_of(measure_own_noise([reference])[0].middle(64), noise_model((1e-2, 1e-4)))
     assert trial.own is not None
     caption = panels_of([], trial).captions["clean"]
     assert f"{-10 * math.log10(trial.own):.2f} dB" in caption and "own noise" in caption
@@ -78,7 +86,7 @@ def test_the_clean_picture_states_its_own_noise(reference: Pair) -> None:
 def test_noise_as_weak_as_the_references_own_is_said() -> None:
     raw = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(0))
     texture = Pair("texture", torch.zeros(3, 128, 128, dtype=torch.uint8), raw, CFA.RGGB)
-    assert Measured([texture])[0].own_noise is None, "no flat regions, no figure"
+    assert measure_own_noise([texture])[0].own_noise is None, "no flat regions, no figure"
 
     def trial(own: float, added: float) -> Trial:
         return Trial(torch.zeros(1), torch.zeros(1), torch.full((1,), added), own=own)

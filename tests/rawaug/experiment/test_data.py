@@ -13,7 +13,7 @@ import torch
 from rawaug.bayer import bin_mosaic
 from rawaug.cli import main
 from rawaug.data import Pair, demo_pairs
-from rawaug.data.pairs import names_of, stamps
+from rawaug.data.frames import as_frames
 from rawaug.experiment.data import name_given_pairs, open_frames, read_frames, require_usable, use_all_pairs
 from rawaug.experiment.recipe import find_recipe, read_recipe, recipe_list, shipped_recipes
 from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
@@ -72,7 +72,9 @@ def test_own_pairs_are_all_used_and_a_part_of_them_is_held_out(own: Path, data: 
 
     recipe = use_all_pairs(mine, content, {"data.pairs"})
     frames, lines = open_frames(recipe, {})
-    assert names_of(frames["pairs"]) == [f"shot{k}" for k in range(6)] and names_of(frames["validation"]) == ["shot6"]
+    assert as_frames(frames["pairs"]).names == [f"shot{k}" for k in range(6)] and as_frames(
+        frames["validation"]
+    ).names == ["shot6"]
     train, validate, test, pictures, isp = lines
     assert train.startswith(f"train     6 of 7 of pairs:{own}: shot0,")
     assert validate == f"validate  1 of 7 of pairs:{own}, held out: shot6"
@@ -82,12 +84,14 @@ def test_own_pairs_are_all_used_and_a_part_of_them_is_held_out(own: Path, data: 
 def test_damaged_frames_are_named_and_the_rest_is_used(own: Path, data: DataConfig, tmp_path: Path) -> None:
     recipe = Recipe(arms=ARMS, data=replace(data, pairs=f"pairs:{own}", count=None, validation="auto"))
     whole, none = read_frames(recipe, opened(recipe))
-    assert none == [] and names_of(whole["pairs"]) == [f"shot{k}" for k in range(6)]
-    assert stamps(whole["test"]) == stamps(opened(recipe)["test"])
+    assert none == [] and as_frames(whole["pairs"]).names == [f"shot{k}" for k in range(6)]
+    assert as_frames(whole["test"]).stamps() == as_frames(opened(recipe)["test"]).stamps()
     (own / "shot1.npz").write_bytes(b"damaged")
     (tmp_path / "test" / "b.npz").write_bytes((tmp_path / "test" / "b.npz").read_bytes()[:300])
     read, lines = read_frames(recipe, opened(recipe))
-    assert names_of(read["pairs"]) == ["shot0", "shot2", "shot3", "shot4", "shot5"] and names_of(read["test"]) == ["a"]
+    assert as_frames(read["pairs"]).names == ["shot0", "shot2", "shot3", "shot4", "shot5"] and as_frames(
+        read["test"]
+    ).names == ["a"]
     assert lines[0] == "left out of data.pairs: 1 of 6 frames, unreadable" and "shot1.npz" in lines[1]
     assert lines[2] == "left out of data.test: 1 of 2 frames, unreadable" and "b.npz" in lines[3] and len(lines) == 4
     (own / "shot6.npz").write_bytes(b"damaged")  # all that is held out
@@ -112,15 +116,18 @@ def test_pairs_from_python_are_divided_and_seen_by_their_content(data: DataConfi
     assert list(frames["test"]) == test[:1]
     other = replace(pairs[4], raw=pairs[4].raw * 0.5)
     changed = opened(recipe, pairs=[*pairs[:4], other], test=test)
-    assert stamps(frames["validation"]) != stamps(changed["validation"])
-    assert stamps(frames["pairs"]) == stamps(changed["pairs"])
+    assert as_frames(frames["validation"]).stamps() != as_frames(changed["validation"]).stamps()
+    assert as_frames(frames["pairs"]).stamps() == as_frames(changed["pairs"]).stamps()
     single = opened(recipe, pairs=pairs[:1])
     assert len(single["pairs"]) == 1 and not single["validation"], "nothing is held out"
     _, lines = open_frames(name_given_pairs(recipe, {"pairs": pairs[:1]}), {"pairs": pairs[:1]})
     assert "final weights are kept" in lines[1]
     with pytest.raises(ValueError, match=r"data\.test: .*train_00_astronaut"):
         opened(recipe, pairs=pairs, test=pairs[:1])
-    assert names_of(opened(recipe, pairs=pairs, validation=test[1:], test=test[:1])["pairs"]) == names_of(pairs)
+    assert (
+        as_frames(opened(recipe, pairs=pairs, validation=test[1:], test=test[:1])["pairs"]).names
+        == as_frames(pairs).names
+    )
 
 
 def test_validation_and_test_frames_are_binned_and_cropped_and_training_frames_are_not(data: DataConfig) -> None:
@@ -136,7 +143,7 @@ def test_validation_and_test_frames_are_binned_and_cropped_and_training_frames_a
 def test_two_folders_may_use_the_same_names(own: Path, data: DataConfig, tmp_path: Path) -> None:
     more = write_pairs(tmp_path / "more", ["shot0"])
     mine = replace(data, pairs=f"pairs:{own}", validation="auto", test=f"pairs:{more}")
-    assert names_of(opened(Recipe(arms=ARMS, data=mine))["test"]) == ["shot0"]
+    assert as_frames(opened(Recipe(arms=ARMS, data=mine))["test"]).names == ["shot0"]
     with pytest.raises(ValueError, match="pairs"):
         opened(Recipe(arms=ARMS, data=replace(mine, test=f"pairs:{own}")))
 

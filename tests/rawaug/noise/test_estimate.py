@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from rawaug.bayer import CFA, bin_mosaic_variance, unpack
-from rawaug.data import Binned, Pair
-from rawaug.evaluation.trials import Measured
+from rawaug.data import Pair
+from rawaug.evaluation.trials import measure_own_noise
 from rawaug.noise import (
     DefectPixels,
     FixedLevels,
@@ -242,8 +242,8 @@ def reference(truth: Tensor) -> Pair:
 @pytest.mark.parametrize(("factor", "together"), [(1, False), (4, False), (4, True)])
 def test_the_share_of_a_known_own_noise_is_found(factor: int, together: bool) -> None:
     truth = patches()
-    pairs = Binned(Measured([reference(truth)]), factor, together)
-    clean = Pair("truth", pairs.pairs[0].srgb, truth, CFA.GRBG).binned(factor, together).raw
+    pairs = measure_own_noise([reference(truth)]).binned(factor, together)
+    clean = Pair("truth", reference(truth).srgb, truth, CFA.GRBG).binned(factor, together).raw
     denoised = clean + 3e-3 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(2))
     error = (denoised - pairs[0].raw).square().mean().item()
     levels = pairs[0].own_noise
@@ -257,7 +257,9 @@ def test_what_cannot_be_measured_is_unknown_and_what_is_stated_is_taken() -> Non
     assert own_noise(small.raw, small.cfa) is None
     stated = Pair("a", small.srgb, small.raw, small.cfa, own_noise=(3.2e-5, 1.6e-7))
     for together, left in ((False, bin_mosaic_variance(4)), (True, bin_mosaic_variance(4, together=True))):
-        assert Binned(Measured([stated]), 4, together)[0].own_noise == pytest.approx((3.2e-5 * left, 1.6e-7 * left))
+        assert measure_own_noise([stated]).binned(4, together)[0].own_noise == pytest.approx(
+            (3.2e-5 * left, 1.6e-7 * left)
+        )
 
 
 def test_of_a_clean_frame_it_is_said_that_there_is_no_noise() -> None:
