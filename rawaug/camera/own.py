@@ -18,7 +18,8 @@ level give the variances on the scale white = 1:
 .. math:: \mathrm{shot\_var} = K / V, \qquad \mathrm{read\_var} = \sigma^2 / V^2 .
 
 If ``bits`` is given, RAW is rounded to whole DN. Noise that is measured on RAW files contains this rounding, a variance
-of :math:`1 / (12 V^2)`, so it is subtracted from ``read_var`` before the rounding adds it again.
+of :math:`1 / (12 V^2)`, so it is subtracted from ``read_var`` before the rounding adds it again. A file of whole DN
+holds nothing below 0 DN, which is where the noise of black is clipped: at -black level / V.
 """
 
 from __future__ import annotations
@@ -46,16 +47,20 @@ from rawaug.camera.lights import (
     weights_in_light,
 )
 from rawaug.camera.matrices import camera_from_srgb, gains_in_light, load_cameras
+from rawaug.camera.tuning import read_tuning
 from rawaug.errors import count_of
 from rawaug.files import read_yaml
 from rawaug.registry import suggest
 
 _YAML_EXTENSIONS = (".yaml", ".yml")
-"""Extensions of a camera's file."""
+_TUNING_EXTENSION = ".json"
+"""Extension of a tuning file of libcamera."""
 
 MatrixKind = Literal["xyz_to_camera", "srgb_to_camera", "camera_to_srgb"]
 NoiseUnit = Literal["variance", "DN"]
 
+_INVERSE_DIAGONAL = 1.1
+"""A matrix to the camera whose diagonal is above this is the inverse of one: of 1,427 cameras none is like that."""
 _LARGEST = 1e9
 """No figure of a camera is larger."""
 _MOST_GAIN = 100.0
@@ -105,7 +110,7 @@ class Camera:
         white_balance: gains of R, G and B that make white grey, or a mapping of lights to them. They may be left out
             with ``"xyz_to_camera"``, which determines them.
         cfa: pattern of the sensor.
-        black_level: black level in DN.
+        black_level: black level in DN; four equal ones, as a DNG has for its planes, are one.
         white_level: DN at which the sensor saturates; by default the largest number of ``bits``.
         bits: depth of the RAW, 1 to 16; RAW is then rounded to whole DN. By default nothing is rounded.
         noise: levels by ISO. Each is ``(shot_var, read_var)``, variances on the scale white = 1, or ``(K, sigma)`` in
@@ -114,6 +119,7 @@ class Camera:
         noise_in: unit of levels without names, ``"variance"`` or ``"DN"``.
         tone: name of one of the ISP's tone curves, or points ``(linear light, value of the picture)``, both from 0 to 1
             and ascending. By default any of the ISP's curves is drawn.
+        source: where the figures are from, for reports.
 
     Raises:
         ValueError: if a figure is missing, of another shape or out of range; the message names it.
@@ -145,6 +151,7 @@ class Camera:
     noise: Any = None
     noise_in: NoiseUnit = "variance"
     tone: Any = None
+    source: str | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
@@ -157,9 +164,12 @@ class Camera:
                 if abs(number) > _LARGEST:
                     raise self._error(field.name, f"has a number beyond {_LARGEST:g}, as no camera has")
 
+        if isinstance(self.black_level, list) and len(self.black_level) == 4 and len(set(self.black_level)) == 1:
+            object.__setattr__(self, "black_level", self.black_level[0])  # one for each plane, as in a DNG
+
         self._check_choices()
         self._check_grid()
-        self.anchors()  # raises ValueError for matrices and gains
+        self._check_colours(self.anchors())
         self._check_levels()
         self.inverse_curve(2)  # raises ValueError for points of the tone curve
 
@@ -171,7 +181,22 @@ class Camera:
 
         patterns = [*CFA.__members__, *PATTERNS]
         if self.cfa not in patterns:
-            raise self._error("cfa", f"is unknown: {self.cfa!r}; use one of {', '.join(dict.fromkeys(patterns))}")
+            capitals = str(self.cfa).upper()
+            hint = f"; did you mean {capitals!r}?" if capitals in patterns else ""
+            raise self._error(
+                "cfa", f"is unknown: {self.cfa!r:.40}; use one of {', '.join(dict.fromkeys(patterns))}{hint}"
+            )
+
+    def _check_colours(self, anchors: Sequence[Anchor]) -> None:
+        """Refuse matrices in the wrong direction, and neutral colours in place of gains."""
+        for light, _, matrix, gains, _ in anchors:
+            if self.matrix_is != "xyz_to_camera" and bool((matrix.diagonal() > _INVERSE_DIAGONAL).all()):
+                other = "srgb_to_camera" if self.matrix_is == "camera_to_srgb" else "camera_to_srgb"
+                reason = f"of light {light} adds colour on the way to the camera, whose colours overlap"
+                raise self._error("matrix", f"{reason}; is it {other}?")
+            if self.white_balance is not None and float(gains[0]) < 0.95 and float(gains[2]) < 0.95:
+                reason = f"of light {light} makes green the strongest, as no sensor needs"
+                raise self._error("white_balance", f"{reason}; of an AsShotNeutral give the reciprocals")
 
     def _check_grid(self) -> None:
         if self.bits is not None and (not isinstance(self.bits, int) or not 1 <= self.bits <= 16):
@@ -196,6 +221,20 @@ class Camera:
         values = [level.iso for level in self.levels]
         if len(set(values)) < len(values) or (None in values and len(values) > 1):
             raise self._error("noise", f"must have a level for each ISO, or a single one without, got {values}")
+
+        known = [level for level in self.levels if level.iso is not None and level.shot_var > 0]
+        if len(known) > 1 and known[-1].shot_var < 0.9 * known[0].shot_var:
+            raise self._error("noise", "falls with ISO; K is in DN per electron, the reciprocal of electrons per DN")
+        if len(known) > 1 and known[-1].iso >= 4 * known[0].iso:  # type: ignore[operator]
+            growth = math.log(known[-1].shot_var / known[0].shot_var) / math.log(known[-1].iso / known[0].iso)  # type: ignore[operator]
+            if 0.45 < growth < 0.55:
+                raise self._error("noise", "grows with the root of ISO; are these deviations? Give their squares")
+        for level in self.levels:
+            if level.read_var > level.shot_var > 0:
+                reason = (
+                    f"of {level.read_var:.3g} in read_var is more than the shot noise at white, {level.shot_var:.3g}"
+                )
+                raise self._error("noise", f"{reason}, as no sensor has; is it a deviation?")
 
         rounding = self.quantum**2 / 12
         for level in self.levels:
@@ -279,7 +318,7 @@ class Camera:
     def noise_spec(self) -> dict[str, Any] | None:
         """The noise as a name with settings, which :func:`rawaug.noise.noise_model` reads; None if unknown.
 
-        It includes the grid of digital numbers if ``bits`` is given.
+        It includes the grid of digital numbers, which begins at 0 DN, if ``bits`` is given.
         """
         if not self.levels:
             return None
@@ -292,6 +331,7 @@ class Camera:
         settings: dict[str, Any] = {"camera": self.name, "levels": rows}
         if self.quantum:
             settings["quantum"] = self.quantum
+            settings["lowest"] = -self.black_level / self.full_scale
         return {"name": "MeasuredNoise", "settings": settings}
 
     # -- colour -------------------------------------------------------------------------------------------------------
@@ -460,13 +500,37 @@ class Camera:
 
     @classmethod
     def load(cls, path: str | Path) -> Camera:
-        """Read a camera from a YAML file with the names of the arguments as keys.
+        """Read a camera from a YAML file with the names of the arguments as keys, or from a tuning file (``.json``).
 
         Raises:
             FileNotFoundError: if there is no such file.
             ValueError: if it is not YAML, or a figure is wrong.
         """
+        if Path(path).suffix.lower() == _TUNING_EXTENSION:
+            return cls.from_tuning(path)
         return cls.from_json(read_yaml(path, "camera"), str(path))
+
+    @classmethod
+    def from_tuning(cls, path: str | Path, cfa: str = "RGGB") -> Camera:
+        """Read a sensor's tuning file, such as libcamera's and Raspberry Pi's ``imx477.json``, of version 1 or 2.
+
+        It states the black level, matrices and white points by colour temperature, the noise by analogue gain (ISO is
+        100 times the gain) and the tone curve; see :mod:`rawaug.camera.tuning` for the formulas. Its lens shading is
+        not read.
+
+        Args:
+            path: the file.
+            cfa: pattern of the sensor, which the file does not state.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is no tuning file, is of a monochrome sensor, or does not state what a camera needs.
+
+        Example:
+            >>> Camera.from_tuning("imx477.json").levels[0].shot_var  # doctest: +SKIP
+            0.00012461
+        """
+        return cls.from_json({**read_tuning(path), "cfa": cfa}, str(path))
 
     @classmethod
     def published(cls, name: str) -> Camera:
@@ -476,8 +540,8 @@ class Camera:
 
 
 def is_camera_file(name: object) -> bool:
-    """Whether a name or path is that of a camera's YAML file."""
-    return isinstance(name, (str, Path)) and Path(name).suffix.lower() in _YAML_EXTENSIONS
+    """Whether a name or path is that of a camera's YAML file or of a tuning file."""
+    return isinstance(name, (str, Path)) and Path(name).suffix.lower() in (*_YAML_EXTENSIONS, _TUNING_EXTENSION)
 
 
 def as_camera(camera: str | Path | Camera) -> Camera:

@@ -157,24 +157,29 @@ class RoundedNoise(ShotReadNoise):
     Args:
         levels: levels whose ``read_var`` contains the rounding, as it does if it is measured on RAW files.
         quantum: step of the digital numbers, white = 1; None rounds nothing.
+        lowest: what 0 DN is on this scale, at most 0; files hold nothing below. None clips nothing.
 
     Raises:
         ValueError: if the step is not in (0, 1).
     """
 
-    def __init__(self, levels: NoiseLevels, quantum: float | None = None) -> None:
+    def __init__(self, levels: NoiseLevels, quantum: float | None = None, lowest: float | None = None) -> None:
         if quantum is not None and not 0.0 < quantum < 1.0:
             raise ValueError(f"quantum must be between 0 and 1, got {quantum}")
-        self.quantum = quantum
+        if lowest is not None and not lowest <= 0.0:
+            raise ValueError(f"lowest must be at most 0, got {lowest}")
+        self.quantum, self.lowest = quantum, lowest
         super().__init__(levels)
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        """Draw ``shot_var``, ``read_var`` (without the rounding), ``seed`` and, if RAW is rounded, ``quantum``."""
+        """Draw ``shot_var``, ``read_var`` (without the rounding), ``seed``, and ``quantum``, ``lowest`` of whole DN."""
         params = super().sample(batch, generator)
         if self.quantum is not None:
             quantum = torch.full_like(params["read_var"], self.quantum)
             params["read_var"] = (params["read_var"] - quantum.square() / 12).clamp_min(0.0)
             params["quantum"] = quantum
+        if self.lowest is not None:
+            params["lowest"] = torch.full_like(params["read_var"], self.lowest)
         return params
 
     def apply(self, clean: Tensor, params: Params) -> Tensor:
@@ -203,11 +208,13 @@ class RoundedNoise(ShotReadNoise):
 
 
 def _round_to_quantum(noisy: Tensor, params: Params) -> Tensor:
-    """Round RAW ``(B, 4, h, w)`` in place to multiples of the drawn steps, if there are any."""
-    if "quantum" not in params:
-        return noisy
-    quantum = per_picture(params["quantum"], noisy)
-    return noisy.div_(quantum).round_().mul_(quantum)
+    """Round RAW ``(B, 4, h, w)`` in place to multiples of the drawn steps, from 0 DN on, if there are any."""
+    if "quantum" in params:
+        quantum = per_picture(params["quantum"], noisy)
+        noisy = noisy.div_(quantum).round_().mul_(quantum)
+    if "lowest" in params:
+        torch.maximum(noisy, per_picture(params["lowest"], noisy), out=noisy)
+    return noisy
 
 
 @NOISE.register("MeasuredNoise")
@@ -217,7 +224,7 @@ class MeasuredNoise(RoundedNoise):
     Args:
         levels: ``{iso, shot_var, read_var}`` for each ISO, and ``r2`` and ``frames`` if known.
         camera: make and model.
-        quantum: as for :class:`RoundedNoise`.
+        quantum, lowest: as for :class:`RoundedNoise`.
         iso: one ISO, or (lowest, highest), from which the levels are drawn; by default the whole measured range.
 
     Raises:
@@ -230,6 +237,7 @@ class MeasuredNoise(RoundedNoise):
         camera: str = "unknown",
         quantum: float | None = None,
         iso: Iso = None,
+        lowest: float | None = None,
     ) -> None:
         rows = []
         for row in levels:
@@ -241,7 +249,7 @@ class MeasuredNoise(RoundedNoise):
         drawn_from: NoiseLevels = self.law
         if iso is not None:
             drawn_from = self.law.within(iso)
-        super().__init__(drawn_from, quantum)
+        super().__init__(drawn_from, quantum, lowest)
 
 
 def camera_law(stored: Mapping[str, Any]) -> MeasuredLevels:
@@ -262,14 +270,15 @@ def measured_noise(specs: Sequence[Mapping[str, Any]], iso: Iso = None) -> Round
         ValueError: if a law is not a camera's, or the cameras round to different digital numbers.
     """
     laws: list[NoiseLevels] = []
-    quanta = set()
+    grids = set()
     for spec in specs:
         law = camera_law(spec)
         laws.append(law if iso is None else law.within(iso))
-        quanta.add(spec.get("settings", {}).get("quantum"))
+        settings = spec.get("settings", {})
+        grids.add((settings.get("quantum"), settings.get("lowest")))
 
-    if len(quanta) > 1:
+    if len(grids) > 1:
         raise ValueError("the cameras round to different digital numbers; give the noise of one, or leave out bits")
     if len(laws) == 1:
-        return RoundedNoise(laws[0], quanta.pop())
-    return RoundedNoise(MixedLevels(laws), quanta.pop())
+        return RoundedNoise(laws[0], *grids.pop())
+    return RoundedNoise(MixedLevels(laws), *grids.pop())

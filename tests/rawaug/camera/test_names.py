@@ -68,7 +68,7 @@ def test_the_list_says_what_is_known_of_each(capsys: pytest.CaptureFixture[str],
     head, row, *levels = capsys.readouterr().out.splitlines()
     assert head.split()[:2] == ["camera", "matrix"] and row.split("  ")[0] == "Sony ILCE-7M3"
     assert row.split()[2:] == ["yes", "100", "to", "102400"]
-    assert len(levels) == 11 and levels[0].split()[:6] == ["ISO", "100", "shot_var", "1.00e-05", "to", "1.59e-05"]
+    assert len(levels) == 11 and levels[0].split()[:6] == ["ISO", "100", "shot_var", "8.35e-06", "to", "1.59e-05"]
     assert main(["info", "cameras", "Nikon D850", "--json"]) == 0
     (camera,) = json.loads(capsys.readouterr().out)["cameras"]
     assert camera["noise"][0][0] == camera["iso"][0] and all(
