@@ -5,6 +5,8 @@ several seeds; the published fit learns dictionaries, encoders and both masks on
 frames of other photographs, drawn with a seed of their own.
 
 ``--score-file FILE`` measures an ISP instead: PSNR_r on frames of test or validation, blind and with as-shot gains.
+``--errors-of FILE`` measures how far off its choice and as-shot gains are on the frames of
+validation, as large as they are tested.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ from rawaug.data.pairs import Pair
 from rawaug.data.phones import PhoneFrames
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.samples import CLIPPED_RAW
-from rawaug.isp.fit.start import plausible_matrices
+from rawaug.isp.fit.samples import CLIPPED_RAW, sample_pixels
+from rawaug.isp.fit.start import measure_gain_errors, plausible_matrices
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import worst_and_best_quarter
 
@@ -84,8 +86,9 @@ def main(
     raw_loss: str = "log",
     score_file: str | None = None,
     split: str = "validation",
+    errors_of: str | None = None,
 ) -> None:
-    """Fit the ISP and print how its training went, or score one.
+    """Fit the ISP and print how its training went, or score one, or measure its errors.
 
     Args:
         photographs: folder with subfolders ``train`` and ``test``.
@@ -97,8 +100,18 @@ def main(
         raw_loss: l2 or log.
         score_file: an ISP to score in place of a fit, on seeds 0 and 7.
         split: of the frames that it is scored on.
+        errors_of: an ISP whose gain errors are measured anew on the frames of validation; it is written to ``out``.
     """
     torch.set_num_threads(1)
+    watched = draw_frames(photographs, "validation", [WATCH_SEED])
+    if errors_of is not None:
+        isp = DictionaryISP.from_pretrained(errors_of)
+        seen = sample_pixels(PhoneFrames(photographs, "validation"), pixels, seed=0)
+        measure_gain_errors(isp, seen, seen)
+        isp.save(out)
+        print(isp.info["gain_errors"])
+        return
+
     if score_file is not None:
         score(photographs, score_file, split, (0, 7))
         return
@@ -112,7 +125,6 @@ def main(
         raw_loss=raw_loss,  # type: ignore[arg-type]
     )
     frames = draw_frames(photographs, "train", range(1, seeds + 1), step=2)
-    watched = draw_frames(photographs, "validation", [WATCH_SEED])
     isp = fit_isp(frames, config, state=f"{out}.state", watched=watched)
 
     count = len(isp.info["frames"])

@@ -71,17 +71,13 @@ class ColourDictionary(nn.Module):
         """Mix the atoms by weights ``(B, N)`` into matrices ``(B, 3, 3)``."""
         return torch.einsum("bn,nij->bij", weights, self.atoms())
 
-    def weights_for(self, white_balance: Tensor) -> Tensor:
-        """Weigh the atoms by how near their light is to that of as-shot multipliers ``(B, 3)``: ``(B, N)``."""
-        distance = (log_light(white_balance)[:, None] - self.light) ** 2
-        return torch.softmax(-distance.sum(2) / (2.0 * self.spread**2), dim=1)
+    def weights_for(self, white_balance: Tensor, chosen: Tensor) -> Tensor:
+        """Weigh the atoms by how near their light is to that of as-shot multipliers ``(B, 3)``: ``(B, N)``.
 
-    def gains_for(self, white_balance: Tensor, weights: Tensor) -> Tensor:
-        """Compute the gains ``(B, 3)`` under which grey becomes ``1 / white_balance``, digital gain included.
-
-        ``white_balance`` is ``(B, 3)``; ``weights`` ``(B, N)`` are the weights of the atoms.
+        ``chosen`` ``(B, N)`` are the weights that they have if nothing is known of the light.
         """
-        return white_balance * (weights @ self.neutral).exp() * self.combine(weights).sum(2)
+        distance = (log_light(white_balance)[:, None] - self.light) ** 2
+        return torch.softmax(chosen.clamp_min(1e-6).log() - distance.sum(2) / (2.0 * self.spread**2), dim=1)
 
 
 class CameraDictionary(ColourDictionary):
@@ -127,7 +123,7 @@ class CameraDictionary(ColourDictionary):
 
         return (weights @ self.responses())[:, :, None] * matrix @ XYZ_TO_SRGB.to(matrix)
 
-    def weights_for(self, white_balance: Tensor) -> Tensor:
+    def weights_for(self, white_balance: Tensor, chosen: Tensor) -> Tensor:
         """The typical weights ``(B, N)``: multipliers ``(B, 3)`` of an unknown light say nothing about the camera."""
         return self.typical.expand(len(white_balance), -1)
 

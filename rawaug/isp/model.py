@@ -152,12 +152,13 @@ class DictionaryISP(StagedISP):
             srgb: ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides.
             params: the settings of the pictures; by default the encoders, or their constants, choose them.
             white_balance: the camera's as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``, scaled so that green is 1.
-                They also choose the colour atoms of that light.
-            digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
+                They are fused with what the ISP would choose, by the errors of both (:mod:`rawaug.isp.staged`), and
+                weigh the colour atoms by how near their light is.
+            digital_gain: the factor on all channels, scalar or ``(B,)``, if it is known.
             tone: the tone curve that the picture was rendered with, if the ISP has a dictionary of them
                 (``isp.info["tones"]``): a name such as ``"linear"``, which is LibRaw's rendering, or a mixture
                 (:func:`rawaug.isp.staged.with_tone`). By default the ISP chooses it.
-            raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are computed from these few readings
+            raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains follow from these few readings
                 (:func:`rawaug.isp.staged.with_raw_samples`).
             coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame
                 (:func:`rawaug.isp.functional.frame_coordinates`); by default the picture is taken for a full frame.
@@ -176,14 +177,16 @@ class DictionaryISP(StagedISP):
         with self._float32(srgb):
             x = functional.as_display_referred(srgb)
 
-            params = staged.with_white_balance(self, params or self.choose(x), white_balance, digital_gain)
-            params = staged.with_tone(self, params, tone)
+            params = staged.with_tone(self, params or self.choose(x), tone)
             if len(params.gains) != len(x):
                 pictures = count_of(len(params.gains), "picture")
                 raise ValueError(f"the parameters are for {pictures}, but the batch has {len(x)}")
-            if raw_samples is not None:
+            if raw_samples is None:
+                params = staged.with_white_balance(self, params, white_balance, digital_gain)
+            else:
                 where = functional.coordinates_or_full(x, coordinates)
-                params = staged.with_raw_samples(self, x, params, raw_samples, where)
+                stated = white_balance, digital_gain
+                params = staged.with_raw_samples(self, x, params, raw_samples, where, *stated)
 
             images: dict[str, Tensor] = {}
             x5 = self.reverse_pixels(x, params, coordinates, images if intermediates else None)
@@ -250,7 +253,12 @@ class DictionaryISP(StagedISP):
 
         if white_balance is None:
             return params
-        return staged.with_white_balance(self, params, tuple(white_balance), None)
+
+        # without a picture there is nothing to fuse with: the file decides
+        balance = torch.tensor([tuple(white_balance)]).to(params.gains)
+        balance = balance / balance[:, 1:2]
+        weights = self.colour.weights_for(balance, colour_weights)
+        return staged.with_grey(self, params, weights, balance.log() + weights @ self.colour.neutral)
 
     @torch.no_grad()
     def reverse_table(self, setting: ISPParams, nodes: int = 33) -> Tensor:

@@ -4,12 +4,25 @@ An encoder gives the weights of a dictionary's atoms, ``w = softmax(b + E(I))``,
 make of one picture (Conde et al., AAAI 2022, "Parameter Dictionaries"). ``b`` is a learned constant, which decides
 alone if there is no network ``E``.
 
-A file states the white balance wb and the digital gain d. Grey ``(1, 1, 1)`` becomes ``C 1 / g`` here and ``1 / (wb
-d)`` in the file, hence ``g = wb d (C 1)``. RAW readings ``y_k`` of a channel give its gain by least squares, ``1 / g =
-sum w x5 y / sum w x5^2`` with ``x5`` made under gain 1. They are weighted by ``w = 1 / (y + 0.01)`` for shot noise and
-reweighted (Cauchy) against readings that lie on edges. If tone is a mixture of curves and the camera a mixture of
-cameras, readings choose these as well, in turn: given the gains, ``g_c y = sum_k v_k (C T_k(x))_c`` is linear in the
-weights v, and ``sum_n w_n (C_n T(x))_c`` in w.
+What is known of a shot is fused with that choice, not put in its place. Of a picture, let ``t = log(g / C 1)`` be the
+gains of grey. The choice gives ``m = t + e``, and a file's white balance ``z = log wb + k = t + n``, with ``k`` the
+digital gain and tint that go with the atoms. With the covariances ``S_e`` and ``S_n`` of these errors, which a fit
+measures, the estimate and its covariance are
+
+    t = m + K (z - m),    K = S_e (S_e + S_n)^-1,    P = S_e - K S_e
+
+If ``S_n`` is zero, the file decides; if it is infinite, the choice stays. Both guess the digital gain, which no file
+states, and err alike, so that only one guess may count: unless the file's is clearly better, ``S_n`` is infinite along
+(1, 1, 1), and z says the ratios alone. Constants are a choice with a large ``S_e``; where nothing was measured it is 1, and
+the file decides. Atoms keep the weights that the encoders gave them, times ``exp(-d^2 / 2 spread^2)`` for the distance
+d of their light to that of the file. A known digital gain, the green of ``t``, and RAW readings are further
+observations ``t_o`` of the same state, ``t <- t + P (P + S_o)^-1 (t_o - t)``.
+
+RAW readings ``y_k`` of a channel give its gain by least squares, ``1 / g = sum w x5 y / sum w x5^2`` with ``x5`` made
+under gain 1. They are weighted by ``w = 1 / (y + 0.01)`` for shot noise and reweighted (Cauchy) against readings that
+lie on edges. If tone is a mixture of curves and the camera a mixture of cameras, readings choose these as well, in
+turn: given the gains, ``g_c y = sum_k v_k (C T_k(x))_c`` is linear in the weights v, and ``sum_n w_n (C_n T(x))_c`` in
+w.
 """
 
 from __future__ import annotations
@@ -40,6 +53,8 @@ CLIPPED = 0.98
 _SHADOW = 0.01
 """The share of read noise, which is added to a reading that serves as a variance."""
 ROUNDS = 4
+DIGITAL_SLACK = 1e-6
+"""Variance of the logarithm of a digital gain that nothing was measured of, beside 1 of what is chosen."""
 _PULL = 1e-4
 """Strength of the pull of weights towards the typical ones, as a share of the readings' mean square."""
 
@@ -184,6 +199,17 @@ class StagedISP(nn.Module):
             return self.colour.matrices.new_zeros(0)
         return self.tone.typical
 
+    def gain_errors(self) -> Tensor:
+        """The covariances S_e and S_n of the errors of the gains of grey, float64 ``(2, 3, 3)``; see the module.
+
+        They are those that the fit has measured. An ISP without any believes the file, but for the digital gain if that
+        is stated as well.
+        """
+        measured = self.info.get("gain_errors")
+        if measured is not None:
+            return torch.tensor(measured, dtype=torch.float64)
+        return torch.stack([torch.eye(3), torch.full((3, 3), DIGITAL_SLACK)]).double()
+
     def reverse_pixels(
         self, x: Tensor, params: ISPParams, coordinates: Tensor | None = None, seen: dict[str, Tensor] | None = None
     ) -> Tensor:
@@ -248,19 +274,33 @@ def with_white_balance(
     white_balance: Tensor | tuple[float, ...] | None,
     digital_gain: Tensor | float | None,
 ) -> ISPParams:
-    """Replace the gains of a setting by what the camera states, and its colour atoms by those of that light.
+    """Fuse the gains and the colour atoms that were chosen for pictures with what the camera states.
 
     Args:
         isp: the ISP whose dictionaries are used.
-        params: the settings of B pictures.
-        white_balance: as-shot multipliers of R, G, B, ``(3,)`` or ``(B, 3)``, scaled so that green is 1. None keeps the
-            gains.
-        digital_gain: the factor on all channels, a scalar or ``(B,)``. None keeps the setting's own.
+        params: the settings chosen for B pictures.
+        white_balance: as-shot multipliers of R, G, B, ``(3,)`` or ``(B, 3)``, scaled so that green is 1. None if they
+            are not known.
+        digital_gain: the factor on all channels, a scalar or ``(B,)``. None if it is not known.
 
     Raises:
         ValueError: if a multiplier is not positive, or the shapes are for another number of pictures.
     """
+    params, _ = _fuse_stated(isp, params, white_balance, digital_gain)
+    return params
+
+
+def _fuse_stated(
+    isp: StagedISP,
+    params: ISPParams,
+    white_balance: Tensor | tuple[float, ...] | None,
+    digital_gain: Tensor | float | None,
+) -> tuple[ISPParams, Tensor]:
+    """Do :func:`with_white_balance`, and also return the covariance P of the gains of grey, float64 ``(B, 3, 3)``."""
     batch = len(params.gains)
+    chosen, stated = isp.gain_errors().to(params.gains.device)
+    covariance = chosen.expand(batch, 3, 3)
+
     if white_balance is not None:
         balance = torch.as_tensor(white_balance, dtype=params.gains.dtype, device=params.gains.device)
         if balance.shape not in ((3,), (1, 3), (batch, 3)):
@@ -268,9 +308,14 @@ def with_white_balance(
         _require_factor("white_balance", balance)
 
         balance = (balance / balance[..., 1:2]).expand_as(params.gains)
-        weights = isp.colour.weights_for(balance)
-        matrix, gains = isp.colour.combine(weights), isp.colour.gains_for(balance, weights)
-        params = params._replace(colour_weights=weights, matrix=matrix, gains=gains)
+        weights = isp.colour.weights_for(balance, params.colour_weights)
+        grey = log_grey(params)
+        seen = balance.log() + weights @ isp.colour.neutral
+
+        share = torch.linalg.solve(chosen + stated, chosen, left=False)
+        grey = grey + ((seen - grey).double() @ share.T).to(grey)
+        covariance = (chosen - share @ chosen).expand(batch, 3, 3)
+        params = with_grey(isp, params, weights, grey)
 
     if digital_gain is not None:
         digital = torch.as_tensor(digital_gain, dtype=params.gains.dtype, device=params.gains.device).reshape(-1, 1)
@@ -278,10 +323,25 @@ def with_white_balance(
             raise ValueError(f"digital_gain must be a number or ({batch},), got {len(digital)}")
         _require_factor("digital_gain", digital)
 
-        own = params.gains[:, 1:2] / params.matrix[:, 1:2].sum(2)
-        params = params._replace(gains=params.gains / own * digital)
+        grey = log_grey(params)
+        share = covariance[:, :, 1] / covariance[:, 1:2, 1]
+        grey = grey + (share * (digital.log() - grey[:, 1:2])).to(grey)
+        covariance = covariance - share[:, :, None] * covariance[:, 1:2]
+        params = with_grey(isp, params, params.colour_weights, grey)
 
-    return params
+    return params, covariance
+
+
+def log_grey(params: ISPParams) -> Tensor:
+    """Compute ``log(g / C 1)`` ``(B, 3)``, the logarithm of the gains of grey, of the settings of B pictures."""
+    return (params.gains / params.matrix.sum(2).clamp_min(1e-3)).log()
+
+
+def with_grey(isp: StagedISP, params: ISPParams, colour_weights: Tensor, grey: Tensor) -> ISPParams:
+    """Change the weights ``(B, N)`` of the colour atoms, and the logarithms ``(B, 3)`` of the gains of grey."""
+    matrix = isp.colour.combine(colour_weights)
+    gains = grey.exp() * matrix.sum(2).clamp_min(1e-3)
+    return params._replace(colour_weights=colour_weights, matrix=matrix, gains=gains)
 
 
 Tone = str | Mapping[str, float] | Tensor
@@ -338,18 +398,25 @@ def _require_factor(name: str, value: Tensor) -> None:
 
 
 def with_raw_samples(
-    isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: Tensor, coordinates: Tensor
+    isp: StagedISP,
+    x: Tensor,
+    params: ISPParams,
+    raw_samples: Tensor,
+    coordinates: Tensor,
+    white_balance: Tensor | tuple[float, ...] | None = None,
+    digital_gain: Tensor | float | None = None,
 ) -> ISPParams:
-    """Compute the gains from RAW readings, choose the colour atoms of that light, and compute the gains again.
+    """Fuse the chosen gains with RAW readings and what the camera states; the readings' light weighs the colour atoms.
 
     Clipped readings do not count.
 
     Args:
         isp: the camera.
         x: sRGB as float ``(B, 3, H, W)``.
-        params: the settings to start from.
+        params: the settings chosen for the pictures.
         raw_samples: ``(B, K, 3)`` of row, column and RAW value.
         coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame.
+        white_balance, digital_gain: as for :func:`with_white_balance`.
 
     Raises:
         ValueError: if a reading is NaN or lies outside the picture.
@@ -365,17 +432,26 @@ def with_raw_samples(
     own = F.one_hot(channel, 3).transpose(1, 2).to(x)
     value = raw_samples[..., 2]
 
-    params = _solve(isp, pixels, where, own, value, params)
+    chosen_weights = params.colour_weights
+    params, covariance = _fuse_stated(isp, params, white_balance, digital_gain)
+    expected = log_grey(params)
+    solved, precision = _solve(isp, pixels, where, own, value, params)
+
     if isp.tone is not None and isinstance(isp.colour, CameraDictionary):
         for _ in range(ROUNDS):
-            params = _fit_mixtures(isp.colour, isp.tone, pixels, own, value, params)
-            params = _solve(isp, pixels, where, own, value, params)
-        return params
+            solved = _fit_mixtures(isp.colour, isp.tone, pixels, own, value, solved)
+            solved, precision = _solve(isp, pixels, where, own, value, solved)
+    else:
+        light = (log_grey(solved) - solved.colour_weights @ isp.colour.neutral).exp()
+        weights = isp.colour.weights_for(light, chosen_weights)
+        solved = with_grey(isp, solved, weights, log_grey(solved))
+        solved, precision = _solve(isp, pixels, where, own, value, solved)
 
-    light = params.gains / params.matrix.sum(2) / (params.colour_weights @ isp.colour.neutral).exp()
-    weights = isp.colour.weights_for(light)
-    params = params._replace(colour_weights=weights, matrix=isp.colour.combine(weights))
-    return _solve(isp, pixels, where, own, value, params)
+    # P (P + S)^-1 by the readings' precision 1 / S, which is 0 for a channel without any
+    information = torch.diag_embed(precision)
+    share = torch.linalg.solve(torch.eye(3).to(covariance) + covariance @ information, covariance) @ information
+    grey = expected + (share @ (log_grey(solved) - expected).double()[:, :, None])[:, :, 0].to(expected)
+    return with_grey(isp, solved, solved.colour_weights, grey)
 
 
 def _fit_mixtures(
@@ -421,7 +497,10 @@ def _require_places(raw_samples: Tensor, x: Tensor) -> None:
         raise ValueError(f"raw_samples: a row or column is outside the picture, {x.shape[-2]} x {x.shape[-1]}")
 
 
-def _solve(isp: StagedISP, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams) -> ISPParams:
+def _solve(
+    isp: StagedISP, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams
+) -> tuple[ISPParams, Tensor]:
+    """Solve for the gains of the readings; also return the precision of their logarithms, float64 ``(B, 3)``."""
     unit = params._replace(gains=torch.ones_like(params.gains))
     x5 = isp.reverse_pixels(pixels, unit, where)[:, :, 0]
     y = value[:, None].expand_as(x5)
@@ -436,4 +515,8 @@ def _solve(isp: StagedISP, pixels: Tensor, where: Tensor, own: Tensor, value: Te
 
     solvable = (usable.sum(2) > 0) & (inverse > 0)
     gains = torch.where(solvable, 1.0 / inverse.clamp_min(1e-6), params.gains)
-    return params._replace(gains=gains)
+
+    # 1.5 median residuals are a deviation, with which least squares has the variance s^2 / sum w x5^2
+    deviation = 1.5 * typical[..., 0].nan_to_num(1.0)
+    precision = (inverse / deviation).square() * (weight * x5 * x5).sum(2)
+    return params._replace(gains=gains), torch.where(solvable, precision, 0.0).double()

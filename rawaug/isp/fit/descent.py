@@ -394,7 +394,7 @@ def joint_steps(config: FitConfig, frames: int) -> int:
 
 def train_jointly(
     isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent, watched: FitFrames | None = None
-) -> None:
+) -> FitFrames | None:
     """Refine everything at once, if ``config.joint_steps`` asks for it; the gain is noted in ``isp.info``.
 
     The properties of the atoms that as-shot gains depend on are measured anew afterwards.
@@ -405,11 +405,14 @@ def train_jointly(
         config: the settings of the fit.
         descent: runs the training.
         watched: frames that choose the best step; by default a tenth of the others, which is held out.
+
+    Returns:
+        The watched frames; None without a training.
     """
     count = len(frames.shots)
     steps = joint_steps(config, count)
     if steps == 0:
-        return
+        return None
     if watched is None and count < 2:
         raise ValueError("joint_steps: end-to-end training holds frames out for validation; give two frames or more")
 
@@ -445,6 +448,7 @@ def train_jointly(
         "gain_db": round(score.best - score.start, 2),
         "curve": score.curve(),
     }
+    return watched
 
 
 def _draw_batches(

@@ -8,6 +8,7 @@
 4. Encoders, if frames that were left out of stages 1 to 3 as well show that they help.
 5. Forward. The forward networks, given the reverse pass: l2 on sRGB and on every intermediate image.
 6. Joint. With many frames, everything at once, kept as far as frames left out of it gain.
+7. Errors. How far off the chosen and the as-shot gains are, so that they can be fused (:mod:`rawaug.isp.staged`).
 
 Model and losses are those of Conde et al., AAAI 2022; a global and a per-frame part make the fit work with a handful of
 frames.
@@ -45,6 +46,7 @@ from rawaug.isp.fit.start import (
     Tie,
     fit_fall_off,
     least_squares,
+    measure_gain_errors,
     set_dictionaries,
 )
 from rawaug.isp.model import DictionaryISP
@@ -115,7 +117,8 @@ def fit_isp(
         fit.fit_reverse(report)
         train_encoders(fit.isp, frames, config, descent, refit)
         fit.forward()
-        train_jointly(fit.isp, frames, config, descent, held_out)
+        held_out = train_jointly(fit.isp, frames, config, descent, held_out)
+        measure_gain_errors(fit.isp, frames, held_out)
 
     descent.finish()
     info = fit.isp.info

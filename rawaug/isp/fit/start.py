@@ -26,6 +26,7 @@ from rawaug.isp.dictionary import l1_normalise, log_light
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.samples import FitFrames, FrameSummary, PixelSamples, as_shot
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.staged import DIGITAL_SLACK, log_grey
 from rawaug.seeding import derive_seed
 
 TIE = 1e-1
@@ -314,30 +315,87 @@ def measure_lights(isp: DictionaryISP, frames: FitFrames) -> None:
     which as-shot gains come nearest to each frame's best gains, and the spread is the one that works best with them.
     """
     balance = frames.as_shot
+    chosen = _chosen(isp, frames).colour_weights
     if isp.config.encoders:
-        frame_weights = torch.cat([isp.choose(shot.srgb).colour_weights for shot in frames.shots])
-        share = frame_weights / frame_weights.sum(dim=0).clamp_min(1e-6)
+        share = chosen / chosen.sum(dim=0).clamp_min(1e-6)
         isp.colour.light.copy_(share.T @ log_light(balance))
 
-    pixels = frames.pixels.pick(torch.arange(min(_LIGHT_PIXELS, frames.pixels.srgb.shape[-1])))
     errors: dict[float, float] = {}
     neutrals: dict[float, Tensor] = {}
     for spread in _SPREADS:
         isp.colour.spread.fill_(spread)
-        weights = isp.colour.weights_for(balance)
-        matrix = isp.colour.combine(weights)
-        a, b, has_pixels = _second_moments(isp, pixels, weights, matrix)
-        best = b.clamp_min(1e-9) / a.clamp_min(1e-9)
-        neutral = -best.log() - balance.log() - matrix.sum(2).clamp_min(1e-3).log()
-        neutrals[spread] = _solve_mixture(weights, neutral)
-        isp.colour.neutral.copy_(neutrals[spread])
-        inverse = 1.0 / isp.colour.gains_for(balance, weights)
-        excess = (has_pixels * (inverse * a - b) ** 2 / a.clamp_min(1e-9)).sum(dim=1)
-        errors[spread] = float((excess + _SPREAD_EPS).log().sum())
+        weights = isp.colour.weights_for(balance, chosen)
+        best, power, has_pixels = _best_grey(isp, frames, weights)
+        neutrals[spread] = _solve_mixture(weights, best - balance.log())
+        off = (best - balance.log() - weights @ neutrals[spread]).exp() - 1.0
+        errors[spread] = float(((has_pixels * power * off**2).sum(dim=1) + _SPREAD_EPS).log().sum())
 
     spread = min(errors, key=lambda width: errors[width])
     isp.colour.spread.fill_(spread)
     isp.colour.neutral.copy_(neutrals[spread])
+
+
+FEWEST_JUDGES = 8
+"""Minimum number of frames to judge encoders on; with fewer, they are taken to be no better than the constants."""
+_CHOICE_VARIANCE = 0.03
+"""Variance of the logarithms of chosen gains in the frames that stand for what is known before any is measured."""
+_PRIOR_FRAMES = 3
+_CLEARLY = 0.25
+"""A file's digital gain is believed if its variance is at most this share of that of the chosen one."""
+_UNKNOWN = 1e4
+"""Variance of the logarithm of a digital gain that is not believed."""
+
+
+@torch.no_grad()
+def measure_gain_errors(isp: DictionaryISP, frames: FitFrames, watched: FitFrames | None) -> None:
+    """Measure how far off chosen gains and as-shot gains are, and note the covariances in ``isp.info``.
+
+    Args:
+        isp: the fitted ISP.
+        frames: the frames of the fit.
+        watched: frames that the encoders were not trained on, if there are any. Of other frames the errors of the
+            constants are measured, since encoders know those frames.
+    """
+    judged, judges_encoders = frames, False
+    if watched is not None and len(watched.shots) >= FEWEST_JUDGES:
+        judged, judges_encoders = watched, True
+
+    chosen = _chosen(isp, judged)
+    if not judges_encoders:
+        typical = isp.typical_setting()
+        chosen = ISPParams(*[tensor.expand(len(judged.shots), *tensor.shape[1:]) for tensor in typical])
+
+    balance = judged.as_shot
+    weights = isp.colour.weights_for(balance, chosen.colour_weights)
+    best, _, has_pixels = _best_grey(isp, judged, weights)
+    usable = has_pixels.bool().all(dim=1)
+
+    of_choice = (log_grey(chosen) - best)[usable].double()
+    of_file = (balance.log() + weights @ isp.colour.neutral - best)[usable].double()
+    count = len(of_choice) + _PRIOR_FRAMES
+    choice = (of_choice.T @ of_choice + _PRIOR_FRAMES * _CHOICE_VARIANCE * torch.eye(3)) / count
+    file = of_file.T @ of_file / count + DIGITAL_SLACK
+    if file[1, 1] > _CLEARLY * choice[1, 1]:
+        file = file + _UNKNOWN
+    isp.info["gain_errors"] = [choice.tolist(), file.tolist()]
+
+
+def _chosen(isp: DictionaryISP, frames: FitFrames) -> ISPParams:
+    """The settings that the ISP chooses for the frames."""
+    settings = [isp.choose(shot.srgb) for shot in frames.shots]
+    return ISPParams(*map(torch.cat, zip(*settings, strict=True)))
+
+
+def _best_grey(isp: DictionaryISP, frames: FitFrames, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Find the logarithms ``(F, 3)`` of each frame's best gains of grey under weights ``(F, N)`` of the colour atoms.
+
+    Also return the power of its readings that they explain, and which channels have any pixel.
+    """
+    pixels = frames.pixels.pick(torch.arange(min(_LIGHT_PIXELS, frames.pixels.srgb.shape[-1])))
+    matrix = isp.colour.combine(weights)
+    a, b, has_pixels = _second_moments(isp, pixels, weights, matrix)
+    inverse = b.clamp_min(1e-9) / a.clamp_min(1e-9)
+    return -inverse.log() - matrix.sum(2).clamp_min(1e-3).log(), b.square() / a.clamp_min(1e-9), has_pixels
 
 
 def _second_moments(

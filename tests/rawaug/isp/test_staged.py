@@ -97,7 +97,7 @@ def test_a_channel_without_a_reading_keeps_its_gain() -> None:
     green = (samples[..., 0] + samples[..., 1]) % 2 == 1  # RGGB
     solved = isp.reverse(picture(), raw_samples=samples[green][None]).params.gains
     torch.testing.assert_close(solved[0, 1], truth.params.gains[0, 1], rtol=1e-4, atol=0)
-    assert torch.equal(solved[:, 0::2], chosen[:, 0::2])
+    torch.testing.assert_close(solved[:, 0::2], chosen[:, 0::2])
 
 
 def test_readings_reproduce_an_unseen_shot(fitted: DictionaryISP, exact_pair: Callable[..., Pair]) -> None:
@@ -116,18 +116,71 @@ def test_readings_choose_the_colour_atoms_of_their_light() -> None:
     torch.testing.assert_close(solved.colour_weights, truth.params.colour_weights, atol=1e-3, rtol=0)
 
 
-def test_a_digital_gain_is_that_of_grey(fitted: DictionaryISP, exact_pairs: list[Pair]) -> None:
-    srgb = exact_pairs[0].srgb[None]
+def grey(params: ISPParams) -> torch.Tensor:
+    return params.matrix[0].sum(1) / params.gains[0]
 
-    def grey(params: ISPParams) -> torch.Tensor:
-        return params.matrix[0].sum(1) / params.gains[0]
 
-    params = fitted.reverse(srgb, white_balance=(2.0, 1.0, 1.6), digital_gain=0.5).params
-    torch.testing.assert_close(grey(params), 1 / (0.5 * torch.tensor([2.0, 1.0, 1.6])), atol=0.01, rtol=0)
-    own = fitted.reverse(srgb).params
-    scaled = fitted.reverse(srgb, digital_gain=0.5).params
-    torch.testing.assert_close(grey(scaled)[1], torch.tensor(2.0))
-    torch.testing.assert_close(scaled.gains / scaled.gains[:, 1:2], own.gains / own.gains[:, 1:2])
+def test_a_file_decides_where_nothing_was_measured_and_grey_is_its_inverse() -> None:
+    isp = DictionaryISP()
+    isp.colour.neutral.copy_(torch.tensor([0.4]).log().expand(16, 3))
+    params = isp.reverse(picture(), white_balance=(2.0, 1.0, 1.6)).params
+    torch.testing.assert_close(grey(params), 1 / (0.4 * torch.tensor([2.0, 1.0, 1.6])), rtol=1e-4, atol=0)
+    params = isp.reverse(picture(), white_balance=(2.0, 1.0, 1.6), digital_gain=0.5).params
+    torch.testing.assert_close(grey(params), 1 / (0.5 * torch.tensor([2.0, 1.0, 1.6])), rtol=1e-4, atol=0)
+
+
+CHOICE = [[0.05, 0.03, 0.03], [0.03, 0.05, 0.03], [0.03, 0.03, 0.08]]
+
+
+@pytest.mark.parametrize(("noise", "share"), [(0.0, 1.0), (1e8, 0.0)])
+def test_a_file_without_noise_fulfils_its_ratios_and_with_infinite_noise_leaves_the_choice(
+    noise: float, share: float
+) -> None:
+    isp = DictionaryISP()
+    isp.info["gain_errors"] = [CHOICE, (noise * torch.eye(3) + 1e4).tolist()]
+    blind = isp.reverse(picture()).params
+    params = isp.reverse(picture(), white_balance=LIGHT).params
+    light = torch.tensor(LIGHT)
+    ratios = (1.0 - share) * grey(blind).log() - share * light.log()
+    torch.testing.assert_close(grey(params).log() - grey(params)[1].log(), ratios - ratios[1], atol=2e-3, rtol=0)
+    if share:
+        # the digital gain of the choice is kept as its errors go together, not replaced by the file's
+        file = DictionaryISP().reverse(picture(), white_balance=LIGHT).params
+        assert not torch.isclose(grey(params)[1], grey(file)[1], rtol=1e-2)
+
+
+def test_the_less_noisy_of_choice_and_file_counts_more() -> None:
+    isp = DictionaryISP()
+    off = []
+    blind, light = grey(isp.reverse(picture()).params), 1 / (torch.tensor(LIGHT) / LIGHT[1])
+    for noise in (0.01, 0.05, 0.25):
+        isp.info["gain_errors"] = [(0.05 * torch.eye(3)).tolist(), (noise * torch.eye(3)).tolist()]
+        fused = grey(isp.reverse(picture(), white_balance=LIGHT).params)
+        off.append(((fused / blind).log() / (light / blind).log()).tolist())
+    expected = torch.tensor([0.05 / 0.06, 0.5, 0.05 / 0.3])[:, None].expand(3, 3)
+    torch.testing.assert_close(torch.tensor(off), expected, rtol=1e-3, atol=0)
+
+
+def test_a_known_digital_gain_is_met_and_moves_the_others_as_their_errors_go_together() -> None:
+    isp = DictionaryISP()
+    isp.info["gain_errors"] = [CHOICE, (1e-6 * torch.eye(3)).tolist()]
+    blind = grey(isp.reverse(picture()).params)
+    known = grey(isp.reverse(picture(), digital_gain=0.5).params)
+    torch.testing.assert_close(known[1], torch.tensor(2.0))
+    torch.testing.assert_close((known / blind).log()[0], 0.6 * (known / blind).log()[1])
+
+
+def test_readings_with_much_noise_are_weighed_against_the_choice() -> None:
+    isp = DictionaryISP()
+    truth = isp.reverse(picture(), white_balance=LIGHT)
+    samples = readings(truth.raw, 8)
+    samples[..., 2] *= torch.exp(0.5 * torch.randn(8, generator=torch.Generator().manual_seed(0)))
+    shares = []
+    for variance in (1e-8, 1e-2, 1e4):
+        isp.info["gain_errors"] = [(variance * torch.eye(3)).tolist(), torch.eye(3).tolist()]
+        moved = isp.reverse(picture(), raw_samples=samples).params.gains / isp.choose(picture()).gains
+        shares.append(moved.log().norm().item())
+    assert shares[0] < 1e-4 < shares[1] < shares[2]
 
 
 @pytest.mark.parametrize(
