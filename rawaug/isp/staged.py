@@ -13,9 +13,9 @@ measures, the estimate and its covariance are
 
 If ``S_n`` is zero, the file decides; if it is infinite, the choice stays. Both guess the digital gain, which no file
 states, and err alike, so that only one guess may count: unless the file's is clearly better, ``S_n`` is infinite along
-(1, 1, 1), and z says the ratios alone. Constants are a choice with a large ``S_e``; where nothing was measured it is 1, and
-the file decides. Atoms keep the weights that the encoders gave them, times ``exp(-d^2 / 2 spread^2)`` for the distance
-d of their light to that of the file. A known digital gain, the green of ``t``, and RAW readings are further
+(1, 1, 1), and z says the ratios alone. Constants are a choice with a large ``S_e``; where nothing was measured it is 1,
+and the file decides. Atoms keep the weights that the encoders gave them, times ``exp(-d^2 / 2 spread^2)`` for the
+distance d of their light to that of the file. A known digital gain, the green of ``t``, and RAW readings are further
 observations ``t_o`` of the same state, ``t <- t + P (P + S_o)^-1 (t_o - t)``.
 
 RAW readings ``y_k`` of a channel give its gain by least squares, ``1 / g = sum w x5 y / sum w x5^2`` with ``x5`` made
@@ -55,6 +55,8 @@ _SHADOW = 0.01
 ROUNDS = 4
 DIGITAL_SLACK = 1e-6
 """Variance of the logarithm of a digital gain that nothing was measured of, beside 1 of what is chosen."""
+_LEAST_DEVIATION = 1e-3
+"""Least deviation of a reading, in units of the root of itself; the residuals of one or two readings say nothing."""
 _PULL = 1e-4
 """Strength of the pull of weights towards the typical ones, as a share of the readings' mean square."""
 
@@ -517,6 +519,6 @@ def _solve(
     gains = torch.where(solvable, 1.0 / inverse.clamp_min(1e-6), params.gains)
 
     # 1.5 median residuals are a deviation, with which least squares has the variance s^2 / sum w x5^2
-    deviation = 1.5 * typical[..., 0].nan_to_num(1.0)
+    deviation = (1.5 * typical[..., 0]).nan_to_num(1.0).clamp_min(_LEAST_DEVIATION)
     precision = (inverse / deviation).square() * (weight * x5 * x5).sum(2)
     return params._replace(gains=gains), torch.where(solvable, precision, 0.0).double()

@@ -45,12 +45,11 @@ def test_combining_parameters_equals_combining_images() -> None:
 
 def test_a_known_light_chooses_the_atoms_that_were_seen_in_it() -> None:
     colour, balance = ColourDictionary(3), torch.tensor([[2.0, 1.0, 1.5], [3.0, 2.0, 4.0]])
-    torch.testing.assert_close(
-        colour.weights_for(balance, torch.ones(2, 3)), torch.full((2, 3), 1 / 3)
-    )  # uninformative light
+    even = torch.full((2, 3), 1 / 3)
+    torch.testing.assert_close(colour.weights_for(balance, even), even)  # uninformative light
     colour.light.copy_(torch.tensor([[2.0, 1.5], [1.5, 2.0], [1.0, 1.0]]).log())
     colour.spread.fill_(0.05)
-    torch.testing.assert_close(colour.weights_for(balance, torch.ones(2, 3)), torch.eye(3)[:2], atol=1e-4, rtol=0)
+    torch.testing.assert_close(colour.weights_for(balance, even), torch.eye(3)[:2], atol=1e-4, rtol=0)
 
 
 @given(st.lists(st.floats(-2, 2), min_size=1, max_size=9))

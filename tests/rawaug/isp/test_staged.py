@@ -173,14 +173,14 @@ def test_a_known_digital_gain_is_met_and_moves_the_others_as_their_errors_go_tog
 def test_readings_with_much_noise_are_weighed_against_the_choice() -> None:
     isp = DictionaryISP()
     truth = isp.reverse(picture(), white_balance=LIGHT)
-    samples = readings(truth.raw, 8)
-    samples[..., 2] *= torch.exp(0.5 * torch.randn(8, generator=torch.Generator().manual_seed(0)))
+    samples = readings(truth.raw, 64)
+    samples[..., 2] *= torch.exp(0.5 * torch.randn(64, generator=torch.Generator().manual_seed(0)))
     shares = []
     for variance in (1e-8, 1e-2, 1e4):
         isp.info["gain_errors"] = [(variance * torch.eye(3)).tolist(), torch.eye(3).tolist()]
         moved = isp.reverse(picture(), raw_samples=samples).params.gains / isp.choose(picture()).gains
         shares.append(moved.log().norm().item())
-    assert shares[0] < 1e-4 < shares[1] < shares[2]
+    assert shares[0] < 1e-3 < shares[1] < shares[2]
 
 
 @pytest.mark.parametrize(

@@ -82,7 +82,7 @@ def test_a_report_sees_the_isp_as_it_would_be_and_changes_nothing(
         return f"{scores[-1]:.1f} dB"
 
     last = fit_isp(exact_pairs[:1], TINY, progress=False, report=report)
-    assert scores[-1] == pytest.approx(error_db(last, exact_pairs[0], exact_pairs[0].white_balance), abs=1e-3)
+    assert scores[-1] == pytest.approx(error_db(last, exact_pairs[0], exact_pairs[0].white_balance), abs=0.02)
     seen = last.state_dict()
     unseen = fit_isp(exact_pairs[:1], TINY, progress=False).state_dict()
     assert len(scores) == 2 and min(scores) > 45.0  # after 2 and 3 steps
