@@ -1,12 +1,16 @@
-"""Kills: what was there stays whole, and a run goes on as if nothing had been.
+"""Kills and full disks: what was there stays whole, and a run goes on as if nothing had been.
 
-    python -m benchmarks.faults [--kills 20] [--seed 0] [--commands fit run synth denoise] [--quick]
+    python -m benchmarks.faults [--kills 20] [--disks 20] [--seed 0] [--commands fit run synth ...] [--quick]
 
-Every command runs in a forked child on small generated files. First it runs to its end; then it is killed ``--kills``
-times at moments drawn uniformly over that time, by SIGKILL, SIGTERM and SIGINT in turn, and after each kill the same
-command is run again to its end in the same folder. Its files must then equal those of the run that was not killed, bit
-for bit (tensors of safetensors), and nothing else may be left. Exit status 1 if anything differs. Full disks, two runs
-at once and folders that vanish or cannot be written are in tests/test_faults.py.
+Every command that writes runs in a forked child on small generated files. First it runs to its end; then it is killed
+``--kills`` times at moments drawn uniformly over that time, by SIGKILL, SIGTERM and SIGINT in turn, and after each kill
+the same command is run again to its end in the same folder. Its files must then equal those of the run that was not
+killed, bit for bit (tensors of safetensors), and nothing else may be left.
+
+``--disks`` times it writes to a disk (a tmpfs, which needs root) whose free space is drawn uniformly up to what the
+command needs. It must then end in one line with status 2, or with all its files; whatever it has left must be whole;
+and the same command must complete once there is space. Exit status 1 if anything is otherwise. Two runs at once and
+folders that vanish or cannot be written are in tests/test_faults.py.
 """
 
 from __future__ import annotations
@@ -16,9 +20,12 @@ import os
 import random
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +38,12 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 FORK = multiprocessing.get_context("fork")
 PATIENCE = 600.0
 OUT = "out"
-LEFT_OUT = (".csv", ".html", ".png", ".lock")
+LEFT_OUT = (".csv", ".html", ".png", ".lock", ".tex")
 """Endings of files that hold times, or pictures of them."""
+ENDS = {".csv": b"\n", ".html": b"</html>", ".png": b"IEND\xaeB`\x82", ".tex": b"}\n"}
+"""A file with such an ending is whole if it ends with these bytes, but for blanks."""
+ROOM = 2**18
+"""What a command needs besides its files: locks, and a file beside the one that it replaces."""
 
 COMMANDS: dict[str, list[str]] = {
     "fit": ["fit", "shots", "--out", f"{OUT}/camera.safetensors", "--steps", "10", "--pixels", "256", "--batch", "128",
@@ -40,6 +51,15 @@ COMMANDS: dict[str, list[str]] = {
     "run": ["run", "recipe.yaml", "--out", OUT],
     "synth": ["synth", "pictures", OUT, "--per-image", "4", "--workers", "0", "--noise", "[0.001, 1e-5]"],
     "denoise": ["denoise", "shots", OUT, "--denoiser", "denoiser.safetensors"],
+    "previews": ["denoise", "shots", OUT, "--denoiser", "denoiser.safetensors", "--preview", f"{OUT}/previews"],
+    "shards": ["synth", "pictures", OUT, "--format", "webdataset", "--per-shard", "2", "--workers", "0", "--noise",
+               "[0.001, 1e-5]"],
+    "evaluate": ["evaluate", "denoiser.safetensors", "--data", "shots", "--noise", "upi", "--json",
+                 f"{OUT}/scores.json", "--report", f"{OUT}/page.html", "--overwrite"],
+    "hdr": ["hdr", "pictures/000000.jpg", "--out", f"{OUT}/merged.tif", "--overwrite"],
+    "hdr-light": ["hdr", "pictures/000000.jpg", "--out", f"{OUT}/merged.exr", "--overwrite"],
+    "preview": ["preview", "pictures/000000.jpg", "--out", f"{OUT}/stages.jpg", "--count", "1", "--overwrite"],
+    "export": ["export", "denoiser.safetensors", f"{OUT}/denoiser.onnx", "--overwrite"],
 }  # fmt: skip
 """In a folder that :func:`make_inputs` has filled."""
 
@@ -130,6 +150,8 @@ Files = dict[str, Any]
 
 def contents(folder: Path) -> Files:
     """The files of a folder."""
+    import OpenImageIO
+
     from rawaug.files import read_tensors
 
     found: Files = {}
@@ -140,6 +162,8 @@ def contents(folder: Path) -> Files:
         if file.suffix == ".safetensors":
             tensors = read_tensors(file, "it is damaged", infinite=("colour.spread",))[1]
             found[name] = {key: (value.shape, value.numpy().tobytes()) for key, value in tensors.items()}
+        elif file.suffix == ".exr":  # holds the time
+            found[name] = OpenImageIO.ImageInput.open(str(file)).read_image().tobytes()
         else:
             found[name] = file.read_bytes()
     return found
@@ -149,6 +173,18 @@ def fresh(folder: Path) -> Path:
     """The folder without what a run wrote."""
     shutil.rmtree(folder / OUT, ignore_errors=True)
     return folder
+
+
+def torn(folder: Path) -> list[str]:
+    """The files of a folder that are cut short, among those that are not compared."""
+    names = []
+    for file in sorted(folder.rglob("*")):
+        if file.suffix not in ENDS or not file.is_file():
+            continue
+        content = file.read_bytes().rstrip(b" \n")
+        if content and not content.endswith(ENDS[file.suffix].rstrip(b"\n")):
+            names.append(str(file.relative_to(folder)))
+    return names
 
 
 # -- kills -------------------------------------------------------------------------------------------------------------
@@ -173,9 +209,14 @@ def killed(folder: Path, name: str, number: signal.Signals, delay: float, whole:
     again = Child(folder, COMMANDS[name])
     if (status := again.wait()) or "Traceback" in again.said():
         return f"{name}, {number.name} after {delay:.2f} s, run again: status {status}: {again.said()}"
-    after = contents(folder / OUT)
-    different = sorted(key for key in whole.keys() | after.keys() if whole.get(key) != after.get(key))
+    different = differences(folder / OUT, whole)
     return f"{name}, {number.name} after {delay:.2f} s: {', '.join(different)} differ" if different else None
+
+
+def differences(folder: Path, whole: Files) -> list[str]:
+    """The files that are not those of the run that was left alone, and those that are cut short."""
+    after = contents(folder)
+    return sorted(key for key in whole.keys() | after.keys() if whole.get(key) != after.get(key)) + torn(folder)
 
 
 def kills(folder: Path, name: str, count: int, seed: int, whole: Files, seconds: float) -> list[str]:
@@ -187,22 +228,77 @@ def kills(folder: Path, name: str, count: int, seed: int, whole: Files, seconds:
     return [outcome for outcome in outcomes if outcome]
 
 
+# -- full disks --------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def disk(folder: Path, size: int) -> Iterator[None]:
+    """A disk of this size, in bytes, at ``folder``; PermissionError for others than root."""
+    folder.mkdir(parents=True, exist_ok=True)
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode:
+        raise PermissionError("a disk of its own needs root")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+def full_disk(folder: Path, name: str, share: float, whole: Files, size: int) -> str | None:
+    """What went wrong on a disk with this share of the bytes that a command needs; None if nothing did."""
+    label = f"{name}, {share:.0%} of a disk"
+    with disk(fresh(folder) / OUT, size + ROOM):
+        filler = folder / OUT / "filler"
+        filler.write_bytes(bytes(int((1 - share) * size) + ROOM))
+        child = Child(folder, COMMANDS[name])
+        status = child.wait()
+        filler.unlink()
+        if status not in (0, 2) or "Traceback" in child.said():
+            return f"{label}: status {status}: {child.said()}"
+        left = contents(folder / OUT)
+        cut = [key for key in left.keys() & whole.keys() if left[key] != whole[key]] + torn(folder / OUT)
+        if cut or (status == 0 and left.keys() < whole.keys()):
+            return f"{label}: status {status}, {', '.join(cut)} torn: {child.said()}"
+
+        again = Child(folder, COMMANDS[name])
+        if (status := again.wait()) or "Traceback" in again.said():
+            return f"{label}, run again: status {status}: {again.said()}"
+        different = differences(folder / OUT, whole)
+        return f"{label}: {', '.join(different)} differ" if different else None
+
+
+def full_disks(folder: Path, name: str, count: int, seed: int, whole: Files) -> list[str]:
+    """What went wrong on ``count`` disks that a command fills."""
+    size = sum(file.stat().st_size for file in (folder / OUT).rglob("*") if file.is_file())
+    shares = random.Random(f"{seed} {name} disk")
+    outcomes = (full_disk(folder, name, shares.random(), whole, size) for _ in range(count))
+    return [outcome for outcome in outcomes if outcome]
+
+
 def main(arguments: list[str] | None = None) -> int:
     cli = parser(__doc__)
     cli.add_argument("--kills", type=int, default=20, help="of each command")
+    cli.add_argument("--disks", type=int, default=20, help="of each command")
     cli.add_argument("--seed", type=int, default=0)
     cli.add_argument("--commands", nargs="+", choices=COMMANDS, default=list(COMMANDS))
-    cli.add_argument("--quick", action="store_true", help="one kill of each command")
+    cli.add_argument("--quick", action="store_true", help="one kill and one full disk of each command")
     args = cli.parse_args(arguments)
     torch.set_num_threads(1)
-    count, failures = 1 if args.quick else args.kills, list[str]()
+    kill_count, disk_count = (1, 1) if args.quick else (args.kills, args.disks)
+    failures = list[str]()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         make_inputs(folder)
         for command in args.commands:
             whole, seconds = uninterrupted(folder, command)
-            wrong = kills(folder, command, count, args.seed, whole, seconds)
-            print(f"{command:8} {seconds:5.1f} s  {count} kills, {len(wrong)} wrong", flush=True)
+            try:
+                wrong = full_disks(folder, command, disk_count, args.seed, whole)
+                disks = f"{disk_count} full disks, {len(wrong)} wrong"
+            except PermissionError as error:
+                wrong, disks = [], f"no full disk ({error})"
+            failures += wrong
+            wrong = kills(folder, command, kill_count, args.seed, whole, seconds)
+            print(f"{command:9} {seconds:5.1f} s  {kill_count} kills, {len(wrong)} wrong; {disks}", flush=True)
             failures += wrong
     print(*failures, sep="\n", end="")
     return int(bool(failures))
