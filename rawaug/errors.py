@@ -87,6 +87,10 @@ _WAYS_OUT = (
         "a worker process was killed, perhaps for its memory; use fewer workers, or find a damaged file with rawaug "
         "data check",
     ),
+    (
+        r"connection (closed|reset) by peer|gloo/|nccl|distbackenderror",
+        "another process of this training has died, perhaps for its memory",
+    ),
     (r"no space left on device|pytorchstreamwriter", "the disk is full; free some space"),
 )
 """These are patterns of an error's text in lower case, with advice. The first pattern that matches counts."""

@@ -34,7 +34,7 @@ class AugmentConfig:
             ISP's cameras.
         noise: a preset, a measured camera, camera (as measured by the fit, or stated by your camera), an ISP's file, a
             camera's .yaml sheet, or [shot_var, read_var]. By default that of your camera where its file states one,
-            else cycleisp_sidd.
+            at an ISO that of a published camera, else cycleisp_sidd.
         iso: ISO of a measured camera's noise, instead of a draw from its measured range.
         draw: how the camera settings are drawn.
         target: raw, rgb for clean linear camera RGB, or srgb for noisy and clean developed pictures.
@@ -63,6 +63,8 @@ class AugmentConfig:
         if self.noise == _USUAL_NOISE:
             own = self.own_camera
             noise = "camera" if own is not None and own.levels else USUAL
+            if own is None and self.camera is not None and self.iso is not None:
+                noise = self.camera  # a preset has no ISO
             object.__setattr__(self, "noise", noise)
 
     @property
