@@ -22,13 +22,14 @@ from rawaug.cli import main
 from rawaug.data import PictureFolder
 from rawaug.data.formats import write_npz, write_tiff
 from rawaug.errors import resource_error
-from rawaug.evaluation.figures import new_figure, save_figure
+from rawaug.evaluation.figures import new_figure, read_log, save_figure
 from rawaug.evaluation.page import Page
 from rawaug.files import LOCK, locked, write_json, write_tensors
 from rawaug.io import RawFrame, read_picture, write_dng, write_picture
 from rawaug.synthesis import files as pair_files
 from rawaug.synthesis.folder import synth
 from rawaug.training.config import TrainConfig
+from rawaug.training.journal import Journal
 from rawaug.training.state import TrainingState
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs forks, signals and limits of Linux")
@@ -174,6 +175,19 @@ def test_a_full_disk_leaves_what_was_there_and_says_so(kind: str, tmp_path: Path
     assert caught.value.filename == str(path) and caught.value.strerror
 
 
+def test_a_full_disk_stops_no_log_for_ever(tmp_path: Path) -> None:
+    Journal(tmp_path, 0).log(1, loss=0.5)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8, limits[1]))
+    try:
+        with pytest.raises(OSError):
+            Journal(tmp_path, 1).log(2, loss=0.25)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    Journal(tmp_path, 1).log(2, loss=0.25)
+    assert [row["step"] for row in read_log(tmp_path / "log.csv")] == ["1", "2"]
+
+
 def test_an_output_folder_that_is_removed_on_the_way_is_reported(
     tmp_path: Path, inputs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -272,6 +286,7 @@ def test_a_worker_that_the_system_kills_is_one_line(
         ("received 0 items of ancdata", "ulimit -n"),
         ("unable to open shared memory object </torch_1> in read-write mode: Too many open files (24)", "ulimit -n"),
         ("DataLoader worker (pid(s) 5, 6) exited unexpectedly", "fewer workers"),
+        ("[gloo/transport/tcp/pair.cc:537] Read error [127.0.0.1]:23682: Connection reset by peer.", "process"),
         ("CUDA out of memory. Tried to allocate 2.00 GiB.\nMore lines", "smaller batch"),
     ],
 )  # fmt: skip

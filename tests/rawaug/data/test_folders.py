@@ -20,6 +20,7 @@ from torch.utils.data import DataLoader
 from rawaug.bayer import CFA, turn
 from rawaug.data import PictureFolder, RawFolder, open_pairs, open_pictures
 from rawaug.data.frames import Cached, Readable
+from rawaug.data.opening import picture_stamp
 from rawaug.data.pair_folder import require_no_pairs
 from rawaug.io import develop, read_raw, write_picture
 
@@ -191,6 +192,19 @@ def test_nothing_is_opened_at_the_start(tmp_path: Path, monkeypatch: pytest.Monk
         (tmp_path / f"{k:02d}.jpg").touch()
     monkeypatch.setattr("rawaug.data.folders.read_picture", lambda *_: pytest.fail("opened"))
     assert len(PictureFolder(tmp_path)) == 30
+
+
+def test_the_stamp_of_a_folder_follows_its_files(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        write_picture(tmp_path / name, grey(1))
+    stamps = [picture_stamp(tmp_path), picture_stamp(tmp_path)]
+    write_picture(tmp_path / "a.png", grey(2))  # of the same name and size
+    stamps.append(picture_stamp(tmp_path))
+    (tmp_path / "b.png").rename(tmp_path / "c.png")
+    stamps.append(picture_stamp(tmp_path))
+    assert stamps[0] == stamps[1] and len(set(stamps)) == 3
+    assert picture_stamp(["demo:", tmp_path]) != picture_stamp(["demo:"])
+    assert picture_stamp("shapes:10") == "shapes:10"
 
 
 def test_names_may_hold_any_bytes(tmp_path: Path) -> None:

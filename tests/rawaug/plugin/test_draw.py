@@ -47,6 +47,14 @@ def test_one_tone_curve_is_drawn_and_the_camera_stays() -> None:
     assert torch.equal(setting.isp.matrix, any_tone.isp.matrix) and torch.equal(setting.isp.gains, any_tone.isp.gains)
 
 
+def test_an_iso_of_a_published_camera_is_of_its_own_noise() -> None:
+    config = AugmentConfig(camera="Nikon D750", iso=6400.0)
+    expected = RawAugment.from_pretrained("universal", camera="Nikon D750", iso=6400.0)
+    drawn = [augment.sample(PICTURE, seeded()).noise for augment in (config.make(), expected)]
+    assert all(torch.equal(drawn[0][key], drawn[1][key]) for key in drawn[1]) and config.noise == "Nikon D750"
+    assert AugmentConfig(camera="Nikon D750").noise == AugmentConfig().noise
+
+
 CONFIGS = [
     AugmentConfig(
         camera="Nikon D750", noise="Nikon D750", iso=1600, draw=Draw("convex", 0.1, -0.5, 4000, "linear"), cfa="BGGR"
