@@ -163,7 +163,7 @@ def contents(folder: Path) -> Files:
             tensors = read_tensors(file, "it is damaged", infinite=("colour.spread",))[1]
             found[name] = {key: (value.shape, value.numpy().tobytes()) for key, value in tensors.items()}
         elif file.suffix == ".exr":  # holds the time
-            found[name] = OpenImageIO.ImageInput.open(str(file)).read_image().tobytes()
+            found[name] = OpenImageIO.ImageBuf(str(file)).get_pixels(OpenImageIO.HALF).tobytes()
         else:
             found[name] = file.read_bytes()
     return found
