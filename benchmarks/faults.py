@@ -163,7 +163,9 @@ def contents(folder: Path) -> Files:
             tensors = read_tensors(file, "it is damaged", infinite=("colour.spread",))[1]
             found[name] = {key: (value.shape, value.numpy().tobytes()) for key, value in tensors.items()}
         elif file.suffix == ".exr":  # holds the time
-            found[name] = OpenImageIO.ImageBuf(str(file)).get_pixels(OpenImageIO.HALF).tobytes()
+            pixels = OpenImageIO.ImageBuf(str(file)).get_pixels(OpenImageIO.HALF)
+            assert pixels is not None, file
+            found[name] = pixels.tobytes()
         else:
             found[name] = file.read_bytes()
     return found
