@@ -128,7 +128,7 @@ def compare_pictures(comparison: Comparison) -> None:
         ValueError: if a setting is not the default that has no meaning for pictures.
     """
     usual = Comparison(comparison.denoisers, comparison.data)
-    for key in ("bin", "noise", "iso", "seed", "report"):
+    for key in ("bin", "noise", "iso", "seed", "report", "table", "figure"):
         if getattr(comparison, key) != getattr(usual, key):
             raise ValueError(f"{comparison.data}: has developed pictures; --{key} is for RAW")
 

@@ -194,7 +194,7 @@ def test_a_benchmark_of_pictures_crops_and_counts_and_refuses_what_is_for_raw(tm
     whole, cropped = scores.values()
     assert (whole["pictures"], cropped["pictures"], cropped["crop"]) == (3, 2, 32)
     assert whole["rows"]["noisy input"] != cropped["rows"]["noisy input"]
-    of_raw: dict[str, Any] = {"bin": 2, "noise": "upi", "iso": [100.0], "seed": 1, "report": "r.html"}
+    of_raw: dict[str, Any] = {"bin": 2, "noise": "upi", "iso": [100.0], "seed": 1, "report": "r.html", "table": "t.tex"}
     for key, value in of_raw.items():
         with pytest.raises(ValueError, match=f"--{key} is for RAW"):
             compare_pictures(replace(Comparison(["NonLocalMeans@10"], f"cc15:{tmp_path}"), **{key: value}))
