@@ -22,8 +22,8 @@ from rawaug.data import DemoCamera, open_pairs
 from rawaug.data.demo import FRAME
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.evaluation.figures import PANEL, Panels, panels_of, save_picture
-from rawaug.evaluation.trials import trial_of
+from rawaug.evaluation.figures import PANEL, Panels, make_panels, save_picture
+from rawaug.evaluation.trials import make_trial
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.seeding import keyed_generator
 
@@ -70,7 +70,7 @@ def row(pair: Pair, place: tuple[int, int], noise: NoiseModel, names: list[str],
     columns = slice(left - margin, left + PANEL + margin)
     raw, srgb = pair.raw[:, rows, columns], pair.srgb[:, rows, columns]
     piece = replace(pair, raw=raw, srgb=srgb, noisy=None, shot_var=None, read_var=None)
-    return panels_of([RawDenoiser.of(name) for name in ("NonLocalMeans", *names)], trial_of(piece, noise, cfa))
+    return make_panels([RawDenoiser.of(name) for name in ("NonLocalMeans", *names)], make_trial(piece, noise, cfa))
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -44,7 +44,7 @@ from rawaug.data.mat import read_value
 from rawaug.data.published import read_packed
 from rawaug.data.sidd_scenes import colour_of, mosaic_of
 from rawaug.evaluation.tables import print_rows
-from rawaug.experiment.recipe import kind_of, read_recipe, settings_of
+from rawaug.experiment.recipe import find_kind, find_settings, read_recipe
 from rawaug.experiment.settings import Recipe
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng
 from rawaug.io.isolated import isolated
@@ -111,7 +111,7 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
 def _set_up(path: Path) -> None:
     """A recipe as the command line sets it up, its networks without their memory."""
     content = read_recipe(path)
-    recipe = with_values(settings_of(kind_of(content, path)), content, path)
+    recipe = with_values(find_settings(find_kind(content, path)), content, path)
     try:
         if isinstance(recipe, Recipe):
             with torch.device("meta"):

@@ -31,7 +31,7 @@ from rawaug.data.frames import Cached
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import group_rows, score
-from rawaug.evaluation.trials import trial_of
+from rawaug.evaluation.trials import make_trial
 from rawaug.noise import noise_model
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.crops import PictureCrops
@@ -95,7 +95,7 @@ def trained(name: str, size: dict[str, Any], args: argparse.Namespace) -> dict[s
     augment = rawaug.RawAugment.from_pretrained("universal", noise=noise)
     crops = PictureCrops(rawaug.RawPairs(pictures, augment, args.crop, zoom=2.0))
     cfa = augment.isp.cfa
-    frames = [trial_of(pair, noise, cfa) for pair in middles(args)]
+    frames = [make_trial(pair, noise, cfa) for pair in middles(args)]
     stream = TrainingStream(None, crops, args.batch, 1.0, seed=0)
     config = TrainConfig(batch=args.batch, crop=args.crop, learning_rate=1e-3, weigh="mixed", clip_norm=1.0)
     config.precision = args.precision
@@ -124,7 +124,7 @@ def references(args: argparse.Namespace) -> dict[str, dict[str, float]]:
     noise, cfa = noise_model(NOISE), CFA.RGGB
     named = [SHIPPED, *([args.pmrid] if args.pmrid else [])]
     everyone = [RawDenoiser.of(name) for name in ("NonLocalMeans", *named)]
-    trials = (trial_of(pair, noise, cfa) for pair in middles(args))
+    trials = (make_trial(pair, noise, cfa) for pair in middles(args))
     rows = {}
     for label, scores in group_rows(score(everyone, trials, "references")).items():
         rows[label] = {key: fmean(getattr(row, key) for row in scores) for key in ("psnr", "psnr_srgb")}

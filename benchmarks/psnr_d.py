@@ -29,7 +29,7 @@ from rawaug.data import open_pairs, open_pictures
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import Row, score
 from rawaug.evaluation.tables import mean_and_spread, print_rows
-from rawaug.evaluation.trials import trial_of
+from rawaug.evaluation.trials import make_trial
 from rawaug.experiment.recipe import find_recipe, read_recipe
 from rawaug.files import write_json
 from rawaug.isp.model import DictionaryISP, restrict_to_cameras
@@ -106,7 +106,7 @@ def filtered(specs: Sequence[str], factor: int) -> list[float]:
     """The row that needs no training."""
     noise, cfa = noise_model(CONFIG.noise), CFA.RGGB
     frames = [pair.middle(1024) for spec in specs for pair in open_pairs(spec, split="test", bin=factor)]
-    return means(list(score([RawDenoiser.of("NonLocalMeans")], (trial_of(pair, noise, cfa) for pair in frames))))
+    return means(list(score([RawDenoiser.of("NonLocalMeans")], (make_trial(pair, noise, cfa) for pair in frames))))
 
 
 def named(values: Sequence[str]) -> dict[str, list[str]]:

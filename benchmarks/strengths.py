@@ -21,7 +21,7 @@ import torch
 from benchmarks.measure import parser
 from rawaug.data import open_pairs
 from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.evaluation.benchmark import REAL, TOLD, strengths_of, trials
+from rawaug.evaluation.benchmark import REAL, TOLD, choose_strengths, trials
 from rawaug.evaluation.scores import NOISY, score
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial, measure_own_noise
@@ -57,7 +57,7 @@ def frozen_trials(spec: str, crop: int) -> list[Trial]:
     data, _, factor = spec.partition("@")
     pairs = open_pairs(data, split="test")
     frames = measure_own_noise(pairs, len(pairs)).binned(int(factor or 1))
-    return trials(frames, crop, strengths=strengths_of())
+    return trials(frames, crop, strengths=choose_strengths())
 
 
 def add_scores(table: Scores, name: str, spec: str, everything: Sequence[Trial], path: Path) -> None:

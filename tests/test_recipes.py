@@ -14,13 +14,13 @@ from torch import Tensor
 
 import denoisers
 from rawaug.cli import main
-from rawaug.experiment.recipe import find_recipe, kind_of, read_recipe
+from rawaug.experiment.recipe import find_kind, find_recipe, read_recipe
 from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
 from rawaug.training.estimators import Supervised
 
 FOLDER = Path(__file__).parents[1] / "recipes"
 FILES = {file.relative_to(FOLDER).with_suffix("").as_posix(): file for file in sorted(FOLDER.rglob("*.yaml"))}
-ALL = {name: kind_of(read_recipe(file)) for name, file in FILES.items()}
+ALL = {name: find_kind(read_recipe(file)) for name, file in FILES.items()}
 NAMES = [name for name, kind in ALL.items() if kind in ("raw", "srgb")]
 """The recipes that train denoisers."""
 

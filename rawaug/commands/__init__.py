@@ -25,7 +25,7 @@ def require_results(json: str | None, report: str | None, overwrite: bool, input
             require_output(path, overwrite, extensions, files)
 
 
-def value_of(text: str) -> Any:
+def parse_value(text: str) -> Any:
     """Parse a word of the command line as YAML, in which ``demo:`` is a name and not a mapping."""
     value = yaml_value(text)
     if isinstance(value, dict) and not text.lstrip().startswith("{"):
@@ -33,7 +33,7 @@ def value_of(text: str) -> Any:
     return value
 
 
-YAML = Parameter(converter=lambda _, tokens: value_of(tokens[0].value), n_tokens=1, json_list=False, metavar="VALUE")
+YAML = Parameter(converter=lambda _, tokens: parse_value(tokens[0].value), n_tokens=1, json_list=False, metavar="VALUE")
 """One argument may be a name, a list as ``[1e-3, 1e-5]``, or ``{name: ..., settings: {...}}``."""
 
 

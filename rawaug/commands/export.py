@@ -22,7 +22,7 @@ from denoisers.onnx import feeds, open_session
 from rawaug.commands import YAML
 from rawaug.data import demo_pairs
 from rawaug.errors import extra
-from rawaug.evaluation.trials import trial_of
+from rawaug.evaluation.trials import make_trial
 from rawaug.files import find_weights, read_header, replacing, require_output, write_text
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
@@ -189,6 +189,6 @@ def export(denoiser: str | Path, out: str | Path) -> str:
 
 def _comparison_frame() -> tuple[Tensor, Tensor]:
     """Make noisy packed RAW ``(1, 4, h, w)`` of a generated scene, and its variance."""
-    trial = trial_of(demo_pairs("test", count=1)[0], noise_model("cycleisp_sidd"))
+    trial = make_trial(demo_pairs("test", count=1)[0], noise_model("cycleisp_sidd"))
     assert trial.variance is not None
     return trial.noisy, trial.variance

@@ -18,10 +18,10 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from rawaug.commands import value_of
+from rawaug.commands import parse_value
 from rawaug.experiment import run as experiment
 from rawaug.experiment.data import use_all_pairs
-from rawaug.experiment.recipe import find_recipe, kind_of, read_recipe, recipe_list, settings_of
+from rawaug.experiment.recipe import find_kind, find_recipe, find_settings, read_recipe, recipe_list
 from rawaug.experiment.settings import Recipe
 from rawaug.registry import list_bounds, suggest
 
@@ -59,13 +59,13 @@ def run(
 
     file = find_recipe(recipe)
     content = read_recipe(file)
-    kind = kind_of(content, file)
+    kind = find_kind(content, file)
     if keys:
-        print_keys(settings_of(kind), content)
+        print_keys(find_settings(kind), content)
         return
 
-    options = parse_options(changes, settings_of(kind))
-    settings = with_values(settings_of(kind), merge_options(content, options), file)
+    options = parse_options(changes, find_settings(kind))
+    settings = with_values(find_settings(kind), merge_options(content, options), file)
     if isinstance(settings, Recipe):
         settings = use_all_pairs(settings, content, {key for key, _ in options})
 
@@ -87,7 +87,7 @@ def parse_options(words: Sequence[str], settings: type[Any]) -> Options:
         ValueError: if a word is no key, or a key has no value.
     """
     field_names = set()
-    for key in keys_of(settings):
+    for key in list_keys(settings):
         field_names.update(key.name.split("."))
 
     options = []
@@ -107,7 +107,7 @@ def parse_options(words: Sequence[str], settings: type[Any]) -> Options:
             underscored = part.replace("-", "_")
             parts.append(underscored if underscored in field_names else part)
 
-        value = value_of(text)
+        value = parse_value(text)
         if parts[-1] == "denoiser" and isinstance(value, str):
             parts.append("name")
         options.append((".".join(parts), value))
@@ -210,7 +210,7 @@ def with_values(settings: type[Any], content: Mapping[str, Any], source: object)
         values.pop("experiment", None)
 
     try:
-        _require_keys(settings, values, [key.name for key in keys_of(settings)])
+        _require_keys(settings, values, [key.name for key in list_keys(settings)])
         return TypeAdapter(settings).validate_python(values)
     except ValidationError as error:
         raise ValueError(f"{source}: {_reason(error.errors()[0], values)}") from None
@@ -226,7 +226,7 @@ class Key(NamedTuple):
     meaning: str
 
 
-def keys_of(settings: type[Any], above: str = "") -> Iterator[Key]:
+def list_keys(settings: type[Any], above: str = "") -> Iterator[Key]:
     """Yield the keys of a dataclass and of those in it, as their docstrings explain them."""
     hints = get_type_hints(settings)
     meanings: dict[str, str] = {}
@@ -252,7 +252,7 @@ def keys_of(settings: type[Any], above: str = "") -> Iterator[Key]:
             yield Key(name, default, meaning)
 
         if part is not None:
-            yield from keys_of(part, f"{name}.NAME." if by_name else f"{name}.")
+            yield from list_keys(part, f"{name}.NAME." if by_name else f"{name}.")
 
 
 def describe_bounds(bounds: Interval) -> str:
@@ -271,7 +271,7 @@ def print_keys(settings: type[Any], content: Mapping[str, Any]) -> None:
     """Print the keys of a recipe by section, each with its value in ``content``."""
     console = Console(soft_wrap=False)
     sections: dict[str, list[Key]] = {}
-    for key in keys_of(settings):
+    for key in list_keys(settings):
         sections.setdefault(key.name.rpartition(".")[0], []).append(key)
 
     for section, keys in sections.items():

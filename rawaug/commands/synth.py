@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from rawaug.commands import OPTIONS, value_of
+from rawaug.commands import OPTIONS, parse_value
 from rawaug.errors import escape
 from rawaug.evaluation.tables import print_rows
 from rawaug.io.pictures import MAX_PIXELS
@@ -54,7 +54,7 @@ def run(
     """
     settings: dict[str, Any] = dict(vars(config))
     if isinstance(config.noise, str):
-        settings["noise"] = value_of(config.noise)  # it may be [shot_var, read_var]
+        settings["noise"] = parse_value(config.noise)  # it may be [shot_var, read_var]
     result = synth(
         pictures,
         out,

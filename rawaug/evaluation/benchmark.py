@@ -23,7 +23,7 @@ from rawaug import bayer
 from rawaug.data.pairs import Pair, centre
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.errors import count_of
-from rawaug.evaluation.figures import Panels, panels_of
+from rawaug.evaluation.figures import Panels, make_panels
 from rawaug.evaluation.scores import METRICS, NOISY, Row, group_rows, score, summary
 from rawaug.evaluation.tables import join_figures
 from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise, raw_trial
@@ -68,7 +68,7 @@ _CONDITIONS = TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensor
 """What the denoisers are told, or how the sensor behaves; each has a table."""
 
 
-def strengths_of(
+def choose_strengths(
     noise: str | Sequence[float] | Sequence[str] | None = None, isos: Sequence[float] | None = None
 ) -> dict[str, NoiseLevels]:
     """Noise levels by the name of their column: :data:`STRENGTHS`, or those of ``noise`` at each of ``isos``.
@@ -100,9 +100,9 @@ def trials(
         frames: clean references.
         crop: side of the middles in pixels of the mosaic.
         seed: seed of the noise.
-        strengths: noise levels by name, see :func:`strengths_of`.
+        strengths: noise levels by name, see :func:`choose_strengths`.
     """
-    strengths = strengths or strengths_of()
+    strengths = strengths or choose_strengths()
     with_faults = set(_OF_SENSORS).intersection(strengths) or set(strengths)
 
     cases: list[Trial] = []
@@ -159,7 +159,7 @@ def _middle(noisy: Noisy, frame: Pair, crop: int, condition: str, strength: str)
     return raw_trial(frame, image, clean, variance, noisy.levels, frame.cfa, condition=condition, strength=strength)
 
 
-def hash_of(trials: Iterable[Trial]) -> str:
+def hash_trials(trials: Iterable[Trial]) -> str:
     """Eight digits of the SHA-256 of all noisy inputs, rounded to steps of 2^-12, on which all processors agree."""
     cases = list(trials)
     strengths = _strengths_in(cases)
@@ -194,7 +194,7 @@ def benchmark(denoisers: Sequence[RawDenoiser], cases: Sequence[Trial]) -> dict[
         rows[one.name]["gmac"] = _gmac(one, cases[0])
 
     frames = list(dict.fromkeys(trial.frame for trial in cases))
-    return {"frames": frames, "hash": hash_of(cases), "rows": rows}
+    return {"frames": frames, "hash": hash_trials(cases), "rows": rows}
 
 
 def _strengths_in(cases: Iterable[Trial]) -> list[str]:
@@ -327,7 +327,7 @@ def _format_cost(value: float | None) -> str:
     return f"{value:.2f}"
 
 
-def costs_of(result: Mapping[str, Any]) -> dict[str, tuple[float | None, float, float]]:
+def collect_costs(result: Mapping[str, Any]) -> dict[str, tuple[float | None, float, float]]:
     """Get GMAC per megapixel and PSNR of RAW and sRGB, at the strength that is shown, by denoiser."""
     strength = display_strength(result["rows"]["noisy input"]["scores"][TOLD])
     costs = {}
@@ -356,5 +356,5 @@ def crops(denoisers: Sequence[RawDenoiser], cases: Iterable[Trial], most: int) -
     count = 0
     for trial in cases:
         if trial.condition == TOLD and trial.strength == strength and count < most:
-            yield panels_of(denoisers, trial)
+            yield make_panels(denoisers, trial)
             count += 1

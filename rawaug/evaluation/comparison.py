@@ -16,16 +16,16 @@ from rawaug.errors import count_of
 from rawaug.evaluation.benchmark import (
     TOLD,
     benchmark,
-    costs_of,
+    choose_strengths,
+    collect_costs,
     crops,
     display_strength,
     noise_note,
     ranking,
-    strengths_of,
     tables,
     trials,
 )
-from rawaug.evaluation.evaluate import denoiser_of
+from rawaug.evaluation.evaluate import named_denoiser
 from rawaug.evaluation.figures import plot_costs, save_picture
 from rawaug.evaluation.page import Figure, Page, command_line
 from rawaug.evaluation.picture_trials import picture_scores, print_pictures
@@ -83,7 +83,7 @@ def compare_raw(comparison: Comparison) -> None:
     """Compare denoisers of RAW on the same frozen noise; print the tables, and write them as JSON and as a page."""
     count, crop = comparison.count or _FRAMES, comparison.crop or _CROP
     comparison = replace(comparison, count=count, crop=crop)
-    strengths = strengths_of(comparison.noise, comparison.iso)
+    strengths = choose_strengths(comparison.noise, comparison.iso)
     denoisers = _open_denoisers(comparison)
 
     pairs = open_pairs(comparison.data, split="test")
@@ -106,7 +106,7 @@ def compare_raw(comparison: Comparison) -> None:
 
     for line in ranking(result):
         print(line)
-    notes = _notes_of(result)
+    notes = _make_notes(result)
     print("\n".join([*notes, noise]))
 
     if comparison.json:
@@ -117,8 +117,11 @@ def compare_raw(comparison: Comparison) -> None:
     if comparison.figure:
         print(f"figure: {save_picture(list(crops(denoisers, cases, _ON_PAGE)), Path(comparison.figure))}")
     if comparison.report:
-        page = _page_of(comparison, result, denoisers, cases, notes)
-        print(f"page: {page.write(Path(comparison.report), settings_of(comparison))}")
+        page = _make_page(comparison, result, denoisers, cases, notes)
+        settings = asdict(comparison)
+        for key in ("device", "json", "report"):
+            del settings[key]
+        print(f"page: {page.write(Path(comparison.report), settings)}")
 
 
 def compare_pictures(comparison: Comparison) -> None:
@@ -151,7 +154,7 @@ def _open_denoisers(comparison: Comparison) -> list[RawDenoiser]:
     """Open the denoisers of the table; one whose name is taken goes by its spec."""
     by_name: dict[str, RawDenoiser] = {}
     for spec in dict.fromkeys((_ALWAYS, *shipped_of_mosaics(), *comparison.denoisers)):
-        denoiser = denoiser_of(spec, comparison.device).require_mosaic()
+        denoiser = named_denoiser(spec, comparison.device).require_mosaic()
         if denoiser.name in by_name:
             denoiser = replace(denoiser, name=spec)
         by_name[denoiser.name] = denoiser
@@ -159,7 +162,7 @@ def _open_denoisers(comparison: Comparison) -> list[RawDenoiser]:
     return list(by_name.values())
 
 
-def _notes_of(result: dict[str, Any]) -> list[str]:
+def _make_notes(result: dict[str, Any]) -> list[str]:
     """Make the lines below the tables."""
     summaries = {}
     for name, row in result["rows"].items():
@@ -177,7 +180,7 @@ def _notes_of(result: dict[str, Any]) -> list[str]:
     return notes
 
 
-def _page_of(
+def _make_page(
     comparison: Comparison,
     result: dict[str, Any],
     denoisers: Sequence[RawDenoiser],
@@ -190,8 +193,8 @@ def _page_of(
     for title, head, cells in tables(result):
         page.add(title, head=["", *head], rows=cells)
 
-    strength = display_strength(strengths_of(comparison.noise, comparison.iso))
-    costs = plot_costs(costs_of(result))
+    strength = display_strength(choose_strengths(comparison.noise, comparison.iso))
+    costs = plot_costs(collect_costs(result))
     chart = Figure(costs, "PSNR over GMAC", "curve", f"{strength}, levels told")
     page.add("Quality and cost", figures=[chart])
 
@@ -200,11 +203,3 @@ def _page_of(
         page.add_frame(panels, comparison.crop)
 
     return page
-
-
-def settings_of(comparison: Comparison) -> dict[str, Any]:
-    """The settings at the end of the page."""
-    settings = asdict(comparison)
-    for key in ("device", "json", "report", "table", "figure"):
-        del settings[key]
-    return settings

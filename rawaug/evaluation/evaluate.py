@@ -16,12 +16,12 @@ from rawaug.data.pair_folder import PairSettings
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import RawDenoiser, denoiser_file
 from rawaug.denoising.pictures import PictureDenoiser
-from rawaug.evaluation.figures import panels_of
+from rawaug.evaluation.figures import make_panels
 from rawaug.evaluation.page import Page, select_for_page
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, print_pictures
 from rawaug.evaluation.scores import NOISY, Row, group_rows, score, summary
 from rawaug.evaluation.tables import print_scores
-from rawaug.evaluation.trials import Trial, make_trials, measure_own_noise, own_noise_note, trial_of
+from rawaug.evaluation.trials import Trial, make_trial, make_trials, measure_own_noise, own_noise_note
 from rawaug.files import sha256, write_json
 from rawaug.noise import NoiseSpec, noise_model
 from rawaug.registry import Spec
@@ -83,7 +83,7 @@ def evaluate_raw(evaluation: Evaluation) -> dict[str, Any]:
 
     The plain scores are printed and written first, then those of the self-ensemble and of filters, which take longer.
     """
-    denoiser = replace(denoiser_of(evaluation.denoiser, evaluation.device), checked=False).require_mosaic()
+    denoiser = replace(named_denoiser(evaluation.denoiser, evaluation.device), checked=False).require_mosaic()
     filters = [RawDenoiser.of(spec) for spec in evaluation.classical]
     noise = evaluation.noise or denoiser.info.get("noise", PRESET)
     model = noise_model(noise, info=denoiser.info)
@@ -92,7 +92,7 @@ def evaluate_raw(evaluation: Evaluation) -> dict[str, Any]:
     frames = Readable(measure_own_noise(pairs).binned(evaluation.bin).kept())
     for _ in frames:
         pass  # finds the pairs that cannot be read
-    trials = make_trials(frames.readable(), lambda pair: trial_of(pair, model, denoiser.cfa, evaluation.seed))
+    trials = make_trials(frames.readable(), lambda pair: make_trial(pair, model, denoiser.cfa, evaluation.seed))
 
     facts = evaluation.facts("denoiser", denoiser_file(evaluation.denoiser))
     unreadable = {}
@@ -174,7 +174,7 @@ def evaluate_pictures(evaluation: Evaluation) -> dict[str, Any]:
     return result
 
 
-def denoiser_of(spec: str, device: str = "cpu") -> RawDenoiser:
+def named_denoiser(spec: str, device: str = "cpu") -> RawDenoiser:
     """Open the denoiser that the command line names; only here is ``package.module:function`` imported."""
     module, colon, function = spec.partition(":")
     if not colon or Path(spec).suffix in (".onnx", ".safetensors"):
@@ -223,6 +223,6 @@ def _page(
     title = f"{denoiser.name} on {evaluation.data}"
     page = Page.of_scores(title, {denoiser.name: [runs]}, result.get("classical", {}), facts)
     for trial in select_for_page(trials):
-        page.add_frame(panels_of([*filters, denoiser], trial))
+        page.add_frame(make_panels([*filters, denoiser], trial))
 
     return page

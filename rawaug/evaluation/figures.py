@@ -72,7 +72,7 @@ class Panels:
         return self.trial.develop(image)
 
 
-def panels_of(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOISY) -> Panels:
+def make_panels(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOISY) -> Panels:
     """Make the pictures of a trial: noisy, denoised by each denoiser, and clean.
 
     Captions state the PSNR. That of the clean image states its own noise, as the PSNR of a perfect denoiser. ``noisy``

@@ -27,7 +27,7 @@ from rawaug.evaluation.tables import (
     first_runs,
     join_figures,
     levels_note,
-    table_of,
+    make_table,
 )
 from rawaug.evaluation.trials import Trial, evenly_spaced, own_noise_note
 from rawaug.evaluation.verdict import verdict
@@ -134,7 +134,7 @@ class Page:
         first_arm = next(iter(results.values()))
         notes = list(filter(None, [levels_note(first_arm[0]["plain"])]))
         for heading, columns in (("Scores", PLAIN), ("Self-ensemble", ENSEMBLE), ("Worst and best frames", QUARTERS)):
-            table = table_of(results, others, columns)
+            table = make_table(results, others, columns)
             if not table.rows:
                 continue
             head = ["", *table.columns]

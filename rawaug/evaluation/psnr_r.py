@@ -68,7 +68,7 @@ def block_psnr(estimate: Tensor, raw: Tensor, clipped: Tensor) -> float:
     return -10.0 * error[:, ~clipped].mean().log10().item()
 
 
-def windows_of(pair: Pair, count: int | None) -> list[tuple[int, int]]:
+def draw_windows(pair: Pair, count: int | None) -> list[tuple[int, int]]:
     """Choose corners of ``count`` random patches of a frame, keyed by its name; None for all of :func:`patch_psnr`."""
     height, width = pair.raw.shape[-2:]
     rows = range(0, max(height - PATCH, 0) + 1, PATCH)
@@ -86,7 +86,7 @@ def windows_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair, count: in
     """Average the PSNR over windows; ``make`` maps an sRGB patch ``(1, 3, h, w)`` and its place in the frame to RAW."""
     height, width = pair.raw.shape[-2:]
     values = []
-    for corner in windows_of(pair, count):
+    for corner in draw_windows(pair, count):
         y, x = corner
         window = (None, slice(None), slice(y, y + PATCH), slice(x, x + PATCH))
         place = frame_coordinates(min(PATCH, height), min(PATCH, width), corner, (height, width))

@@ -105,15 +105,15 @@ def score(denoisers: Sequence[Denoiser], trials: Iterable[Trial], label: str = "
 
     Args:
         denoisers: the denoisers to compare, see :meth:`rawaug.RawDenoiser.of`; :data:`NOISY` is the input itself.
-        trials: see :func:`rawaug.evaluation.trials.trial_of`.
+        trials: see :func:`rawaug.evaluation.trials.make_trial`.
         label: label of the progress bar.
 
     Example:
         >>> from rawaug import RawDenoiser
         >>> from rawaug.data import demo_pairs
-        >>> from rawaug.evaluation.trials import trial_of
+        >>> from rawaug.evaluation.trials import make_trial
         >>> from rawaug.noise import noise_model
-        >>> trial = trial_of(demo_pairs("test", count=1)[0].middle(64), noise_model("cycleisp_sidd"))
+        >>> trial = make_trial(demo_pairs("test", count=1)[0].middle(64), noise_model("cycleisp_sidd"))
         >>> noisy, denoised = score([NOISY, RawDenoiser.of("NonLocalMeans")], [trial])
         >>> denoised.psnr > noisy.psnr
         True

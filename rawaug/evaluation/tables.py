@@ -75,7 +75,7 @@ class Table(NamedTuple):
     best: set[tuple[str, int]]
 
 
-def table_of(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, columns: Columns) -> Table:
+def make_table(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, columns: Columns) -> Table:
     """Make a table of the noisy input, other denoisers and the arms, without columns and rows that have no figure."""
     first_arm = next(iter(results.values()))
     methods: dict[str, Sequence[Mapping[str, Any]]] = {"noisy input": [{"plain": input_summary(first_arm[0]["plain"])}]}
@@ -258,7 +258,7 @@ def print_table(results: Runs, title: str, others: Mapping[str, Mapping[str, Any
 
     ``results`` has one entry per seed in an arm's list, ``others`` a summary by name.
     """
-    table = table_of(results, others, _PRINTED)
+    table = make_table(results, others, _PRINTED)
     print_cells(title, ["arm", *table.columns], table.rows)
 
     first_arm = next(iter(results.values()))

@@ -108,7 +108,7 @@ class Trial:
         return bayer.unpack_if_packed(image, self.cfa)
 
 
-def trial_of(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: int = 0, **about: Any) -> Trial:
+def make_trial(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: int = 0, **about: Any) -> Trial:
     """Make a test case of a frame in the domain ``raw``, with its captured noise or noise keyed by (seed, name).
 
     Args:

@@ -14,7 +14,7 @@ from rawaug.errors import count_of
 from rawaug.evaluation.trials import measure_own_noise
 from rawaug.experiment.settings import HELD_OUT, DataConfig, Recipe
 from rawaug.training.estimators import ESTIMATORS
-from rawaug.training.noisy_frames import drop_clean, noise_of
+from rawaug.training.noisy_frames import drop_clean, frame_levels
 
 _MOST_HELD_OUT = 16
 """At most this many frames are held out for validation: a fifth of them, and at least one."""
@@ -135,7 +135,7 @@ def _open_pairs(recipe: Recipe, spec: str | Sequence[Pair] | None, split: str, c
 
     data = recipe.data
     developed = recipe.target == "srgb"
-    return open_pairs(spec, split, clean, data.max_pixels, developed=developed, **data.settings_of(spec))
+    return open_pairs(spec, split, clean, data.max_pixels, developed=developed, **data.pair_settings(spec))
 
 
 def _prepare(recipe: Recipe, frames: Sequence[Any], part: str) -> Sequence[Any]:
@@ -280,4 +280,4 @@ def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[P
     if real:
         noisy_frames += pairs
     for pair in noisy_frames:
-        noise_of(pair, levels)
+        frame_levels(pair, levels)

@@ -11,7 +11,7 @@ from torch import nn
 from rawaug.bayer import CFA
 from rawaug.data.frames import PairPictures
 from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.evaluation.trials import Trial, make_trials, trial_of
+from rawaug.evaluation.trials import Trial, make_trial, make_trials
 from rawaug.experiment.task import TASKS, Task
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
@@ -79,7 +79,7 @@ class RawTask(Task):
     ) -> Sequence[Trial]:
         """Take frames with frozen noise, or as r2r pairs if no arm sees clean ones; without any, pictures as RAW."""
         if frames and not self.recipe.self_supervised:
-            return [trial_of(pair, noise, isp.cfa) for pair in frames]
+            return [make_trial(pair, noise, isp.cfa) for pair in frames]
 
         augment = RawAugment(isp, noise, draw=self.recipe.draw, target=self.recipe.target)
         if self.recipe.self_supervised:
@@ -90,7 +90,7 @@ class RawTask(Task):
 
     def test(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
         """Take the frames with captured or frozen noise, in the pattern of the ISP."""
-        return make_trials(frames, lambda pair: trial_of(pair, noise, isp.cfa))
+        return make_trials(frames, lambda pair: make_trial(pair, noise, isp.cfa))
 
     def denoiser(self, name: str, network: nn.Module, cfa: CFA, views: int = 1) -> RawDenoiser:
         """Make a denoiser of the network, in tiles, for its own pattern."""

@@ -31,7 +31,7 @@ def read_recipe(file: str | Path) -> dict[str, Any]:
     return content
 
 
-def kind_of(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
+def find_kind(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
     """Find the kind of experiment that a recipe is for; raise ValueError, with the file's name, if it is unknown."""
     kind = content.get("experiment", _DEFAULT_KIND)
     if kind not in kinds():
@@ -45,7 +45,7 @@ def kinds() -> list[str]:
     return [*TASKS, *EXPERIMENTS]
 
 
-def settings_of(kind: str) -> type[Any]:
+def find_settings(kind: str) -> type[Any]:
     """Find the dataclass with a kind's keys: a task's, or the type of a function's first argument."""
     if kind in TASKS:
         settings: type[Any] = TASKS[kind].settings

@@ -27,7 +27,7 @@ from rawaug.data.frames import as_frames
 from rawaug.data.opening import picture_stamp
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser, require_classical
-from rawaug.evaluation.figures import panels_of
+from rawaug.evaluation.figures import make_panels
 from rawaug.evaluation.scores import Row, group_rows, score, summary
 from rawaug.evaluation.trials import Trial, added_noise_note, training_noise_note
 from rawaug.experiment.data import name_given_pairs, open_frames, read_frames, require_usable
@@ -158,7 +158,7 @@ def run(
         for trial in task.shown(trials):
             shown = [denoiser for denoiser in compared[trial.table] if denoiser.name not in hidden]
             shown = [denoiser for denoiser in (*shown, *networks.values()) if trial.takes(denoiser)]
-            panels.append(panels_of(shown, trial, task.input))
+            panels.append(make_panels(shown, trial, task.input))
 
         notes = [*reports(frames["pictures"]), *unreadable]
         write_report(recipe, folder, frames, tables, others, compared, panels, training_note, notes)

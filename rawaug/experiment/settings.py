@@ -125,7 +125,7 @@ class DataConfig(PairSettings):
             if value is not None:
                 raise ValueError(f"data.{key}: applies to {_PAIRS}PATH, which neither pairs, validation nor test is")
 
-    def settings_of(self, spec: str | Sequence[Pair]) -> dict[str, Any]:
+    def pair_settings(self, spec: str | Sequence[Pair]) -> dict[str, Any]:
         """Give the settings of ``pairs:PATH`` for this spec; there are none for another kind of data."""
         if not _is_pair_folder(spec):
             return {}

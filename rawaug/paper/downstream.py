@@ -22,7 +22,7 @@ from rawaug.data.frames import as_frames, skip_broken
 from rawaug.data.pairs import Sample
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import Row, score
-from rawaug.evaluation.trials import Trial, trial_of
+from rawaug.evaluation.trials import Trial, make_trial
 from rawaug.isp.functional import as_float
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
@@ -117,7 +117,7 @@ def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> list[Row]:
         for pair in skip_broken(frames, spec):
             if config.test_crop is not None:
                 pair = pair.middle(config.test_crop)
-            trials.append(trial_of(pair, noise, cfa))
+            trials.append(make_trial(pair, noise, cfa))
     return list(score([denoiser], trials, "PSNR_d"))
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
+from rawaug.evaluation.psnr_r import block_psnr, draw_windows, psnr_r, windows_psnr
 from rawaug.files import find_weights
 from rawaug.isp import staged
 from rawaug.isp.config import ISPParams
@@ -170,7 +170,7 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None, balanced: bool =
 
     height, width = pair.raw.shape[-2:]
     area = min(PATCH, height) * min(PATCH, width)
-    pixels = len(makers) * len(windows_of(pair, patches)) * area
+    pixels = len(makers) * len(draw_windows(pair, patches)) * area
 
     own = own_rendering(model, pair)
     if own is not None:

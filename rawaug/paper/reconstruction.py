@@ -25,7 +25,7 @@ from rawaug.data.pairs import Pair, centre
 from rawaug.data.selection import select_pairs
 from rawaug.errors import count_of
 from rawaug.evaluation.tables import mean_and_spread, print_rows
-from rawaug.evaluation.trials import trial_of
+from rawaug.evaluation.trials import make_trial
 from rawaug.experiment.folder import claim, require_free, run_folder
 from rawaug.experiment.recipe import EXPERIMENTS
 from rawaug.files import cached, write_json
@@ -431,7 +431,7 @@ def _training_frames(settings: Comparison, every: Sequence[Pair]) -> list[Pair]:
     noise = noise_model(settings.noise)  # frozen, keyed by the frame's name, as a noisy capture is
     captured = []
     for pair in pairs:
-        noisy = trial_of(pair, noise).noisy
+        noisy = make_trial(pair, noise).noisy
         captured.append(replace(pair, noisy=bayer.unpack(noisy, pair.cfa)[0]))
     return captured
 

@@ -112,7 +112,7 @@ def fit(
         if noise_figure is not None:
             estimate.plot(noise_figure)
 
-    isp.info["rendering"] = rendering_of(pairs, len(isp.info["frames"]), isp.info["registered"])
+    isp.info["rendering"] = describe_rendering(pairs, len(isp.info["frames"]), isp.info["registered"])
     isp.info["seconds"] = round(time.perf_counter() - start, 2)
     return isp
 
@@ -143,7 +143,7 @@ def _measure_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -
         return str(error)
 
 
-def rendering_of(pairs: Frames, frames: int, registered: int) -> str:
+def describe_rendering(pairs: Frames, frames: int, registered: int) -> str:
     """Name the renderings that were fitted, whose tone curve and colours the ISP undoes.
 
     Registered pairs are not JPEGs of the camera.

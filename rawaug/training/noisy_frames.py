@@ -109,7 +109,7 @@ def drop_clean(pair: Pair) -> Pair:
     return replace(pair, raw=pair.noisy, srgb=srgb, registered=True)
 
 
-def noise_of(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float]:
+def frame_levels(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float]:
     """Look up (shot_var, read_var) of a real noisy frame: its own levels, or those of its camera's law at its ISO.
 
     Raises:
@@ -132,7 +132,7 @@ def noise_of(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float
 
 def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
     """Make a real noisy frame with its levels; ``camera`` is a noise law as an ISP's file holds it."""
-    shot_var, read_var = noise_of(pair, camera)
+    shot_var, read_var = frame_levels(pair, camera)
     return NoisyFrame(pair.name, pair.raw, shot_var, read_var, pair.cfa)
 
 

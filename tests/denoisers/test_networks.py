@@ -312,7 +312,7 @@ def test_pmrid_s_published_weights_denoise(camera_files: Path) -> None:
     from safetensors.torch import load_file
 
     from rawaug.data import open_pairs
-    from rawaug.evaluation.trials import trial_of
+    from rawaug.evaluation.trials import make_trial
     from rawaug.metrics import psnr
     from rawaug.noise import noise_model
 
@@ -322,7 +322,7 @@ def test_pmrid_s_published_weights_denoise(camera_files: Path) -> None:
     model = PMRID().eval()
     model.load_state_dict(load_file(weights))
     frame = open_pairs(str(camera_files / "raw/canon"))[0].middle(256)
-    sample = trial_of(frame, noise_model("cycleisp_sidd"))
+    sample = make_trial(frame, noise_model("cycleisp_sidd"))
     with torch.no_grad():
         denoised = model(sample.noisy, sample.variance)
     assert psnr(denoised, sample.clean).item() > psnr(sample.noisy, sample.clean).item() + 10.0

@@ -43,7 +43,7 @@ def test_a_step_of_one_takes_the_noisy_mosaic_in_place_of_the_estimate() -> None
 
 def test_published_weights_denoise(camera_files: Path) -> None:
     from rawaug.data import open_pairs
-    from rawaug.evaluation.trials import trial_of
+    from rawaug.evaluation.trials import make_trial
     from rawaug.metrics import psnr
     from rawaug.noise import noise_model
 
@@ -53,7 +53,7 @@ def test_published_weights_denoise(camera_files: Path) -> None:
     model = PBRID().eval()
     model.load_state_dict(load_file(weights))
     frame = open_pairs(str(camera_files / "raw/canon"))[0].middle(128)
-    sample = trial_of(frame, noise_model("cycleisp_sidd"))
+    sample = make_trial(frame, noise_model("cycleisp_sidd"))
     with torch.no_grad():
         denoised = model(sample.noisy)
     assert psnr(denoised, sample.clean).item() > psnr(sample.noisy, sample.clean).item() + 10.0

@@ -17,10 +17,10 @@ import torch
 
 from denoisers.classical import FILTERS
 from rawaug.cli import COMMANDS, app, main
-from rawaug.commands.run import keys_of
+from rawaug.commands.run import list_keys
 from rawaug.data import demo_pictures
-from rawaug.evaluation.benchmark import strengths_of
-from rawaug.experiment.recipe import kinds, settings_of
+from rawaug.evaluation.benchmark import choose_strengths
+from rawaug.experiment.recipe import find_settings, kinds
 from rawaug.io import write_picture
 
 QUICK_FIT = ["--steps", "4", "--curve-steps", "10", "--prior-steps", "10", "--pixels", "512", "--batch", "128"]
@@ -120,7 +120,7 @@ def test_every_option_says_what_it_does(command: str) -> None:
     shared = [text for text in said.values() if list(said.values()).count(text) > 1]
     assert set(shared) <= {"pixels of each frame in a step."}, "the text of a whole group of options"
     for kind in kinds() if command == "run" else ():
-        assert not [key.name for key in keys_of(settings_of(kind)) if not key.meaning], kind
+        assert not [key.name for key in list_keys(find_settings(kind)) if not key.meaning], kind
 
 
 def test_help_is_quick() -> None:
@@ -259,7 +259,7 @@ def test_benchmark_takes_a_law_of_ones_own_at_an_iso() -> None:
     law = f"{{name: MeasuredNoise, settings: {{camera: M1, levels: {levels}}}}}"
 
     _, bound, _ = app.parse_args(["benchmark", "--noise", law, "--iso", "800"], exit_on_error=False, print_error=False)
-    levels_at = strengths_of(bound.arguments["noise"], bound.arguments["iso"])
+    levels_at = choose_strengths(bound.arguments["noise"], bound.arguments["iso"])
 
     shot_var, read_var = levels_at["ISO 800"].sample(1, torch.Generator())
     assert 5.0e-5 < float(shot_var) < 3.1e-3

@@ -18,7 +18,7 @@ from denoisers.pbrid import PBRID
 from denoisers.published import BiasFreeDnCNN
 from rawaug.bayer import CFA, pack, unpack
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
-from rawaug.evaluation.evaluate import denoiser_of
+from rawaug.evaluation.evaluate import named_denoiser
 from rawaug.experiment.full_colour import RgbRecipe
 from rawaug.experiment.run import run
 from rawaug.experiment.settings import ArmConfig, DataConfig
@@ -52,7 +52,7 @@ def test_a_function_that_fails_is_named(run: Callable[..., Any], said: str, nois
 def test_a_function_is_imported_from_the_command_line_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "blind_one.py").write_text("def half(noisy):\n    return (noisy / 2).numpy()\n")
     monkeypatch.chdir(tmp_path)
-    assert (denoiser_of("blind_one:half")(Noisy(torch.ones(1, 4, 8, 8))) == 0.5).all()
+    assert (named_denoiser("blind_one:half")(Noisy(torch.ones(1, 4, 8, 8))) == 0.5).all()
     (tmp_path / "evil.py").write_text("raise SystemExit('imported')\n")
     given: dict[str, Any] = {"isp": "universal", "arms": {"joint": ArmConfig(1.0)}, "out": str(tmp_path)}
     network = DenoiserConfig("JointDRUNet", {"width": 4, "scales": 2})
@@ -77,7 +77,7 @@ def test_a_function_is_imported_from_the_command_line_alone(tmp_path: Path, monk
 )
 def test_what_is_no_denoiser_is_one_line(spec: str, said: str) -> None:
     with pytest.raises((ValueError, FileNotFoundError), match=said):
-        denoiser_of(spec)
+        named_denoiser(spec)
 
 
 def test_networks_of_others_get_the_variance_if_they_take_two_arguments(noisy: Noisy) -> None:

@@ -16,9 +16,18 @@ from rawaug import RawDenoiser
 from rawaug.bayer import CFA, pack
 from rawaug.cli import main
 from rawaug.data import open_pairs
-from rawaug.evaluation.benchmark import ESTIMATED, STRENGTHS, TOLD, benchmark, hash_of, ranking, strengths_of, trials
+from rawaug.evaluation.benchmark import (
+    ESTIMATED,
+    STRENGTHS,
+    TOLD,
+    benchmark,
+    choose_strengths,
+    hash_trials,
+    ranking,
+    trials,
+)
 from rawaug.evaluation.table_files import benchmark_table
-from rawaug.evaluation.trials import trial_of
+from rawaug.evaluation.trials import make_trial
 from rawaug.noise import FixedLevels, NoiseEstimate, estimate_noise, noise_model
 
 DOCS = Path(__file__).parents[3] / "docs" / "benchmark.md"
@@ -54,9 +63,9 @@ def test_the_function_of_the_docs_is_compared(
 
 def test_noise_has_the_stated_variance_and_the_same_bits_again() -> None:
     frames = list(open_pairs("demo:test", split="test"))[:1]
-    strengths = {name: levels for name, levels in strengths_of().items() if name in ("phone", "very strong")}
+    strengths = {name: levels for name, levels in choose_strengths().items() if name in ("phone", "very strong")}
     found, again, other = (trials(frames, 256, seed, strengths) for seed in (0, 0, 1))
-    assert hash_of(found) == hash_of(again) != hash_of(other)
+    assert hash_trials(found) == hash_trials(again) != hash_trials(other)
     for trial in found:
         if trial.condition == TOLD:
             unclipped = trial.clean < 0.5
@@ -83,14 +92,14 @@ def test_estimated_levels_do_not_depend_on_the_clean_frame(monkeypatch: pytest.M
 
 def test_noise_of_the_callers_is_that_of_evaluate() -> None:
     frame = replace(open_pairs("demo:test")[0], noisy=None, shot_var=None, read_var=None)
-    found = trials([frame], crop=10_000, strengths=strengths_of("SonyA7S2", [1600, 6400]))
+    found = trials([frame], crop=10_000, strengths=choose_strengths("SonyA7S2", [1600, 6400]))
     assert {trial.strength for trial in found} == {"ISO 1600", "ISO 6400"}
     (told,) = (trial for trial in found if (trial.condition, trial.strength) == (TOLD, "ISO 6400"))
-    evaluated = trial_of(frame, noise_model("SonyA7S2", iso=6400))
+    evaluated = make_trial(frame, noise_model("SonyA7S2", iso=6400))
     assert told.variance is not None and evaluated.variance is not None
     assert torch.equal(told.noisy, evaluated.noisy) and torch.allclose(told.variance, evaluated.variance)
     with pytest.raises(ValueError, match=r"iso: .*camera"):
-        strengths_of(isos=[100])
+        choose_strengths(isos=[100])
 
 
 def result_of(**scores: list[float]) -> dict[str, Any]:

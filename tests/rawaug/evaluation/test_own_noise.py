@@ -15,16 +15,16 @@ from rawaug.bayer import CFA
 from rawaug.data.frames import as_frames
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.evaluation.figures import panels_of
+from rawaug.evaluation.figures import make_panels
 from rawaug.evaluation.scores import Row, score, summary
-from rawaug.evaluation.tables import PLAIN, table_of
+from rawaug.evaluation.tables import PLAIN, make_table
 from rawaug.evaluation.trials import (
     Trial,
     added_noise_note,
+    make_trial,
     measure_own_noise,
     own_noise_note,
     training_noise_note,
-    trial_of,
 )
 from rawaug.noise import noise_model
 
@@ -48,7 +48,7 @@ def reference() -> Pair:
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_a_perfect_denoiser_is_left_with_the_references_own_noise(reference: Pair, factor: int) -> None:
     noise = noise_model((1e-2, 1e-4))
-    trial = trial_of(measure_own_noise([reference]).binned(factor).middles(256)[0], noise)
+    trial = make_trial(measure_own_noise([reference]).binned(factor).middles(256)[0], noise)
     middle = as_frames([replace(reference, raw=scene())]).binned(factor).middles(256)[0]
     truth = bayer.pack(middle.raw[None], CFA.GRBG)
     result = summary(score([RawDenoiser.of(lambda noisy: truth)], [trial]))
@@ -72,14 +72,14 @@ def test_a_score_that_keeps_noise_is_not_the_best_of_a_table() -> None:
         return [{"plain": {"images": [], "psnr": psnr, "own_noise": share, "psnr_noisy": 30.0}}]
 
     honest = {"first": runs(40.0, 0.4), "second": runs(39.0, 0.3)}
-    assert ("first", 0) in table_of(honest, None, PLAIN).best
-    assert not table_of({**honest, "keeps": runs(41.0, 1.2)}, None, PLAIN).best
+    assert ("first", 0) in make_table(honest, None, PLAIN).best
+    assert not make_table({**honest, "keeps": runs(41.0, 1.2)}, None, PLAIN).best
 
 
 def test_the_clean_picture_states_its_own_noise(reference: Pair) -> None:
-    trial = trial_of(measure_own_noise([reference])[0].middle(64), noise_model((1e-2, 1e-4)))
+    trial = make_trial(measure_own_noise([reference])[0].middle(64), noise_model((1e-2, 1e-4)))
     assert trial.own is not None
-    caption = panels_of([], trial).captions["clean"]
+    caption = make_panels([], trial).captions["clean"]
     assert f"{-10 * math.log10(trial.own):.2f} dB" in caption and "own noise" in caption
 
 

@@ -22,7 +22,7 @@ from rawaug.data import Pair, demo_pairs
 from rawaug.denoising.denoiser import Noisy, RawDenoiser, require_classical
 from rawaug.evaluation.scores import NOISY, Row, compare, score, summary
 from rawaug.evaluation.tables import print_scores
-from rawaug.evaluation.trials import trial_of
+from rawaug.evaluation.trials import make_trial
 from rawaug.experiment.run import find_classical
 from rawaug.io import write_picture
 from rawaug.isp.config import ISPConfig
@@ -43,11 +43,11 @@ def test_the_noise_map_of_a_test_is_that_of_the_noisy_frame() -> None:
     assert captured.shot_var is not None and captured.read_var is not None
     drawn = replace(captured, noisy=None, shot_var=None, read_var=None)
     for pair, levels in ((captured, (captured.shot_var, captured.read_var)), (drawn, (1e-2, 1e-4))):
-        sample = trial_of(pair, noise_model((1e-2, 1e-4)))
+        sample = make_trial(pair, noise_model((1e-2, 1e-4)))
         assert not torch.equal(sample.noisy, sample.clean) and sample.noisy.min() < 0
         expected = levels[0] * sample.noisy.clamp_min(0.0) + levels[1]
         torch.testing.assert_close(sample.variance, expected, rtol=1e-4, atol=1e-8)
-        again, other = (trial_of(pair, noise_model((1e-2, 1e-4)), seed=k).noisy for k in (0, 1))
+        again, other = (make_trial(pair, noise_model((1e-2, 1e-4)), seed=k).noisy for k in (0, 1))
         assert torch.equal(sample.noisy, again) and torch.equal(again, other) == (pair is captured)
 
 
@@ -55,7 +55,7 @@ def test_scores_whose_levels_came_from_the_clean_frame_are_marked(capsys: pytest
     pair = demo_pairs("test", count=1)[0].middle(64)
     measured = replace(pair, name="measured", shot_var=None, read_var=None)  # so that they are measured
     noise = noise_model((1e-2, 1e-4))
-    trials = [trial_of(frame, noise) for frame in (pair, measured)]
+    trials = [make_trial(frame, noise) for frame in (pair, measured)]
     result = summary(score([RawDenoiser.of(lambda noisy: noisy * 0.99)], trials))
     assert result["levels_from_clean"] == 1
     assert [image.get("levels_from_clean") for image in result["images"]] == [None, True]
@@ -72,7 +72,7 @@ def test_a_denoiser_that_does_nothing_scores_as_its_input(
     assert result["psnr"] == pytest.approx(result["psnr_noisy"], abs=1e-4)
     assert result["ssim"] == pytest.approx(result["ssim_noisy"], abs=1e-5)
     assert result["psnr_worst25"] < result["psnr"] < result["psnr_best25"]
-    rows = list(score([NOISY], [trial_of(pair, noise_model("upi")) for pair in middles]))
+    rows = list(score([NOISY], [make_trial(pair, noise_model("upi")) for pair in middles]))
     assert "psnr_worst25" in summary(rows) and "psnr_worst25" not in summary(rows[:3]), "three have no quarter"
     figures = {"psnr", "ssim", "psnr_srgb", "ssim_srgb"}
     assert set(result["images"][0]) == {"name", "shot_var", "read_var", *figures, *(f"{f}_noisy" for f in figures)}
@@ -117,7 +117,7 @@ def test_a_capture_without_levels_is_the_test_case_and_its_levels_are_measured()
     pair = demo_pairs("test", count=1)[0]
     assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
     bare, noise = replace(pair, shot_var=None, read_var=None), noise_model("cycleisp_sidd")
-    with_levels, measured = (trial_of(p, noise) for p in (pair, bare))
+    with_levels, measured = (make_trial(p, noise) for p in (pair, bare))
     assert measured.variance is not None and with_levels.variance is not None
     assert torch.equal(measured.noisy, with_levels.noisy)
     assert (measured.variance / with_levels.variance).mean() == pytest.approx(1.0, abs=0.1)
@@ -140,16 +140,16 @@ def test_classical_denoisers_stand_beside_it(identity: Path, given: list[Pair]) 
 def test_noise_of_another_kind_is_scored_without_stabilisation() -> None:
     pair = replace(demo_pairs("test", count=1)[0], noisy=None, shot_var=None, read_var=None)
     noise = noise_model((0.0, 1e-3))
-    noisy, denoised = score([NOISY, RawDenoiser.of("Wavelet")], [trial_of(pair, noise)])
+    noisy, denoised = score([NOISY, RawDenoiser.of("Wavelet")], [make_trial(pair, noise)])
     assert denoised.psnr > noisy.psnr + 3.0
 
 
 def test_the_development_is_the_same_for_both() -> None:
     """Halving clean and result alike changes nothing after development, since the exposure is the clean frame's."""
     pair = demo_pairs("test", count=1)[0]
-    trial = trial_of(pair, noise_model("cycleisp_sidd"))
+    trial = make_trial(pair, noise_model("cycleisp_sidd"))
     whole = compare(trial.noisy, trial)
-    dark = replace(trial_of(replace(pair, raw=pair.raw / 2), noise_model((0.0, 0.0))), noisy=trial.noisy / 2)
+    dark = replace(make_trial(replace(pair, raw=pair.raw / 2), noise_model((0.0, 0.0))), noisy=trial.noisy / 2)
     half = compare(dark.noisy, dark)
     assert half[2:] == pytest.approx(whole[2:], rel=1e-4) and half[0] == pytest.approx(whole[0] + 6.02, abs=0.01)
 

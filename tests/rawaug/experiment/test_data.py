@@ -172,7 +172,7 @@ def test_settings_of_pairs_need_pairs() -> None:
         DataConfig(noisy="*_NOISY_*")
     with pytest.raises(ValueError, match="pairs"):
         DataConfig(pairs=None, validation="auto")
-    assert DataConfig(test="pairs:x", cfa="RGGB").settings_of("pairs:x")["cfa"] == "RGGB"
+    assert DataConfig(test="pairs:x", cfa="RGGB").pair_settings("pairs:x")["cfa"] == "RGGB"
 
 
 def test_recipes_are_listed_and_explained_with_their_own_values(capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,7 @@ BURST = '''
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from rawaug.evaluation.trials import make_trials, trial_of
+from rawaug.evaluation.trials import make_trials, make_trial
 from rawaug.noise import noise_model
 from rawaug.experiment.task import TASKS
 from rawaug.experiment.raw import RawTask
@@ -55,7 +55,7 @@ class BurstTask(RawTask):
     def test(self, frames, isp, noise):
         def make(pair):
             clean = replace(pair, noisy=None, shot_var=None, read_var=None)
-            return trial_of(clean, self.noise, isp.cfa, condition=f"{self.recipe.shots} shots")
+            return make_trial(clean, self.noise, isp.cfa, condition=f"{self.recipe.shots} shots")
 
         return make_trials(frames, make)
 '''

@@ -13,7 +13,7 @@ import pytest
 from rawaug.cli import main
 from rawaug.commands.run import with_values
 from rawaug.experiment import run as experiment
-from rawaug.experiment.recipe import EXPERIMENTS, find_recipe, kind_of, kinds, read_recipe, settings_of
+from rawaug.experiment.recipe import EXPERIMENTS, find_kind, find_recipe, find_settings, kinds, read_recipe
 from rawaug.experiment.settings import ArmConfig, DataConfig, ISPSource, Recipe
 from rawaug.experiment.task import TASKS
 from rawaug.isp.fit.samples import BLOCK
@@ -42,15 +42,15 @@ def test_every_kind_has_settings_that_name_it() -> None:
     assert set(TASKS) == {"raw", "rgb", "mosaic", "srgb"}
     assert set(EXPERIMENTS) == {"reconstruction", "ablation", "paper"}
     for name in TASKS:
-        assert settings_of(name).kind == name and TASKS[name].settings is settings_of(name)
+        assert find_settings(name).kind == name and TASKS[name].settings is find_settings(name)
     for name in ("reconstruction", "ablation"):
-        assert settings_of(name)().name == name
+        assert find_settings(name)().name == name
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_commands_of_a_header_can_be_given(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     last = name.rpartition("/")[2]
-    kind = kind_of(read_recipe(find_recipe(name)))
+    kind = find_kind(read_recipe(find_recipe(name)))
     assert kind == (last if last in kinds() else OTHERS.get(name, "raw"))
     given: list[Any] = []
 
@@ -97,7 +97,7 @@ def test_what_is_no_recipe_ends_in_one_line_with_its_name(content: str, reason: 
     file = tmp_path / "mine.yaml"
     file.write_text(content)
     with pytest.raises(ValueError, match=rf"mine\.yaml: {reason}|mine\.yaml: .*{reason}") as error:
-        kind_of(read_recipe(file), file)
+        find_kind(read_recipe(file), file)
     assert "\n" not in str(error.value) and len(str(error.value)) < 500
 
 
@@ -105,7 +105,7 @@ def test_a_recipe_that_names_no_kind_trains_and_bytes_are_none(tmp_path: Path) -
     mine = tmp_path / "mine.yaml"
     for content in ("name: x\n", ""):
         mine.write_text(content)
-        assert kind_of(read_recipe(mine)) == "raw"
+        assert find_kind(read_recipe(mine)) == "raw"
     mine.write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(ValueError, match=r"mine\.yaml"):
         read_recipe(mine)
@@ -159,20 +159,20 @@ def test_a_weighing_that_moves_the_mean_of_noisy_targets_is_refused(name: str) -
 def test_on_and_off_are_words_and_truth_values_stay(tmp_path: Path) -> None:
     content = "fit: {encoders: on, shading: off, attention: true}\nself_ensemble: off\narms: {real: {}}\n"
     (tmp_path / "mine.yaml").write_text(content)
-    recipe = with_values(settings_of("raw"), read_recipe(tmp_path / "mine.yaml"), "mine")
+    recipe = with_values(find_settings("raw"), read_recipe(tmp_path / "mine.yaml"), "mine")
     assert (recipe.fit.encoders, recipe.fit.shading) == ("on", "off")
     assert recipe.fit.attention is True and recipe.self_ensemble is False
 
 
 def test_null_is_taken_where_the_types_have_it() -> None:
     content = {"isp": "universal", "steps": None, "arms": {"real": {"denoiser": None}}}
-    recipe = with_values(settings_of("raw"), content, "mine")
+    recipe = with_values(find_settings("raw"), content, "mine")
     assert recipe.steps is None and recipe.network("real") == recipe.denoiser
     for key in ("data", "fit", "train", "arms", "device", "seed", "out", "views", "noise"):
         with pytest.raises(ValueError, match=f"^mine: {key}.* got None"):
-            with_values(settings_of("raw"), {key: None}, "mine")
+            with_values(find_settings("raw"), {key: None}, "mine")
     with pytest.raises(ValueError, match=r"^mine: .*denoiser"):
-        with_values(settings_of("raw"), {"arms": {"real": {"denoiser": {"name": None}}}}, "mine")
+        with_values(find_settings("raw"), {"arms": {"real": {"denoiser": {"name": None}}}}, "mine")
 
 
 @pytest.mark.parametrize(

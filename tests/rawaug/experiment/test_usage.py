@@ -19,7 +19,7 @@ from rawaug.evaluation.verdict import verdict
 from rawaug.experiment import report
 from rawaug.experiment import run as experiment
 from rawaug.experiment.settings import ArmConfig
-from rawaug.training.noisy_frames import NoisyFrame, faintness_note, noise_of
+from rawaug.training.noisy_frames import NoisyFrame, faintness_note, frame_levels
 
 
 def scores(psnr: float) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def test_the_help_lists_the_networks_of_the_registry(capsys: pytest.CaptureFixtu
 
 def test_frames_without_known_noise_ask_for_the_command_to_type() -> None:
     with pytest.raises(ValueError, match="--noise"):
-        noise_of(replace(demo_pairs("train", count=1)[0], shot_var=None, read_var=None), None)
+        frame_levels(replace(demo_pairs("train", count=1)[0], shot_var=None, read_var=None), None)
 
 
 def test_frames_with_next_to_no_noise_are_named_before_training() -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.trials import trial_of
+from rawaug.evaluation.trials import make_trial
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
@@ -56,10 +56,10 @@ def scored(monkeypatch: pytest.MonkeyPatch, given: list[Pair], frame_of: Callabl
 
     def trial(pair: Pair, *rest: Any) -> Any:
         seen.append(pair)
-        return trial_of(pair, *rest)
+        return make_trial(pair, *rest)
 
     given.extend([frame_of("small", size=(64, 64)), frame_of("large", size=(96, 130))])
-    monkeypatch.setattr(downstream, "trial_of", trial)
+    monkeypatch.setattr(downstream, "make_trial", trial)
     return seen
 
 

@@ -17,7 +17,7 @@ import torch
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
 from rawaug.evaluation.figures import read_log
-from rawaug.evaluation.trials import Trial, trial_of
+from rawaug.evaluation.trials import Trial, make_trial
 from rawaug.noise import noise_model
 from rawaug.training import loop
 from rawaug.training.config import DenoiserConfig, TrainConfig
@@ -40,7 +40,7 @@ def stream() -> TrainingStream:
 @pytest.fixture(scope="module")
 def validation() -> list[Trial]:
     pair = demo_pairs("validation", count=1)[0]
-    return [replace(trial_of(pair, noise_model("cycleisp_sidd"), CFA.GRBG), develop=None)]
+    return [replace(make_trial(pair, noise_model("cycleisp_sidd"), CFA.GRBG), develop=None)]
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import denoisers
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
 from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.evaluation.trials import trial_of
+from rawaug.evaluation.trials import make_trial
 from rawaug.experiment.run import change_cfa, find_pattern
 from rawaug.experiment.settings import ArmConfig, Recipe
 from rawaug.isp.config import ISPConfig
@@ -129,7 +129,7 @@ def test_a_mosaic_of_another_pattern_is_denoised_in_the_network_s_own() -> None:
             return noisy * torch.tensor([2.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1, 1)
 
     pair = demo_pairs("test", count=1)[0]
-    trial = trial_of(pair, noise_model("cycleisp_sidd"))
+    trial = make_trial(pair, noise_model("cycleisp_sidd"))
     for own in CFA:
         denoised = RawDenoiser.of(Red(width=4, scales=2), cfa=own)(trial.input)
         # The two greens may exchange their names where the pattern moves by a line.

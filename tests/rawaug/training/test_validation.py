@@ -8,7 +8,7 @@ from torch import Tensor
 
 from rawaug.data import demo_pairs
 from rawaug.evaluation.scores import compare
-from rawaug.evaluation.trials import Trial, trial_of
+from rawaug.evaluation.trials import Trial, make_trial
 from rawaug.noise import noise_model
 from rawaug.training.loop import validate
 
@@ -45,7 +45,7 @@ def test_a_network_is_validated_in_eval_mode_and_goes_on_in_train_mode() -> None
 
 def test_srgb_is_that_of_the_evaluation() -> None:
     pair = demo_pairs("validation", count=1)[0]
-    trial = trial_of(pair, noise_model("cycleisp_sidd"))
+    trial = make_trial(pair, noise_model("cycleisp_sidd"))
     scores = validate(Nothing(), [trial], CPU)
     expected = compare(trial.noisy, trial)
     assert (scores["psnr"], scores["psnr_srgb"]) == pytest.approx((expected[0], expected[2]), abs=1e-3)
