@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from rawaug.commands import YAML, as_options, network_or_filter, require_results
-from rawaug.denoising.denoise import files_for
+from rawaug.denoising.denoise import files_for, is_mixed
 from rawaug.denoising.files import DenoisedFolder, denoise_file, denoise_folder
+from rawaug.denoising.picture_files import PictureFiles
 from rawaug.denoising.raw_files import Greens
 from rawaug.errors import count_of, escape
 from rawaug.files import write_json
+from rawaug.io.content import PICTURE_KINDS
 from rawaug.registry import Spec
 
 
@@ -33,10 +35,11 @@ def run(
     json: str | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Denoise a RAW file to DNG, a JPEG, PNG or TIFF to another, or a folder of either.
+    """Denoise a RAW file to DNG, a JPEG, PNG or TIFF to another, or a folder of them.
 
     Args:
-        source: a RAW file, a developed picture, or a folder of either.
+        source: a RAW file, a developed picture, or a folder of them; of RAW files and pictures with the same stem, the
+            RAW files are denoised.
         out: output DNG or picture, or output folder.
         denoiser: .safetensors file written by rawaug run, .onnx file written by rawaug export (faster on a CPU), or
             the name of a shipped denoiser; by default rawaug-small, rawaug-xtrans for X-Trans and Quad-Bayer, and
@@ -76,7 +79,15 @@ def run(
         if Path(out).suffix.lower() in kind.formats and not Path(out).is_dir():
             extension = Path(out).suffix
             raise ValueError(f"{out}: {source} is a folder, and so is its output; give a name without {extension}")
-        result = denoise_folder(source, out, kind, previews=preview, overwrite=overwrite)
+        if spec is None and is_mixed(Path(source)):
+            pictures = PictureFiles(strength=strength, self_ensemble=self_ensemble, device=device)
+            result = denoise_folder(
+                source, out, kind, previews=preview, overwrite=overwrite, elsewhere=("rendering", *PICTURE_KINDS)
+            )
+            others = ("RAW file", "other file")
+            result += denoise_folder(source, out, pictures, overwrite=overwrite, elsewhere=others)
+        else:
+            result = denoise_folder(source, out, kind, previews=preview, overwrite=overwrite)
     else:
         _, done = denoise_file(source, out, kind, preview=preview, overwrite=overwrite)
         result = DenoisedFolder([done])

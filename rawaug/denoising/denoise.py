@@ -7,11 +7,11 @@ from typing import Any
 
 from rawaug.denoising.files import Files, denoise_file
 from rawaug.denoising.levels import Noise
-from rawaug.denoising.picture_files import PictureFiles
+from rawaug.denoising.picture_files import LINEAR, PictureFiles
 from rawaug.denoising.raw_files import Greens, RawFiles
 from rawaug.files import files_below, require_output
 from rawaug.io import RawFrame
-from rawaug.io.content import ALL_PICTURE_EXTENSIONS, RAW_EXTENSIONS, content_of
+from rawaug.io.content import ALL_PICTURE_EXTENSIONS, RAW_EXTENSIONS, content_of, picture_extensions
 
 
 def denoise(
@@ -112,6 +112,19 @@ def files_for(
         if is_set:
             raise ValueError(f"{source}: is a developed picture; {argument}= is for RAW")
     return PictureFiles(denoiser, strength=strength, self_ensemble=self_ensemble, device=device)
+
+
+def is_mixed(folder: Path) -> bool:
+    """Tell whether a folder holds both RAW files and developed pictures that are not the camera's own of them."""
+    developed = set(picture_extensions()).difference(LINEAR)
+    raw, pictures = set(), set()
+    for file in files_below(folder):
+        extension = file.suffix.lower()
+        if extension in RAW_EXTENSIONS:
+            raw.add(file.with_suffix(""))
+        elif extension in developed:
+            pictures.add(file.with_suffix(""))
+    return bool(raw) and bool(pictures - raw)
 
 
 def _is_raw(source: str | Path | RawFrame) -> bool:

@@ -7,7 +7,7 @@ cannot be read, or whose decoder crashes or hangs, is named and counted, and the
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -57,15 +57,15 @@ class Files(ABC, Generic[T]):
         """List the files of a folder that are of this kind; raise ValueError if there is none."""
         extensions = self.extensions()
         listing = list_files(folder, extensions, self.others)
-        self._advise(listing)
+        self._select(folder, listing)
         if not listing.files:
             contents = "; ".join(listing.lines()) or f"supported extensions are {', '.join(extensions)}"
             raise ValueError(f"{folder}: contains no {self.what} file; {contents}")
         return listing
 
     @abstractmethod
-    def _advise(self, listing: Listing) -> None:
-        """Say what to do with files that are left out, if this kind knows better."""
+    def _select(self, folder: Path, listing: Listing) -> None:
+        """Leave out files that are not to be denoised, and say what to do with those that are left out."""
 
     def remarks(self, files: Sequence[Path]) -> list[str]:
         """Write lines on the results of these files of a folder."""
@@ -126,6 +126,15 @@ class DenoisedFolder(Generic[T]):
     left_out: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
 
+    def __iadd__(self, other: DenoisedFolder[Any]) -> DenoisedFolder[Any]:
+        """Add what was done to the files of another kind."""
+        self.files += other.files
+        self.existing += other.existing
+        self.broken |= other.broken
+        self.left_out += other.left_out
+        self.remarks += other.remarks
+        return self
+
 
 def denoise_file(
     source: str | Path,
@@ -172,6 +181,7 @@ def denoise_folder(
     *,
     previews: str | Path | None = None,
     overwrite: bool = False,
+    elsewhere: Collection[str] = (),
 ) -> DenoisedFolder[T]:
     """Denoise the files of a folder and its subfolders; existing results are left.
 
@@ -181,6 +191,7 @@ def denoise_folder(
         kind: how files of this kind are denoised.
         previews: a folder for a JPEG of each result of a RAW file as LibRaw develops it.
         overwrite: replace existing results.
+        elsewhere: kinds of files, as :class:`rawaug.io.content.Listing` calls them, that another call denoises.
 
     Returns:
         What was done, and what was not.
@@ -199,7 +210,7 @@ def denoise_folder(
     if kind.settings is not None:
         require_same_settings(out / SETTINGS, kind.settings, overwrite)
 
-    result: DenoisedFolder[T] = DenoisedFolder(left_out=listing.lines())
+    result: DenoisedFolder[T] = DenoisedFolder(left_out=listing.lines(elsewhere))
     unknown = []
     denoised: list[Path] = []
     for file in progress(listing.files, label="denoise", unit="file", leave=True):

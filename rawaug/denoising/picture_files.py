@@ -15,12 +15,13 @@ from rawaug.denoising.base import Noisy
 from rawaug.denoising.files import Files
 from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.errors import escape
+from rawaug.files import files_below
 from rawaug.io import RawFrame
-from rawaug.io.content import Listing, picture_extensions
+from rawaug.io.content import RAW_EXTENSIONS, Listing, picture_extensions
 from rawaug.io.isolated import isolated
 from rawaug.io.stored import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
 
-_LINEAR = (".exr",)
+LINEAR = (".exr",)
 """The extensions of pictures of linear light."""
 _SUBSTITUTE = ".png"
 """The format of results of pictures whose own format is read but not written; it loses nothing."""
@@ -74,9 +75,17 @@ class PictureFiles(Files[DenoisedPicture]):
         self.denoiser: PictureDenoiser = denoiser
 
     def extensions(self) -> tuple[str, ...]:
-        return tuple(extension for extension in picture_extensions() if extension not in _LINEAR)
+        return tuple(extension for extension in picture_extensions() if extension not in LINEAR)
 
-    def _advise(self, listing: Listing) -> None:
+    def _select(self, folder: Path, listing: Listing) -> None:
+        """Leave out a picture that has the stem of a RAW file: it is the camera's own rendering of it."""
+        raw = {file.with_suffix("") for file in files_below(folder) if file.suffix.lower() in RAW_EXTENSIONS}
+        beside = [file for file in listing.files if file.with_suffix("") in raw]
+        for file in beside:
+            advice = "pictures of the camera's own, beside the RAW files that they show; name one to denoise it"
+            listing.leave_out("rendering", advice, file.suffix.lower())
+            listing.files.remove(file)
+
         if "picture" in listing.left_out:
             listing.left_out["picture"].advice = "linear light; save it as a developed picture"
 

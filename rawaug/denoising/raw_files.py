@@ -251,7 +251,7 @@ class RawFiles(Files[Denoised]):
     def extensions(self) -> tuple[str, ...]:
         return RAW_EXTENSIONS
 
-    def _advise(self, listing: Listing) -> None:
+    def _select(self, folder: Path, listing: Listing) -> None:
         if "RAW file" in listing.left_out:
             listing.left_out["RAW file"].advice = "there is no decoder for these kinds of RAW"
 

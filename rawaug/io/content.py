@@ -11,7 +11,7 @@ linear RAW (34892). Source: TIFF 6.0; DNG 1.7.1; ISO/IEC 14496-12 (brands of HEI
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -25,6 +25,9 @@ RAW_EXTENSIONS = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
     *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
 )
+PICTURE_KINDS = ("picture", "HEIC picture", "AVIF picture")
+"""What :class:`Listing` calls files of developed pictures."""
+
 PICTURE_EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
 """Pictures with these extensions are read without an extra."""
 HEIF_EXTENSIONS, AVIF_EXTENSIONS = (".heic", ".heif", ".hif"), (".avif",)
@@ -200,9 +203,9 @@ class Listing:
     files: list[Path] = field(default_factory=list)
     left_out: dict[str, LeftOut] = field(default_factory=dict)
 
-    def lines(self) -> list[str]:
-        """Write a line for each kind that is left out."""
-        return [str(kind) for kind in self.left_out.values()]
+    def lines(self, elsewhere: Collection[str] = ()) -> list[str]:
+        """Write a line for each kind that is left out, but for kinds that are taken care of ``elsewhere``."""
+        return [str(kind) for what, kind in self.left_out.items() if what not in elsewhere]
 
     def leave_out(self, what: str, advice: str, extension: str) -> None:
         """Count a file that is not read."""
@@ -266,7 +269,7 @@ def list_files(folder: Path, taken: Sequence[str], other: str) -> Listing:
             listing.leave_out(what, why, extension)
 
     listing.files.sort()
-    order = ("picture", "HEIC picture", "AVIF picture", "RAW file", "other file")
+    order = (*PICTURE_KINDS, "RAW file", "other file")
     listing.left_out = {what: listing.left_out[what] for what in order if what in listing.left_out}
     return listing
 

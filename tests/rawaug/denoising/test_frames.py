@@ -25,7 +25,7 @@ from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.denoising.files import denoise_file, denoise_folder
 from rawaug.denoising.levels import find_levels
 from rawaug.denoising.raw_files import OTHER_PATTERNS, RawFiles
-from rawaug.io import RawFrame, read_picture, read_raw, write_dng
+from rawaug.io import RawFrame, read_picture, read_raw, write_dng, write_picture
 from rawaug.io.raw import MONOCHROME
 from rawaug.noise import noise_levels
 
@@ -429,6 +429,24 @@ def test_a_folder_names_what_is_left_out(
     assert main(["denoise", str(tmp_path / "in"), str(tmp_path / "out"), "--denoiser", str(identity)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 4 and "2 RAW files left out (.x3f 2): there is no decoder" in lines[2]
+
+
+def test_a_mixed_folder_is_denoised_whole_but_for_the_cameras_own_renderings(
+    tmp_path: Path, bayer_dng: Dng, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "in").mkdir()
+    shot(tmp_path / "in" / "a.dng", bayer_dng)
+    picture = torch.rand(3, 40, 48, generator=torch.Generator().manual_seed(0))
+    for name in ("a.jpg", "b.jpg", "c.png"):
+        write_picture(tmp_path / "in" / name, picture)
+    (tmp_path / "in" / "notes.txt").write_text("mine")
+
+    assert main(["denoise", str(tmp_path / "in"), str(tmp_path / "out"), "--noise", "[1e-3, 1e-5]"]) == 0
+    results = {file.name for file in (tmp_path / "out").iterdir() if file.suffix in (".dng", ".jpg", ".png")}
+    assert results == {"a.dng", "b.jpg", "c.png"}
+    printed = capsys.readouterr().out
+    assert "1 rendering left out (.jpg 1)" in printed and "1 other file left out (.txt 1)" in printed
+    assert "picture left out" not in printed and "pictures left out" not in printed
 
 
 def test_the_shipped_denoiser_of_each_pattern_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
