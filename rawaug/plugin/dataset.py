@@ -190,8 +190,8 @@ class RawPairs(_Pairs[Sample]):
         turns: whether to draw flips and quarter turns; a crop that is not square is only flipped.
         keys: names for the pair's noisy, clean, variance and params, in this order, as many as are wanted. The pair is
             then a dict of these; in samples that are mappings they replace the picture. Or a mapping from names to
-            these fields, to ``name`` (the picture's name) or to ``level`` (the strength of its noise), such as
-            ``{"L": "noisy", "H": "clean", "L_path": "name"}``.
+            these fields, to ``name`` (the picture's name), ``level`` (the strength of its noise) or ``picture`` (the
+            crop as it was cut and turned, in [0, 1]), such as ``{"L": "noisy", "H": "clean", "L_path": "name"}``.
         fields: as many of the same fields as are wanted, such as ``("clean", "noisy")``. The pair is then a tuple.
         order: order of the planes of packed RAW: a CFA, for the order that ``pixel_unshuffle`` of such a mosaic gives;
             ``"RGBG"`` or the like, in which the first G is Gr; or four names of R, Gr, Gb, B. By default R, Gr, Gb, B.
@@ -365,7 +365,7 @@ class RawPairs(_Pairs[Sample]):
 
             for place, number in enumerate(group):
                 pair = pairs.map(lambda tensor, place=place: tensor[place])
-                form = self.form(pair, self._name_of(indices[number]))
+                form = self.form(pair, self._name_of(indices[number]), batch[place])
                 finished.append(replace_picture(*samples[number], form))
         return finished
 
@@ -525,7 +525,7 @@ class RawPairStream(_Pairs[Any], IterableDataset[Any]):
             raise ValueError(f"picture {name}: {error}") from error
 
         pair = batch.map(lambda tensor: tensor[0])
-        return replace_picture(sample, where, self.form(pair, self._name_of(name)))
+        return replace_picture(sample, where, self.form(pair, self._name_of(name), patch))
 
     def _read_identity(self, sample: Any) -> int | str:
         try:

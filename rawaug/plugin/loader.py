@@ -421,8 +421,8 @@ class WrappedLoader(ResumableLoader[Batch]):
         pictures = self._with_channel(get_picture(batch, where))
         generator = keyed_generator(self.augment.seed, "wrap", epoch, number, *rank_key())
 
-        pair = self._make_pair(pictures, generator)
-        converted: Batch = replace_picture(batch, where, self.form(pair))
+        pair, patches = self._make_pair(pictures, generator)
+        converted: Batch = replace_picture(batch, where, self.form(pair, picture=patches))
         return converted
 
     def _with_channel(self, batch: Any) -> Any:
@@ -433,13 +433,16 @@ class WrappedLoader(ResumableLoader[Batch]):
             return batch[:, None]
         return batch
 
-    def _make_pair(self, pictures: Any, generator: torch.Generator) -> RawPair:
+    def _make_pair(self, pictures: Any, generator: torch.Generator) -> tuple[RawPair, Tensor]:
+        """Make the pairs of a batch of pictures, and return them with the pictures as they were cut."""
         if self.crop is None:
             batch = self.augment.as_batch(pictures, self.bgr).to(self.device, non_blocking=True)
-            return self.augment.make_pair(batch, generator, chosen=self.augment.look(None))  # they may be crops
+            chosen = self.augment.look(None)  # the pictures may be crops
+            return self.augment.make_pair(batch, generator, chosen=chosen), batch
 
         patches, places, chosen = self._draw_crops(pictures, generator)
-        return self.augment.make_pair(patches.to(self.device, non_blocking=True), generator, places, chosen)
+        patches = patches.to(self.device, non_blocking=True)
+        return self.augment.make_pair(patches, generator, places, chosen), patches
 
     def _draw_crops(self, pictures: Any, generator: torch.Generator) -> tuple[Tensor, Tensor, ISPParams | None]:
         """Draw a crop of each picture ``(B, C, height, width)``, their places ``(B, 5)``, and their chosen settings."""

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rawaug.files import read_tensors, write_tensors
 from rawaug.isp.config import ISPParams
+from rawaug.isp.functional import as_float
 
 _KIND = "augment_params"
 
@@ -46,6 +47,37 @@ class AugmentParams(NamedTuple):
         noise = {name: change(value) for name, value in self.noise.items()}
         extras = {name: change(value) for name, value in self.extras.items()}
         return AugmentParams(isp, noise, change(self.crop), extras)
+
+    def camera(self) -> dict[str, Tensor]:
+        """Say what a RAW file of this shot would, for networks that are conditioned on metadata, in the words of DNG.
+
+        Returns:
+            Tensors with a leading B if the parameters have one: ``AsShotNeutral`` ``(3,)``, the camera's colour of
+            grey; ``white_balance`` ``(4,)``, the gains of R, Gr, Gb and B, green 1; ``camera_to_srgb`` ``(3, 3)``,
+            white-balanced camera RGB to linear sRGB; ``BaselineExposure``, the stops by which the development
+            brightens; ``NoiseProfile`` ``(2,)``, shot_var and read_var, if the noise has these; ``BlackLevel`` 0 and
+            ``WhiteLevel`` 1.
+
+        Example:
+            >>> from rawaug import DictionaryISP, RawAugment
+            >>> camera = RawAugment(DictionaryISP())(torch.rand(2, 3, 32, 32)).params.camera()
+            >>> camera["white_balance"].shape, camera["camera_to_srgb"].shape
+            (torch.Size([2, 4]), torch.Size([2, 3, 3]))
+        """
+        gains = self.isp.gains
+        green = gains[..., 1]
+        balance = gains / green[..., None]
+        values = {
+            "AsShotNeutral": 1.0 / balance,
+            "white_balance": balance[..., [0, 1, 1, 2]],
+            "camera_to_srgb": torch.linalg.inv(self.isp.matrix),
+            "BaselineExposure": green.log2(),
+            "BlackLevel": torch.zeros_like(green),
+            "WhiteLevel": torch.ones_like(green),
+        }
+        if {"shot_var", "read_var"} <= self.noise.keys():
+            values["NoiseProfile"] = torch.stack([self.noise["shot_var"], self.noise["read_var"]], dim=-1)
+        return values
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the parameters as a flat dict, to store with a batch; :meth:`from_tensors` reads it back."""
@@ -122,8 +154,8 @@ class RawPair(NamedTuple):
         return square.flatten(1).mean(1).sqrt()
 
 
-FIELDS = ("noisy", "clean", "variance", "params", "name", "level")
-"""The fields of a sample of a Dataset: a pair's parts, the name of its picture, and the strength of its noise."""
+FIELDS = ("noisy", "clean", "variance", "params", "name", "level", "picture")
+"""The fields of a sample: a pair's parts, the name of its picture, the strength of its noise, and the picture."""
 
 RAW_PLANES = ("R", "Gr", "Gb", "B")
 """The planes of packed RAW, in order."""
@@ -145,12 +177,13 @@ class PairForm:
     keys: tuple[str, ...] | None = None
     planes: tuple[int, ...] | None = None
 
-    def __call__(self, pair: RawPair, name: str | None = None) -> Any:
+    def __call__(self, pair: RawPair, name: str | None = None, picture: Tensor | None = None) -> Any:
         """Hand over a pair, with or without B.
 
         Args:
             pair: packed RAW ``(..., 4, h, w)`` in the order R, Gr, Gb, B, or any other target.
             name: name of its picture.
+            picture: ``(..., 3, H, W)``, the crop of the picture as it was cut and turned; 8 bits become [0, 1].
 
         Raises:
             ValueError: if the name is asked for and there is none.
@@ -162,7 +195,9 @@ class PairForm:
 
         values = []
         for field in self.fields:
-            if field != "name":
+            if field == "picture" and picture is not None:
+                values.append(as_float(picture))
+            elif field != "name":
                 values.append(getattr(pair, field))
             elif name is not None:
                 values.append(name)

@@ -16,8 +16,10 @@ import rawaug
 from rawaug.bayer import CFA, unpack
 from rawaug.data.demo import demo_photographs
 from rawaug.io import write_picture
+from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs, RawPairStream
+from rawaug.plugin.draw import Draw
 from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import PairForm, pair_form
 
@@ -143,3 +145,25 @@ def test_attributes_of_the_dataset_are_those_of_the_pairs(augment: RawAugment) -
 def test_other_forms_are_refused(augment: RawAugment, srgb: Tensor, settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"keys|fields|order"):
         rawaug.RawPairs(list(srgb), augment, crop=16, **settings)
+
+
+def test_the_picture_comes_beside_its_raw_with_what_a_file_says(universal: DictionaryISP) -> None:
+    pictures = list(torch.randint(256, (2, 3, 40, 48), generator=torch.Generator().manual_seed(0), dtype=torch.uint8))
+    augment = RawAugment(universal, noise=(1e-9, 0.0), draw=Draw(exposure=-1.0))
+    pairs = RawPairs(pictures, augment, crop=16, keys={"raw": "clean", "rgb": "picture", "params": "params"}).freeze()
+    for number in range(2):
+        sample = pairs[number]
+        assert sample["rgb"].shape == (3, 16, 16) and sample["rgb"].dtype == torch.float32
+        patch = (sample["rgb"] * 255).round().to(torch.uint8)
+        assert torch.equal(augment.apply(patch, sample["params"]).clean, sample["raw"]), "the crop, as it was turned"
+
+        camera = sample["params"].camera()
+        grey = torch.tensor([[[0.2]]]).expand(3, 16, 16)
+        red, green_r, green_b, blue = augment.apply(grey, sample["params"]).clean.mean((1, 2))
+        neutral = torch.stack([red, green_r, blue]) / green_b
+        assert torch.allclose(neutral, camera["AsShotNeutral"], rtol=1e-3)
+        assert torch.allclose(camera["white_balance"] * neutral[[0, 1, 1, 2]], torch.ones(4), rtol=1e-3)
+        assert camera["NoiseProfile"].tolist() == pytest.approx([1e-9, 0.0])
+        assert torch.allclose(camera["camera_to_srgb"] @ sample["params"].isp.matrix, torch.eye(3), atol=1e-5)
+    (batch,) = wrap([torch.stack(pictures)], augment, crop=16, keys={"rgb": "picture"})
+    assert batch["rgb"].shape == (2, 3, 16, 16)
