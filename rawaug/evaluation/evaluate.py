@@ -143,7 +143,7 @@ def evaluate_pictures(evaluation: Evaluation) -> dict[str, Any]:
     """
     names = PairSettings(noisy=evaluation.settings.noisy, clean=evaluation.settings.clean)
     if evaluation.noise is not None or evaluation.bin != 1 or evaluation.seed or evaluation.report:
-        raise ValueError(f"{evaluation.data}: has developed pictures; --noise, --bin, --seed and --report are for RAW")
+        raise ValueError(f"{evaluation.data}: has developed pictures; noise=, bin=, seed= and report= are for RAW")
     if evaluation.settings != names:
         raise ValueError(f"{evaluation.data}: has developed pictures; a CFA and levels are for RAW")
 

@@ -265,7 +265,7 @@ def read_exposure(path: str | Path) -> float:
     exposure = _exposure_of(Path(path))
     missing = [name for name, value in exposure.items() if not 0 < value < math.inf]
     if missing:
-        raise ValueError(f"{path}: its EXIF has no {' or '.join(missing)}; give the exposures with --ev")
+        raise ValueError(f"{path}: its EXIF has no {' or '.join(missing)}; give the exposures as ev=")
 
     seconds, f_number, speed = exposure.values()
     return math.log2(seconds * speed / (100.0 * f_number**2))

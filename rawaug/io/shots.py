@@ -56,7 +56,7 @@ def read_shot_exposure(path: str | Path) -> float:
     }
     missing = [name for name, value in exposure.items() if not value]
     if missing:
-        raise ValueError(f"{path}: does not state its {' or '.join(missing)}; give the exposures with --ev")
+        raise ValueError(f"{path}: does not state its {' or '.join(missing)}; give the exposures as ev=")
 
     seconds, f_number, speed = exposure.values()
     return math.log2(seconds * speed / (100.0 * f_number**2))

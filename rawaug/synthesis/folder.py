@@ -205,7 +205,7 @@ def _run_tasks(tasks: Sequence[Task], settings: Settings, max_pixels: int, worke
             yield future.result()
     except BrokenProcessPool:
         raise OSError(
-            "a worker died, perhaps out of memory or of a damaged picture; run it again with fewer --workers, "
+            "a worker died, perhaps out of memory or of a damaged picture; run it again with fewer workers=, "
             "or look for the picture with rawaug data check"
         ) from None
     finally:

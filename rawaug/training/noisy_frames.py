@@ -121,7 +121,7 @@ def frame_levels(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, f
     if camera is None:
         raise ValueError(
             f"{pair.name}: has no noise levels, and those of noise are the pictures'; "
-            "add --noise camera to measure them on the frames that the ISP is fitted to"
+            "set noise: camera to measure them on the frames that the ISP is fitted to"
         )
 
     try:

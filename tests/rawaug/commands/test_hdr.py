@@ -69,7 +69,7 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
     first, second = shot(tmp_path / "a.jpg", 60, 1 / 60), shot(tmp_path / "b.jpg", 90)
     wide = shot(tmp_path / "wide.jpg", 90, 1 / 15, size=(8, 16))
     for pictures, stops, message in (
-        ([first, second], None, r"b\.jpg: its EXIF has no exposure time or f-number or ISO; give .* with --ev$"),
+        ([first, second], None, r"b\.jpg: its EXIF has no exposure time or f-number or ISO; give .* as ev=$"),
         ([first, wide], None, r"wide\.jpg: is 8 x 16, but .*a\.jpg is 8 x 12; align and crop"),
         ([first, second], [0.0], r"--ev: one exposure for each picture is needed, got 1 for 2$"),
         ([first, second], [0.0, math.inf], r"an exposure must be a number from -30.0 to 30.0, got inf"),
