@@ -161,13 +161,21 @@ class TiffFile:
 
     def rational(self, entry: Entry | None) -> float:
         """Read the first number of a tag of fractions; return 0 if it is missing, holds others, or divides by zero."""
+        numbers = self.rationals(entry)
+        if not numbers:
+            return 0.0
+        return numbers[0]
+
+    def rationals(self, entry: Entry | None) -> list[float]:
+        """Read a tag of fractions, with 0 for one that divides by zero; there are none if it is missing."""
         if entry is None or entry.dtype not in (5, 10):
-            return 0.0
+            return []
         letter = "I" if entry.dtype == 5 else "i"
-        numerator, denominator = struct.unpack_from(f"{self.order}2{letter}", self.tag(entry).data)
-        if not denominator:
-            return 0.0
-        return float(numerator / denominator)
+        numbers = struct.unpack(f"{self.order}{2 * entry.values}{letter}", self.tag(entry).data)
+        fractions = []
+        for numerator, denominator in zip(numbers[0::2], numbers[1::2], strict=True):
+            fractions.append(numerator / denominator if denominator else 0.0)
+        return fractions
 
     def _following(self, place: int, pointer: str) -> int:
         """Read where the next directory begins. Some programs leave this out after the last one."""

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from rawaug.io.colour import ADOBE_RGB, SRGB_COLOUR, Colour, colour_of_code_points, colour_of_numbers
-from rawaug.io.directories import EXIF, INTEROPERABILITY, ORIENTATION, DamagedTags, TiffFile
+from rawaug.io.directories import EXIF, INTEROPERABILITY, ORIENTATION, DamagedTags, Directory, TiffFile
 
 EXIF_PREFIX = b"Exif\0\0"
 XMP_PREFIX = b"http://ns.adobe.com/xap/1.0/\0"
@@ -32,6 +32,7 @@ _MOST_STRAY_BYTES = 1024
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 ICC_PREFIX = b"ICC_PROFILE\0"
 _COLOR_SPACE, _INTEROPERABILITY_INDEX = 40961, 1
+_WHITE_POINT, _CHROMATICITIES = 318, 319
 _XMP_ORIENTATION = re.compile(rb"""tiff:Orientation(?:>|=["'])([1-8])\b""")
 
 
@@ -362,8 +363,28 @@ def _of_tiff(file: BinaryIO) -> Headers:
     xmp = first.entries.get(XMP_TAG)
     colour = None
     if ICC_TAG not in first.entries:
-        colour = colour_of_exif(file)
+        colour = colour_of_exif(file) or _colour_of_tags(tiff, first)
     return Headers(xmp=tiff.tag(xmp).data if xmp else None, stated=stated if 1 <= stated <= 8 else None, colour=colour)
+
+
+def _colour_of_tags(tiff: TiffFile, first: Directory) -> Colour | None:
+    """Find the space by WhitePoint and PrimaryChromaticities, if a TIFF states them."""
+    white, primaries = (tiff.rationals(first.entries.get(code)) for code in (_WHITE_POINT, _CHROMATICITIES))
+    if len(white) != 2 or len(primaries) != 6:
+        return None
+    return colour_of_numbers([*primaries, *white], None)
+
+
+def _of_bmp(file: BinaryIO) -> Headers:
+    """Read the profile that the fifth version of BMP may hold."""
+    file.seek(0)
+    head = file.read(138)
+    if len(head) < 138 or head[70:74] != b"DEBM":  # "MBED", embedded
+        return Headers()
+    place, size = struct.unpack_from("<II", head, 126)
+    file.seek(14 + place)
+    profile = file.read(min(size, _MOST_BYTES))
+    return Headers(colour=Colour(profile) if profile else None)
 
 
 # -- boxes of HEIF and JPEG XL -----------------------------------------------------------------------------------------
@@ -602,6 +623,7 @@ _READERS = {
     "PNG": _of_png,
     "WebP": _of_webp,
     "TIFF": _of_tiff,
+    "BMP": _of_bmp,
     "HEIC": _of_heif,
     "AVIF": _of_heif,
     "JPEG XL": _of_jpeg_xl,

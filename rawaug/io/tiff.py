@@ -368,8 +368,8 @@ def read_floats(path: Path) -> np.ndarray:
     """
     with opened_tiff(path) as tiff:
         numbers = main_mosaic(all_pages(tiff)).asarray()
-        if not np.isfinite(numbers).all():
-            raise ValueError("the mosaic holds numbers that are not finite")
+    if not np.isfinite(numbers).all():
+        raise OSError(f"{path}: is damaged inside (its mosaic holds numbers that are not finite); copy it again")
     return np.asarray(numbers, np.float32).reshape(numbers.shape[:2])
 
 

@@ -223,3 +223,23 @@ def test_the_primary_item_of_heif_decides(wide: bool) -> None:
     assert headers_of_opened(BytesIO(heif(1, wide)), "HEIC").colour == Colour()
     assert headers_of_opened(BytesIO(heif(2, wide)), "HEIC").colour == colour_of_code_points(12, 13)
     assert colour_of_code_points(12, 13).chromaticities == P3 and ADOBE_RGB.chromaticities != SRGB
+
+
+def test_a_tiff_has_the_chromaticities_that_it_states(tmp_path: Path) -> None:
+    corners = [number for value in P3 for number in (round(1e5 * value), 100000)]
+    tags = [(318, 5, 2, tuple(corners[12:]), True), (319, 5, 6, tuple(corners[:12]), True)]
+    numbers = np.rint(65535 * encode(LIGHT @ TO_P3.T)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "a.tif", numbers, photometric="rgb", metadata=None, extratags=tags)
+    assert error(tmp_path / "a.tif") < 1.1
+
+
+def test_the_profile_in_a_bmp_is_applied(tmp_path: Path) -> None:
+    profile = colour_of_code_points(12, 13).icc()
+    assert profile is not None
+    pixels = np.rint(255 * encode(LIGHT @ TO_P3.T)).astype(np.uint8)[::-1, :, ::-1].tobytes()  # 108 bytes a row
+    sizes = struct.pack("<IiiHHIIiiII", 124, 36, 24, 1, 24, 0, len(pixels), 0, 0, 0, 0)
+    end = struct.pack("<IIII", 4, 124 + len(pixels), len(profile), 0)
+    header = sizes + bytes(16) + b"DEBM" + bytes(48) + end
+    file = b"BM" + struct.pack("<IHHI", 138 + len(pixels) + len(profile), 0, 0, 138) + header + pixels + profile
+    (tmp_path / "a.bmp").write_bytes(file)
+    assert error(tmp_path / "a.bmp") < 3
