@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rawaug.camera.own import Camera as Camera
     from rawaug.denoising.denoise import denoise as denoise
     from rawaug.denoising.denoiser import RawDenoiser as RawDenoiser
+    from rawaug.evaluation.judge import judge as judge
     from rawaug.isp.config import ISPConfig as ISPConfig
     from rawaug.isp.config import ISPParams as ISPParams
     from rawaug.isp.config import ISPResult as ISPResult
@@ -43,6 +44,7 @@ _PUBLIC = {
     "rawaug.bayer": ("CFA",),
     "rawaug.denoising.denoiser": ("RawDenoiser",),
     "rawaug.denoising.denoise": ("denoise",),
+    "rawaug.evaluation.judge": ("judge",),
     "rawaug.isp.config": ("ISPConfig", "ISPParams", "ISPResult"),
     "rawaug.isp.model": ("DictionaryISP",),
     "rawaug.camera.own": ("Camera",),

@@ -38,6 +38,7 @@ COMMANDS = {
     "fit": "Fit a dictionary ISP to RAW files of a camera.",
     "hdr": "Merge exposures of a scene in RAW, or change the exposure of a single picture.",
     "info": "Describe a weights file, or list the known cameras: rawaug info cameras [PART].",
+    "judge": "Estimate the PSNR of denoisers on your own RAW files, without clean ones.",
     "preview": "Draw a picture at every stage of an ISP, and as augmented RAW.",
     "run": "Run a recipe: rawaug run RECIPE [--key value ...]; resumable, writes runs/NAME.",
     "submit": "Denoise the noisy blocks of a benchmark, in the form that its server takes.",
@@ -48,7 +49,7 @@ COMMANDS = {
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 """These numbers are from glibc's malloc.h."""
 
-NETWORKS = ("benchmark", "denoise", "evaluate", "run")
+NETWORKS = ("benchmark", "denoise", "evaluate", "judge", "run")
 """These commands run networks. They take huge pages and keep them, as page faults took a third of their time."""
 
 _OWN = {*COMMANDS, "data", "completion"}

@@ -1,0 +1,67 @@
+"""``rawaug judge``: the PSNR of denoisers on RAW files that have no clean version; in Python :func:`rawaug.judge`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+from rawaug.commands import YAML
+from rawaug.evaluation.judge import Judgement, judge, plot_judgement, print_judgement
+from rawaug.files import require_writable, write_json
+
+
+def run(
+    files: list[str],
+    /,
+    *,
+    denoisers: Annotated[list[str] | None, YAML] = None,
+    noise: Annotated[tuple[float, float] | str, YAML] = "auto",
+    crop: int | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    picture: str | None = None,
+    json: str | None = None,
+) -> None:
+    """Estimate the PSNR of denoisers on your own RAW files, without clean ones.
+
+    Args:
+        files: RAW files of Bayer sensors, as shot.
+        denoisers: names, .safetensors or .onnx files as a list, [rawaug-small, NonLocalMeans]; by default NonLocalMeans
+            and the shipped networks.
+        noise: where the levels of the noise come from, as for rawaug denoise: auto, profile, estimate, a camera, or
+            [shot_var, read_var].
+        crop: judge only the middle of this side in pixels, which is faster; by default the whole frame.
+        seed: seed of the small change with which each denoiser makes its second pass.
+        device: where networks run: auto, cpu, cuda, cuda:1, mps.
+        picture: write where each denoiser gains and where it harms to this .png; for a single file.
+        json: write the figures to this file.
+    """
+    for path in (picture, json):
+        if path:
+            require_writable(Path(path))
+    if picture and len(files) > 1:
+        raise ValueError(f"--picture {picture}: shows one file, but {len(files)} are given")
+
+    judgements = []
+    for file in files:
+        judgement = judge(file, denoisers, noise, crop=crop, seed=seed, device=device)
+        print_judgement(judgement)
+        judgements.append(judgement)
+
+    if json:
+        write_json({"files": [_as_json(judgement) for judgement in judgements]}, json)
+    if picture and judgements[0].denoisers:
+        plot_judgement(judgements[0], Path(picture))
+        print(f"picture: {picture}")
+    refused = [judgement.name for judgement in judgements if judgement.refusals]
+    if refused:
+        raise ValueError(f"{', '.join(refused)}: not judged, for the reasons above")
+
+
+def _as_json(judgement: Judgement) -> dict[str, Any]:
+    """Make JSON of what was found on a frame, without the maps of blocks."""
+    result = asdict(judgement)
+    for one in result["denoisers"].values():
+        del one["gain"]
+    return result
