@@ -6,9 +6,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
-from rawaug.commands import YAML
+from rawaug.commands import YAML, require_results
 from rawaug.evaluation.judge import Judgement, judge, plot_judgement, print_judgement
-from rawaug.files import require_writable, write_json
+from rawaug.files import require_output, write_json
 
 
 def run(
@@ -22,6 +22,7 @@ def run(
     device: str = "auto",
     picture: str | None = None,
     json: str | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Estimate the PSNR of denoisers on your own RAW files, without clean ones.
 
@@ -36,10 +37,11 @@ def run(
         device: where networks run: auto, cpu, cuda, cuda:1, mps.
         picture: write where each denoiser gains and where it harms to this .png; for a single file.
         json: write the figures to this file.
+        overwrite: replace existing files of --picture and --json.
     """
-    for path in (picture, json):
-        if path:
-            require_writable(Path(path))
+    require_results(json, None, overwrite, files)
+    if picture is not None:
+        require_output(picture, overwrite, (".png",), files)
     if picture and len(files) > 1:
         raise ValueError(f"--picture {picture}: shows one file, but {len(files)} are given")
 
