@@ -51,6 +51,8 @@ HEADROOM = 0.2
 RIDGES = (1e-4, 1e-3, 1e-2, 3e-2)
 PHONES = ["iPhone 7", "Google Pixel", "Samsung Galaxy S6 Edge", "Motorola Nexus 6", "LG G4"]
 """The noise of the frames, at any of its ISOs."""
+LENS = 0.6
+"""Deviation in pixels of the lens of the frames."""
 STABILISED = DOMAINS["anscombe"]
 
 Moments = tuple[Tensor, Tensor]
@@ -164,14 +166,14 @@ def sources(
     def of_pictures(draw: Draw) -> Source:
         return PictureCrops(RawPairs(pictures, augment(draw), CROP))
 
-    perturbed, sharp = Draw(sampling="perturb"), Draw(sampling="perturb", blur=0.0)
+    sharp, soft = Draw(sampling="perturb", blur=0.0), Draw(sampling="perturb", blur=LENS)
     without_noise = [Pair(pair.name, pair.srgb, pair.raw, pair.cfa) for pair in pairs]
     return {
         "more pairs (the ceiling)": RealCrops(more, noise, CROP, isp.cfa),
         "the same frames, fresh noise": RealCrops(without_noise, noise, CROP, isp.cfa),
         "own pictures": OwnPictureCrops(pairs, augment(sharp), CROP),
-        "soft pictures": of_pictures(perturbed),
-        "soft pictures, mixtures of atoms": of_pictures(Draw()),
+        "soft pictures": of_pictures(soft),
+        "soft pictures, mixtures of atoms": of_pictures(Draw(blur=LENS)),
         "sharp pictures": of_pictures(sharp),
         "sharp pictures, mixtures of atoms": of_pictures(Draw(blur=0.0)),
     }
