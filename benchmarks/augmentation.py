@@ -29,7 +29,7 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.pairs import Pair, Sample
 from rawaug.data.selection import select_pairs
-from rawaug.evaluation.trials import trial_of
+from rawaug.evaluation.trials import make_trial
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
@@ -119,7 +119,7 @@ class TestFrames:
     def __init__(self, features: Features, frames: Sequence[Pair], patches: int) -> None:
         self.parts = []
         for number, pair in enumerate(frames):
-            trial = trial_of(pair.middle(256).with_levels(), noise_model((0.0, 0.0)), CFA.RGGB)
+            trial = make_trial(pair.middle(256).with_levels(), noise_model((0.0, 0.0)), CFA.RGGB)
             assert trial.variance is not None
             sample = Sample(trial.noisy[0], trial.clean[0], trial.variance[0])
             cut, _, mean, clean = cut_patches(sample, patches, keyed_generator(0, "test patches", number))

@@ -112,11 +112,11 @@ def fit_family(
 
 
 def end_to_end(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Give the steps and the curve of an ISP's end-to-end training from its fit's record; empty without one.
+    """Give the steps and the curve of an ISP's end-to-end training from its fit's record; empty without a curve.
 
     The curve has the squared error on held-out frames, as the curves of networks have their losses.
     """
-    if "joint" not in info:
+    if "curve" not in info.get("joint", {}):
         return {}
 
     curve = []
