@@ -101,7 +101,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
         ("run fewshot --seeds", "--seeds needs a value"),
         ("run fewshot --train.learning 1", "train.learning: no such key (nearest: train.learning_rate)"),
         ("run fewshot --arms.real.augmneted 1", "arms.real.augmneted: no such key (nearest: arms.NAME.augmented)"),
-        ("run fewshot --arms.real.augmented 7", "arms.real: augmented must be a number from 0.0 to 1.0, got 7"),
+        ("run fewshot --arms.real.augmented 7", "arms.real.augmented: input should be less than or equal to 1, got 7"),
         ("run fewshot --data.count few", "data.count: input should be a valid integer"),
         ("run fewshot --fit.tone curves", "fit.tone: input should be 'auto', 'learned' or 'curve', got 'curves'"),
         ("run fewshot --device null", "device: input should be a valid string, got None"),

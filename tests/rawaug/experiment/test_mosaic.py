@@ -78,7 +78,7 @@ def test_a_network_of_mosaics_is_scored_in_every_pattern_and_others_in_bayer(tmp
     for name in ("BGGR", "XTRANS", "QUAD-RGGB"):
         noisy, same = score([NOISY, own], [mosaic_trial(pair, name, noise_model((1e-3, 1e-5)))])
         assert same.condition == name and same.psnr == pytest.approx(noisy.psnr, abs=0.01)  # untrained: the identity
-    with pytest.raises(ValueError, match=r"NonLocalMeans: .*--denoiser"):
+    with pytest.raises(ValueError, match=r"NonLocalMeans: .*rawaug-xtrans"):
         RawDenoiser.of("NonLocalMeans")(mosaic_trial(pair, "XTRANS", noise_model((1e-3, 1e-5))).input)
 
 
