@@ -25,7 +25,7 @@ def run(
     *,
     denoiser: str | None = None,
     classical: Annotated[Spec | None, YAML] = None,
-    noise: Annotated[tuple[float, float] | str, YAML] = "auto",
+    noise: Annotated[tuple[float, float] | str | dict[str, Any], YAML] = "auto",
     strength: float = 1.0,
     linear: bool = False,
     self_ensemble: bool = False,
@@ -48,8 +48,8 @@ def run(
             or {name, settings}.
         noise: auto (the NoiseProfile tag where the frame bears it out, else an estimate, else the camera's published
             law, else the levels of the folder's files of the same camera and ISO), profile, estimate, camera (the law
-            that the denoiser was trained for), an ISP file (uses its stored noise law), the name of a camera, or
-            [shot_var, read_var].
+            that the denoiser was trained for), an ISP file (uses its stored noise law), a camera's .yaml sheet, the
+            name of a camera, [shot_var, read_var], or a law as {name: MeasuredNoise, levels: ...}.
         strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing; for pictures, a factor on
             the estimated level of the noise: 2 removes more, 0.5 less.
         linear: also demosaic, to a linear DNG of full colour; by default with rawaug-joint.

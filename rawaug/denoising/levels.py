@@ -29,10 +29,10 @@ from rawaug.seeding import keyed_generator
 
 Shots = Mapping[tuple[str, float | None], tuple[float, float]]
 """Levels by camera and ISO."""
-Noise = str | Sequence[float] | MeasuredLevels | Shots
+Noise = str | Mapping[Any, Any] | Sequence[float] | MeasuredLevels
 """Where levels come from: ``"auto"``, ``"profile"`` (the tag), ``"estimate"``, a measured camera's name or law (at the
-file's ISO), ``"camera"`` (the law that the denoiser was trained for), an ISP's file or a camera's sheet, two variances,
-or the levels of other files."""
+file's ISO), ``"camera"`` (the law that the denoiser was trained for), an ISP's file or a camera's sheet, a law as
+``{"name": "MeasuredNoise", ...}``, two variances, or the levels of other files."""
 
 LOOSE = 0.9
 """The least R^2 of a reliable estimate."""
@@ -165,11 +165,16 @@ def _of_other_files(levels: Shots, frame: RawFrame) -> tuple[float, float, str]:
 
 
 def load_noise(noise: Noise, denoiser: ImageDenoiser) -> Noise:
-    """Turn ``"camera"``, an ISP's file or a camera's sheet into the law that it holds; keep all else.
+    """Turn ``"camera"``, an ISP's file, a camera's sheet or ``{"name": ...}`` into its law; keep all else.
 
     Raises:
         ValueError: if it holds no camera's noise law, or those of several.
     """
+    if isinstance(noise, Mapping) and "name" in noise:
+        law = noise_levels(noise, info=denoiser.info)
+        if not isinstance(law, (MeasuredLevels, FixedLevels)):
+            raise ValueError(f"noise {noise}: has no levels by ISO; give MeasuredNoise, or a camera's name")
+        return law if isinstance(law, MeasuredLevels) else (law.shot_var, law.read_var)
     if not isinstance(noise, str) or noise in ("auto", "profile", "estimate"):
         return noise
     if noise != CAMERA and not noise.endswith(".safetensors") and not is_camera_file(noise):

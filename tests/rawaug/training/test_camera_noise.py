@@ -148,6 +148,9 @@ def test_denoise_takes_the_law_at_the_files_iso(noisy_pair: Pair, tmp_path: Path
         camera="Maker Model", iso=400, noise_profile=None, orientation=0, name="a",
     )  # fmt: skip
     assert find_levels(frame, stored) == (8e-4, 1e-5, "camera")
+    assert find_levels(frame, load_noise(law.spec(), RawDenoiser.of(weights))) == (8e-4, 1e-5, "camera")
+    with pytest.raises(ValueError, match="levels by ISO"):
+        load_noise({"name": "upi"}, RawDenoiser.of(weights))
     with pytest.raises(ValueError, match="noise"):
         find_levels(replace(frame, camera="Other"), stored)
     with pytest.raises(ValueError, match="noise="):
