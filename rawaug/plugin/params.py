@@ -193,7 +193,7 @@ class PairForm:
         if self.fields is None:
             return pair
 
-        values = []
+        values: list[Any] = []
         for field in self.fields:
             if field == "picture" and picture is not None:
                 values.append(as_float(picture))

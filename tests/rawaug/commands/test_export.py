@@ -62,6 +62,36 @@ def test_any_size_gives_pytorch_s_numbers(
             assert (torch.from_numpy(denoised) - model(noisy, variance)).abs().max() < 1e-4
 
 
+@pytest.mark.parametrize("half", [False, True])
+def test_tiles_of_one_shape_give_pytorch_s_numbers(half: bool, tmp_path: Path) -> None:
+    for library in ("onnx", "onnxruntime"):
+        pytest.importorskip(library, reason="pip install rawaug[export]")
+    model = denoisers.build("PMRID", width=4, variance_map=True)
+    model.initialise(seed=1, gain=0.6)
+    weights, out = tmp_path / "small.safetensors", tmp_path / "small.onnx"
+    denoisers.save(model.eval(), weights, {"cfa": "RGGB"})
+
+    said = export(weights, out, "1,4,64,96", half)
+    assert "1 x 4 x 64 x 96" in said and ("float16" in said) == half
+    session = open_session(out)
+    assert [value.shape for value in session.get_inputs()] == [[1, 4, 64, 96]] * 2
+    assert {value.type for value in session.get_inputs()} == {"tensor(float)"}
+    metadata = session.get_modelmeta().custom_metadata_map
+    assert metadata["shape"] == "1,4,64,96" and "black 0, white 1" in metadata["domain"]
+
+    noisy = torch.rand(1, 4, 64, 96, generator=torch.Generator().manual_seed(0))
+    variance = noise_variance(noisy, 1e-3, 1e-5)
+    (denoised,) = session.run(None, {"noisy": noisy.numpy(), "variance": variance.numpy()})
+    with torch.no_grad():
+        difference = float((torch.from_numpy(denoised) - model(noisy, variance)).abs().max())
+    assert difference < (5e-3 if half else 1e-4)
+    assert (difference > 1e-5) == half, "float16 has 11 bits"
+
+    for shape in ("1,3,64,96", "64,96", "a,b,c,d"):
+        with pytest.raises(ValueError, match="--shape"):
+            export(weights, out, shape)
+
+
 class Levels(nn.Module):
     def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
         return torch.cat(fit_levels(noisy, variance))
