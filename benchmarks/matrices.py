@@ -242,7 +242,7 @@ def write_pngs(folder: Path) -> Iterator[Path]:
     }
     for name, (values, chunks) in spaces.items():
         for bits, dtype in ((8, ">u1"), (16, ">u2")):
-            if bits == 8 and values.min() < 0.06:  # linear light in 8 bits is coarse
+            if bits == 8 and name in ("cicp_linear", "gama_chrm_p3"):  # linear light in 8 bits is coarse
                 continue
             rows = np.rint(values * (2**bits - 1)).astype(dtype)
             pixels = zlib.compress(b"".join(b"\0" + row.tobytes() for row in rows))
