@@ -86,7 +86,7 @@ def move_opcodes(opcodes: bytes, shift: Pair, size: Pair, new_size: Pair) -> tup
                 continue
             try:
                 body = move(opcode.body, shift, size, new_size)
-            except (struct.error, ValueError, ZeroDivisionError):
+            except (struct.error, ValueError, ArithmeticError):
                 left_out.append(f"opcode {opcode.code}, which is damaged")
                 continue
             if body is not None:
