@@ -25,7 +25,7 @@ from rawaug.data import open_pairs
 from rawaug.data.frames import as_frames
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.evaluation.scores import compare, to_domain
+from rawaug.evaluation.scores import compare_images, to_domain
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.full_colour import libraw_demosaic, mosaic_trial
@@ -72,7 +72,7 @@ def scores_of(pair: Pair, cfa: str, noise: Any, networks: list[RawDenoiser]) -> 
     for one in networks:
         if one.takes_pattern(cfa):
             found[one.name] = next(image for _, image in to_domain(one.name, one(trial.input), trial))
-    scored = {name: compare(image, trial) for name, image in found.items()}
+    scored = {name: compare_images(image, trial) for name, image in found.items()}
     return {name: (rgb, srgb or 0.0) for name, (rgb, _, srgb, _) in scored.items()}
 
 

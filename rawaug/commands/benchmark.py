@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from rawaug.commands import YAML, require_results
 from rawaug.data.picture_pairs import is_picture_pairs
-from rawaug.evaluation.comparison import Comparison, compare_pictures, compare_raw
+from rawaug.evaluation.comparison import BenchmarkSettings, compare_pictures, compare_raw
 from rawaug.files import require_output
 from rawaug.registry import require_between
 
@@ -59,7 +59,9 @@ def run(
         if path is not None:
             require_output(path, overwrite, extensions, inputs)
 
-    comparison = Comparison(denoisers, data, bin, count, crop, noise, iso, seed, device, json, report, table, figure)
+    comparison = BenchmarkSettings(
+        denoisers, data, bin, count, crop, noise, iso, seed, device, json, report, table, figure
+    )
     for option, value in (("count", count), ("crop", crop)):
         if value is not None:
             require_between(f"--{option}", value, 1, 2**20)

@@ -31,9 +31,6 @@ SHARED = ("channels", "variance_map", "deviation", "domain")
 _LARGE = 2**31
 """Numbers beyond this are allowed, but nobody means them."""
 
-Options = list[tuple[str, Any]]
-"""These are the dotted keys of the command line with their values, in their order."""
-
 
 def run(
     recipe: str = "",
@@ -78,7 +75,7 @@ def run(
 # -- the command line --------------------------------------------------------------------------------------------------
 
 
-def parse_options(words: Sequence[str], settings: type[Any]) -> Options:
+def parse_options(words: Sequence[str], settings: type[Any]) -> list[tuple[str, Any]]:
     """Parse the words of a command line, ``--key value`` or ``--key=value``, into dotted keys and values.
 
     ``--denoiser DnCNN`` is short for ``--denoiser.name DnCNN``; a field of the settings may be spelt with hyphens.
@@ -115,7 +112,7 @@ def parse_options(words: Sequence[str], settings: type[Any]) -> Options:
     return options
 
 
-def merge_options(content: Mapping[str, Any], options: Options) -> dict[str, Any]:
+def merge_options(content: Mapping[str, Any], options: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     """Put the values of the command line into the content of a recipe's file."""
     merged = deepcopy(dict(content))
     for key, value in options:

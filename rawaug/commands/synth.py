@@ -17,7 +17,7 @@ from rawaug.synthesis.shards import PER_SHARD
 
 
 @dataclass(frozen=True)
-class Options(AugmentConfig):
+class SynthOptions(AugmentConfig):
     """The settings of an augmentation, each an option of its own."""
 
     draw: Annotated[Draw, OPTIONS] = Draw()
@@ -30,7 +30,7 @@ def run(
     *,
     format: Format = "dng",
     per_image: int = 1,
-    config: Annotated[Options, OPTIONS] = Options(),
+    config: Annotated[SynthOptions, OPTIONS] = SynthOptions(),
     seed: int = 0,
     workers: int | None = None,
     max_pixels: int = MAX_PIXELS,

@@ -109,7 +109,7 @@ def trials(
     for frame in progress(frames, label="noise", unit="frame"):
         middle = frame.middle(crop)
         for name, levels in strengths.items():
-            exact = noisy_frame(frame, name, levels, seed)
+            exact = draw_noisy(frame, name, levels, seed)
             cases.append(_middle(exact, middle, crop, TOLD, name))
 
             with suppress(ValueError):  # too little of the frame is flat
@@ -118,13 +118,13 @@ def trials(
                 cases.append(_middle(estimated, middle, crop, ESTIMATED, name))
 
             if name in with_faults:
-                faulty = noisy_frame(frame, name, levels, seed, real=True)
+                faulty = draw_noisy(frame, name, levels, seed, real=True)
                 cases.append(_middle(faulty, middle, crop, REAL, name))
 
     return cases
 
 
-def noisy_frame(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real: bool = False) -> Noisy:
+def draw_noisy(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real: bool = False) -> Noisy:
     """Make a whole frame with noise of a strength, ``(1, 4, h, w)``.
 
     Args:

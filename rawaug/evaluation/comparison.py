@@ -45,7 +45,7 @@ _ON_PAGE = 4
 
 
 @dataclass(frozen=True)
-class Comparison:
+class BenchmarkSettings:
     """The settings of a comparison by ``rawaug benchmark``.
 
     Attributes:
@@ -79,7 +79,7 @@ class Comparison:
     figure: str | None = None
 
 
-def compare_raw(comparison: Comparison) -> None:
+def compare_raw(comparison: BenchmarkSettings) -> None:
     """Compare denoisers of RAW on the same frozen noise; print the tables, and write them as JSON and as a page."""
     count, crop = comparison.count or _FRAMES, comparison.crop or _CROP
     comparison = replace(comparison, count=count, crop=crop)
@@ -124,13 +124,13 @@ def compare_raw(comparison: Comparison) -> None:
         print(f"page: {page.write(Path(comparison.report), settings)}")
 
 
-def compare_pictures(comparison: Comparison) -> None:
+def compare_pictures(comparison: BenchmarkSettings) -> None:
     """Compare denoisers of pictures; print the table, and write it as JSON.
 
     Raises:
         ValueError: if a setting is not the default that has no meaning for pictures.
     """
-    usual = Comparison(comparison.denoisers, comparison.data)
+    usual = BenchmarkSettings(comparison.denoisers, comparison.data)
     for key in ("bin", "noise", "iso", "seed", "report", "table", "figure"):
         if getattr(comparison, key) != getattr(usual, key):
             raise ValueError(f"{comparison.data}: has developed pictures; --{key} is for RAW")
@@ -150,7 +150,7 @@ def compare_pictures(comparison: Comparison) -> None:
         write_json({**facts, **result}, comparison.json)
 
 
-def _open_denoisers(comparison: Comparison) -> list[RawDenoiser]:
+def _open_denoisers(comparison: BenchmarkSettings) -> list[RawDenoiser]:
     """Open the denoisers of the table; one whose name is taken goes by its spec."""
     by_name: dict[str, RawDenoiser] = {}
     for spec in dict.fromkeys((_ALWAYS, *shipped_of_mosaics(), *comparison.denoisers)):
@@ -181,7 +181,7 @@ def _make_notes(result: dict[str, Any]) -> list[str]:
 
 
 def _make_page(
-    comparison: Comparison,
+    comparison: BenchmarkSettings,
     result: dict[str, Any],
     denoisers: Sequence[RawDenoiser],
     cases: Sequence[Trial],

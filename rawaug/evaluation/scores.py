@@ -135,7 +135,7 @@ def _score_one(denoiser: Denoiser, trial: Trial) -> Iterator[Row]:
     seconds = (time.perf_counter() - start) / (noisy.image.numel() / 1e6)
 
     for name, image in to_domain(denoiser.name, denoised, trial):
-        metrics = compare(image, trial)
+        metrics = compare_images(image, trial)
         error = 10.0 ** (-metrics[0] / 10.0)
         share = None
         if trial.own is not None and error > 0:
@@ -168,7 +168,7 @@ def to_domain(name: str, denoised: Tensor, trial: Trial) -> Iterator[tuple[str, 
         yield ", ".join(filter(None, [name, way])), follow(denoised)
 
 
-def compare(image: Tensor, trial: Trial) -> tuple[float, float, float | None, float | None]:
+def compare_images(image: Tensor, trial: Trial) -> tuple[float, float, float | None, float | None]:
     """Compute PSNR in dB and SSIM of an image against the clean one of its shape, and both again after development.
 
     ``image`` has the form of the trial's domain: ``(1, 4, h, w)`` or ``(1, 3, H, W)``.

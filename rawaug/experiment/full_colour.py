@@ -87,7 +87,7 @@ def rgb_trial(
 
     follow = {}
     for name, method in (ways or {}).items():
-        follow[name] = partial(demosaic, pair=pair, method=method, cfa=cfa)
+        follow[name] = partial(demosaic_mosaic, pair=pair, method=method, cfa=cfa)
 
     return Trial(
         noisy,
@@ -97,7 +97,7 @@ def rgb_trial(
         "rgb",
         levels=levels,
         cfa=bayer.canonical_cfa(cfa),
-        develop=partial(develop, pair=pair, exposure=exposure_of(bayer.pack_rgb(rgb, CFA.RGGB), pair)),
+        develop=partial(develop_rgb, pair=pair, exposure=exposure_of(bayer.pack_rgb(rgb, CFA.RGGB), pair)),
         ways=follow,
         **about,
     )
@@ -111,7 +111,7 @@ def _in_pattern(squares: Tensor, cfa: str) -> Tensor:
     return bayer.pack_if_bayer(bayer.unpack(squares, CFA.RGGB), cfa)
 
 
-def develop(image: Tensor, pair: Pair, exposure: float) -> Tensor:
+def develop_rgb(image: Tensor, pair: Pair, exposure: float) -> Tensor:
     """Develop linear RGB ``(1, 3, H, W)``, or packed RAW at its size, to sRGB ``(3, H, W)`` in the frame's colours."""
     rgb = image[0]
     if image.shape[1] == PACKED:
@@ -120,7 +120,7 @@ def develop(image: Tensor, pair: Pair, exposure: float) -> Tensor:
     return render_rgb(rgb, pair.white_balance, pair.color_matrix, exposure, least=None)
 
 
-def demosaic(image: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB) -> Tensor:
+def demosaic_mosaic(image: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB) -> Tensor:
     """Demosaic RAW, as a denoiser gives it, to linear camera RGB ``(1, 3, H, W)``.
 
     Args:

@@ -111,7 +111,9 @@ def run(
 
         for seed in recipe.all_seeds:
             # Fit the ISP. If it has measured the noise, frames and trials have this noise; else they stay.
-            isp = finished_isp or fit_isp(recipe, frames["pairs"], folder / f"seed{seed}" / "isp.safetensors", seed)
+            isp = finished_isp or fit_to_pairs(
+                recipe, frames["pairs"], folder / f"seed{seed}" / "isp.safetensors", seed
+            )
             if seed == recipe.seed or recipe.noise == "camera":
                 noise = noise_model(recipe.noise_at_iso, info=isp.info)
                 real = as_trained(recipe, frames["pairs"], isp)
@@ -255,7 +257,7 @@ def warn_of_noise(
 # -- fit, train --------------------------------------------------------------------------------------------------------
 
 
-def fit_isp(recipe: Recipe, pairs: Sequence[Pair], file: Path, seed: int) -> DictionaryISP:
+def fit_to_pairs(recipe: Recipe, pairs: Sequence[Pair], file: Path, seed: int) -> DictionaryISP:
     """Fit the ISP to the few pairs, or read it if it was fitted to them before; its hash is ``info["key"]``."""
     measures_noise = recipe.noise == "camera"
     settings = {**asdict(recipe.fit), "seed": seed}

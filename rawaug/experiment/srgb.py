@@ -155,28 +155,17 @@ class SrgbTask(Task):
         return list(first.values())
 
 
-def _level_name(levels: Levels) -> str:
-    """Write a level's name in tables and files."""
-    shot_var, read_var = levels
-    return f"shot variance {shot_var:g}, read variance {read_var:g}"
-
-
 def srgb_trials(pairs: Sequence[Any], levels: Sequence[Levels], label: str) -> list[Trial]:
     """Make trials of frames in the domain ``srgb``: RAW at every level, pairs of pictures as they are."""
     trials: list[Trial] = []
     for pair in progress(pairs, label=label, unit="frame"):
         if isinstance(pair, PicturePair):
-            trials.append(_real_trial(pair))
+            (trial,) = picture_trials([pair])
+            trials.append(replace(trial, condition="", strength=REAL))
         else:
             trials += _drawn_trials(pair, levels)
 
     return trials
-
-
-def _real_trial(pair: PicturePair) -> Trial:
-    """Make a trial of a pair of pictures as it is published."""
-    (trial,) = picture_trials([pair])
-    return replace(trial, condition="", strength=REAL)
 
 
 def _drawn_trials(pair: Pair, levels: Sequence[Levels]) -> list[Trial]:
@@ -193,7 +182,7 @@ def _drawn_trials(pair: Pair, levels: Sequence[Levels]) -> list[Trial]:
 
         inputs: dict[str, Noisy] = {RawDenoiser.takes: Noisy(noisy, variance, level, pair.cfa)}
         image = _unpacked_and_developed(noisy, pair)
-        strength = _level_name(level)
+        strength = f"shot variance {level[0]:g}, read variance {level[1]:g}"
         trials.append(Trial(image, clean, None, pair.name, "srgb", strength=strength, inputs=inputs, ways=ways))
 
     return trials

@@ -20,7 +20,7 @@ from rawaug.data.pairs import Pair
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
-from rawaug.training.camera_noise import CameraNoise, measure_camera_noise
+from rawaug.training.camera_noise import measure_camera_noise, plot_camera_noise
 
 WATCHED_PATCHES = 4
 """This many patches of a held-out frame are scored during the fit."""
@@ -86,9 +86,21 @@ def fit(
 
     watch = None
     if held_out is not None:
-        watch = _Watch(_held_out_pairs(held_out, pairs, camera_jpeg, mosaics))
+        others = _open_pairs(held_out, camera_jpeg, mosaics if str(held_out).startswith("pairs:") else {})
+        shared = shared_frame(others, pairs)
+        if shared is not None:
+            raise ValueError(f"held-out: {shared} is also fitted; hold out other frames")
+        watch = _Watch(others)
 
-    estimate = _measure_noise(frames, noise, dark)  # before the fit, so that failures come early
+    law = None
+    reason = ""
+    if noise != "off":  # before the fit, so that failures come early
+        try:
+            law, estimates = measure_camera_noise(frames, dark)
+        except ValueError as error:
+            if noise == "on":
+                raise
+            reason = str(error)
 
     figures = None
     if camera is not None:
@@ -105,42 +117,16 @@ def fit(
     if unreadable:
         isp.info["unreadable"] = unreadable
 
-    if isinstance(estimate, str):
-        isp.info["noise_not_measured"] = estimate
-    elif estimate is not None:
-        isp.info["noise"] = estimate.law.spec()
+    if reason:
+        isp.info["noise_not_measured"] = reason
+    elif law is not None:
+        isp.info["noise"] = law.spec()
         if noise_figure is not None:
-            estimate.plot(noise_figure)
+            plot_camera_noise(law, estimates, noise_figure)
 
     isp.info["rendering"] = describe_rendering(pairs, len(isp.info["frames"]), isp.info["registered"])
     isp.info["seconds"] = round(time.perf_counter() - start, 2)
     return isp
-
-
-def _held_out_pairs(
-    held_out: str | Path | Sequence[Pair], pairs: Sequence[Pair], camera_jpeg: bool, mosaics: Mapping[str, Any]
-) -> Sequence[Pair]:
-    """Open the held-out frames; raise ValueError if one of them is among the fitted ones, ``pairs``."""
-    if not str(held_out).startswith("pairs:"):
-        mosaics = {}
-    others = _open_pairs(held_out, camera_jpeg, mosaics)
-
-    shared = shared_frame(others, pairs)
-    if shared is not None:
-        raise ValueError(f"held-out: {shared} is also fitted; hold out other frames")
-    return others
-
-
-def _measure_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> CameraNoise | str | None:
-    """Measure the levels; return the reason if they cannot be measured."""
-    if noise == "off":
-        return None
-    try:
-        return measure_camera_noise(pairs, dark)
-    except ValueError as error:
-        if noise == "on":
-            raise
-        return str(error)
 
 
 def describe_rendering(pairs: Frames, frames: int, registered: int) -> str:

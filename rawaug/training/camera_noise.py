@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 from torch import Tensor
 
@@ -25,32 +24,26 @@ _UNKNOWN = "unknown"
 """Files that do not name a camera have this one."""
 
 
-class CameraNoise(NamedTuple):
-    """The noise of a camera.
-
-    Attributes:
-        law: the camera's levels by ISO.
-        estimates: the measured points by ISO.
-    """
-
-    law: MeasuredLevels
-    estimates: dict[float | None, NoiseEstimate]
-
-    def plot(self, path: str | Path) -> None:
-        """Draw the measured points and the line of each ISO, one file for each, see :func:`noise_figures`."""
-        for file, (iso, estimate) in zip(noise_figures(path, self.law), self.estimates.items(), strict=True):
-            title = self.law.camera
-            if iso is not None:
-                title = f"{self.law.camera}, ISO {iso:g}"
-            plot_noise(estimate, file, title=title)
+def plot_camera_noise(law: MeasuredLevels, estimates: Mapping[float | None, NoiseEstimate], path: str | Path) -> None:
+    """Draw the measured points and the line of each ISO, one file for each, see :func:`noise_figures`."""
+    for file, (iso, estimate) in zip(noise_figures(path, law), estimates.items(), strict=True):
+        title = law.camera
+        if iso is not None:
+            title = f"{law.camera}, ISO {iso:g}"
+        plot_noise(estimate, file, title=title)
 
 
-def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) -> CameraNoise:
+def measure_camera_noise(
+    pairs: Sequence[Pair], dark: str | Path | None = None
+) -> tuple[MeasuredLevels, dict[float | None, NoiseEstimate]]:
     """Measure (shot_var, read_var) of one camera at each ISO of its files.
 
     Args:
         pairs: the frames, flat areas among them.
         dark: folder of dark frames to measure the read variance.
+
+    Returns:
+        The camera's levels by ISO, and the measured points of each.
 
     Raises:
         ValueError: if the frames are of several cameras, have no common noise law, or cannot be read.
@@ -71,7 +64,7 @@ def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) 
             if camera == _UNKNOWN:
                 camera = frame.camera
 
-    return CameraNoise(MeasuredLevels(levels, camera), estimates)
+    return MeasuredLevels(levels, camera), estimates
 
 
 def _measure(

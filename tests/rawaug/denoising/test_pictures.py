@@ -23,7 +23,7 @@ from rawaug.denoising.files import denoise_folder
 from rawaug.denoising.picture_files import PictureFiles
 from rawaug.denoising.picture_levels import estimate_level
 from rawaug.denoising.pictures import PictureDenoiser
-from rawaug.evaluation.comparison import Comparison, compare_pictures
+from rawaug.evaluation.comparison import BenchmarkSettings, compare_pictures
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, register
 from rawaug.io.pictures import read_picture, write_picture
 from rawaug.plugin.finishing import blur
@@ -197,7 +197,7 @@ def test_a_benchmark_of_pictures_crops_and_counts_and_refuses_what_is_for_raw(tm
     of_raw: dict[str, Any] = {"bin": 2, "noise": "upi", "iso": [100.0], "seed": 1, "report": "r.html", "table": "t.tex"}
     for key, value in of_raw.items():
         with pytest.raises(ValueError, match=f"--{key} is for RAW"):
-            compare_pictures(replace(Comparison(["NonLocalMeans@10"], f"cc15:{tmp_path}"), **{key: value}))
+            compare_pictures(replace(BenchmarkSettings(["NonLocalMeans@10"], f"cc15:{tmp_path}"), **{key: value}))
 
 
 def test_a_cmyk_picture_is_refused_in_one_line(tmp_path: Path) -> None:

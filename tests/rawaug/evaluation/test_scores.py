@@ -20,7 +20,7 @@ from rawaug.cli import main
 from rawaug.commands.evaluate import run as evaluate
 from rawaug.data import Pair, demo_pairs
 from rawaug.denoising.denoiser import Noisy, RawDenoiser, require_classical
-from rawaug.evaluation.scores import NOISY, Row, compare, score, summary
+from rawaug.evaluation.scores import NOISY, Row, compare_images, score, summary
 from rawaug.evaluation.tables import print_scores
 from rawaug.evaluation.trials import make_trial
 from rawaug.experiment.run import find_classical
@@ -148,9 +148,9 @@ def test_the_development_is_the_same_for_both() -> None:
     """Halving clean and result alike changes nothing after development, since the exposure is the clean frame's."""
     pair = demo_pairs("test", count=1)[0]
     trial = make_trial(pair, noise_model("cycleisp_sidd"))
-    whole = compare(trial.noisy, trial)
+    whole = compare_images(trial.noisy, trial)
     dark = replace(make_trial(replace(pair, raw=pair.raw / 2), noise_model((0.0, 0.0))), noisy=trial.noisy / 2)
-    half = compare(dark.noisy, dark)
+    half = compare_images(dark.noisy, dark)
     assert half[2:] == pytest.approx(whole[2:], rel=1e-4) and half[0] == pytest.approx(whole[0] + 6.02, abs=0.01)
 
 

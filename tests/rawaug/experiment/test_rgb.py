@@ -16,9 +16,9 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import demo_pictures
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.scores import compare
+from rawaug.evaluation.scores import compare_images
 from rawaug.experiment.data import open_frames
-from rawaug.experiment.full_colour import RgbRecipe, demosaic, full_colour, rgb_trial
+from rawaug.experiment.full_colour import RgbRecipe, demosaic_mosaic, full_colour, rgb_trial
 from rawaug.experiment.run import run
 from rawaug.experiment.run import run as train_denoiser
 from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
@@ -76,10 +76,10 @@ def test_noise_is_on_the_mosaic_of_the_truth_and_the_same_every_time() -> None:
 def test_what_is_smooth_is_demosaiced_to_itself(method: str) -> None:
     """LibRaw's result is in the same units, though it works on balanced RAW: red and blue are twice as bright there."""
     trial = rgb_trial(a_pair(), NOISE)
-    rgb = demosaic(bayer.pack_rgb(trial.clean, CFA.RGGB), a_pair(), method)
+    rgb = demosaic_mosaic(bayer.pack_rgb(trial.clean, CFA.RGGB), a_pair(), method)
     error = (rgb - trial.clean)[..., 6:-6, 6:-6].abs().amax(dim=(0, 2, 3))
     assert error.max() < 4e-3, error
-    assert compare(rgb, trial)[0] > compare(rgb + 0.01, trial)[0] > 35
+    assert compare_images(rgb, trial)[0] > compare_images(rgb + 0.01, trial)[0] > 35
 
 
 def small(folder: Path, **changes: Any) -> RgbRecipe:

@@ -63,7 +63,7 @@ def test_files_and_folders_are_fitted_together(
     assert f"{out}: fitted to 4 frames in {isp.info['seconds']} s" in capsys.readouterr().out
     by_hand = rawaug.fit([one, tmp_path / "more", two], progress=False, noise="off", **SETTINGS)
     assert same(isp, by_hand)
-    assert not same(isp, fit(out, one, two))
+    assert not same(isp, fit(tmp_path / "y.safetensors", one, two))
 
 
 def test_what_cannot_be_fitted_together_is_named(tmp_path: Path, shoot: Shoot, refused: Callable[..., str]) -> None:

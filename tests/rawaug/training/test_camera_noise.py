@@ -54,7 +54,7 @@ def test_dark_frames_set_the_read_variance(noisy_pair: Pair, tmp_path: Path, bay
     rng = np.random.default_rng(0)
     dark = rng.normal(512, READ_VAR**0.5 * (16383 - 512), (128, 128)).round().astype(np.uint16)
     bayer_dng(tmp_path / "dark.dng", dark, cfa="GRBG", black=(512,), white=16383)
-    shot_var, read_var = measure_camera_noise([noisy_pair], dark=tmp_path).law.at(None)
+    shot_var, read_var = measure_camera_noise([noisy_pair], dark=tmp_path)[0].at(None)
     assert read_var == pytest.approx(READ_VAR, rel=0.03)
     assert shot_var == pytest.approx(SHOT_VAR, rel=0.1)
 
@@ -92,7 +92,7 @@ def test_the_limits_are_a_slope_above_0_and_half_the_variance_explained(
     found = estimate_noise(noisy_pair.noisy, noisy_pair.cfa)
     monkeypatch.setattr("rawaug.training.camera_noise.estimate_noise", estimate)
     if accepted:
-        assert measure_camera_noise([noisy_pair]).law.at(None)[0] == shot_var
+        assert measure_camera_noise([noisy_pair])[0].at(None)[0] == shot_var
     else:
         with pytest.raises(ValueError, match=f"R\\^2 {r2:.2f}"):
             measure_camera_noise([noisy_pair])

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rawaug.data import demo_pairs
-from rawaug.evaluation.scores import compare
+from rawaug.evaluation.scores import compare_images
 from rawaug.evaluation.trials import Trial, make_trial
 from rawaug.noise import noise_model
 from rawaug.training.loop import validate
@@ -47,5 +47,5 @@ def test_srgb_is_that_of_the_evaluation() -> None:
     pair = demo_pairs("validation", count=1)[0]
     trial = make_trial(pair, noise_model("cycleisp_sidd"))
     scores = validate(Nothing(), [trial], CPU)
-    expected = compare(trial.noisy, trial)
+    expected = compare_images(trial.noisy, trial)
     assert (scores["psnr"], scores["psnr_srgb"]) == pytest.approx((expected[0], expected[2]), abs=1e-3)
