@@ -99,7 +99,7 @@ def test_the_help_lists_the_networks_of_the_registry(capsys: pytest.CaptureFixtu
 
 
 def test_frames_without_known_noise_ask_for_the_command_to_type() -> None:
-    with pytest.raises(ValueError, match="--noise"):
+    with pytest.raises(ValueError, match="noise: camera"):
         frame_levels(replace(demo_pairs("train", count=1)[0], shot_var=None, read_var=None), None)
 
 
