@@ -9,7 +9,7 @@ with a U-Net U and a step :math:`\mu` in (0, 1) that a small head reads from x. 
 project's own; layers are named as in the file of weights that its authors publish. That file has no licence, so it is
 used for measuring only: it does not ship, and nothing is trained from it.
 
-Source: https://github.com/hellopipu/PBRID, the winner of the RAW denoising challenge of Megvii, 2022.
+Source: https://github.com/hellopipu/PBRID, one of the entries of the RAW denoising challenge of Megvii, 2022.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from inspect import signature
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from rawaug.commands import YAML, as_options, network_or_filter, require_results
 from rawaug.denoising.denoise import files_for, is_mixed
@@ -30,6 +30,7 @@ def run(
     linear: bool = False,
     self_ensemble: bool = False,
     greens: Greens = "auto",
+    guard: Literal["on", "off"] = "off",
     device: str = "auto",
     preview: str | None = None,
     json: str | None = None,
@@ -56,6 +57,8 @@ def run(
         self_ensemble: average eight views of a network, at eight times the cost.
         greens: auto makes the two greens of a Bayer sensor agree if they clearly differ, since demosaicing turns the
             difference into a maze; keep leaves them as they are.
+        guard: on blends the result of a Bayer mosaic with its input where it is estimated to be worse, as at a camera's
+            base ISO or at a small light; it takes two more passes over a sample of the frame.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         preview: also write the result, developed by LibRaw, as this .jpg or .png; for a folder, write a JPEG of each
             result to this folder.
@@ -72,6 +75,7 @@ def run(
         linear=linear,
         self_ensemble=self_ensemble,
         greens=greens,
+        guard=guard == "on",
         device=device,
     )
 

@@ -24,6 +24,7 @@ def denoise(
     linear: bool = False,
     self_ensemble: bool = False,
     greens: Greens = "auto",
+    guard: bool = False,
     device: str = "auto",
     preview: str | Path | None = None,
     overwrite: bool = False,
@@ -42,6 +43,7 @@ def denoise(
         linear: also demosaic RAW, to linear camera RGB.
         self_ensemble: average eight views, at eight times the cost.
         greens: ``"keep"`` leaves the two greens of a Bayer sensor that differ as they are.
+        guard: blend the result of a Bayer mosaic with its input where it is estimated to be worse than that.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         preview: a .jpg or .png of the result of RAW to write as well, developed by LibRaw.
         overwrite: replace ``out`` and ``preview`` if they exist.
@@ -66,6 +68,7 @@ def denoise(
         linear=linear,
         self_ensemble=self_ensemble,
         greens=greens,
+        guard=guard,
         device=device,
     )
     if not isinstance(source, RawFrame):
@@ -87,6 +90,7 @@ def files_for(
     linear: bool = False,
     self_ensemble: bool = False,
     greens: Greens = "auto",
+    guard: bool = False,
     device: str = "auto",
 ) -> Files[Any]:
     """Say how the files of a source are denoised: by its content; a folder is of pictures if it has no RAW file.
@@ -105,10 +109,16 @@ def files_for(
             linear=linear,
             self_ensemble=self_ensemble,
             greens=greens,
+            guard=guard,
             device=device,
         )
 
-    for argument, is_set in (("linear", linear), ("greens", greens != "auto"), ("noise", noise != "auto")):
+    for argument, is_set in (
+        ("linear", linear),
+        ("greens", greens != "auto"),
+        ("guard", guard),
+        ("noise", noise != "auto"),
+    ):
         if is_set:
             raise ValueError(f"{source}: is a developed picture; {argument}= is for RAW")
     return PictureFiles(denoiser, strength=strength, self_ensemble=self_ensemble, device=device)

@@ -28,8 +28,10 @@ from torch import Tensor
 from denoisers.files import JOINT
 from rawaug import bayer
 from rawaug.bayer import CFA, GreenDifference
+from rawaug.denoising.base import Noisy
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.denoising.files import Files
+from rawaug.denoising.guard import guard_result
 from rawaug.denoising.levels import Noise, as_json, find_levels, load_noise
 from rawaug.errors import escape
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
@@ -75,6 +77,8 @@ class Denoised:
         seconds: the time for reading, denoising and writing.
         camera, iso: the source's camera and ISO.
         corrected: errors of the sensor that were taken out.
+        blended: the mean share of the result in its blend with the input; 1 without the guard, or where it found none
+            of the frame harmed.
     """
 
     source: Path | None
@@ -87,10 +91,13 @@ class Denoised:
     camera: str
     iso: float | None
     corrected: Corrected
+    blended: float = 1.0
 
     def __str__(self) -> str:
         levels = f"shot_var {self.shot_var:.3g}, read_var {self.read_var:.3g} ({self.noise_source})"
         line = f"{escape(self.out)}: {levels}{self.corrected}, {self.seconds:.1f} s"
+        if self.blended < 0.995:
+            line += f"; blended with its input, {self.blended:.0%} of what was removed stays removed"
         if self.below_zero:
             line += f"; {self.below_zero:.2%} below digital number 0, written as 0"
         return line
@@ -106,6 +113,8 @@ class RawFiles(Files[Denoised]):
         linear: whether the result is demosaiced, too.
         self_ensemble: whether eight views are averaged.
         greens: ``"keep"`` leaves greens that differ.
+        guard: whether a result that is estimated to be worse than its input is blended with it
+            (:mod:`rawaug.denoising.guard`); for Bayer mosaics with known levels.
         device: where a network runs: auto, cpu, cuda, ...
 
     Raises:
@@ -130,6 +139,7 @@ class RawFiles(Files[Denoised]):
         linear: bool = False,
         self_ensemble: bool = False,
         greens: Greens = "auto",
+        guard: bool = False,
         device: str = "auto",
     ) -> None:
         if greens not in get_args(Greens):
@@ -153,7 +163,10 @@ class RawFiles(Files[Denoised]):
             raise ValueError(f"{denoiser.name}: denoises the mosaic; linear=True demosaics, too, use {JOINT}")
         if denoiser.demosaics and not linear:
             raise ValueError(f"{denoiser.name}: demosaics too, to a linear DNG; add linear=True")
+        if guard and denoiser.demosaics:
+            raise ValueError(f"{denoiser.name}: demosaics, too; guard compares mosaics")
         self.greens = greens
+        self.guard = guard
         self.noise = load_noise(noise, denoiser)
 
     @property
@@ -166,6 +179,8 @@ class RawFiles(Files[Denoised]):
 
         if self.greens != "auto":
             settings["greens"] = self.greens
+        if self.guard:
+            settings["guard"] = True
         if self.denoiser.strength != 1.0:
             settings["strength"] = self.denoiser.strength
         return settings
@@ -216,12 +231,17 @@ class RawFiles(Files[Denoised]):
 
         # The levels of its noise.
         levels, noise_source = None, "not needed"
-        if denoiser.reads_levels:
+        if denoiser.reads_levels or self.guard:
             shot_var, read_var, noise_source = find_levels(mosaic, self.noise)
             levels = shot_var, read_var
 
         # The result: full colour, or a mosaic that digital numbers can hold, with the noise that is left.
         image = denoiser.frame(mosaic, levels)
+        blended = 1.0
+        if self.guard and levels is not None and mosaic.cfa in CFA.__members__:
+            noisy = Noisy.of(bayer.pack(mosaic.mosaic[None], mosaic.cfa), levels, mosaic.cfa)
+            guarded, blended = guard_result(denoiser, noisy, bayer.pack(image[None], mosaic.cfa))
+            image = bayer.unpack(guarded, mosaic.cfa)[0].clamp(max=1.0)
         rgb = None
         if denoiser.demosaics:
             rgb = image
@@ -242,7 +262,17 @@ class RawFiles(Files[Denoised]):
 
         shot_var, read_var = levels or (0.0, 0.0)
         done = Denoised(
-            file, out, shot_var, read_var, noise_source, below_zero, seconds, frame.camera, frame.iso, corrected
+            file,
+            out,
+            shot_var,
+            read_var,
+            noise_source,
+            below_zero,
+            seconds,
+            frame.camera,
+            frame.iso,
+            corrected,
+            blended,
         )
         return (frame if rgb is None else rgb), done
 

@@ -1,0 +1,90 @@
+"""The guard: it costs nothing where a denoiser is right, and gives back what is lost where it is not."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+import rawaug
+from rawaug import RawDenoiser, bayer
+from rawaug.denoising.base import Noisy
+from rawaug.denoising.guard import guard_result
+from rawaug.io import RawFrame
+
+LEVELS = (1e-3, 1e-6)
+
+
+def noisy_of(clean: Tensor, told: float = 1.0) -> Noisy:
+    deviation = (LEVELS[0] * clean + LEVELS[1]).sqrt()
+    image = clean + deviation * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+    return Noisy.of(image, (told * LEVELS[0], told * LEVELS[1]), "RGGB")
+
+
+def mean(noisy: Noisy) -> Tensor:
+    """The mean over 25 cells: right where the scene is flat, and blind to all detail."""
+    return F.avg_pool2d(F.pad(noisy.image, (2, 2, 2, 2), mode="reflect"), 5, stride=1)
+
+
+def error(image: Tensor, clean: Tensor) -> float:
+    return float((image - clean).square().mean())
+
+
+def flat() -> Tensor:
+    return torch.linspace(0.1, 0.4, 128).expand(1, 4, 128, 128).clone()
+
+
+def textured(amplitude: float) -> Tensor:
+    return (flat() + amplitude * torch.randn(1, 4, 128, 128, generator=torch.Generator().manual_seed(7))).clamp_min(0.0)
+
+
+@pytest.mark.parametrize("told", [0.5, 1.0, 2.0])
+def test_a_denoiser_that_is_right_is_left_alone_whatever_the_levels_say(told: float) -> None:
+    noisy = noisy_of(flat(), told)
+    guarded, share = guard_result(mean, noisy, mean(noisy))
+    assert share == pytest.approx(1.0, abs=1e-3)
+    torch.testing.assert_close(guarded, mean(noisy))
+
+
+@pytest.mark.parametrize("amplitude", [0.005, 0.08])
+def test_the_blend_is_near_the_best_one(amplitude: float) -> None:
+    clean = textured(amplitude)
+    clean[..., :24] = flat()[..., :24]  # which shows that the levels are right
+    noisy = noisy_of(clean)
+    denoised = mean(noisy)
+    guarded, _ = guard_result(mean, noisy, denoised)
+    assert error(guarded, clean) < 1.15 * min(error(noisy.image, clean), error(denoised, clean))
+
+    blends = [error(noisy.image.lerp(denoised, share), clean) for share in torch.linspace(0, 1, 21).tolist()]
+    assert error(guarded, clean) < 1.25 * min(blends)
+
+
+def test_a_light_is_given_back_and_a_hot_pixel_is_not() -> None:
+    clean = flat()
+    light = torch.zeros(256, 256)
+    places = torch.arange(256.0)
+    light += 0.5 * torch.exp(-((places - 100.5)[:, None].square() + (places - 60.5).square()) / (2 * 0.6**2))
+    lit = clean + bayer.pack(light[None, None], "RGGB")
+    noisy = noisy_of(lit)
+    noisy.image[0, 1, 90, 90] = 0.9
+    guarded, _ = guard_result(mean, noisy, mean(noisy))
+
+    window = (..., slice(46, 55), slice(26, 35))
+    peak = (lit - clean)[window].max()
+    assert (mean(noisy) - clean)[window].max() < 0.2 * peak < 0.7 * peak < (guarded - clean)[window].max()
+    assert guarded[0, 1, 90, 90] < 0.5
+
+
+def test_a_frame_is_guarded_on_request() -> None:
+    clean = textured(0.08)
+    mosaic = bayer.unpack(noisy_of(clean).image, "RGGB")[0].clamp(max=1.0)
+    frame = RawFrame(mosaic, "RGGB", floating=True)
+    denoiser = RawDenoiser.of(lambda noisy: mean(Noisy(noisy)), name="mean")
+    results = {}
+    for guard in (False, True):
+        result = rawaug.denoise(frame, denoiser=denoiser, noise=LEVELS, guard=guard)
+        results[guard] = error(bayer.pack(result.mosaic[None], "RGGB"), clean)
+    assert results[True] < 0.5 * results[False]
+    with pytest.raises(ValueError, match="levels"):
+        guard_result(mean, Noisy(clean), clean)
