@@ -14,11 +14,19 @@ from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.trials import Trial, make_trial, make_trials
 from rawaug.experiment.task import TASKS, Task
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseModel
+from rawaug.noise import CalibratedNoise, NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.seeding import derive_seed
-from rawaug.training.crops import WATCHED, OwnPictureCrops, PictureCrops, RealCrops, Source, freeze_samples
+from rawaug.training.crops import (
+    WATCHED,
+    OwnPictureCrops,
+    PictureCrops,
+    RealCrops,
+    Source,
+    draw_statistics,
+    freeze_samples,
+)
 from rawaug.training.estimators import ESTIMATORS, SelfSupervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, r2r_trials
 from rawaug.training.stream import TrainingStream
@@ -56,6 +64,13 @@ class RawTask(Task):
                 real = RealCrops(frames, noise, train.crop, isp.cfa)
             if augment is not None:
                 synthetic = self._synthetic_crops(arm, pictures, augment, noise)
+                if isinstance(noise, CalibratedNoise) and noise.is_typical:
+                    signals, _ = draw_statistics(synthetic)
+                    noise = noise.at_signals(signals)
+                    augment = augment.with_draws(noise, settings.draw or self.recipe.draw)
+                    synthetic = self._synthetic_crops(arm, pictures, augment, noise)
+                    _, decibels = draw_statistics(synthetic)
+                    print(f"{arm}: noisy crops have a mean PSNR of {decibels:.2f} dB")
 
         return TrainingStream(real, synthetic, train.batch, settings.augmented, seed)
 

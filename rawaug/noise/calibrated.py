@@ -48,9 +48,9 @@ class CalibratedNoise(ShotReadNoise):
 
     Args:
         pair_psnr: mean PSNR over all pairs, in dB; single pairs scatter around it as the law and the pictures do.
-        signal: mean signal of the clean RAW, a number or one for each of some pictures. The default is that of
-            photographs made RAW by ``universal``. For other pictures or another ISP, measure it with
-            :meth:`rawaug.RawAugment.measure_signals`.
+        signal: mean signal of the clean RAW, a number or one for each of some pictures. A recipe measures it on crops
+            of its pictures through its ISP; elsewhere :meth:`rawaug.RawAugment.measure_signals` does so. The default is
+            that of photographs made RAW by ``universal``.
         levels: the law to scale, as :func:`rawaug.noise.noise_levels` knows it.
 
     Raises:
@@ -62,12 +62,18 @@ class CalibratedNoise(ShotReadNoise):
     def __init__(
         self,
         pair_psnr: float,
-        signal: float | Sequence[float] = TYPICAL_SIGNAL,
+        signal: float | Sequence[float] | None = None,
         levels: str | Sequence[float] | Sequence[str] = "cycleisp_sidd",
     ) -> None:
         if not math.isfinite(pair_psnr):
             raise ValueError(f"pair_psnr must be finite, got {pair_psnr}")
 
+        self.pair_psnr, self.levels_to_scale = pair_psnr, levels
+        self.is_typical = signal is None
+        """Whether the signal is only that of typical pictures, which :meth:`at_signals` replaces."""
+
+        if signal is None:
+            signal = TYPICAL_SIGNAL
         signals = list(signal) if isinstance(signal, Sequence) else [signal]
         if not signals or not all(0.0 < mean <= 1.0 for mean in signals):
             raise ValueError(f"signal: mean signals must be above 0 and at most 1, got {signal}")
@@ -79,6 +85,10 @@ class CalibratedNoise(ShotReadNoise):
 
         factor = 10.0 ** ((uncalibrated - pair_psnr) / 10.0)
         super().__init__(ScaledLevels(law, factor))
+
+    def at_signals(self, signals: Sequence[float]) -> CalibratedNoise:
+        """Make the same noise for pictures of these mean signals."""
+        return CalibratedNoise(self.pair_psnr, signals, self.levels_to_scale)
 
 
 def _mean_psnr(law: NoiseLevels, signals: list[float]) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
+from statistics import fmean
 from typing import Any, Protocol
 
 import torch
@@ -14,6 +15,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair, Sample
 from rawaug.evaluation.trials import Trial
+from rawaug.metrics import psnr
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
@@ -39,6 +41,20 @@ def freeze_samples(source: Source, key: str) -> list[Trial]:
         sample = source.draw(keyed_generator(key, k))
         trials.append(Trial(sample.noisy[None], sample.clean[None], sample.variance[None]))
     return trials
+
+
+_CALIBRATED_ON = 1024
+"""This many samples are drawn to set the noise by the PSNR of the pairs."""
+
+
+def draw_statistics(source: Source) -> tuple[list[float], float]:
+    """Measure samples of a source: the mean signal of each one's clean RAW, and the mean PSNR of the pairs in dB."""
+    signals, decibels = [], []
+    for k in range(_CALIBRATED_ON):
+        sample = source.draw(keyed_generator("pair_psnr", k))
+        signals.append(float(sample.clean.mean().clamp(1e-6, 1.0)))
+        decibels.append(psnr(sample.noisy[None], sample.clean[None]).item())
+    return signals, fmean(decibels)
 
 
 def add_noise(clean: Tensor, noise: NoiseModel, generator: torch.Generator) -> Sample:
