@@ -3,7 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := PYTHONWARNINGS=ignore $(BIN)/pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
-# The build backend warns of every editable installation.
+# The build backend warns of every editable installation. In compat mode it is a path, which a script beside the clone
+# finds as well: there the clone's folder would be taken for a namespace package.
+EDITABLE := --config-settings editable_mode=compat --editable
 # pip would take 40 s to compile 16,000 modules; Python compiles the few that it meets, and keeps them.
 export PYTHONDONTWRITEBYTECODE :=
 
@@ -74,15 +76,15 @@ $(BIN)/python:  # the pip that comes with Python 3.11 takes three times as long 
 	-$(BIN)/pip install --quiet --disable-pip-version-check --upgrade pip
 
 $(VENV)/.demo: setup.cfg pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) --editable .[raw,train,data]
+	$(PIP) $(EDITABLE) .[raw,train,data]
 	touch $@
 
 $(VENV)/.test: setup.cfg pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) --editable .[test]
+	$(PIP) $(EDITABLE) .[test]
 	touch $(VENV)/.demo $@
 
 $(VENV)/.docs: setup.cfg pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) --editable .[docs]
+	$(PIP) $(EDITABLE) .[docs]
 	touch $(VENV)/.demo $@
 
 $(VENV)/.uv: | $(BIN)/python
