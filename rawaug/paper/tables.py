@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, stdev
 from typing import Any, NamedTuple
 
 from rawaug.evaluation.page import Figure, Page, command_line
@@ -340,20 +341,29 @@ def still_falling(curve: Sequence[float] | None) -> float | None:
 
 
 class Order(NamedTuple):
-    """How the rows of a table are ordered in the paper and here: pairs of rows that are alike, and that are not."""
+    """How the rows of a table are ordered in the paper and here: pairs of rows that are alike, refuted, and open.
+
+    A pair is open if its rows differ by no more than two standard errors over the seeds, or by less than
+    :data:`TENTH` where there is one seed, of which no spread is known.
+    """
 
     same: int
     reversed: list[str]
+    undecided: list[str]
 
     def sentence(self) -> str:
         """Say in a sentence whether the paper's order is found again."""
-        if not self.same and not self.reversed:
+        total = self.same + len(self.reversed) + len(self.undecided)
+        if not total:
             return ""
-        if not self.reversed:
-            return f"The paper's order is found again in all {self.same} pairs of rows."
-        total = self.same + len(self.reversed)
-        wrong = "; ".join(self.reversed)
-        return f"The paper's order is found again in {self.same} of {total} pairs of rows; refuted: {wrong}."
+        if self.same == total:
+            return f"The paper's order is found again in all {total} pairs of rows."
+
+        sentence = f"The paper's order is found again in {self.same} of {total} pairs of rows"
+        for answer, pairs in (("refuted", self.reversed), ("not decided", self.undecided)):
+            if pairs:
+                sentence += f"; {answer}: {', '.join(pairs)}"
+        return f"{sentence}."
 
 
 def compare_order(table: Table, column: str) -> Order:
@@ -362,17 +372,37 @@ def compare_order(table: Table, column: str) -> Order:
     for name, cells in table.items():
         ours, paper = mean_of(cells.get(column)), cells.get(f"{column}, paper")
         if ours is not None and paper is not None:
-            figures[name] = (ours, paper)
+            figures[name] = (ours, _standard_error(cells[column]), paper)
 
-    same, wrong = 0, []
-    for (first, (a, b)), (second, (c, d)) in combinations(figures.items(), 2):
-        if (a - c) * (b - d) > 0:
-            same += 1
-        elif b > d:
-            wrong.append(f"{first} above {second}")
+    order = Order(0, [], [])
+    for (first, (a, error_a, b)), (second, (c, error_c, d)) in combinations(figures.items(), 2):
+        pair = f"{first} above {second}" if b > d else f"{second} above {first}"
+        margin = TENTH
+        if error_a is not None and error_c is not None:
+            margin = 2.0 * math.hypot(error_a, error_c)
+
+        if abs(a - c) <= margin:
+            order.undecided.append(pair)
+        elif (a - c) * (b - d) > 0:
+            order = order._replace(same=order.same + 1)
         else:
-            wrong.append(f"{second} above {first}")
-    return Order(same, wrong)
+            order.reversed.append(pair)
+    return order
+
+
+TENTH = 0.1
+"""Least difference in dB that a table of one seed is believed."""
+
+
+def _standard_error(value: Any) -> float | None:
+    """Compute the standard error of a figure that is given for several seeds; None of one."""
+    if not isinstance(value, list):
+        return None
+
+    numbers = [number for number in value if number is not None]
+    if len(numbers) < 2:
+        return None
+    return stdev(numbers) / math.sqrt(len(numbers))
 
 
 def mean_of(value: Any) -> float | None:

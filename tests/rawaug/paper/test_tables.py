@@ -75,6 +75,20 @@ def test_the_order_of_the_rows_is_compared_pair_by_pair(folder: Path) -> None:
     assert "2 of 3 pairs" in order.sentence() and compare_order({}, "PSNR_r").sentence() == ""
 
 
+def test_an_order_is_found_again_refuted_or_not_decided() -> None:
+    table: Any = {
+        "a": {"PSNR": [40.0, 40.2, 40.1], "PSNR, paper": 50.0},
+        "b": {"PSNR": [39.9, 40.3, 40.0], "PSNR, paper": 49.0},
+        "c": {"PSNR": [42.0, 42.2, 42.1], "PSNR, paper": 48.0},
+        "d": {"PSNR": [39.0, 39.1, 39.2], "PSNR, paper": 47.0},
+    }
+    order = compare_order(table, "PSNR")
+    assert order.same == 3 and order.undecided == ["a above b"]
+    assert order.reversed == ["a above c", "b above c"]
+    one_seed: Any = {"a": {"PSNR": 40.0, "PSNR, paper": 50.0}, "b": {"PSNR": 40.05, "PSNR, paper": 49.0}}
+    assert compare_order(one_seed, "PSNR").undecided == ["a above b"]
+
+
 def test_one_page_and_one_file_have_all_of_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paper = Paper(out=str(folder.parent), parts=[])
     (folder / "run.json").write_text(json.dumps(asdict(paper)))
