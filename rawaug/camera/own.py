@@ -47,6 +47,7 @@ from rawaug.camera.lights import (
     weights_in_light,
 )
 from rawaug.camera.matrices import camera_from_srgb, gains_in_light, load_cameras
+from rawaug.camera.softness import MTF50
 from rawaug.camera.tuning import read_tuning
 from rawaug.errors import count_of
 from rawaug.files import read_yaml
@@ -120,6 +121,11 @@ class Camera:
         tone: name of one of the ISP's tone curves, or points ``(linear light, value of the picture)``, both from 0 to 1
             and ascending. By default any of the ISP's curves is drawn.
         source: where the figures are from, for reports.
+        blur: softness of lens, low-pass filter and pixels: the standard deviation, from 0 to 1 pixel, of a Gaussian
+            that makes photographs for the screen as soft as RAW of this camera, or the lowest and the highest. By
+            default they are left as they are.
+        mtf50: the same as the spatial frequency in cycles a pixel at which contrast is halved, at least 0.188, in place
+            of ``blur``.
 
     Raises:
         ValueError: if a figure is missing, of another shape or out of range; the message names it.
@@ -152,6 +158,8 @@ class Camera:
     noise_in: NoiseUnit = "variance"
     tone: Any = None
     source: str | None = None
+    blur: Any = None
+    mtf50: float | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
@@ -171,6 +179,7 @@ class Camera:
         self._check_grid()
         self._check_colours(self.anchors())
         self._check_levels()
+        self._check_blur()
         self.inverse_curve(2)  # raises ValueError for points of the tone curve
 
     def _check_choices(self) -> None:
@@ -242,6 +251,31 @@ class Camera:
                 at = "" if level.iso is None else f" at ISO {level.iso:g}"
                 reason = f"{level.read_var:.3g} of read_var{at} is less than rounding alone makes, {rounding:.3g}"
                 raise self._error("noise", f"{reason}; leave out bits to round nothing")
+
+    def _check_blur(self) -> None:
+        if self.mtf50 is not None:
+            if self.blur is not None:
+                raise self._error("mtf50", "is another form of blur; leave one of them out")
+            if not (_is_number(self.mtf50) and self.mtf50 >= MTF50):
+                raise self._error("mtf50", f"must be at least {MTF50:.3f} cycles a pixel, got {self.mtf50!r:.100}")
+        if self.blur is None:
+            return
+
+        ends = self.blur if isinstance(self.blur, list) else [self.blur, self.blur]
+        if len(ends) != 2 or not all(_is_number(end) and 0 <= end <= 1 for end in ends) or ends[0] > ends[1]:
+            rule = "must be a number of pixels from 0 to 1, or the lowest and the highest"
+            raise self._error("blur", f"{rule}, got {self.blur!r:.100}")
+
+    @property
+    def blur_range(self) -> tuple[float, float]:
+        """The least and the largest standard deviation of the blur, in pixels."""
+        if self.mtf50 is not None:
+            return MTF50 / self.mtf50, MTF50 / self.mtf50
+        if self.blur is None:
+            return 0.0, 0.0
+        if isinstance(self.blur, list):
+            return self.blur[0], self.blur[1]
+        return self.blur, self.blur
 
     def _error(self, key: str, reason: str) -> ValueError:
         return ValueError(f"camera {self.name!r}: {key} {reason}")

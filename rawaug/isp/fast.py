@@ -238,58 +238,57 @@ class FastForward(nn.Module):
         Returns:
             sRGB ``(B, 3, H, W)`` in [0, 1] for each of ``raws``.
         """
-        directional = any(method in bayer.DIRECTIONAL for method in methods)
-        if directional and len(methods) > 1:
-            return self._develop_each(raws, methods, params, place)
-
         display = self._display(raws[0], params, place)
         gain = self._gain(raws[0], place)
         if gain is not None:  # the gains change slowly, so they are about the same before demosaicing and after
             raws = [raw * gain for raw in raws]
 
-        def in_steps(raw: Tensor) -> Tensor:
-            pictures = []
-            for picture, method, gains in zip(raw.split(1), methods, display.gains, strict=True):
-                pictures.append(self._demosaic_balanced(picture, method, gains))
-            linear = torch.cat(pictures)
-            return fastest("render", linear, display, otherwise=lambda: render(linear, display))
+        groups: dict[str, list[int]] = {}
+        for number, method in enumerate(methods):
+            kind = method if method in bayer.DIRECTIONAL else ""
+            groups.setdefault(kind, []).append(number)
+        if len(groups) == 1:
+            return [self._develop_alike(raw, methods, display) for raw in raws]
 
-        developed = []
-        for raw in raws:
-            if directional:
-                srgb = in_steps(raw)
-            else:
-                srgb = fastest("develop", raw, display, self.cfa, methods, otherwise=partial(in_steps, raw))
-            developed.append(srgb)
+        developed = [raw.new_empty(len(raw), 3, *raw.shape[-2:], dtype=torch.float32) for raw in raws]
+        for numbers in groups.values():
+            members = torch.tensor(numbers)
+            own_methods = [methods[number] for number in numbers]
+            own_display = display.of(members.to(raws[0].device))
+            for raw, srgb in zip(raws, developed, strict=True):
+                index = members.to(raw.device)
+                srgb[index] = self._develop_alike(raw[index], own_methods, own_display)
         return developed
 
-    def _develop_each(
-        self, raws: Sequence[Tensor], methods: Sequence[str], params: ISPParams, place: Tensor | None
-    ) -> list[Tensor]:
-        """Develop picture by picture, so that the result does not depend on the rest of the batch."""
-        pictures = []
-        for i, method in enumerate(methods):
-            own_params = ISPParams(*[value[i, None] for value in params])
-            own_place = None
-            if place is not None:
-                own_place = place[i, None]
+    def _develop_alike(self, raw: Tensor, methods: Sequence[str], display: Display) -> Tensor:
+        """Develop mosaics ``(B, 1, H, W)``, all by stencils or all by one method that chooses directions."""
 
-            own_raws = [raw[i, None] for raw in raws]
-            pictures.append(self.develop(own_raws, [method], own_params, own_place))
-        return list(map(torch.cat, zip(*pictures, strict=True)))
+        def in_steps() -> Tensor:
+            linear = self._demosaic(raw, methods, display.gains)
+            return fastest("render", linear, display, otherwise=lambda: render(linear, display))
+
+        if methods[0] in bayer.DIRECTIONAL:
+            return in_steps()
+        return fastest("develop", raw, display, self.cfa, methods, otherwise=in_steps)
 
     def _gain(self, image: Tensor, place: Tensor | None) -> Tensor | None:
         size = image.shape[-2], image.shape[-1]
         return _place_gain(self.isp.ordered_stages, place, size, self.table, forward=True, batch=len(image))
 
-    def _demosaic_balanced(self, raw: Tensor, method: str, gains: Tensor) -> Tensor:
-        """Demosaic ``(1, 1, H, W)``; choosing a direction needs balanced RAW clipped at black, as developers do it."""
+    def _demosaic(self, raw: Tensor, methods: Sequence[str], gains: Tensor) -> Tensor:
+        """Demosaic ``(B, 1, H, W)``; choosing a direction needs balanced RAW clipped at black, as developers do it."""
+        method = methods[0]
         if method not in bayer.DIRECTIONAL:
-            return bayer.demosaic(raw, self.cfa, method)
+            pictures = [bayer.demosaic(raw, self.cfa, name) for name in dict.fromkeys(methods)]
+            rgb = pictures[0]
+            for name, picture in zip(list(dict.fromkeys(methods))[1:], pictures[1:], strict=True):
+                is_own = torch.tensor([own == name for own in methods], device=raw.device)
+                rgb = torch.where(is_own[:, None, None, None], picture, rgb)
+            return rgb
 
-        balance = gains[:3, None, None]
-        cell = bayer.mosaic(balance.expand(3, 2, 2), self.cfa)
-        sites = cell.repeat(1, raw.shape[-2] // 2, raw.shape[-1] // 2)
+        balance = gains[:, :3, None, None]
+        cell = bayer.mosaic(balance.expand(-1, 3, 2, 2), self.cfa)
+        sites = cell.repeat(1, 1, raw.shape[-2] // 2, raw.shape[-1] // 2)
         balanced = (raw * sites).clamp_min(0.0)
 
         plain = partial(bayer.demosaic, balanced, self.cfa, method)

@@ -36,15 +36,28 @@ def _rows(mosaic, red_row, red_column, homogeneous, rgb, start, stop):  # type: 
     own = mosaic[start : stop + 2 * _MARGIN]
     rows, width = own.shape
     first = (start + red_row) % 2  # of the rows with red
-    pictures = np.zeros((2, 3, rows, width), np.float32)  # along rows, along columns
+    directions = 2 if homogeneous else 1
+    pictures = np.zeros((directions, 3, rows, width), np.float32)  # along rows, along columns
 
     for i in range(2, rows - 2):
-        for j in range(2, width - 2):
-            _green(own, i, j, (i + first + j + red_column) % 2 == 1, homogeneous, pictures)
-    directions = 2 if homogeneous else 1
+        measured = (i + first + red_column + 1) % 2  # columns of this parity hold green
+        above, below = (own[i - 2], own[i - 1]), (own[i + 1], own[i + 2])
+        if homogeneous:
+            _green_in_row(own[i], measured, pictures[0, 1, i])
+            _green_in_column(above[0], above[1], own[i], below[0], below[1], measured, pictures[1, 1, i])
+        else:
+            _green_of_lesser_change(above[0], above[1], own[i], below[0], below[1], measured, pictures[0, 1, i])
     for d in range(directions):
         for i in range(3, rows - 3):
-            _colours(own, i, (i + first) % 2 == 0, red_column, pictures[d])
+            near, far = 2, 0
+            if (i + first) % 2 == 0:
+                near, far = 0, 2
+            sites = red_column
+            if near == 2:
+                sites = 1 - red_column
+            picture, green = pictures[d], pictures[d, 1]
+            _colour_in_row(own[i], green[i], sites, picture[near, i])
+            _colour_between_rows(own[i - 1], own[i + 1], green[i - 1], green[i], green[i + 1], sites, picture[far, i])
 
     lead = np.zeros((rows, width), np.int8)
     if homogeneous:
@@ -67,45 +80,58 @@ def _rows(mosaic, red_row, red_column, homogeneous, rgb, start, stop):  # type: 
 
 
 @compile_part
-def _green(own, i, j, measured, homogeneous, pictures):  # type: ignore[no-untyped-def]
-    """Fill in the green of a site in both pictures; without ``homogeneous`` the first has that of the lesser change."""
-    here = own[i, j]
-    if measured:
-        pictures[0, 1, i, j] = pictures[1, 1, i, j] = here
-        return
-
-    before, after, above, below = own[i, j - 1], own[i, j + 1], own[i - 1, j], own[i + 1, j]
-    bend = _TWO * here - own[i, j - 2] - own[i, j + 2]
-    bend_down = _TWO * here - own[i - 2, j] - own[i + 2, j]
-    row = (before + after) * _HALF + bend * _QUARTER
-    column = (above + below) * _HALF + bend_down * _QUARTER
-
-    if not homogeneous:
-        change = abs(before - after) + abs(bend)
-        change_down = abs(above - below) + abs(bend_down)
-        if change > change_down:
-            row = column
-        elif change == change_down:
-            row = _HALF * (row + column)
-    pictures[0, 1, i, j], pictures[1, 1, i, j] = row, column
+def _green_in_row(own, measured, out):  # type: ignore[no-untyped-def]
+    """Fill in the green of a row from the row itself; columns of the parity ``measured`` hold green."""
+    for j in range(2, len(own) - 2):
+        here = own[j]
+        bend = _TWO * here - own[j - 2] - own[j + 2]
+        value = (own[j - 1] + own[j + 1]) * _HALF + bend * _QUARTER
+        out[j] = here if (j & 1) == measured else value
 
 
 @compile_part
-def _colours(own, i, with_red, red_column, picture):  # type: ignore[no-untyped-def]
-    """Fill in red and blue of a row: green plus the mean difference to green of the colour's sites nearby."""
-    green, near, far = picture[1], 2, 0
-    if with_red:
-        near, far = 0, 2
+def _green_in_column(second_above, above, own, below, second_below, measured, out):  # type: ignore[no-untyped-def]
+    """Fill in the green of a row from the columns, as :func:`_green_in_row`."""
+    for j in range(2, len(own) - 2):
+        here = own[j]
+        bend = _TWO * here - second_above[j] - second_below[j]
+        value = (above[j] + below[j]) * _HALF + bend * _QUARTER
+        out[j] = here if (j & 1) == measured else value
 
-    for j in range(3, own.shape[1] - 3):
-        across = (own[i, j - 1] - green[i, j - 1]) + (own[i, j + 1] - green[i, j + 1])
-        down = (own[i - 1, j] - green[i - 1, j]) + (own[i + 1, j] - green[i + 1, j])
-        if ((j + red_column) % 2 == 0) == with_red:  # a site of the row's colour
-            corners = own[i - 1, j - 1] - green[i - 1, j - 1] + own[i - 1, j + 1] - green[i - 1, j + 1]
-            corners += own[i + 1, j - 1] - green[i + 1, j - 1] + own[i + 1, j + 1] - green[i + 1, j + 1]
-            picture[near, i, j], picture[far, i, j] = own[i, j], green[i, j] + corners * _QUARTER
-        else:
-            picture[near, i, j], picture[far, i, j] = green[i, j] + across * _HALF, green[i, j] + down * _HALF
+
+@compile_part
+def _green_of_lesser_change(second_above, above, own, below, second_below, measured, out):  # type: ignore[no-untyped-def]
+    """Fill in the green of a row from row or column, whichever changes less, or from both if they change alike."""
+    for j in range(2, len(own) - 2):
+        here = own[j]
+        bend = _TWO * here - own[j - 2] - own[j + 2]
+        bend_down = _TWO * here - second_above[j] - second_below[j]
+        row = (own[j - 1] + own[j + 1]) * _HALF + bend * _QUARTER
+        column = (above[j] + below[j]) * _HALF + bend_down * _QUARTER
+        change = abs(own[j - 1] - own[j + 1]) + abs(bend)
+        change_down = abs(above[j] - below[j]) + abs(bend_down)
+
+        value = column if change > change_down else row
+        value = _HALF * (row + column) if change == change_down else value
+        out[j] = here if (j & 1) == measured else value
+
+
+@compile_part
+def _colour_in_row(own, green, sites, out):  # type: ignore[no-untyped-def]
+    """Fill in the colour that a row measures in columns of the parity ``sites``: green plus the difference nearby."""
+    for j in range(3, len(own) - 3):
+        across = (own[j - 1] - green[j - 1]) + (own[j + 1] - green[j + 1])
+        out[j] = own[j] if (j & 1) == sites else green[j] + across * _HALF
+
+
+@compile_part
+def _colour_between_rows(above, below, green_above, green, green_below, sites, out):  # type: ignore[no-untyped-def]
+    """Fill in the colour that the rows above and below measure, at the sites of the row's own colour and beside them."""
+    for j in range(3, len(green) - 3):
+        down = (above[j] - green_above[j]) + (below[j] - green_below[j])
+        corners = above[j - 1] - green_above[j - 1] + above[j + 1] - green_above[j + 1]
+        corners += below[j - 1] - green_below[j - 1] + below[j + 1] - green_below[j + 1]
+        out[j] = green[j] + corners * _QUARTER if (j & 1) == sites else green[j] + down * _HALF
 
 
 @compile_part

@@ -211,6 +211,15 @@ class Display(NamedTuple):
     frame: Tensor
     shading: Tensor
 
+    def of(self, pictures: Tensor) -> Display:
+        """The settings of some pictures, by their numbers."""
+        return self._replace(
+            curves=self.curves[pictures],
+            matrix=self.matrix[pictures],
+            gains=self.gains[pictures],
+            frame=self.frame[pictures],
+        )
+
 
 def render(linear: Tensor, display: Display) -> Tensor:
     """Develop camera colour x5 ``(B, 3, H, W)``, float32, to sRGB in [0, 1]; the pass is differentiable."""

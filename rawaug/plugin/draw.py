@@ -19,6 +19,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
+from rawaug.camera.own import own_cameras
 from rawaug.isp.config import ISPParams
 from rawaug.isp.dictionary import EXPOSURE, perturb
 from rawaug.isp.fast import BakedISP
@@ -53,7 +54,9 @@ class Draw:
         tone: one tone curve of an ISP of published cameras, by name (``rawaug info`` lists them), instead of mixtures.
         blur: lowest and highest standard deviation, or a single one, of the Gaussian that blurs linear light before the
             mosaic, in pixels of the mosaic, from 0 to 1. Pictures for the screen are sharper, pixel by pixel, than RAW
-            of a lens and an optical low-pass filter. 0 leaves them as they are.
+            of a lens and an optical low-pass filter. 0 leaves them as they are. The default is what was measured when
+            an ISP was fitted or what a :class:`rawaug.Camera` states, else 0; :data:`rawaug.camera.softness.PUBLISHED`
+            is a range for cameras of which nothing is known.
 
     Raises:
         ValueError: if the sampling is unknown, or the strength, the exposure or the blur is out of range.
@@ -64,7 +67,7 @@ class Draw:
     exposure: tuple[float, float] | float | None = None
     light: float | str | None = None
     tone: str | None = None
-    blur: tuple[float, float] | float = 0.0
+    blur: tuple[float, float] | float | None = None
 
     def __post_init__(self) -> None:
         if self.sampling not in get_args(Sampling):
@@ -73,7 +76,8 @@ class Draw:
             raise ValueError(f"strength must be at least 0, got {self.strength}")
         if self.exposure is not None:
             _require_range("exposure", self.exposure, "stops")
-        _require_range("blur", self.blur, "pixels", limits=(0.0, 1.0))
+        if self.blur is not None:
+            _require_range("blur", self.blur, "pixels", limits=(0.0, 1.0))
 
     @property
     def exposure_range(self) -> tuple[float, float] | None:
@@ -83,8 +87,8 @@ class Draw:
         return self.exposure
 
     @property
-    def blur_range(self) -> tuple[float, float]:
-        """The least and the largest standard deviation of the blur, in pixels."""
+    def blur_range(self) -> tuple[float, float] | None:
+        """The least and the largest standard deviation of the blur, in pixels; None means those of the ISP."""
         if isinstance(self.blur, (int, float)):
             return self.blur, self.blur
         return self.blur
@@ -130,6 +134,7 @@ class SettingSampler:
 
         usual = EXPOSURE if has_cameras else (0.0, 0.0)
         self.exposure: tuple[float, float] = draw.exposure_range or usual
+        self.blur: tuple[float, float] = draw.blur_range or isp_blur(isp)
         self._cameras = isp.camera_sampler(draw.sampling == "convex", draw.light)
         self._tone = None if draw.tone is None else tone_weights(isp, draw.tone)
 
@@ -167,7 +172,7 @@ class SettingSampler:
 
     def sample_blur(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw ``blur`` ``(batch,)``, standard deviations in pixels; nothing if pictures are left as they are."""
-        low, high = self.draw.blur_range
+        low, high = self.blur
         if not high:
             return {}
         return {"blur": low + (high - low) * torch.rand(batch, generator=generator, dtype=torch.float32)}
@@ -215,10 +220,19 @@ class SettingSampler:
             line += f", light {self.draw.light}"
         line += f", exposure {self.exposure[0]:g} to {self.exposure[1]:g} stops"
 
-        low, high = self.draw.blur_range
+        low, high = self.blur
         if high:
             line += f", blur {low:g} to {high:g} pixels"
         return line
+
+
+def isp_blur(isp: DictionaryISP) -> tuple[float, float]:
+    """The blur of an ISP in pixels, lowest and highest: as its fit has measured or its cameras state, else none."""
+    if "blur" in isp.info:
+        return isp.info["blur"], isp.info["blur"]
+
+    ranges = [camera.blur_range for camera in own_cameras(isp.info)] or [(0.0, 0.0)]
+    return min(low for low, _ in ranges), max(high for _, high in ranges)
 
 
 def tone_weights(isp: DictionaryISP, name: str) -> Tensor:

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal
 
 from rawaug.camera.own import Camera, as_camera
+from rawaug.camera.softness import measure_blur
 from rawaug.data import RawFolder, open_pairs
 from rawaug.data.frames import Frames, Readable, as_frames, left_out, shared_frame
 from rawaug.data.opening import names_dataset
@@ -21,6 +23,9 @@ from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.training.camera_noise import measure_camera_noise, plot_camera_noise
+
+_SOFTNESS_FRAMES = 8
+"""Softness is measured on so many frames."""
 
 WATCHED_PATCHES = 4
 """This many patches of a held-out frame are scored during the fit."""
@@ -59,6 +64,9 @@ def fit(
         camera: figures of the camera to start from, a :class:`rawaug.Camera` or its YAML file, or a published camera by
             its name. They decide what the colours of the frames leave open.
         settings: settings of :class:`rawaug.isp.fit.FitConfig`.
+
+    The softness of the camera is measured on the frames (:mod:`rawaug.camera.softness`) and stored in
+    ``isp.info["blur"]``, in pixels, which :class:`rawaug.RawAugment` then draws.
 
     Fitted and held-out frames that cannot be read are left out; ``isp.info["unreadable"]`` has a line for each.
 
@@ -123,6 +131,10 @@ def fit(
         isp.info["noise"] = law.spec()
         if noise_figure is not None:
             plot_camera_noise(law, estimates, noise_figure)
+
+    blur = measure_blur((pair.raw[0].numpy(), pair.cfa) for pair in islice(iter(frames), _SOFTNESS_FRAMES))
+    if blur is not None:
+        isp.info["blur"] = round(blur, 2)
 
     isp.info["rendering"] = describe_rendering(pairs, len(isp.info["frames"]), isp.info["registered"])
     isp.info["seconds"] = round(time.perf_counter() - start, 2)

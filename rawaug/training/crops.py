@@ -142,7 +142,9 @@ class OwnPictureCrops:
             patch, place = self.draw_patch(pair, generator)
             patches.append(patch[None])
             chosen = self.augment.look(pair.srgb)
-            parameters.append(self.augment.sample(patch[None], generator, place[None], chosen))
+            params = self.augment.sample(patch[None], generator, place[None], chosen)
+            params.extras.pop("blur", None)  # a camera's own pictures are as soft as it is
+            parameters.append(params)
 
         made = self.augment.apply(torch.cat(patches), AugmentParams.concatenate(parameters))
         return list(map(Sample, made.noisy, made.clean, made.variance))

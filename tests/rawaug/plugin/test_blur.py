@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from rawaug import bayer
+from rawaug.camera.own import Camera
+from rawaug.camera.softness import PUBLISHED, measure_blur
+from rawaug.data import demo_pictures
+from rawaug.io import decode_srgb
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.kernels import runtime
-from rawaug.kernels.reference import blur_taps
+from rawaug.kernels.reference import blur, blur_taps
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.params import AugmentParams
@@ -104,7 +111,7 @@ def test_developed_pictures_are_those_of_the_blurred_raw() -> None:
 def test_no_blur_changes_no_bit_and_a_flat_picture_stays_flat() -> None:
     srgb = torch.randint(256, (2, 3, 44, 600), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
     srgb[1] = torch.tensor([10, 200, 90], dtype=torch.uint8)[:, None, None]
-    augment = RawAugment.from_pretrained("universal")
+    augment = RawAugment.from_pretrained("universal", draw=Draw(blur=0.0))
     params = augment.sample(srgb)
     sharp = augment.apply(srgb, params).clean
 
@@ -126,7 +133,7 @@ def test_the_blur_is_drawn_last_and_replays() -> None:
     assert "blur" not in sharp.extras and pair.params._replace(extras={}).tensors().keys() == sharp.tensors().keys()
     for name, tensor in sharp.tensors().items():
         assert torch.equal(tensor, pair.params.tensors()[name])
-    assert augment.settings.draw.blur_range == (0.2, 0.8)
+    assert augment.settings.blur == (0.2, 0.8)
 
     blur = augment.sample(srgb.repeat(64, 1, 1, 1)).extras["blur"]
     assert blur.min() >= 0.2 and blur.max() <= 0.8 and blur.std() > 0.1
@@ -151,3 +158,46 @@ def test_the_taps_are_nearly_those_of_a_gaussian() -> None:
 def test_a_blur_out_of_range_is_refused(blur: object) -> None:
     with pytest.raises(ValueError, match="blur"):
         Draw(blur=blur)  # type: ignore[arg-type]
+
+
+SHEET: dict[str, Any] = {
+    "matrix": [[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.0, -0.6, 1.6]],
+    "matrix_is": "camera_to_srgb",
+    "white_balance": (2.1, 1.0, 1.7),
+}
+
+
+def test_the_blur_is_that_of_the_camera() -> None:
+    """That of a sheet, in pixels or as MTF50; what a fit has measured; else none."""
+    universal = DictionaryISP.from_pretrained("universal")
+    assert RawAugment(universal).settings.blur == (0.0, 0.0)
+    assert RawAugment(universal, draw=Draw(blur=PUBLISHED)).settings.blur == PUBLISHED
+    assert RawAugment(Camera("M1", blur=0.6, **SHEET)).settings.blur == (0.6, 0.6)
+    assert RawAugment(Camera("M1", blur=(0.4, 0.7), **SHEET)).settings.blur == (0.4, 0.7)
+    assert RawAugment(Camera("M1", mtf50=0.25, **SHEET)).settings.blur == pytest.approx((0.75, 0.75), abs=1e-3)
+    assert RawAugment(Camera("M1", **SHEET)).settings.blur == (0.0, 0.0)
+    assert Camera.from_json(Camera("M1", blur=(0.4, 0.7), **SHEET).to_json()).blur_range == (0.4, 0.7)
+
+    fitted = DictionaryISP()
+    assert RawAugment(fitted).settings.blur == (0.0, 0.0)
+    fitted.info["blur"] = 0.7
+    assert RawAugment(fitted).settings.blur == (0.7, 0.7)
+    assert "blur" in RawAugment(fitted).sample(points(torch.uint8)).extras
+
+
+@pytest.mark.parametrize("figures", [{"blur": 1.5}, {"blur": (0.5, 0.2)}, {"mtf50": 0.1}, {"blur": 0.5, "mtf50": 0.3}])
+def test_a_sheet_with_an_impossible_blur_is_refused(figures: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"blur|mtf50"):
+        Camera("M1", **figures, **SHEET)
+
+
+def test_softness_is_measured_on_edges_of_any_contrast_and_pattern() -> None:
+    """Photographs blurred by more measure softer, by about as much, at any exposure; without edges there is none."""
+    light = [decode_srgb(picture.float() / 255.0)[None] for picture in demo_pictures(9)[:4]]
+    measured = []
+    for sigma in (0.5, 0.7, 0.9):
+        taps = blur_taps(torch.tensor([sigma]))
+        frames = [(0.5 * blur(picture, taps)[0, 1].numpy(), "GBRG") for picture in light]
+        measured.append(measure_blur(frames) or 0.0)
+    assert measured == pytest.approx([0.5, 0.7, 0.9], abs=0.2) and measured == sorted(measured)
+    assert measure_blur([(np.full((64, 64), 0.2, np.float32), "RGGB")]) is None
