@@ -126,7 +126,7 @@ def _colour_in_row(own, green, sites, out):  # type: ignore[no-untyped-def]
 
 @compile_part
 def _colour_between_rows(above, below, green_above, green, green_below, sites, out):  # type: ignore[no-untyped-def]
-    """Fill in the colour that the rows above and below measure, at the sites of the row's own colour and beside them."""
+    """Fill in the colour that the rows above and below measure; columns of the parity ``sites`` hold the row's own."""
     for j in range(3, len(green) - 3):
         down = (above[j] - green_above[j]) + (below[j] - green_below[j])
         corners = above[j - 1] - green_above[j - 1] + above[j + 1] - green_above[j + 1]

@@ -22,6 +22,7 @@ from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.params import AugmentParams
 from rawaug.plugin.targets import Burst, Srgb
+from rawaug.training.camera_fit import fit
 
 SIGMAS = torch.tensor([0.0, 0.3, 0.6, 1.0])
 POINTS = ((20, 40), (21, 511), (20, 512), (23, 33))
@@ -201,3 +202,9 @@ def test_softness_is_measured_on_edges_of_any_contrast_and_pattern() -> None:
         measured.append(measure_blur(frames) or 0.0)
     assert measured == pytest.approx([0.5, 0.7, 0.9], abs=0.2) and measured == sorted(measured)
     assert measure_blur([(np.full((64, 64), 0.2, np.float32), "RGGB")]) is None
+
+
+def test_a_fit_measures_the_blur_of_its_frames_and_an_augmentation_draws_it() -> None:
+    isp = fit("demo:train", steps=2, curve_steps=2, pixels=512, noise="off", progress=False)
+    assert 0.0 < isp.info["blur"] <= 1.0
+    assert RawAugment(isp).settings.blur == (isp.info["blur"], isp.info["blur"])
