@@ -16,7 +16,7 @@ PLATFORMS := x86_64-manylinux_2_28 aarch64-apple-darwin x86_64-pc-windows-msvc  
 WHEEL := build/resolve/requirements.in
 LOCKED := \# Exact versions by Python version and platform, written by make lock. CUDA packages are pinned by torch itself.
 
-BENCHMARKS := augment denoise faults folder fuzz loader networks noise synth
+BENCHMARKS := augment denoise faults folder forty_lines fuzz loader networks noise synth
 
 .PHONY: help demo test pytest lint docs bench dist archive lock resolve clean
 
