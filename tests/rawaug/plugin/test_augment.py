@@ -224,7 +224,8 @@ def test_camera_noise_is_that_of_the_file(isp: DictionaryISP) -> None:
     with pytest.raises(ValueError, match="noise"):
         RawAugment(isp, noise="camera")
     measured = DictionaryISP()
-    measured.info["noise"] = {"shot_var": 2e-3, "read_var": 3e-5, "r2": 0.99}
+    levels = [{"shot_var": 2e-3, "read_var": 3e-5, "r2": 0.99}]
+    measured.info["noise"] = {"name": "MeasuredNoise", "settings": {"levels": levels}}
     params = RawAugment(measured, noise="camera")(torch.rand(2, 3, 8, 8)).params
     torch.testing.assert_close(params.noise["shot_var"], torch.full((2,), 2e-3))
     torch.testing.assert_close(params.noise["read_var"], torch.full((2,), 3e-5))
