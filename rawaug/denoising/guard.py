@@ -67,7 +67,7 @@ def guard_result(denoise: Callable[[Noisy], Tensor], noisy: Noisy, denoised: Ten
     share, expected = _share_of_frame(denoise, noisy)
 
     # Where more was removed than noise can explain, the place is nearly as its input.
-    mended = _mend(noisy)
+    mended = _mend(noisy, denoised)
     variance = noise_variance(denoised, *noisy.levels).clamp_min(1e-12)
     removed = ((denoised - mended).square() / variance).mean(1, keepdim=True)
     energy = F.avg_pool2d(removed, _PLACE, ceil_mode=True, count_include_pad=False)
@@ -84,7 +84,7 @@ def _share_of_frame(denoise: Callable[[Noisy], Tensor], noisy: Noisy) -> tuple[f
     for patch in _sample(noisy.image):
         part = Noisy.of(patch, noisy.levels, noisy.cfa)
         probe = probe_denoiser(denoise, part)
-        mended = _mend(part)
+        mended = _mend(part, probe.denoised)
         energy = (probe.denoised - mended).square() / probe.variance
         is_whole = (probe.denoised < 1.0 - 4.0 * probe.variance.sqrt()) & (mended == patch)
         count += float(is_whole.sum())
@@ -132,8 +132,8 @@ def _pool(values: Tensor) -> Tensor:
     return F.avg_pool2d(values.mean(1, keepdim=True), _FLAT)
 
 
-def _mend(noisy: Noisy) -> Tensor:
-    """Replace single defective pixels, unless there are too many to be defects."""
+def _mend(noisy: Noisy, denoised: Tensor) -> Tensor:
+    """Replace single defective pixels that the denoiser takes for defects, too, unless there are too many of them."""
     assert noisy.levels is not None
     levels = [torch.full((1, 1, 1, 1), level) for level in noisy.levels]
     domain = DOMAINS["anscombe"]
@@ -142,4 +142,7 @@ def _mend(noisy: Noisy) -> Tensor:
     is_defect = mended != signal
     if float(is_defect.float().mean()) > MOST_DEFECTS:
         return noisy.image
-    return torch.where(is_defect, domain.inverse(mended, *levels), noisy.image)
+
+    replacement = domain.inverse(mended, *levels)
+    is_defect &= (denoised - replacement).abs() < (denoised - noisy.image).abs()
+    return torch.where(is_defect, replacement, noisy.image)

@@ -442,6 +442,6 @@ def plot_judgement(judgement: Judgement, path: Path) -> None:
     for axis, (name, one) in zip(axes.flat, judgement.denoisers.items(), strict=False):
         shown = axis.imshow(one.gain[0, 0].numpy(), cmap="RdYlGn", vmin=-1.0, vmax=1.0, interpolation="nearest")
         axis.set_title(f"{name}\n{one.psnr:.2f} dB, {one.harmed:.1%} harmed", fontsize=9, parse_math=False)
-    figure.colorbar(shown, ax=axes, shrink=0.7, label="share of the noise removed; below 0: harm")
+    figure.colorbar(shown, ax=axes, shrink=0.7, label="share of the noise removed")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
