@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from statistics import fmean
+
 import pytest
 import torch
 
@@ -10,8 +12,10 @@ from rawaug.data import demo_pairs, demo_pictures
 from rawaug.experiment.raw import RawTask
 from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
+from rawaug.metrics import psnr
 from rawaug.noise import noise_model
 from rawaug.plugin.targets import Srgb, Target
+from rawaug.training import crops
 from rawaug.training.config import TrainConfig
 
 
@@ -69,3 +73,12 @@ def test_an_arm_sees_as_many_real_crops_with_further_ones_as_without() -> None:
 
     with pytest.raises(ValueError, match=r"arms\.one: source: own"):
         Recipe(isp="universal", data=DataConfig(pairs=None), arms={"one": ArmConfig(1.0, source="own")})
+
+
+def test_pairs_have_the_stated_psnr_whatever_the_isp(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crops, "_CALIBRATED_ON", 96)
+    recipe = Recipe(data=DataConfig(pairs=None), isp="phones", arms={"one": ArmConfig(1.0)}, train=TrainConfig(crop=32))
+    isp, noise = DictionaryISP.from_pretrained("phones"), noise_model({"pair_psnr": 36.0})
+    stream = RawTask(recipe).stream("one", [], demo_pictures(2), isp, noise, 0)
+    decibels = [psnr(sample.noisy[None], sample.clean[None]).item() for sample in map(stream.__getitem__, range(96))]
+    assert fmean(decibels) == pytest.approx(36.0, abs=2.0), "4 to 5 dB higher by the signal of universal"
