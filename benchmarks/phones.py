@@ -107,7 +107,7 @@ def main(
     if errors_of is not None:
         isp = DictionaryISP.from_pretrained(errors_of)
         seen = sample_pixels(PhoneFrames(photographs, "validation"), pixels, seed=0)
-        measure_gain_errors(isp, seen, seen)
+        measure_gain_errors(isp, seen)
         isp.save(out)
         print(isp.info["gain_errors"])
         return

@@ -13,10 +13,10 @@ measures, the estimate and its covariance are
 
 If ``S_n`` is zero, the file decides; if it is infinite, the choice stays. Both guess the digital gain, which no file
 states, and err alike, so that only one guess may count: unless the file's is clearly better, ``S_n`` is infinite along
-(1, 1, 1), and z says the ratios alone. Constants are a choice with a large ``S_e``; where nothing was measured it is 1,
-and the file decides. Atoms keep the weights that the encoders gave them, times ``exp(-d^2 / 2 spread^2)`` for the
-distance d of their light to that of the file. A known digital gain, the green of ``t``, and RAW readings are further
-observations ``t_o`` of the same state, ``t <- t + P (P + S_o)^-1 (t_o - t)``.
+(1, 1, 1), and z says the ratios alone. Constants are a choice with a large ``S_e``: of them, and where nothing was
+measured, it is 1, and the file decides. Atoms keep the weights that the encoders gave them, times
+``exp(-d^2 / 2 spread^2)`` for the distance d of their light to that of the file. A known digital gain, the green of
+``t``, and RAW readings are further observations ``t_o`` of the same state, ``t <- t + P (P + S_o)^-1 (t_o - t)``.
 
 RAW readings ``y_k`` of a channel give its gain by least squares, ``1 / g = sum w x5 y / sum w x5^2`` with ``x5`` made
 under gain 1. They are weighted by ``w = 1 / (y + 0.01)`` for shot noise and reweighted (Cauchy) against readings that

@@ -118,7 +118,7 @@ def fit_isp(
         train_encoders(fit.isp, frames, config, descent, refit)
         fit.forward()
         held_out = train_jointly(fit.isp, frames, config, descent, held_out)
-        measure_gain_errors(fit.isp, frames, held_out)
+        measure_gain_errors(fit.isp, held_out)
 
     descent.finish()
     info = fit.isp.info

@@ -336,7 +336,7 @@ def measure_lights(isp: DictionaryISP, frames: FitFrames) -> None:
 
 
 FEWEST_JUDGES = 8
-"""Minimum number of frames to judge encoders on; with fewer, they are taken to be no better than the constants."""
+"""Minimum number of frames to judge encoders on."""
 _CHOICE_VARIANCE = 0.03
 """Variance of the logarithms of chosen gains in the frames that stand for what is known before any is measured."""
 _PRIOR_FRAMES = 3
@@ -347,27 +347,21 @@ _UNKNOWN = 1e4
 
 
 @torch.no_grad()
-def measure_gain_errors(isp: DictionaryISP, frames: FitFrames, watched: FitFrames | None) -> None:
+def measure_gain_errors(isp: DictionaryISP, watched: FitFrames | None) -> None:
     """Measure how far off chosen gains and as-shot gains are, and note the covariances in ``isp.info``.
 
     Args:
         isp: the fitted ISP.
-        frames: the frames of the fit.
-        watched: frames that the encoders were not trained on, if there are any. Of other frames the errors of the
-            constants are measured, since encoders know those frames.
+        watched: frames that the encoders were not trained on. Without enough of them, and of constants, nothing is
+            measured: the file then decides.
     """
-    judged, judges_encoders = frames, False
-    if watched is not None and len(watched.shots) >= FEWEST_JUDGES:
-        judged, judges_encoders = watched, True
+    if not isp.config.encoders or watched is None or len(watched.shots) < FEWEST_JUDGES:
+        return
 
-    chosen = _chosen(isp, judged)
-    if not judges_encoders:
-        typical = isp.typical_setting()
-        chosen = ISPParams(*[tensor.expand(len(judged.shots), *tensor.shape[1:]) for tensor in typical])
-
-    balance = judged.as_shot
+    chosen = _chosen(isp, watched)
+    balance = watched.as_shot
     weights = isp.colour.weights_for(balance, chosen.colour_weights)
-    best, _, has_pixels = _best_grey(isp, judged, weights)
+    best, _, has_pixels = _best_grey(isp, watched, weights)
     usable = has_pixels.bool().all(dim=1)
 
     of_choice = (log_grey(chosen) - best)[usable].double()
