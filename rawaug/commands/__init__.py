@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import glob
 import re
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from cyclopts import Parameter
@@ -23,6 +25,11 @@ def require_results(json: str | None, report: str | None, overwrite: bool, input
             raise ValueError(f"--{option}: needs the name of a file")
         if path is not None:
             require_output(path, overwrite, extensions, files)
+
+    if report is not None:  # its tables lie beside it
+        for table in Path(report).parent.glob(f"{glob.escape(Path(report).stem)}_*"):
+            if table.suffix in (".csv", ".tex"):
+                require_output(table, overwrite, inputs=files)
 
 
 def parse_value(text: str) -> Any:

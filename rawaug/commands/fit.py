@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -49,6 +50,9 @@ def run(
     require_output(out, overwrite, (".safetensors",), data)
 
     figure = Path(out).with_name(f"{Path(out).stem}-noise.png")
+    if not Path(f"{out}.state").exists():  # a fit that goes on may have drawn its figures already
+        for existing in figure.parent.glob(f"{glob.escape(figure.stem)}*.png"):
+            require_output(existing, overwrite)
     figure.parent.mkdir(parents=True, exist_ok=True)
     with locked(Path(f"{out}.lock")):
         isp = fit(

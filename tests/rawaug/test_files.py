@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
@@ -122,6 +123,17 @@ def test_an_output_replaces_nothing_unasked_and_an_input_never(tmp_path: Path) -
         require_output(photograph, True, (".json", ".txt"))
     with pytest.raises(ValueError, match="empty"):
         require_output("")
+
+
+def test_the_files_that_lie_beside_an_output_replace_nothing_either(
+    tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    (tmp_path / "page_scores.tex").write_text("a paper's")
+    (tmp_path / "mine-noise.png").write_bytes(b"a photograph")
+    evaluate = ["evaluate", "rawaug-small", "--data", "demo:test"]
+    assert "page_scores.tex: exists" in refused(*evaluate, "--report", tmp_path / "page.html")
+    assert "mine-noise.png: exists" in refused("fit", "demo:", "--out", tmp_path / "mine.safetensors")
+    assert (tmp_path / "mine-noise.png").read_bytes() == b"a photograph"
 
 
 def test_two_writers_take_turns_and_what_a_killed_one_left_is_removed(tmp_path: Path) -> None:
