@@ -31,7 +31,7 @@ BAD_INPUT = 2
 
 COMMANDS = {
     "benchmark": "Compare denoisers on the same frozen noise over clean references.",
-    "denoise": "Denoise a RAW file to DNG, a JPEG, PNG or TIFF to another, or a folder of either.",
+    "denoise": "Denoise a RAW file to DNG, a JPEG, PNG or TIFF to another, or a folder of them.",
     "evaluate": "Measure PSNR and SSIM of a denoiser or an ISP.",
     "explore": "Show pictures as RAW of any camera, on a page in the browser.",
     "export": "Write a denoiser as ONNX, or an ISP as a .cube.",

@@ -175,7 +175,7 @@ def profile_ends(camera: str) -> list[LevelEnds]:
     Example:
         >>> iso, shot_var, _ = profile_ends("Sony ILCE-7M3")[0]
         >>> f"ISO {iso:g}: {shot_var[0]:.1e} to {shot_var[1]:.1e}"
-        'ISO 100: 1.0e-05 to 1.6e-05'
+        'ISO 100: 8.4e-06 to 1.6e-05'
     """
     low, high = map(round, ProfileLevels(camera).limits[0].exp().tolist())
     doublings = int(math.log2(high / low))

@@ -42,7 +42,7 @@ def shoot(tmp_path: Path, bayer_dng: Shoot) -> Shoot:
 
 
 def fit(out: Path, *arguments: object) -> DictionaryISP:
-    assert main(["fit", *map(str, arguments), "--out", str(out), *QUICK]) == 0
+    assert main(["fit", *map(str, arguments), "--out", str(out), "--overwrite", *QUICK]) == 0
     return DictionaryISP.from_pretrained(out)
 
 
@@ -131,7 +131,7 @@ def test_a_stopped_fit_goes_on_from_its_state_and_removes_it(
     fit(out, frames[0])
     assert "curve" in taken and not state.exists()
     state.write_bytes(b"cut off")
-    assert "x.safetensors.state" in refused("fit", *frames, "--out", out, *QUICK)
+    assert "x.safetensors.state" in refused("fit", *frames, "--out", out, "--overwrite", *QUICK)
 
 
 def test_the_cameras_jpeg_is_taken_unless_it_is_refused(tmp_path: Path, shoot: Shoot) -> None:
@@ -172,8 +172,8 @@ def test_pairs_that_do_not_state_their_cfa_and_levels_are_fitted_by_given_ones(
     out, (fitted, held) = tmp_path / "mine.safetensors", (f"pairs:{folder}" for folder in folders)
     isp = fit(out, fitted, "--held-out", held, *given)
     assert isp.cfa == "GRBG" and isp.info["frames"] == ["fitted"] and "held-out" in capsys.readouterr().out
-    assert "does not state its CFA" in refused("fit", fitted, "--out", out, *QUICK, *given[2:])
-    line = refused("fit", "demo:train", "--out", out, *QUICK, "--cfa", "GRBG")
+    assert "does not state its CFA" in refused("fit", fitted, "--out", out, "--overwrite", *QUICK, *given[2:])
+    line = refused("fit", "demo:train", "--out", out, "--overwrite", *QUICK, "--cfa", "GRBG")
     assert "cfa" in line and "demo:" in line
     with pytest.raises(ValueError, match="PATH"):
         rawaug.fit(rawaug.data.demo_pairs("train", count=1), cfa="GRBG")
