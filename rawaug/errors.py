@@ -89,7 +89,7 @@ _WAYS_OUT = (
     ),
     (
         r"connection (closed|reset) by peer|gloo/|nccl|distbackenderror",
-        "another process of this training has died, perhaps for its memory",
+        "another process of this training was killed, perhaps for its memory; free some",
     ),
     (r"no space left on device|pytorchstreamwriter", "the disk is full; free some space"),
 )
