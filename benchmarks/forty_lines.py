@@ -131,9 +131,7 @@ def cpu_seconds(workers: int) -> float:
     return time.process_time()
 
 
-def milliseconds_of_a_sample(
-    datasets: dict[str, Any], batch_size: int, workers: int, repeats: int
-) -> dict[str, list[float]]:
+def time_samples(datasets: dict[str, Any], batch_size: int, workers: int, repeats: int) -> dict[str, list[float]]:
     """CPU milliseconds of a sample in each repeat; the datasets take turns."""
     times: dict[str, list[float]] = {name: [] for name in datasets}
     for repeat in range(repeats + 1):
@@ -181,7 +179,7 @@ def show(
     args: argparse.Namespace,
 ) -> None:
     """Print a row: milliseconds, and how many times as fast RawPairs are as each of the others."""
-    times = milliseconds_of_a_sample(datasets, batch_size, workers, args.repeats)
+    times = time_samples(datasets, batch_size, workers, args.repeats)
     medians = {name: float(np.median(values)) for name, values in times.items()}
     cells = []
     for name, median in medians.items():

@@ -23,7 +23,7 @@ FRAMES = ("raw/canon", "raw/gopro", "raw_jpeg/gopro", "real_raw/d5000")
 PHOTOGRAPHS = ("photos/train", "photos/test", "srgb")
 
 
-def steepness_of_photographs(files: list[Path], deviation: float) -> list[float]:
+def measure_photographs(files: list[Path], deviation: float) -> list[float]:
     """Measure the 0.9 quantile of the steepness in each photograph that has enough edges, after a blur in pixels."""
     quantiles = []
     for file in files:
@@ -47,7 +47,7 @@ def main() -> None:
         files = sorted(file for file in (options.data / folder).iterdir() if file.suffix in (".jpg", ".png"))
         row = []
         for deviation in STEEPNESS:
-            quantiles = steepness_of_photographs(files[:: options.every], deviation)
+            quantiles = measure_photographs(files[:: options.every], deviation)
             row.append(f"{deviation:g}: {np.median(quantiles):.3f}")
         print(f"{folder:14s} " + "  ".join(row), flush=True)
 

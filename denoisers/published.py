@@ -31,7 +31,6 @@ Image = Literal["raw", "srgb"]
 AGAIN = "download or convert it again"
 """The advice about a damaged file of weights."""
 
-
 Network = TypeVar("Network", bound=nn.Module)
 
 
@@ -161,19 +160,20 @@ def read_network(path: Path) -> NetworkFile:
         name = path.stem
         if name == "denoiser":  # rawaug run writes ARM/denoiser.safetensors
             name = path.resolve().parent.name
-        return NetworkFile(path, name, network, info, _image_of(network.channels), CFA(info.get("cfa", "RGGB")))
+        return NetworkFile(path, name, network, info, _image_kind(network.channels), CFA(info.get("cfa", "RGGB")))
 
-    for one in PUBLISHED:
-        if one.tensor in tensors:
-            return NetworkFile(path, one.name, one.build(path, tensors).eval(), {}, one.image, one.cfa)
+    for published in PUBLISHED:
+        if published.tensor in tensors:
+            built = published.build(path, tensors).eval()
+            return NetworkFile(path, published.name, built, {}, published.image, published.cfa)
 
     raise ValueError(f"{path}: weights of no known denoiser; give a network or a function from Python")
 
 
-def image_of_header(header: Mapping[str, str]) -> Image:
+def find_image_kind(header: Mapping[str, str]) -> Image:
     """Find the kind of image that the network of a rawaug file takes, by the file's metadata."""
-    return _image_of(parse_object(header["config"]).get("channels", PACKED))
+    return _image_kind(parse_object(header["config"]).get("channels", PACKED))
 
 
-def _image_of(channels: int) -> Image:
+def _image_kind(channels: int) -> Image:
     return "srgb" if channels == 3 else "raw"

@@ -260,10 +260,10 @@ def light_xyz(light: str) -> Tensor:
 
 def light_mired(light: str) -> float:
     """A million over the correlated colour temperature of a light."""
-    return float(mired_of(light_xyz(light)[None].numpy())[0])
+    return float(compute_mired(light_xyz(light)[None].numpy())[0])
 
 
-def mired_of(white: Array) -> Array:
+def compute_mired(white: Array) -> Array:
     """A million over the correlated colour temperatures ``(B,)`` of white points ``(B, 3)`` (McCamy, 1992)."""
     total = white.sum(axis=1)
     x, y = white[:, 0] / total, white[:, 1] / total

@@ -40,9 +40,9 @@ from rawaug.camera.lights import (
     REFERENCE,
     XYZ_TO_SRGB,
     adaptation,
+    compute_mired,
     light_mired,
     light_xyz,
-    mired_of,
     mix_by_light,
     weights_in_light,
 )
@@ -463,7 +463,7 @@ class Camera:
         lights = torch.stack([light_xyz(f"{1e6 / mired:.6f}") for mired in mireds])
 
         _, anchor_mireds, matrices, _, from_xyz = zip(*self.anchors(), strict=True)
-        weights = torch.from_numpy(weights_in_light(anchor_mireds, mired_of(lights.numpy())))
+        weights = torch.from_numpy(weights_in_light(anchor_mireds, compute_mired(lights.numpy())))
         gains = gains_in_light(torch.einsum("bn,nij->bij", weights, torch.stack(from_xyz)), lights).clamp_min(1e-6)
 
         stated = torch.tensor(white_balance, dtype=torch.float64)

@@ -5,6 +5,7 @@ Such a file (``imx477.json``) states, on a scale of 16 bits whatever the sensor 
 - ``rpi.black_level``: the black level b, so that V = 65535 - b codes lie between black and white;
 - ``rpi.ccm``: matrices from white-balanced camera RGB to linear sRGB, by colour temperature;
 - ``rpi.awb``: white points R/G and B/G by colour temperature, whose reciprocals are the gains of red and blue;
+- ``rpi.contrast``: the tone curve;
 - ``rpi.noise``: a and s of the standard deviation :math:`a + s \sqrt{S}` of a signal of S codes above black, at an
   analogue gain of 1. Both grow with the root of the gain g (``noise.cpp``), and the calibration subtracts the black
   level but does not stretch what is left (``ctt_noise.py``), so that with white = 1
@@ -14,7 +15,6 @@ Such a file (``imx477.json``) states, on a scale of 16 bits whatever the sensor 
 
 where :math:`\sqrt{y}` of the mixed term c is replaced by its line of least squares, 4/15 + 4/5 y. It is absent in most
 files, whose a is 0. ISO is 100 g, as the DNGs of these systems say.
-- ``rpi.contrast``: the tone curve.
 
 Source: the controllers ``src/ipa/rpi/controller/rpi`` of https://github.com/raspberrypi/libcamera and the calibration
 in ``utils/raspberrypi/ctt``. Version 1 of the format has the same entries in one mapping, version 2 in a list.
@@ -97,7 +97,7 @@ def read_tuning(path: str | Path) -> dict[str, Any]:
 
 
 def _algorithms(content: Any, path: Path) -> dict[str, Any]:
-    """The entries of either version by name."""
+    """List the entries of either version by name."""
     if not isinstance(content, Mapping):
         raise ValueError(f"{path}: must hold entries such as rpi.ccm, as a tuning file of libcamera does")
 
@@ -115,16 +115,17 @@ def _algorithms(content: Any, path: Path) -> dict[str, Any]:
 
 
 def _levels(parts: Mapping[str, Any], full_scale: float) -> dict[float, list[float]]:
-    """The variances by ISO, at an analogue gain of 1 and at the highest."""
+    """Compute the variances by ISO, at an analogue gain of 1 and at the highest."""
     constant, slope = float(parts["rpi.noise"]["reference_constant"]), float(parts["rpi.noise"]["reference_slope"])
     mixed = 2.0 * constant * slope / full_scale**1.5
     shot_var = slope**2 / full_scale + 0.8 * mixed
     read_var = constant**2 / full_scale**2 + mixed * 4.0 / 15.0
 
     highest = _HIGHEST_GAIN
-    for mode in _exposure_modes(parts.get("rpi.agc", {})):
-        highest = max(float(gain) for gain in mode["gain"])
-        break
+    modes = _exposure_modes(parts.get("rpi.agc", {}))
+    if modes:
+        highest = max(float(gain) for gain in modes[0]["gain"])
+
     levels = {}
     for gain in (1.0, highest):
         levels[100.0 * gain] = [gain * shot_var, gain * read_var]
@@ -134,7 +135,7 @@ def _levels(parts: Mapping[str, Any], full_scale: float) -> dict[float, list[flo
 
 
 def _exposure_modes(agc: Mapping[str, Any]) -> list[Any]:
-    """The exposure modes of the automatic gain, the normal one first."""
+    """List the exposure modes of the automatic gain, the normal one first."""
     channel = agc
     if "channels" in agc:
         channel = agc["channels"][0]

@@ -243,14 +243,14 @@ class Cached(Dataset[T]):
 
         picture = self.pictures[index]
         item: T = picture if self.make is None else self.make(picture)
-        size = _bytes_of(item)
+        size = _count_bytes(item)
         if size <= self._free_bytes:
             self._free_bytes -= size
             self._cache[index] = item
         return item
 
 
-def _bytes_of(item: Any) -> int:
+def _count_bytes(item: Any) -> int:
     """The memory of a tensor, or of the tensors among the attributes of an object."""
     if isinstance(item, Tensor):
         return item.nbytes

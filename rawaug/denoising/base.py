@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from denoisers.classical import FILTERS
 from denoisers.files import find_denoiser, list_shipped
-from denoisers.published import Image, NetworkFile, image_of_header, read_network
+from denoisers.published import Image, NetworkFile, find_image_kind, read_network
 from rawaug import bayer
 from rawaug.bayer import CFA, noise_variance
 from rawaug.files import read_header
@@ -139,7 +139,7 @@ class ImageDenoiser(ABC):
         """List the names of the shipped networks that take this kind of image."""
         names = []
         for name in list_shipped():
-            if image_of_header(read_header(find_denoiser(name))) == cls.takes:
+            if find_image_kind(read_header(find_denoiser(name))) == cls.takes:
                 names.append(name)
         return names
 

@@ -64,7 +64,7 @@ def guard_result(denoise: Callable[[Noisy], Tensor], noisy: Noisy, denoised: Ten
     """
     if noisy.levels is None:
         raise ValueError("guard: needs the levels of the noise")
-    share, expected = _share_of_frame(denoise, noisy)
+    share, expected = _compute_share(denoise, noisy)
 
     # Where more was removed than noise can explain, the place is nearly as its input.
     mended = _mend(noisy, denoised)
@@ -77,7 +77,7 @@ def guard_result(denoise: Callable[[Noisy], Tensor], noisy: Noisy, denoised: Ten
     return mended + shares * (denoised - mended), float(shares.mean())
 
 
-def _share_of_frame(denoise: Callable[[Noisy], Tensor], noisy: Noisy) -> tuple[float, float]:
+def _compute_share(denoise: Callable[[Noisy], Tensor], noisy: Noisy) -> tuple[float, float]:
     """Compute w of the frame, and the energy that noise explains per value, in units of the stated variance."""
     assert noisy.levels is not None
     removed = explained = count = flat_removed = flat_explained = 0.0

@@ -7,6 +7,7 @@ up to an even number of bytes. Rows come from the bottom. Source: Microsoft, Win
 
 from __future__ import annotations
 
+import math
 import struct
 from pathlib import Path
 
@@ -24,11 +25,10 @@ def is_rle4(path: Path) -> bool:
 
 
 def unpack_rle4(path: Path) -> bytes:
-    """Give the same BMP without compression; raise ValueError if its data end before its picture."""
+    """Return the file of the same BMP without compression; raise ValueError if its data end before its picture."""
     data = path.read_bytes()
     (start,) = struct.unpack_from("<I", data, 10)
     width, height = struct.unpack_from("<ii", data, 18)
-    # pixels beyond the end of a row are dropped
     pixels = np.zeros((height, width), np.uint8)
     x, y, place = 0, 0, start
     while y < height:
@@ -54,11 +54,11 @@ def unpack_rle4(path: Path) -> bytes:
             run = np.stack([halves >> 4, halves & 15], -1).ravel()[:code]
             place += size + size % 2
 
-        run = run[: max(0, width - x)]
+        run = run[: max(0, width - x)]  # as decoders do, pixels beyond the end of a row are dropped
         pixels[y, x : x + len(run)] = run
         x += len(run)
 
-    padded = np.zeros((height, -(-width // 8) * 8), np.uint8)
+    padded = np.zeros((height, math.ceil(width / 8) * 8), np.uint8)
     padded[:, :width] = pixels
     packed = (padded[:, 0::2] << 4 | padded[:, 1::2]).tobytes()
     head = bytearray(data[:start])

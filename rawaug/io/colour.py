@@ -97,7 +97,7 @@ SRGB_COLOUR = Colour()
 ADOBE_RGB = Colour(None, _ADOBE, _ADOBE_EXPONENT)
 
 
-def colour_of_code_points(primaries: int, transfer: int) -> Colour:
+def colour_from_code_points(primaries: int, transfer: int) -> Colour:
     """Find the space that numbers of H.273 name; raise ValueError for numbers that are unknown."""
     if primaries not in _PRIMARIES:
         raise ValueError(f"its colour primaries (H.273, {primaries}) are unknown")
@@ -108,7 +108,7 @@ def colour_of_code_points(primaries: int, transfer: int) -> Colour:
     return Colour(None, _PRIMARIES[primaries], _TRANSFERS[transfer])
 
 
-def colour_of_numbers(chromaticities: Sequence[float] | None, exponent: float | None) -> Colour:
+def colour_from_chromaticities(chromaticities: Sequence[float] | None, exponent: float | None) -> Colour:
     """Make the space of chromaticities and an exponent, of which any may be unknown; nonsense counts as unknown."""
     corners = SRGB
     if chromaticities is not None and len(chromaticities) == 8 and _are_a_triangle(chromaticities):
@@ -138,7 +138,7 @@ def require_sdr(colour: Colour, path: Path) -> None:
     """Raise ValueError if a picture is HDR, which has to be tone-mapped first."""
     hdr: str | float | None = None
     if colour.profile is not None:
-        hdr = _hdr_of_profile(colour.profile)
+        hdr = _find_hdr_transfer(colour.profile)
     elif colour.transfer in _HDR_TRANSFERS.values():
         hdr = colour.transfer
     if hdr is not None:
@@ -146,7 +146,7 @@ def require_sdr(colour: Colour, path: Path) -> None:
 
 
 @lru_cache(maxsize=8)
-def _hdr_of_profile(profile: bytes) -> str | None:
+def _find_hdr_transfer(profile: bytes) -> str | None:
     """Find the HDR transfer function that a profile states in its tag cicp, or else in its description."""
     from PIL import ImageCms
 

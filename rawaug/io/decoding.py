@@ -24,11 +24,11 @@ import numpy as np
 from rawaug.errors import extra, how_to_install
 from rawaug.files import require_file
 from rawaug.io.bitmaps import is_rle4, unpack_rle4
-from rawaug.io.colour import Colour, colour_of_numbers, require_sdr
+from rawaug.io.colour import Colour, colour_from_chromaticities, require_sdr
 from rawaug.io.content import content_of_opened, reads_avif, reads_heic
 from rawaug.io.headers import ICC_TAG, Headers, headers_of_opened, mend_jpeg_header, png_fault
 from rawaug.io.isolated import damage_as_os_error
-from rawaug.io.tiff_pictures import TiffKind, kind_of_tiff, meaning_of, reader_of
+from rawaug.io.tiff_pictures import TiffKind, choose_tiff_reader, decode_tiff_codes, read_tiff_kind
 
 MAX_PIXELS = 2**26
 """A picture has at most this many pixels by default: 8192 x 8192."""
@@ -115,8 +115,8 @@ def _decode(path: Path, name: str, max_pixels: int, coarse: bool, headers: Heade
         return _decode_with_pillow(path, "BMP", max_pixels, headers)
     if name == "TIFF":
         with path.open("rb") as file:
-            kind = kind_of_tiff(file)
-        if kind is not None and reader_of(kind, path) == "tifffile":
+            kind = read_tiff_kind(file)
+        if kind is not None and choose_tiff_reader(kind, path) == "tifffile":
             return _decode_with_tifffile(path, max_pixels, headers, kind)
     if name == "PNM":
         _require_no_pam(path)
@@ -221,7 +221,7 @@ def _decode_with_oiio(path: Path, name: str, max_pixels: int, coarse: bool, head
         return _decode_with_pillow(path, "JPEG", max_pixels, headers)
 
     has_alpha = _require_grey_or_rgb(spec, path)
-    colour = _colour_of_spec(spec, name, headers)
+    colour = _find_colour(spec, name, headers)
     kind = _number_type(stored, path)
     if coarse and kind == "uint16" and colour.is_srgb and not has_alpha:
         kind = "uint8"
@@ -256,7 +256,7 @@ def _decode_with_oiio(path: Path, name: str, max_pixels: int, coarse: bool, head
     )
 
 
-def _colour_of_spec(spec: Any, name: str, headers: Headers) -> Colour:
+def _find_colour(spec: Any, name: str, headers: Headers) -> Colour:
     """Find the space: what the header states before a profile, the profile, or linear light with its chromaticities."""
     if headers.colour is not None:
         return headers.colour
@@ -267,7 +267,7 @@ def _colour_of_spec(spec: Any, name: str, headers: Headers) -> Colour:
         return Colour()
 
     chromaticities = spec.getattribute("chromaticities")
-    return colour_of_numbers(chromaticities, 1.0)
+    return colour_from_chromaticities(chromaticities, 1.0)
 
 
 def decode_part(
@@ -298,7 +298,7 @@ def decode_part(
     if source is None:
         return None
     spec = source.spec()
-    is_plain = str(spec.format) == "uint8" and spec.nchannels == 3 and _colour_of_spec(spec, "JPEG", headers).is_srgb
+    is_plain = str(spec.format) == "uint8" and spec.nchannels == 3 and _find_colour(spec, "JPEG", headers).is_srgb
     is_upright = (headers.orientation or spec.get_int_attribute("Orientation", 1)) == 1
     if not is_plain or not is_upright or spec.height * spec.width > max_pixels:
         source.close()
@@ -469,7 +469,7 @@ def _decode_with_tifffile(path: Path, max_pixels: int, headers: Headers, kind: T
         codes = codes.reshape(page.imagelength, page.imagewidth, -1)
         profile = page.tags.valueof(ICC_TAG)
 
-    colours, alpha = _split_alpha(meaning_of(codes, kind), bool(kind.extra))
+    colours, alpha = _split_alpha(decode_tiff_codes(codes, kind), bool(kind.extra))
     colour = headers.colour or Colour(profile)
     return Decoded(colours, alpha, kind.extra == (1,), "TIFF", colour, headers.orientation or 1, headers)
 

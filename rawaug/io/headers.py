@@ -16,7 +16,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from rawaug.io.colour import ADOBE_RGB, SRGB_COLOUR, Colour, colour_of_code_points, colour_of_numbers
+from rawaug.io.colour import ADOBE_RGB, SRGB_COLOUR, Colour, colour_from_chromaticities, colour_from_code_points
 from rawaug.io.directories import EXIF, INTEROPERABILITY, ORIENTATION, DamagedTags, Directory, TiffFile
 
 EXIF_PREFIX = b"Exif\0\0"
@@ -156,11 +156,11 @@ def _of_jpeg(file: BinaryIO) -> Headers:
 
     colour = None
     if exif is not None and not has_profile:
-        colour = colour_of_exif(BytesIO(exif))
+        colour = read_exif_colour(BytesIO(exif))
     return Headers(exif, xmp, colour=colour)
 
 
-def colour_of_exif(file: BinaryIO) -> Colour | None:
+def read_exif_colour(file: BinaryIO) -> Colour | None:
     """Find the space that EXIF states: Adobe RGB by R03 (DCF's option file), or by ColorSpace 2 of older cameras."""
     try:
         tiff = TiffFile(file)
@@ -263,7 +263,7 @@ def _of_png(file: BinaryIO) -> Headers:
 
     colour, unread = None, ""
     try:
-        colour = _colour_of_png(spaces)
+        colour = _find_png_colour(spaces)
     except ValueError as error:
         unread = str(error)
     return Headers(exif or raw_profile, xmp, animated=animated, colour=colour, unread=unread)
@@ -272,13 +272,13 @@ def _of_png(file: BinaryIO) -> Headers:
 _PNG_SPACES = (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM")
 
 
-def _colour_of_png(chunks: dict[bytes, bytes]) -> Colour | None:
+def _find_png_colour(chunks: dict[bytes, bytes]) -> Colour | None:
     """Find the space by the first of its chunks that counts; return None for that of the profile, or of none."""
     if len(chunks.get(b"cICP", b"")) == 4:
         primaries, transfer, matrix, is_full_range = chunks[b"cICP"]
         if matrix or not is_full_range:
             raise ValueError("its cICP states a matrix, or the range of video")
-        return colour_of_code_points(primaries, transfer)
+        return colour_from_code_points(primaries, transfer)
     if b"iCCP" in chunks:
         return None
     if b"sRGB" in chunks:
@@ -291,7 +291,7 @@ def _colour_of_png(chunks: dict[bytes, bytes]) -> Colour | None:
     if len(chunks.get(b"cHRM", b"")) == 32:
         numbers = [number / 1e5 for number in struct.unpack(">8I", chunks[b"cHRM"])]
         chromaticities = numbers[2:] + numbers[:2]  # white comes first
-    return colour_of_numbers(chromaticities, exponent)
+    return colour_from_chromaticities(chromaticities, exponent)
 
 
 def xmp_of_text(data: bytes) -> bytes | None:
@@ -363,16 +363,16 @@ def _of_tiff(file: BinaryIO) -> Headers:
     xmp = first.entries.get(XMP_TAG)
     colour = None
     if ICC_TAG not in first.entries:
-        colour = colour_of_exif(file) or _colour_of_tags(tiff, first)
+        colour = read_exif_colour(file) or _read_tiff_colour(tiff, first)
     return Headers(xmp=tiff.tag(xmp).data if xmp else None, stated=stated if 1 <= stated <= 8 else None, colour=colour)
 
 
-def _colour_of_tags(tiff: TiffFile, first: Directory) -> Colour | None:
+def _read_tiff_colour(tiff: TiffFile, first: Directory) -> Colour | None:
     """Find the space by WhitePoint and PrimaryChromaticities, if a TIFF states them."""
     white, primaries = (tiff.rationals(first.entries.get(code)) for code in (_WHITE_POINT, _CHROMATICITIES))
     if len(white) != 2 or len(primaries) != 6:
         return None
-    return colour_of_numbers([*primaries, *white], None)
+    return colour_from_chromaticities([*primaries, *white], None)
 
 
 def _of_bmp(file: BinaryIO) -> Headers:
@@ -448,7 +448,7 @@ def _of_heif(file: BinaryIO) -> Headers:
     if code_points is None:
         return Headers()
     try:
-        return Headers(colour=colour_of_code_points(*code_points))
+        return Headers(colour=colour_from_code_points(*code_points))
     except ValueError as error:
         return Headers(unread=str(error))
 

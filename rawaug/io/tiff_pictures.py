@@ -52,7 +52,7 @@ class TiffKind(NamedTuple):
         return f"{meaning}, {bits} {kind}, compression {self.compression}, predictor {self.predictor}"
 
 
-def kind_of_tiff(file: BinaryIO) -> TiffKind | None:
+def read_tiff_kind(file: BinaryIO) -> TiffKind | None:
     """Read how a TIFF stores its picture; return None if its directory is damaged, which its decoder will say."""
     try:
         tiff = TiffFile(file)
@@ -99,7 +99,7 @@ def _is_reduced(tiff: TiffFile, directory: Directory) -> bool:
     return is_old or bool(tiff.number(directory, _SUBFILE_TYPE) & _REDUCED_OR_MASK)
 
 
-def reader_of(kind: TiffKind, path: Path) -> str:
+def choose_tiff_reader(kind: TiffKind, path: Path) -> str:
     """Say which library reads a kind, ``"OpenImageIO"`` or ``"tifffile"``.
 
     Raises:
@@ -163,7 +163,7 @@ def _tifffile_reads(kind: TiffKind) -> bool:
     return is_plain and bits <= 16
 
 
-def meaning_of(codes: np.ndarray, kind: TiffKind) -> np.ndarray:
+def decode_tiff_codes(codes: np.ndarray, kind: TiffKind) -> np.ndarray:
     """Turn the codes ``(H, W, C)`` of tifffile into numbers that are 0 at black and the most of their type at white."""
     if kind.numbers == _FLOATING:
         numbers = codes.astype(np.float32)

@@ -38,7 +38,7 @@ _LIKENESS = 0.3
 """Minimum correlation of a tile with its reference after it was moved; below it there is too little to see."""
 
 _DARK = 0.004
-"""Light at which noise hides as much as it shows, white = 1."""
+"""Light, white = 1, at which noise hides as much as it shows."""
 
 
 class Motion(NamedTuple):
@@ -84,15 +84,16 @@ def find_motion(reference: Tensor, light: Tensor, clear: Tensor) -> Motion:
     first, second = _details(reference, clear), _details(light, clear)
     height, width = first.shape
 
-    # The whole frame, on a smaller copy.
+    # The shift of the whole frame, on a smaller copy.
     step = max(1, math.ceil(max(height, width) / _COARSE))
     shift, _ = _displacement(first[::step, ::step], second[::step, ::step], upsampled=1)
     shift = np.round(shift * step).astype(int)
 
-    # Its tiles, each looked for where the whole frame says.
+    # The displacements of its tiles, each looked for where the shift leads.
     tile = []
     for side in (height, width):
-        tile.append(max(LEAST_TILE, side // max(4, round(side / TILE))))
+        tiles_across = max(4, round(side / TILE))
+        tile.append(max(LEAST_TILE, side // tiles_across))
     centres, places = [], []
     for top in range(0, height - tile[0] + 1, tile[0]):
         for left in range(0, width - tile[1] + 1, tile[1]):
@@ -143,8 +144,8 @@ def move_back(image: Tensor, motion: Motion) -> Tensor:
     return F.grid_sample(image, grid[None], mode="bicubic", align_corners=False)
 
 
-def contradiction(reference: Tensor, light: Tensor, clear: Tensor) -> Tensor:
-    """Compute where an aligned exposure shows something else than the reference.
+def find_contradictions(reference: Tensor, light: Tensor, clear: Tensor) -> Tensor:
+    """Find where an aligned exposure shows something else than the reference.
 
     Args:
         reference, light: scene light ``(1, 3, H, W)``, exposure divided out.

@@ -23,7 +23,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from rawaug.isp.alignment import Motion, contradiction, move_back
+from rawaug.isp.alignment import Motion, find_contradictions, move_back
 from rawaug.isp.config import ISPParams, ISPResult
 from rawaug.isp.functional import as_display_referred, inverse_gains
 from rawaug.isp.model import DictionaryISP
@@ -93,7 +93,7 @@ def merge_exposures(
         if motions is not None and number != nearest:
             raw, weight = move_back(raw, motions[number]), move_back(weight, motions[number]).clamp(0.0, 1.0)
             clear = weight * reference_weight
-            weight = weight * (1.0 - contradiction(reference_light, raw / 2.0**stops, clear))
+            weight = weight * (1.0 - find_contradictions(reference_light, raw / 2.0**stops, clear))
         if motions is not None and number == nearest:
             weight = weight.clamp_min(_NOTHING_ELSE)
 

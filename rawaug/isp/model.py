@@ -18,7 +18,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.camera.lights import D65, light_range, mired_of, weights_in_light, white_point
+from rawaug.camera.lights import D65, compute_mired, light_range, weights_in_light, white_point
 from rawaug.camera.matrices import gains_in_light, load_cameras
 from rawaug.camera.names import find_camera
 from rawaug.camera.own import Camera, as_camera, is_camera_file, own_cameras
@@ -431,7 +431,7 @@ def _with_own_cameras(isp: DictionaryISP, cameras: Sequence[Camera]) -> Dictiona
     camera_weights = torch.zeros(len(cameras), count)
     atom = 0
     for row, in_lights in enumerate(anchors):
-        by_day = weights_in_light([anchor.mired for anchor in in_lights], mired_of(daylight[None].numpy()))
+        by_day = weights_in_light([anchor.mired for anchor in in_lights], compute_mired(daylight[None].numpy()))
         camera_weights[row, atom : atom + len(in_lights)] = torch.from_numpy(by_day)[0].float()
         for anchor in in_lights:
             own.colour.matrices[atom] = anchor.matrix.float()

@@ -10,9 +10,9 @@ from rawaug.camera.lights import (
     ILLUMINANTS,
     Array,
     LightRange,
+    compute_mired,
     light_range,
     light_xyz,
-    mired_of,
     sample_lights,
     weights_in_light,
 )
@@ -101,7 +101,7 @@ class OwnCameraSampler(CameraSampler):
 
     def _weights(self, cameras: Array, shares: Array, light: Array) -> Array:
         """Compute weights ``(B, N)`` of the atoms for cameras ``(B, 2)`` and their shares in lights ``(B, 3)``."""
-        mired = mired_of(light)
+        mired = compute_mired(light)
         blocks = []
         for number, mireds in enumerate(self._mireds):
             share = (shares * (cameras == number)).sum(axis=1)

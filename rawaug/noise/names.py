@@ -124,7 +124,7 @@ def noise_model(
     options = {"iso": iso, "poisson": poisson, **check_settings(f"noise {name!r}", _choose, settings)}
     if options["iso"] is not None:
         levels = noise_levels(name, iso=options["iso"], info=info)
-    if _is_of_a_file(name) and not options["poisson"]:
+    if _names_a_file(name) and not options["poisson"]:
         return measured_noise(camera_laws(name, info), options["iso"])  # it also rounds as the camera does
     return _shot_read(levels, options["poisson"])
 
@@ -143,7 +143,7 @@ def noise_levels(spec: NoiseSpec, *, iso: Iso = None, info: Mapping[str, Any] | 
         ValueError: if the name is unknown, has no law by ISO, or the ISO is outside the measured range.
     """
     if isinstance(spec, str):
-        if _is_of_a_file(spec):
+        if _names_a_file(spec):
             return measured_noise(camera_laws(spec, info), iso).levels
         return _levels_by_name(spec, iso)
     if isinstance(spec, Mapping):
@@ -198,7 +198,7 @@ def _levels_by_name(name: str, iso: Iso) -> NoiseLevels:
 
 def _has_levels(name: str) -> bool:
     """Whether a name is that of levels, so that no package of noise models has to be loaded."""
-    if name in load_presets()["presets"] or name in _single_cameras() or _is_of_a_file(name):
+    if name in load_presets()["presets"] or name in _single_cameras() or _names_a_file(name):
         return True
     return camera_key(name) in map(camera_key, (ANY_CAMERA, *load_profiles().names))
 
@@ -225,7 +225,7 @@ def _warn_of_swapped_levels(shot_var: float, read_var: float) -> None:
 # -- in files ----------------------------------------------------------------------------------------------------------
 
 
-def _is_of_a_file(name: str) -> bool:
+def _names_a_file(name: str) -> bool:
     return name == CAMERA or name.endswith(".safetensors") or is_camera_file(name)
 
 

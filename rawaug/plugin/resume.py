@@ -1,4 +1,4 @@
-"""Which draw a sample is, and how a loader of others' making goes on after a break.
+"""Which draw a sample is, and how a loader goes on after a break.
 
 A draw is keyed by (seed, epoch, index, occurrence): the occurrence says how often the index came before in its epoch,
 as it does with samplers that draw with replacement. There are two ways to know epoch and occurrence:

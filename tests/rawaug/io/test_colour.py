@@ -15,7 +15,7 @@ import tifffile
 from PIL import Image, ImageCms
 
 from rawaug.io import read_picture
-from rawaug.io.colour import ADOBE_RGB, SRGB, Colour, colour_of_code_points
+from rawaug.io.colour import ADOBE_RGB, SRGB, Colour, colour_from_code_points
 from rawaug.io.directories import Tag, pack_directory
 from rawaug.io.headers import PNG_SIGNATURE, headers_of_opened
 from rawaug.io.metadata import pack_chunk
@@ -221,8 +221,8 @@ def heif(primary: int, wide: bool) -> bytes:
 @pytest.mark.parametrize("wide", [False, True])
 def test_the_primary_item_of_heif_decides(wide: bool) -> None:
     assert headers_of_opened(BytesIO(heif(1, wide)), "HEIC").colour == Colour()
-    assert headers_of_opened(BytesIO(heif(2, wide)), "HEIC").colour == colour_of_code_points(12, 13)
-    assert colour_of_code_points(12, 13).chromaticities == P3 and ADOBE_RGB.chromaticities != SRGB
+    assert headers_of_opened(BytesIO(heif(2, wide)), "HEIC").colour == colour_from_code_points(12, 13)
+    assert colour_from_code_points(12, 13).chromaticities == P3 and ADOBE_RGB.chromaticities != SRGB
 
 
 def test_a_tiff_has_the_chromaticities_that_it_states(tmp_path: Path) -> None:
@@ -234,7 +234,7 @@ def test_a_tiff_has_the_chromaticities_that_it_states(tmp_path: Path) -> None:
 
 
 def test_the_profile_in_a_bmp_is_applied(tmp_path: Path) -> None:
-    profile = colour_of_code_points(12, 13).icc()
+    profile = colour_from_code_points(12, 13).icc()
     assert profile is not None
     pixels = np.rint(255 * encode(LIGHT @ TO_P3.T)).astype(np.uint8)[::-1, :, ::-1].tobytes()  # 108 bytes a row
     sizes = struct.pack("<IiiHHIIiiII", 124, 36, 24, 1, 24, 0, len(pixels), 0, 0, 0, 0)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rawaug.data.demo import demo_photographs
 from rawaug.io.pictures import decode_srgb
-from rawaug.isp.alignment import contradiction, find_motion, move_back
+from rawaug.isp.alignment import find_contradictions, find_motion, move_back
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.exposures import merge_exposures
 from rawaug.isp.model import DictionaryISP
@@ -53,8 +53,8 @@ def test_what_moved_in_the_scene_contradicts_and_noise_does_not(scene: Tensor) -
     walker[:, 100:160, 200:240] = torch.tensor([0.6, 0.1, 0.1])[:, None, None]
     clear = torch.ones(1, 1, *scene.shape[1:])
 
-    assert contradiction(scene[None], noisy[None], clear).mean() < 0.01
-    mask = contradiction(scene[None], walker[None], clear)[0, 0]
+    assert find_contradictions(scene[None], noisy[None], clear).mean() < 0.01
+    mask = find_contradictions(scene[None], walker[None], clear)[0, 0]
     assert mask[108:152, 208:232].mean() > 0.95
     mask[84:176, 184:256] = 0
     assert mask.mean() < 0.01
