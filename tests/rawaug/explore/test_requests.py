@@ -52,7 +52,8 @@ def test_a_request_cannot_name_a_file_of_the_user(served: str, pictures: Path, t
     event = upload_event(served)
     form = FORM % (pictures / "own.png").read_bytes()
     (uploaded,) = post(f"{served}/gradio_api/upload", form, "multipart/form-data; boundary=x")
-    assert open_file(served, event, uploaded) == 2  # behind the two pictures of the folder
+    number = open_file(served, event, uploaded)
+    assert 2 <= number < 100, "behind the two pictures of the folder, and what others uploaded"
 
     (Path(uploaded).parent / "link.png").symlink_to(tmp_path / "id_rsa")
     strangers = [tmp_path / "id_rsa", "/etc/passwd", "http://127.0.0.1:1/own.png", pictures / "in" / "a.png"]
