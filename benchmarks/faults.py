@@ -63,6 +63,9 @@ COMMANDS: dict[str, list[str]] = {
     "hdr": ["hdr", "pictures/000000.jpg", "--out", f"{OUT}/merged.tif", "--overwrite"],
     "hdr-light": ["hdr", "pictures/000000.jpg", "--out", f"{OUT}/merged.exr", "--overwrite"],
     "preview": ["preview", "pictures/000000.jpg", "--out", f"{OUT}/stages.jpg", "--count", "1", "--overwrite"],
+    "submit": ["submit", "sidd:sidd", f"{OUT}/SubmitRaw.csv", "--denoiser", "denoiser.safetensors", "--overwrite"],
+    "judge": ["judge", "clear.dng", "--denoisers", "[Wavelet]", "--noise", "[1e-3, 1e-5]", "--json",
+              f"{OUT}/judged.json", "--picture", f"{OUT}/judged.png", "--overwrite"],
     "export": ["export", "denoiser.safetensors", f"{OUT}/denoiser.onnx", "--overwrite"],
 }  # fmt: skip
 """In a folder that :func:`make_inputs` has filled."""
@@ -84,8 +87,11 @@ arms: {augmented: {augmented: 1.0}}
 
 def make_inputs(folder: Path) -> None:
     """Pictures, RAW files, a denoiser and a recipe."""
+    from scipy.io import savemat
+
     import denoisers
     from rawaug.bayer import CFA
+    from rawaug.data.sidd_scenes import HELD_BACK
     from rawaug.io import write_dng
 
     (folder / "shots").mkdir()
@@ -96,6 +102,16 @@ def make_inputs(folder: Path) -> None:
         light = torch.nn.functional.interpolate(coarse, (96, 128), mode="bilinear")[0]
         mosaic = light * 0.6 + 0.03 * torch.randn(1, 96, 128, generator=generator).abs()
         write_dng(folder / "shots" / f"{k}.dng", small_frame(mosaic, CFA.RGGB))
+    light = torch.linspace(0.1, 0.6, 512).expand(1, 384, 512)
+    clear = light + (1e-3 * light + 1e-5).sqrt() * torch.randn(light.shape, generator=generator)
+    write_dng(folder / "clear.dng", small_frame(clear, CFA.RGGB))
+
+    (folder / "sidd").mkdir()
+    blocks = torch.rand(40, 32, 16, 16, generator=generator).numpy()  # as published, but of 16 x 16
+    savemat(folder / "sidd" / "BenchmarkNoisyBlocksRaw.mat", {"BenchmarkNoisyBlocksRaw": blocks})
+    header = "scene_instance_id, beta1_r, beta2_r, beta1_g, beta2_g, beta1_b, beta2_b\n"
+    levels = [f"{name}, {', '.join(['1e-3, 1e-5'] * 3)}\n" for name in HELD_BACK]
+    (folder / "sidd" / "noise_level_functions.csv").write_text(header + "".join(levels))
     denoisers.save(denoisers.build("DnCNN", width=4, depth=3), folder / "denoiser.safetensors", {"cfa": "RGGB"})
     (folder / "recipe.yaml").write_text(RECIPE)
 
@@ -170,7 +186,7 @@ def contents(folder: Path) -> Files:
             pixels = OpenImageIO.ImageBuf(str(file)).get_pixels(OpenImageIO.HALF)
             assert pixels is not None, file
             found[name] = pixels.tobytes()
-        elif file.name == "scores.json":  # says how long each denoiser took
+        elif file.name in ("scores.json", "judged.json"):  # say how long each denoiser took
             found[name] = re.sub(rb'"seconds": [\d.]+', b"", file.read_bytes())
         else:
             found[name] = file.read_bytes()

@@ -38,7 +38,7 @@ from rawaug.denoising.denoiser import RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.levels import Noise, find_levels
 from rawaug.denoising.raw_files import balance_greens
 from rawaug.denoising.risk import Probe, estimate_risk, probe_denoiser
-from rawaug.evaluation.figures import new_figure
+from rawaug.evaluation.figures import new_figure, save_figure
 from rawaug.evaluation.tables import print_rows
 from rawaug.io import RawFrame, read_raw
 from rawaug.progress import progress
@@ -443,5 +443,4 @@ def plot_judgement(judgement: Judgement, path: Path) -> None:
         shown = axis.imshow(one.gain[0, 0].numpy(), cmap="RdYlGn", vmin=-1.0, vmax=1.0, interpolation="nearest")
         axis.set_title(f"{name}\n{one.psnr:.2f} dB, {one.harmed:.1%} harmed", fontsize=9, parse_math=False)
     figure.colorbar(shown, ax=axes, shrink=0.7, label="share of the noise removed")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    save_figure(figure, path)
