@@ -293,10 +293,10 @@ def weights_in_light(anchors: Sequence[float], mired: Array) -> Array:
 
 
 def mix_by_light(matrices: Mapping[str, Tensor], light: str) -> Tensor:
-    """Get the matrix of a light, or the mixture of the matrices of the lights beside it."""
+    """Get the matrix of a light, or the mixture of those of the lights beside it; all have one shape."""
     if light in matrices:
         return matrices[light]
 
     mireds = list(map(light_mired, matrices))
     weights = torch.from_numpy(weights_in_light(mireds, np.array([light_mired(light)])))[0]
-    return torch.einsum("n,nij->ij", weights, torch.stack(list(matrices.values())))
+    return torch.tensordot(weights, torch.stack(list(matrices.values())), dims=1)

@@ -66,6 +66,8 @@ _LARGEST = 1e9
 """No figure of a camera is larger."""
 _MOST_GAIN = 100.0
 """Gains are between this and one over it."""
+_LONGEST_SHADING = 256
+"""Most rows and columns of a table of lens shading."""
 _LARGEST_VAR = 0.2
 """A shot_var above it means fewer than five electrons at white; such numbers are more likely in DN."""
 
@@ -121,6 +123,8 @@ class Camera:
         tone: name of one of the ISP's tone curves, or points ``(linear light, value of the picture)``, both from 0 to 1
             and ascending. By default any of the ISP's curves is drawn.
         source: where the figures are from, for reports.
+        shading: the share of light that arrives, above 0 to 1: a table of rows and columns over the frame, or three of
+            them for R, G and B; or a mapping of lights to these. None for none.
         blur: softness of lens, low-pass filter and pixels: the standard deviation, from 0 to 1 pixel, of a Gaussian
             that makes photographs for the screen as soft as RAW of this camera, or the lowest and the highest. By
             default they are left as they are.
@@ -158,6 +162,7 @@ class Camera:
     noise_in: NoiseUnit = "variance"
     tone: Any = None
     source: str | None = None
+    shading: Any = None
     blur: Any = None
     mtf50: float | None = None
 
@@ -180,6 +185,7 @@ class Camera:
         self._check_colours(self.anchors())
         self._check_levels()
         self._check_blur()
+        self.shading_by_light()
         self.inverse_curve(2)  # raises ValueError for points of the tone curve
 
     def _check_choices(self) -> None:
@@ -471,6 +477,45 @@ class Camera:
         nearest = weights[int(distance.argmin())]
         return torch.einsum("n,nij->ij", nearest, torch.stack(matrices))
 
+    # -- lens ---------------------------------------------------------------------------------------------------------
+
+    def shading_in(self, light: str) -> Tensor | None:
+        """Get the share of light ``(3, rows, columns)`` that arrives in R, G and B, in a light; None if not stated."""
+        by_light = self.shading_by_light()
+        if not by_light:
+            return None
+        return mix_by_light(by_light, light)
+
+    def shading_by_light(self) -> dict[str, Tensor]:
+        """Get the tables ``(3, rows, columns)`` of each light of the sheet; none if no shading is stated."""
+        if self.shading is None:
+            return {}
+        shading = self.shading
+        if not isinstance(shading, dict):
+            shading = {REFERENCE: shading}
+
+        by_light = {}
+        for light, numbers in shading.items():
+            try:
+                light_xyz(str(light))
+                table = torch.tensor(numbers, dtype=torch.float64)
+            except (TypeError, ValueError) as error:
+                raise self._error("shading", f"of light {light!r:.40} cannot be read: {error}") from None
+
+            if table.ndim == 2:
+                table = table.expand(3, -1, -1)
+            if table.ndim != 3 or len(table) != 3 or min(table.shape) < 2 or max(table.shape) > _LONGEST_SHADING:
+                sides = " x ".join(map(str, table.shape))
+                rule = f"must be a table of 2 to {_LONGEST_SHADING} rows and columns, or three of them"
+                raise self._error("shading", f"of light {light} {rule}, got {sides or 'a number'}")
+            if not bool(((table > 0) & (table <= 1)).all()):
+                raise self._error("shading", f"of light {light} must be above 0 and at most 1; are these gains?")
+            by_light[str(light)] = table
+
+        if len({table.shape for table in by_light.values()}) != 1:
+            raise self._error("shading", "needs tables of one size for all lights")
+        return by_light
+
     # -- tone ---------------------------------------------------------------------------------------------------------
 
     def inverse_curve(self, nodes: int) -> Tensor | None:
@@ -549,8 +594,7 @@ class Camera:
         """Read a sensor's tuning file, such as libcamera's and Raspberry Pi's ``imx477.json``, of version 1 or 2.
 
         It states the black level, matrices and white points by colour temperature, the noise by analogue gain (ISO is
-        100 times the gain) and the tone curve; see :mod:`rawaug.camera.tuning` for the formulas. Its lens shading is
-        not read.
+        100 times the gain), the lens shading and the tone curve; see :mod:`rawaug.camera.tuning` for the formulas.
 
         Args:
             path: the file.

@@ -6,6 +6,10 @@ Such a file (``imx477.json``) states, on a scale of 16 bits whatever the sensor 
 - ``rpi.ccm``: matrices from white-balanced camera RGB to linear sRGB, by colour temperature;
 - ``rpi.awb``: white points R/G and B/G by colour temperature, whose reciprocals are the gains of red and blue;
 - ``rpi.contrast``: the tone curve;
+- ``rpi.alsc``: lens shading over a grid of cells, as the gains that undo it: ``luminance_lut`` L for green, and by
+  colour temperature ``calibrations_Cr`` and ``calibrations_Cb``, by which red and blue take more. Each table counts
+  relative to its minimum (``alsc.cpp``), and the light that arrives is 1 / (L Cr), 1 / L and 1 / (L Cb).
+  ``luminance_strength``, how far the software wants to undo it, does not matter;
 - ``rpi.noise``: a and s of the standard deviation :math:`a + s \sqrt{S}` of a signal of S codes above black, at an
   analogue gain of 1. Both grow with the root of the gain g (``noise.cpp``), and the calibration subtracts the black
   level but does not stretch what is left (``ctt_noise.py``), so that with white = 1
@@ -30,9 +34,13 @@ from typing import Any
 
 import numpy as np
 
+from rawaug.camera.lights import REFERENCE
+
 _CODES = 65535
 """The largest number on the files' scale."""
 _MAX_BYTES = 2**24
+_GRIDS = {192: (12, 16), 1024: (32, 32)}
+"""Rows and columns of a table of shading by the number of its cells: those of the Pi 4 and of the Pi 5."""
 _HIGHEST_GAIN = 16.0
 """Analogue gain up to which noise is stated if the file lists no gains."""
 
@@ -77,8 +85,13 @@ def read_tuning(path: str | Path) -> dict[str, Any]:
             "white_level": _CODES,
             "source": f"{path.name}, a tuning file of libcamera",
         }
+        shaded: list[float] = []
+        if "luminance_lut" in parts.get("rpi.alsc", {}):
+            figures["shading"] = _shading(parts["rpi.alsc"])
+            shaded = [float(ct) for ct in figures["shading"] if ct != REFERENCE]
+
         balance = {}
-        for ct in sorted({*kelvin.tolist(), *matrices}):
+        for ct in sorted({*kelvin.tolist(), *matrices, *shaded}):
             gains = [1.0 / np.interp(ct, kelvin, red), 1.0, 1.0 / np.interp(ct, kelvin, blue)]
             balance[f"{ct:g}"] = [float(gain) for gain in gains]
         figures["white_balance"] = balance
@@ -132,6 +145,31 @@ def _levels(parts: Mapping[str, Any], full_scale: float) -> dict[float, list[flo
     if not math.isfinite(shot_var + read_var) or highest < 1.0:
         raise ValueError("rpi.noise or the gains of rpi.agc are out of range")
     return levels
+
+
+def _shading(alsc: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """Compute the light that arrives, three tables ``(3, rows, columns)`` by colour temperature."""
+    luminance = _cells(alsc["luminance_lut"])
+    red = {float(entry["ct"]): _cells(entry["table"]) for entry in alsc.get("calibrations_Cr", [])}
+    blue = {float(entry["ct"]): _cells(entry["table"]) for entry in alsc.get("calibrations_Cb", [])}
+    if set(red) != set(blue):
+        raise ValueError("rpi.alsc states red and blue at different temperatures")
+    if not red:  # the same for all colours, in any light
+        return {REFERENCE: (1.0 / luminance).round(4).tolist()}
+
+    tables = {}
+    for ct in red:
+        gains = np.stack([luminance * red[ct], luminance, luminance * blue[ct]])
+        tables[f"{ct:g}"] = (gains.min() / gains).round(4).tolist()
+    return tables
+
+
+def _cells(table: Any) -> np.ndarray[Any, Any]:
+    """Arrange a table of gains by rows and columns, relative to its minimum."""
+    gains = np.asarray(table, dtype=np.float64)
+    if gains.size not in _GRIDS or not gains.min() > 0:
+        raise ValueError(f"rpi.alsc has a table of {gains.size} gains; those of 16 x 12 and 32 x 32 cells are read")
+    return (gains / gains.min()).reshape(_GRIDS[gains.size])
 
 
 def _exposure_modes(agc: Mapping[str, Any]) -> list[Any]:

@@ -196,6 +196,13 @@ def describe_camera(camera: Camera) -> str:
         at = "any ISO" if level.iso is None else f"ISO {level.iso:g}"
         lines.append(f"    {at:<10}  shot_var {level.shot_var:.4g}   read_var {level.read_var:.4g}")
 
+    for light, shares in camera.shading_by_light().items():
+        height, width = shares.shape[1:]
+        corners = shares[1, :: height - 1, :: width - 1].mean()
+        lines.append(
+            f"  lens shading in {light}: {height} x {width} cells, {float(corners):.2f} of green in the corners"
+        )
+
     tone = "any of the ISP's"
     if camera.tone is not None:
         tone = dumps(camera.tone)

@@ -92,14 +92,14 @@ class BakedISP(nn.Module):
 
         camera = self._camera(srgb, params, place, blur)
         size = srgb.shape[-2], srgb.shape[-1]
-        gain = _place_gain(self.isp.ordered_stages, place, size, self.table, forward=False)
+        gain = _place_gain(self.isp.ordered_stages, params, place, size, self.table, forward=False)
         if gain is None:
             return _pass(srgb, camera, white)
 
         raw = _pass(srgb, camera, math.inf)
         with one_thread():  # PyTorch's threads do not survive the fork of a worker
-            planes = [gain[..., i::2, j::2] for i, j in CFA(self.config.cfa).sites]
-            return (raw * torch.cat(planes, dim=1)).clamp_max(white)
+            sites = bayer.pack_rgb(gain.expand(-1, 3, -1, -1), self.config.cfa)
+            return (raw * sites).clamp_max(white)
 
     @torch.no_grad()
     def colours(
@@ -130,7 +130,7 @@ class BakedISP(nn.Module):
         gain = None
         if shaded:
             size = srgb.shape[-2], srgb.shape[-1]
-            gain = _place_gain(self.isp.ordered_stages, place, size, self.table, forward=False)
+            gain = _place_gain(self.isp.ordered_stages, params, place, size, self.table, forward=False)
         else:
             camera = camera._replace(attention=camera.attention[:0], shading=camera.shading[:0])
 
@@ -161,7 +161,7 @@ class BakedISP(nn.Module):
             x5 = x5 * look_up(camera.attention, x5)[:, :1]
 
         size = x4.shape[-2], x4.shape[-1]
-        gain = _place_gain(self.isp.ordered_stages, place, size, self.table, forward=False)
+        gain = _place_gain(self.isp.ordered_stages, params, place, size, self.table, forward=False)
         if gain is not None:
             x5 = x5 * gain
         return x5
@@ -214,7 +214,7 @@ class FastForward(nn.Module):
 
         display = self._display(linear, params, place)
         linear = linear.float()
-        gain = self._gain(linear, place)
+        gain = self._gain(linear, params, place)
         if gain is not None:
             linear = linear * gain
 
@@ -239,9 +239,10 @@ class FastForward(nn.Module):
             sRGB ``(B, 3, H, W)`` in [0, 1] for each of ``raws``.
         """
         display = self._display(raws[0], params, place)
-        gain = self._gain(raws[0], place)
+        gain = self._gain(raws[0], params, place)
         if gain is not None:  # the gains change slowly, so they are about the same before demosaicing and after
-            raws = [raw * gain for raw in raws]
+            sites = bayer.mosaic(gain.expand(-1, 3, -1, -1), self.cfa)
+            raws = [raw * sites for raw in raws]
 
         groups: dict[str, list[int]] = {}
         for number, method in enumerate(methods):
@@ -271,9 +272,9 @@ class FastForward(nn.Module):
             return in_steps()
         return fastest("develop", raw, display, self.cfa, methods, otherwise=in_steps)
 
-    def _gain(self, image: Tensor, place: Tensor | None) -> Tensor | None:
+    def _gain(self, image: Tensor, params: ISPParams, place: Tensor | None) -> Tensor | None:
         size = image.shape[-2], image.shape[-1]
-        return _place_gain(self.isp.ordered_stages, place, size, self.table, forward=True, batch=len(image))
+        return _place_gain(self.isp.ordered_stages, params, place, size, self.table, forward=True)
 
     def _demosaic(self, raw: Tensor, methods: Sequence[str], gains: Tensor) -> Tensor:
         """Demosaic ``(B, 1, H, W)``; choosing a direction needs balanced RAW clipped at black, as developers do it."""
@@ -352,22 +353,28 @@ def _batch_params(
 @one_thread()  # as above, and the same gains in every process
 def _place_gain(
     stages: Sequence[Stage],
+    params: ISPParams,
     place: Tensor | None,
     size: tuple[int, int],
     like: Tensor,
     forward: bool,
-    batch: int = 1,
 ) -> Tensor | None:
-    """Compute place-dependent gains ``(B, 1, H, W)`` of pictures of a size, from :data:`_PLACE_NODES` nodes a side."""
+    """Compute place-dependent gains of pictures of a size, from :data:`_PLACE_NODES` nodes a side.
+
+    Returns:
+        ``(B, 1 or 3, H, W)``, or None without any.
+    """
     gaining = [stage for stage in stages if stage.has_place_gain]
     if not gaining:
         return None
 
     height, width = size
-    places = [[0, 0, height, width]] * batch
+    places = [[0, 0, height, width]] * len(params.gains)
     if place is not None:
         places = place.tolist()
     frame = like.new_tensor([mask_frame(row, height, width, (0.0, 0.0)) for row in places])
+    sides = like.new_tensor(places)[:, 2:4]
+    edges = sides / sides.square().sum(dim=1, keepdim=True).sqrt()
 
     down = torch.linspace(0.0, height - 1.0, min(_PLACE_NODES, height)).to(like)[:, None]
     right = torch.linspace(0.0, width - 1.0, min(_PLACE_NODES, width)).to(like)
@@ -378,10 +385,12 @@ def _place_gain(
 
     # One picture at a time: on a GPU the bits of a convolution depend on the number of pictures.
     gains = []
-    for picture in coordinates.split(1):
+    for number, picture in enumerate(coordinates.split(1)):
+        edge = edges[number : number + 1]
+        setting = ISPParams(*[tensor[number : number + 1] for tensor in params])
         gain = torch.ones_like(picture[:, :1])
         for stage in gaining:
-            gain = gain * stage.place_gain(picture, forward)
+            gain = gain * stage.place_gain(picture, edge, setting, forward)
         gains.append(gain)
     gain = torch.cat(gains)
     return F.interpolate(gain, size, mode="bilinear", align_corners=True)

@@ -416,8 +416,12 @@ def _with_own_cameras(isp: DictionaryISP, cameras: Sequence[Camera]) -> Dictiona
     (mosaic,) = patterns
 
     tones, curves = _tones_of(isp, cameras)
+    pipeline = isp.config.stages
+    if any(camera.shading is not None for camera in cameras):
+        pipeline = (*pipeline, stages.FallOff.name)
     own = _without_colour(
         isp,
+        stages=pipeline,
         colour_atoms=count,
         cameras=len(cameras),
         tone_atoms=len(curves),
@@ -427,6 +431,7 @@ def _with_own_cameras(isp: DictionaryISP, cameras: Sequence[Camera]) -> Dictiona
     own.tone.curves.copy_(curves)
 
     assert isinstance(own.colour, CameraDictionary)
+    falloff = own.find(stages.FallOff)
     daylight = white_point(D65)
     camera_weights = torch.zeros(len(cameras), count)
     atom = 0
@@ -436,6 +441,9 @@ def _with_own_cameras(isp: DictionaryISP, cameras: Sequence[Camera]) -> Dictiona
         for anchor in in_lights:
             own.colour.matrices[atom] = anchor.matrix.float()
             own.colour.light[atom] = log_light(gains_in_light(anchor.from_xyz, daylight)[None])[0].float()
+            shares = cameras[row].shading_in(anchor.light)
+            if falloff is not None and shares is not None:
+                falloff.set(atom, shares)
             atom += 1
     own.colour.known.copy_(camera_weights)
 

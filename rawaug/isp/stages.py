@@ -7,7 +7,7 @@ f1      tone mapping     x1 = x + phi(x; theta_r)                        x = x1 
 f2      gamma            x2 = max(x1, eps) ** gamma                      x1 = max(x2, eps) ** (1 / gamma)
 f3      colour           x3 = C x2                                       x2 = pinv(C) x3
 f4      white balance    x4 = h(x3; g), Brooks' highlight-safe 1/g       x3 = g x4
-f5      lens shading     x5 = x4 G(p) A(x4, p)                           x4 = x5 / G(p) A'(x5, p)
+f5      lens shading     x5 = x4 G(p) A(x4, p), or x5 = x4 S(p)          x4 = x5 / G(p) A'(x5, p), or x4 = x5 / S(p)
 f6      mosaic           y = one channel a site                          x5 = bilinear demosaic of y
 ======  ===============  ==============================================  ==============================================
 
@@ -21,7 +21,8 @@ Everything but f6 is pointwise, given the parameters: a set of pixels ``(B, 3, 1
 The baked pass (:mod:`rawaug.isp.fast`) is ``y_c = sum_k C[c, k] T_k(x) max(m + (1 - m) / g_c, 1 / g_c) G(p) A(x4)``.
 The part of a stage that is the same for every picture goes into the tables ``T`` and ``A`` once (:meth:`Stage.bake`).
 The part that depends on a picture's setting or place goes into ``C``, ``1 / g`` and ``G`` for each batch
-(:meth:`Stage.adjust`). A place-dependent gain that no table holds multiplies the RAW (:meth:`Stage.place_gain`).
+(:meth:`Stage.adjust`). A place-dependent gain that no table holds multiplies the RAW (:meth:`Stage.place_gain`): that
+of the attention mask, and S, the shading that the sheets of one's own cameras state.
 
 A new kind of stage is a class with ``@STAGES.register(name)`` above it.
 """
@@ -33,6 +34,7 @@ from abc import ABC, abstractmethod
 from typing import ClassVar, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from rawaug.isp.config import ISPConfig, ISPParams
@@ -48,6 +50,10 @@ from rawaug.isp.layers import AttentionMask, GaussianMask, ToneNetwork
 from rawaug.kernels.reference import mask_frame
 from rawaug.registry import Registry
 
+FALLOFF_NODES = 33
+"""Number of nodes along each side of a table of stated shading."""
+_LEAST_SHARE = 0.01
+"""Less light arrives nowhere in a frame."""
 STAGES = Registry("stage", "rawaug.stages", "rawaug.isp")
 """The stages of an ISP by name: subclasses of :class:`Stage`."""
 
@@ -145,16 +151,18 @@ class Stage(nn.Module, ABC):
         """Whether this stage multiplies RAW by the result of :meth:`place_gain`."""
         return False
 
-    def place_gain(self, coordinates: Tensor, forward: bool) -> Tensor:
-        """Compute the gains of this stage that depend on place alone and that no table holds; they multiply RAW.
+    def place_gain(self, coordinates: Tensor, edge: Tensor, params: ISPParams, forward: bool) -> Tensor:
+        """Compute the gains of this stage that depend on place and setting, and that no table holds; they multiply RAW.
 
         Args:
             coordinates: ``(B, 2, H, W)`` of pixels in the full frame.
+            edge: ``(B, 2)`` coordinates of the frame's bottom and right edge.
+            params: the settings of the pictures.
             forward: True for the forward pass, which multiplies RAW before everything else; False for the reverse pass,
                 which does so after everything else.
 
         Returns:
-            ``(B, 1, H, W)``, ones by default.
+            ``(B, 1, H, W)``, or ``(B, 3, H, W)`` for R, G and B; ones by default.
         """
         return torch.ones_like(coordinates[:, :1])
 
@@ -379,14 +387,14 @@ class LensShading(Stage):
         """Whether there is an attention mask."""
         return self.reverse_attention is not None
 
-    def place_gain(self, coordinates: Tensor, forward: bool) -> Tensor:
+    def place_gain(self, coordinates: Tensor, edge: Tensor, params: ISPParams, forward: bool) -> Tensor:
         """Compute the attention's place-dependent gains ``(B, 1, H, W)``, in the requested direction."""
         attention = self.reverse_attention
         if forward:
             attention = self.forward_attention
 
         if attention is None:
-            return super().place_gain(coordinates, forward)
+            return super().place_gain(coordinates, edge, params, forward)
         return attention.of_place(coordinates)
 
     def describe(self) -> str:
@@ -402,6 +410,79 @@ class LensShading(Stage):
     def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
         """Multiply ``x`` ``(B, 3, H, W)`` by the Gaussian mask alone."""
         return x * self.mask(coordinates_or_full(x, coordinates))
+
+
+@STAGES.register("falloff")
+class FallOff(Stage):
+    """f5 of cameras whose sheets state it: tables of the light that arrives, mixed by the colour atoms' weights.
+
+    An atom is a camera in a light, so the shading changes with the light. A table lies over the whole frame, whatever
+    its shape is; its outermost nodes are the frame's edges.
+    """
+
+    name, makes = "falloff", 5
+    tables: Tensor
+
+    def __init__(self, config: ISPConfig) -> None:
+        super().__init__(config)
+        self.register_buffer("tables", torch.ones(config.colour_atoms, 3, FALLOFF_NODES, FALLOFF_NODES))
+
+    @torch.no_grad()
+    def set(self, atom: int, shares: Tensor) -> None:
+        """Set the table of an atom to the shares ``(3, rows, columns)`` of the cells of a grid over the frame."""
+        for axis in (1, 2):  # half a cell further to the edges of the frame, as it goes on
+            lines = list(shares.unbind(axis))
+            lines = [2 * lines[0] - lines[1], *lines, 2 * lines[-1] - lines[-2]]
+            shares = torch.stack(lines, dim=axis).clamp_min(_LEAST_SHARE)
+
+        rows, columns = shares.shape[1] - 2, shares.shape[2] - 2
+        y = torch.linspace(-rows / (rows + 2), rows / (rows + 2), FALLOFF_NODES)
+        x = torch.linspace(-columns / (columns + 2), columns / (columns + 2), FALLOFF_NODES)
+        nodes = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], dim=-1)[None]
+        self.tables[atom] = F.grid_sample(shares.float()[None], nodes, align_corners=False)[0]
+
+    def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute x5 from x4, both ``(B, 3, H, W)``; the frame of given ``coordinates`` has sides of 3 and 4."""
+        return x * self._shares(x, params, coordinates)
+
+    def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
+        """Compute x4 from x5, both ``(B, 3, H, W)``."""
+        return x / self._shares(x, params, coordinates)
+
+    def _shares(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None) -> Tensor:
+        sides = (3.0, 4.0)
+        if coordinates is None:
+            sides = (float(x.shape[-2]), float(x.shape[-1]))
+        edge = x.new_tensor([sides]) / math.hypot(*sides)
+
+        weights = x.new_full((1, len(self.tables)), 1.0 / len(self.tables))  # before a setting is chosen
+        if params is not None:
+            weights = params.colour_weights
+        return self._look_up(coordinates_or_full(x, coordinates), edge, weights)
+
+    @property
+    def has_place_gain(self) -> bool:
+        """It always has."""
+        return True
+
+    def place_gain(self, coordinates: Tensor, edge: Tensor, params: ISPParams, forward: bool) -> Tensor:
+        """Look up the shares of light ``(B, 3, H, W)``, or one over them for the forward pass."""
+        shares = self._look_up(coordinates, edge, params.colour_weights)
+        if forward:
+            return 1.0 / shares
+        return shares
+
+    def _look_up(self, coordinates: Tensor, edge: Tensor, weights: Tensor) -> Tensor:
+        """Mix the tables by weights ``(B, N)``, and look up ``coordinates`` ``(1 or B, 2, H, W)``: ``(B, 3, H, W)``."""
+        tables = torch.einsum("bn,nchw->bchw", weights.to(self.tables), self.tables)
+        place = (coordinates / edge[:, :, None, None]).flip(1).permute(0, 2, 3, 1)  # grid_sample takes (x, y)
+        place = place.expand(len(tables), -1, -1, -1)
+        return F.grid_sample(tables, place, padding_mode="border", align_corners=True)
+
+    def describe(self) -> str:
+        """Describe the tables by the light that they leave in the corners."""
+        corners = self.tables[:, 1, :: FALLOFF_NODES - 1, :: FALLOFF_NODES - 1].mean()
+        return f"falloff: tables of {len(self.tables)} atoms, {float(corners):.2f} of the light in the corners"
 
 
 def _bake_attention(tables: Tables, mask: AttentionMask | None) -> Tables:

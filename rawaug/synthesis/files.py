@@ -20,12 +20,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from rawaug.bayer import CFA
 from rawaug.data.formats import write_npz, write_tiff
 from rawaug.files import digest, find_weights, read_header, sha256, write_bytes, write_tensors
 from rawaug.io import GainMap, RawFrame, read_picture, write_dng
 from rawaug.io.pictures import MAX_PIXELS, encode_png
 from rawaug.isp.functional import frame_coordinates
-from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance
+from rawaug.isp.stages import FALLOFF_NODES, ColorCorrection, FallOff, LensShading, WhiteBalance
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.config import AugmentConfig, pair_generator
 from rawaug.plugin.params import AugmentParams, RawPair, load_params
@@ -405,12 +406,28 @@ def _black(darkest: float) -> float:
 
 
 def _shading_maps(augment: RawAugment, pair: RawPair) -> tuple[GainMap, ...]:
-    """Make gain maps that correct the Gaussian part of the shading, if the ISP has any."""
+    """Make gain maps that correct the shading, if the ISP has any: its Gaussian part, or the tables of a camera."""
+    height, width = augment.mosaic(pair.clean).shape[-2:]
+    falloff = augment.isp.find(FallOff)
+    if falloff is not None:
+        tables = torch.einsum("n,nchw->chw", pair.params.isp.colour_weights, falloff.tables)
+        spacing = 1 / (FALLOFF_NODES - 1)
+        maps = []
+        for colour, (row, column) in zip((0, 1, 1, 2), CFA(augment.cfa).sites, strict=True):
+            corrections = GainMap(
+                area=(row, column, height, width),
+                pitch=(2, 2),
+                planes=(0, 1),
+                origin=(0.0, 0.0),
+                spacing=(spacing, spacing),
+                gains=1 / tables[colour : colour + 1],
+            )
+            maps.append(corrections)
+        return tuple(maps)
+
     lens = augment.isp.find(LensShading)
     if lens is None:
         return ()
-
-    height, width = augment.mosaic(pair.clean).shape[-2:]
 
     rows, columns = _SHADING_NODES
     y = torch.linspace(0, height, rows) - height / 2

@@ -13,8 +13,8 @@ import rawpy
 import tifffile
 import torch
 
-from rawaug import Burst, DictionaryISP, ISPConfig, RawAugment, Srgb
-from rawaug.bayer import pack
+from rawaug import Burst, Camera, DictionaryISP, ISPConfig, RawAugment, Srgb
+from rawaug.bayer import CFA, pack
 from rawaug.cli import main
 from rawaug.files import replacing
 from rawaug.io import read_picture, read_raw, write_picture
@@ -203,6 +203,29 @@ def test_lens_shading_comes_as_a_gain_map() -> None:
     assert (flat.std((1, 2)) / flat.mean((1, 2))).max() < 1e-3
     rgb = flat[[0, 1, 3]].mean((1, 2)) * torch.tensor(clean.white_balance) * 2**stops
     assert rgb == pytest.approx(torch.full((3,), 0.5**2.2), rel=1e-2)
+
+
+def test_the_shading_of_a_sheet_comes_as_a_map_for_each_site() -> None:
+    red = [[0.5, 0.8, 0.6], [0.9, 1.0, 0.8], [0.6, 0.9, 0.4]]
+    green = [[0.7, 0.9, 0.8], [0.9, 1.0, 0.9], [0.8, 0.9, 0.6]]
+    colours: dict[str, Any] = {
+        "matrix": [[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.0, -0.6, 1.6]],
+        "matrix_is": "camera_to_srgb",
+    }
+    camera = Camera("M1", **colours, white_balance=(2.1, 1.0, 1.7), cfa="GRBG", shading=[red, green, green])
+    augment = RawAugment(camera, noise=(0.0, 0.0))
+    srgb = torch.full((3, 64, 96), 0.5)
+    pair = augment.apply(srgb, augment.sample(srgb, torch.Generator().manual_seed(0)))
+    clean = camera_frames(pair, augment)[0]["_clean"]
+    assert clean.mosaic.std() / clean.mosaic.mean() > 0.05 and len(clean.gain_maps) == 4
+    for plane, (top, left), corrections in zip(
+        pack(clean.mosaic, clean.cfa), CFA.GRBG.sites, clean.gain_maps, strict=True
+    ):
+        assert corrections.area[:2] == (top, left)
+        y, x = (torch.arange(top, 64, 2) + 0.5) / 32 - 1, (torch.arange(left, 96, 2) + 0.5) / 48 - 1
+        place = torch.stack(torch.meshgrid(y, x, indexing="ij")[::-1], dim=-1)[None]
+        flat = plane * torch.nn.functional.grid_sample(corrections.gains[None], place, align_corners=True)[0, 0]
+        assert flat.std() / flat.mean() < 3e-3
 
 
 def test_what_cannot_be_is_refused(tmp_path: Path, pictures: Path) -> None:
