@@ -41,6 +41,7 @@ lint: $(VENV)/.test  ## style and types alone
 
 docs: $(VENV)/.docs  ## the site, in site/; a broken link or reference stops it
 	$(BIN)/python .ci/cards.py
+	$(BIN)/python .ci/figures.py
 	$(BIN)/zensical build --strict --clean
 
 bench: $(VENV)/.demo  ## what things cost and what damaged files do, each benchmark quickly

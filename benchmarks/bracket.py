@@ -23,6 +23,8 @@ of it, has no gain.
 from __future__ import annotations
 
 import math
+import shlex
+import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
@@ -301,6 +303,7 @@ def main(command: Sequence[str] | None = None) -> None:
     figures = start(args)
     specs = ("NonLocalMeans", *args.denoisers, *shipped_of_mosaics())
     everyone: list[Denoiser] = [NoisyInput("noisy"), *(RawDenoiser.of(spec).require_mosaic() for spec in specs)]
+    figures["command"] = shlex.join(["python", "-m", "benchmarks.bracket", *sys.argv[1:]])
     for noisy, reference in pairwise(bracket(args.folder)):
         title = f"{noisy.named} against {reference.named}"
         figures[title] = scored(noisy, reference, everyone, args)

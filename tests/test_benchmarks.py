@@ -9,11 +9,25 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import augment, binning, crops, denoise, ingredients, measure, patterns, pictures, sensors, synth
+from benchmarks import (
+    augment,
+    binning,
+    crops,
+    denoise,
+    figures,
+    ingredients,
+    measure,
+    patterns,
+    pictures,
+    sensors,
+    synth,
+)
+from denoisers.files import find_denoiser
 from denoisers.network import DENOISERS
 from rawaug.data.demo import FRAME
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import NOISY
+from rawaug.files import sha256
 from rawaug.io import read_picture
 
 CPU = torch.device("cpu")
@@ -144,3 +158,40 @@ def test_files_are_compared_with_other_readers(tmp_path: Path, capsys: pytest.Ca
     assert outcomes["000000.jpg"] == outcomes["000001.jpg"] == "equal"
     assert outcomes["notes.txt"] == "neither picture nor RAW" and "refused" in outcomes["cut.jpg"]
     assert "4 files" in capsys.readouterr().out
+
+
+def test_a_figure_of_drawn_noise_is_bold_only_where_every_frame_says_so() -> None:
+    ahead = [(40.0, 30.0), (50.0, 35.0), (45.0, 33.0), (42.0, 31.0)]
+    behind = [(raw - 0.5 + 0.01 * k, srgb + (-1) ** k) for k, (raw, srgb) in enumerate(ahead)]
+    rows = figures.figures_of_drawn_noise("strong", {"rawaug-base": ahead, "PBRID": behind})
+    assert rows["strong"] == {"rawaug-base": "**44.25** / 32.25", "PBRID": "43.77 / 32.25"}
+    low, high = map(float, rows["strong, its interval"]["rawaug-base"].split(" to "))
+    assert 0.4 < low < 0.49 < high < 0.55
+
+    alone = figures.figures_of_drawn_noise("strong", {"rawaug-base": ahead[:1], "PBRID": behind[:1]})
+    assert alone["strong"]["rawaug-base"] == "40.00 / 30.00" and not alone["strong, its interval"]
+
+
+def test_figures_are_recorded_with_their_network(tmp_path: Path) -> None:
+    path = tmp_path / "figures.json"
+    for psnr in ("1.00", "2.00"):
+        row = {"strong": {"rawaug-small": psnr, "PBRID": "0.00"}}
+        figures.record("set", row, "rawaug benchmark", "none", commit="abc", path=path)
+    recorded = json.loads(path.read_text())["set"]
+    assert recorded["figures"]["strong"]["rawaug-small"] == "2.00" and recorded["commit"] == "abc"
+    assert recorded["networks"] == {"rawaug-small": sha256(find_denoiser("rawaug-small"))}
+
+
+def test_figures_of_a_bracket() -> None:
+    errors = {"noisy": [[4e-4, 4e-3], [4e-4, 4e-3], [8e-4, 4e-3]], "PBRID, published weights": [[1e-4, 1e-3]] * 3}
+    shot = {
+        "scores": {name: [38.0, 28.0] for name in errors},
+        "first in": {"noisy": 0, "PBRID, published weights": 3},
+        "gains": {"noisy": [-6.02, -9.0, -6.0]},
+        "errors": errors,
+    }
+    rows = figures.figures_of_bracket({"machine": {}, "1/640 s against 1/160 s": shot})
+    assert rows["1/640 s"] == {"noisy": "38.00 / 28.00", "PBRID": "38.00 / 28.00"}
+    assert rows["1/640 s, best in"] == {"noisy": "0", "PBRID": "**3**"}
+    assert rows["all blocks, PBRID ahead in"] == {"noisy": "3"}
+    assert rows["all blocks, PBRID ahead by"] == {"noisy": "6.02"}

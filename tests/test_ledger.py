@@ -1,11 +1,19 @@
-"""Every figure of the README and of the model cards stands in the ledger, docs/results.md and the pages beside it."""
+"""Pages show the figures of docs/figures.json and of the ledger, docs/results.md; they are those of shipped networks.
+
+``python .ci/figures.py`` fills the pages, ``python -m benchmarks.figures`` the file.
+"""
 
 from __future__ import annotations
 
+import json
 import re
+import runpy
 from pathlib import Path
 
 import pytest
+
+from denoisers.files import find_denoiser
+from rawaug.files import sha256
 
 ROOT = Path(__file__).parents[1]
 PAGES = [page.read_text() for page in sorted((ROOT / "docs").glob("results*.md"))]
@@ -13,6 +21,43 @@ LEDGER = "\n".join(PAGES)
 CARDS = sorted([*(ROOT / "denoisers" / "weights").glob("*.md"), *(ROOT / "rawaug" / "weights").glob("*.md")])
 DECIMALS = re.compile(r"(?<![\w.-])\d+\.\d+(?![\w.])(?!e-)")
 """Figures have decimals; an exponent makes one a noise level, a hyphen before it the version of a licence."""
+
+FILLING = runpy.run_path(str(ROOT / ".ci" / "figures.py"))
+SETS = json.loads((ROOT / "docs" / "figures.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("page", FILLING["PAGES"], ids=lambda page: page.stem)
+def test_a_page_shows_the_figures_that_were_measured(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert text == FILLING["fill"](text, FILLING["read_figures"]()), "run python .ci/figures.py"
+    assert not re.search(r"^ *<!-- .*: ", text, re.MULTILINE), "a comment at the start of a line ends the paragraph"
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_a_figure_is_of_the_network_that_ships(name: str) -> None:
+    measured = SETS[name]
+    assert measured["command"] and measured["commit"] and measured["frames"]
+    for network, digest in measured["networks"].items():
+        assert sha256(find_denoiser(network)) == digest, f"{name}: {network} has changed; measure it again"
+    for row in measured["figures"].values():
+        shipped = {column for column in row if column.startswith("rawaug-")}
+        assert shipped <= measured["networks"].keys()
+
+
+def test_filling_a_page() -> None:
+    fill, figures = (
+        FILLING["fill"],
+        {"real": {"1/640 s": {"noisy": "55.84", "`a`": "0", "a": "62.36"}, "best": {"a": "3"}}},
+    )
+    table = "| | `a` | noisy | old |\n|---|---|---|---|\n| shot <!-- real: 1/640 s --> | 1 | 2 | 9 |"
+    assert fill(table, figures).endswith("| shot <!-- real: 1/640 s --> | 62.36 | 55.84 | 9 |")
+    turned = "| | 1/640 s | best |\n|---|---|---|\n| a <!-- real: a --> | | |"
+    assert fill(turned, figures).endswith("| 62.36 | 3 |")
+    assert fill("by <!-- real: best: a -->2<!-- --> dB", figures) == "by <!-- real: best: a -->3<!-- --> dB"
+    with pytest.raises(KeyError):
+        fill("<!-- real: best: b -->2<!-- -->", figures)
+    with pytest.raises(KeyError):
+        fill(table.replace("1/640 s", "1/2 s"), figures)
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", *CARDS], ids=lambda page: page.stem)
@@ -28,7 +73,8 @@ def test_the_pages_have_figures_to_look_for() -> None:
 
 
 def test_the_readme_is_read_in_two_minutes() -> None:
-    words = [word for word in re.split(r"[\s|]+", (ROOT / "README.md").read_text()) if re.search(r"\w", word)]
+    shown = re.sub(r"<!--.*?-->", "", (ROOT / "README.md").read_text())
+    words = [word for word in re.split(r"[\s|]+", shown) if re.search(r"\w", word)]
     assert len(words) <= 700
 
 

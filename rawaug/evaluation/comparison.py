@@ -98,6 +98,8 @@ def compare_raw(comparison: BenchmarkSettings) -> None:
         "crop": crop,
         "seed": comparison.seed,
         "noise": noise,
+        "command": command_line(),
+        "weights_sha256": _hash_weights(denoisers),
     }
     result = {**facts, **benchmark(denoisers, cases)}
 
@@ -160,6 +162,15 @@ def _open_denoisers(comparison: BenchmarkSettings) -> list[RawDenoiser]:
         by_name[denoiser.name] = denoiser
 
     return list(by_name.values())
+
+
+def _hash_weights(denoisers: Sequence[RawDenoiser]) -> dict[str, str]:
+    """Get the SHA-256 of the file of each network."""
+    hashes = {}
+    for denoiser in denoisers:
+        if "denoiser_sha256" in denoiser.settings:
+            hashes[denoiser.name] = denoiser.settings["denoiser_sha256"]
+    return hashes
 
 
 def _make_notes(result: dict[str, Any]) -> list[str]:
