@@ -85,6 +85,36 @@ def mend_mosaic(signal: Tensor, planes: Tensor) -> Tensor:
     return torch.where(_is_beyond(signal, low, high) & (count > 2) & is_alone, mean, signal)
 
 
+def find_outliers(signal: Tensor, planes: Tensor) -> Tensor:
+    """Find the pixels that lie far beyond all pixels of their colour around them but one, which may be a defect, too.
+
+    Args:
+        signal: a mosaic ``(B, 1, H, W)``, whose noise has deviation 1.
+        planes: which colour each pixel has, ``(B, 3, H, W)``, one-hot.
+
+    Returns:
+        1 where a pixel is above the others, -1 where it is below, and 0 elsewhere, of the mosaic's shape.
+    """
+    colour = planes.argmax(1, keepdim=True)
+    low = second_low = torch.full_like(signal, torch.inf)
+    high = second_high = -low
+    for neighbour in _neighbours(torch.cat([signal, colour.to(signal)], dim=1), 2):
+        value, colour_of_value = neighbour.split(1, dim=1)
+        is_same = colour_of_value == colour
+
+        above = value.where(is_same, -torch.inf)
+        second_high = torch.maximum(second_high, torch.minimum(high, above))
+        high = torch.maximum(high, above)
+
+        below = value.where(is_same, torch.inf)
+        second_low = torch.minimum(second_low, torch.maximum(low, below))
+        low = torch.minimum(low, below)
+
+    is_compared = second_low.isfinite() & second_high.isfinite()
+    side = (signal > second_high).to(signal.dtype) - (signal < second_low).to(signal.dtype)
+    return side * (_is_beyond(signal, second_low, second_high) & is_compared)
+
+
 def _is_beyond(signal: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Mark where a signal lies far beyond the lowest or the highest of its neighbours: a mask of its shape."""
     above = signal > high + SHARE * high.abs() + DEVIATIONS

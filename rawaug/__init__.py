@@ -13,6 +13,7 @@ from rawaug.version import __version__
 if TYPE_CHECKING:
     from rawaug.bayer import CFA as CFA
     from rawaug.camera.own import Camera as Camera
+    from rawaug.denoising.defects import find_defects as find_defects
     from rawaug.denoising.denoise import denoise as denoise
     from rawaug.denoising.denoiser import RawDenoiser as RawDenoiser
     from rawaug.evaluation.judge import judge as judge
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 _PUBLIC = {
     "rawaug.bayer": ("CFA",),
     "rawaug.denoising.denoiser": ("RawDenoiser",),
+    "rawaug.denoising.defects": ("find_defects",),
     "rawaug.denoising.denoise": ("denoise",),
     "rawaug.evaluation.judge": ("judge",),
     "rawaug.isp.config": ("ISPConfig", "ISPParams", "ISPResult"),

@@ -31,6 +31,7 @@ BAD_INPUT = 2
 
 COMMANDS = {
     "benchmark": "Compare denoisers on the same frozen noise over clean references.",
+    "defects": "Map a sensor's hot and dead pixels, by RAW files of different scenes.",
     "denoise": "Denoise a RAW file to DNG, a JPEG, PNG or TIFF to another, or a folder of them.",
     "evaluate": "Measure PSNR and SSIM of a denoiser or an ISP.",
     "explore": "Show pictures as RAW of any camera, on a page in the browser.",

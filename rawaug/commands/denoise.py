@@ -30,6 +30,7 @@ def run(
     linear: bool = False,
     self_ensemble: bool = False,
     greens: Greens = "auto",
+    defects: str = "mend",
     guard: Literal["on", "off"] = "off",
     device: str = "auto",
     preview: str | None = None,
@@ -57,6 +58,9 @@ def run(
         self_ensemble: average eight views of a network, at eight times the cost.
         greens: auto makes the two greens of a Bayer sensor agree if they clearly differ, since demosaicing turns the
             difference into a maze; keep leaves them as they are.
+        defects: mend replaces single hot and dead pixels, as every shipped network does; keep leaves such sites as they
+            are, for small stars; or a map of the sensor's defects, of rawaug defects or dcraw's .badpixels, whose sites
+            are replaced while all others are kept.
         guard: on blends the result of a Bayer mosaic with its input where it is estimated to be worse, as at a camera's
             base ISO or at a small light; it takes two more passes over a sample of the frame.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
@@ -75,6 +79,7 @@ def run(
         linear=linear,
         self_ensemble=self_ensemble,
         greens=greens,
+        defects=defects,
         guard=guard == "on",
         device=device,
     )

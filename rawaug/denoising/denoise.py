@@ -24,6 +24,7 @@ def denoise(
     linear: bool = False,
     self_ensemble: bool = False,
     greens: Greens = "auto",
+    defects: str | Path = "mend",
     guard: bool = False,
     device: str = "auto",
     preview: str | Path | None = None,
@@ -43,6 +44,9 @@ def denoise(
         linear: also demosaic RAW, to linear camera RGB.
         self_ensemble: average eight views, at eight times the cost.
         greens: ``"keep"`` leaves the two greens of a Bayer sensor that differ as they are.
+        defects: ``"mend"`` leaves single hot and dead pixels to the denoiser, which replaces them; ``"keep"`` keeps
+            them, as stars are; or the file of a map of defects, whose sites are replaced while others are kept, see
+            :func:`rawaug.find_defects`.
         guard: blend the result of a Bayer mosaic with its input where it is estimated to be worse than that.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         preview: a .jpg or .png of the result of RAW to write as well, developed by LibRaw.
@@ -68,6 +72,7 @@ def denoise(
         linear=linear,
         self_ensemble=self_ensemble,
         greens=greens,
+        defects=defects,
         guard=guard,
         device=device,
     )
@@ -90,6 +95,7 @@ def files_for(
     linear: bool = False,
     self_ensemble: bool = False,
     greens: Greens = "auto",
+    defects: str | Path = "mend",
     guard: bool = False,
     device: str = "auto",
 ) -> Files[Any]:
@@ -109,6 +115,7 @@ def files_for(
             linear=linear,
             self_ensemble=self_ensemble,
             greens=greens,
+            defects=defects,
             guard=guard,
             device=device,
         )
@@ -116,6 +123,7 @@ def files_for(
     for argument, is_set in (
         ("linear", linear),
         ("greens", greens != "auto"),
+        ("defects", defects != "mend"),
         ("guard", guard),
         ("noise", noise != "auto"),
     ):

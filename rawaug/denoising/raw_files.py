@@ -23,17 +23,20 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal, get_args
 
+import torch
 from torch import Tensor
 
 from denoisers.files import JOINT
 from rawaug import bayer
 from rawaug.bayer import CFA, GreenDifference
 from rawaug.denoising.base import Noisy
+from rawaug.denoising.defects import find_lone_sites, mend_sites, read_defects
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.denoising.files import Files
 from rawaug.denoising.guard import guard_result
 from rawaug.denoising.levels import Noise, as_json, find_levels, load_noise
-from rawaug.errors import escape
+from rawaug.errors import count_of, escape
+from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
 from rawaug.io.content import RAW_EXTENSIONS, Listing
 from rawaug.io.dng import LINEAR_WHITE, cell_of_planes
@@ -49,20 +52,29 @@ Greens = Literal["auto", "keep"]
 
 @dataclass(frozen=True)
 class Corrected:
-    """The correction of a frame's greens.
+    """The corrections of a frame's greens and defects.
 
     Attributes:
         greens: by how much the two greens differ; None if that cannot be measured.
         balanced: whether the difference was taken out.
+        mended: the number of sites of a map of defects that were replaced.
+        kept: the number of sites that look like defects and were left as they are.
     """
 
     greens: GreenDifference | None = None
     balanced: bool = False
+    mended: int = 0
+    kept: int = 0
 
     def __str__(self) -> str:
-        if self.greens is None or not self.balanced:
-            return ""
-        return f", greens differed by {self.greens.share:.2%} +- {self.greens.error:.2%}, balanced"
+        words = ""
+        if self.greens is not None and self.balanced:
+            words += f", greens differed by {self.greens.share:.2%} +- {self.greens.error:.2%}, balanced"
+        if self.mended:
+            words += f", {count_of(self.mended, 'defect')} of the map mended"
+        if self.kept:
+            words += f", {count_of(self.kept, 'lone site')} kept"
+        return words
 
 
 @dataclass(frozen=True)
@@ -113,6 +125,9 @@ class RawFiles(Files[Denoised]):
         linear: whether the result is demosaiced, too.
         self_ensemble: whether eight views are averaged.
         greens: ``"keep"`` leaves greens that differ.
+        defects: ``"mend"`` leaves single hot and dead pixels to the denoiser, which replaces them; ``"keep"`` keeps
+            them as they are; or the file of a map (:mod:`rawaug.denoising.defects`), whose sites are replaced while
+            all others are kept.
         guard: whether a result that is estimated to be worse than its input is blended with it
             (:mod:`rawaug.denoising.guard`); for Bayer mosaics with known levels.
         device: where a network runs: auto, cpu, cuda, ...
@@ -139,6 +154,7 @@ class RawFiles(Files[Denoised]):
         linear: bool = False,
         self_ensemble: bool = False,
         greens: Greens = "auto",
+        defects: str | Path = "mend",
         guard: bool = False,
         device: str = "auto",
     ) -> None:
@@ -165,7 +181,14 @@ class RawFiles(Files[Denoised]):
             raise ValueError(f"{denoiser.name}: demosaics too, to a linear DNG; add linear=True")
         if guard and denoiser.demosaics:
             raise ValueError(f"{denoiser.name}: demosaics, too; guard compares mosaics")
+        if defects != "mend" and denoiser.demosaics:
+            raise ValueError(f"{denoiser.name}: demosaics, too; defects is for mosaics")
+
         self.greens = greens
+        self.defects = defects
+        self.sites: Tensor | None = None
+        if defects not in ("mend", "keep"):
+            self.sites = read_defects(defects)
         self.guard = guard
         self.noise = load_noise(noise, denoiser)
 
@@ -179,6 +202,10 @@ class RawFiles(Files[Denoised]):
 
         if self.greens != "auto":
             settings["greens"] = self.greens
+        if self.sites is not None:
+            settings["defects_sha256"] = sha256(Path(self.defects))
+        elif self.defects != "mend":
+            settings["defects"] = self.defects
         if self.guard:
             settings["guard"] = True
         if self.denoiser.strength != 1.0:
@@ -223,6 +250,9 @@ class RawFiles(Files[Denoised]):
         corrected = Corrected()
         if denoiser.strength > 0:
             frame, corrected = balance_greens(frame, self.greens)
+        if self.sites is not None:
+            frame = mend_sites(frame, self.sites)
+            corrected = replace(corrected, mended=len(self.sites))
         mosaic = frame
         if frame.cfa == MONOCHROME:
             if denoiser.demosaics:
@@ -231,7 +261,7 @@ class RawFiles(Files[Denoised]):
 
         # The levels of its noise.
         levels, noise_source = None, "not needed"
-        if denoiser.reads_levels or self.guard:
+        if denoiser.reads_levels or self.guard or self.defects != "mend":
             shot_var, read_var, noise_source = find_levels(mosaic, self.noise)
             levels = shot_var, read_var
 
@@ -242,6 +272,10 @@ class RawFiles(Files[Denoised]):
             noisy = Noisy.of(bayer.pack(mosaic.mosaic[None], mosaic.cfa), levels, mosaic.cfa)
             guarded, blended = guard_result(denoiser, noisy, bayer.pack(image[None], mosaic.cfa))
             image = bayer.unpack(guarded, mosaic.cfa)[0].clamp(max=1.0)
+        if self.defects != "mend" and levels is not None:
+            lone = find_lone_sites(mosaic, levels)
+            image = torch.where(lone, mosaic.mosaic.clamp(max=1.0), image)
+            corrected = replace(corrected, kept=int(lone.sum()))
         rgb = None
         if denoiser.demosaics:
             rgb = image

@@ -144,7 +144,7 @@ class Comparison:
     select: str | list[str] = "first"
     test_count: int | None = None
     noise: str | None = None
-    methods: list[str] = field(default_factory=lambda: ["dictionary", "upi", "upi-tuned"])
+    methods: list[str] = field(default_factory=lambda: ["dictionary", "curve-matrix", "upi", "upi-tuned"])
     sizes: dict[str, dict[str, Any]] = field(default_factory=dict)
     seconds: float | None = 20.0
     steps: int | None = None

@@ -34,7 +34,7 @@ def base() -> denoisers.DRUNet:
     settings: dict[str, Any] = {"limits": True, "mend": True, "pyramid": 2, "variance_map": False, "domain": "anscombe"}
     network = denoisers.DRUNet(width=4, blocks=1, seed=2, **settings)
     with torch.no_grad():
-        network.tail.weight.copy_(0.05 * torch.randn(network.tail.weight.shape, generator=generator()))
+        network.tail.weight.copy_(0.02 * torch.randn(network.tail.weight.shape, generator=generator()))
     return network.eval()
 
 
@@ -69,6 +69,25 @@ def test_the_second_network_sees_what_the_first_removed(base: denoisers.DRUNet) 
     before = cascade(noisy, variance)
     torch.nn.init.normal_(cascade.second.removed.weight, std=0.5, generator=generator())
     assert (cascade(noisy, variance) - before).abs().max() > 1e-4
+
+
+def test_the_second_network_cannot_take_a_light_away_but_may_restore_what_the_first_removed() -> None:
+    cascade = denoisers.CascadeDRUNet(width=4).eval()
+    noisy, variance = noisy_frame()
+    noisy[..., 10, 10] += 0.5
+    variance = noise_variance(noisy, 4e-3, 1e-5)
+    deviation = variance.sqrt()
+    levels = fit_levels(noisy, variance)
+
+    with torch.no_grad():
+        cascade.second.residual = lambda features: torch.full_like(features[:, :4], -1e3)  # type: ignore[method-assign]
+        lowered = cascade._correct(noisy, noisy, levels)
+        cascade.second.residual = lambda features: torch.full_like(features[:, :4], 1e3)  # type: ignore[method-assign]
+        raised = cascade._correct(noisy - 0.1, noisy, levels)
+
+    site = (0, 0, 10, 10)
+    assert 2.5 < (noisy - lowered)[site] / deviation[site] < 3.5
+    assert 2.5 < (raised - noisy)[site] / deviation[site] < 3.5
 
 
 def test_frozen_the_first_network_keeps_its_weights(base: denoisers.DRUNet) -> None:

@@ -25,7 +25,7 @@ from rawaug.bayer import CFA
 from rawaug.camera.lights import SRGB_TO_XYZ
 from rawaug.isp import functional
 from rawaug.isp.config import HIGHLIGHT_KNEE
-from rawaug.isp.fit.samples import FramePair, PixelSamples, sample_pixels
+from rawaug.isp.fit.samples import FramePair, sample_pixels
 from rawaug.paper.baselines.base import BASELINES, BaselineISP, Training
 
 GAMMA = 2.2
@@ -136,10 +136,9 @@ class TunedUPI(SmoothstepISP):
 
     def learn(self, pairs: Sequence[FramePair], training: Training) -> list[float]:
         """Fit to pairs of any CFA, registered or not; raise ValueError if the best matrix turns white black."""
-        moments = Moments.of(sample_pixels(pairs, PIXELS, training.seed).pixels)
-        product = moments.solve(torch.ones(len(moments.energy)).double())
-        for _ in range(ROUNDS):
-            product = moments.solve(1.0 / (moments.error(product) + LOG_MSE_EPS))
+        pixels = sample_pixels(pairs, PIXELS, training.seed).pixels
+        linear = functional.gamma_expand(inverse_smoothstep(pixels.srgb), GAMMA)
+        product = Moments.of(linear, pixels.target, pixels.known).fit()
         sums = product.sum(1)
         if (sums <= 0.0).any():
             raise ValueError("tuned UPI: the pairs fit only with negative gains; give frames with more colours")
@@ -156,12 +155,16 @@ class Moments(NamedTuple):
     energy: Tensor  # (F,): of the output
 
     @classmethod
-    def of(cls, samples: PixelSamples) -> Moments:
-        """Compute the moments of the pixels below the highlights, where the inverse gains are plain divisions."""
-        linear = functional.gamma_expand(inverse_smoothstep(samples.srgb), GAMMA)
-        below = samples.known * (linear.mean(1, keepdim=True) < HIGHLIGHT_KNEE)
+    def of(cls, linear: Tensor, target: Tensor, known: Tensor) -> Moments:
+        """Compute the moments of the pixels below the highlights, where the inverse gains are plain divisions.
+
+        Args:
+            linear: linear colour, ``(F, 3, 1, P)``.
+            target, known: as in :class:`rawaug.isp.fit.samples.PixelSamples`.
+        """
+        below = known * (linear.mean(1, keepdim=True) < HIGHLIGHT_KNEE)
         x = linear[:, :, 0].double()
-        y = samples.target[:, :, 0].double()
+        y = target[:, :, 0].double()
         weight = below[:, :, 0].double()
         if (weight.sum(2) < 32).any():
             raise ValueError("a frame has too few pixels below the highlights; use better exposed frames")
@@ -169,6 +172,13 @@ class Moments(NamedTuple):
         weight = weight / weight.sum((1, 2), keepdim=True)
         a = torch.einsum("fip,fjp,fcp->fcij", x, x, weight)
         return cls(a, torch.einsum("fip,fcp,fcp->fci", x, y, weight), (weight * y * y).sum((1, 2)))
+
+    def fit(self) -> Tensor:
+        """Compute the matrix ``(3, 3)`` of the least sum of the logarithms of the frames' errors."""
+        product = self.solve(torch.ones(len(self.energy)).double())
+        for _ in range(ROUNDS):
+            product = self.solve(1.0 / (self.error(product) + LOG_MSE_EPS))
+        return product
 
     def solve(self, weights: Tensor) -> Tensor:
         """Compute the matrix ``(3, 3)`` of least weighted error; ``weights`` of the frames are ``(F,)``."""

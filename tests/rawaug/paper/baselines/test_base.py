@@ -30,13 +30,14 @@ from rawaug.paper.methods import reverse_parameters
 SMALL: dict[str, dict[str, Any]] = {
     "upi": {},
     "upi-tuned": {},
+    "curve-matrix": {},
     "unet": {"width": 4},
     "cycleisp": {"features": 8, "groups": 1, "blocks": 1},
     "invisp": {"blocks": 2, "growth": 4},
     "invisp-jpeg": {"blocks": 2, "growth": 4},
     "invgrey": {"features": 4, "blocks": 1},
 }
-NETWORKS = [name for name in SMALL if not name.startswith("upi")]
+NETWORKS = [name for name in SMALL if SMALL[name]]
 
 
 def small(name: str, cfa: CFA | str = "RGGB") -> BaselineISP:

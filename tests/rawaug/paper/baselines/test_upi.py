@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.isp.fit.samples import sample_pixels
+from rawaug.isp.functional import gamma_expand
 from rawaug.paper.baselines import Training, fit_baseline
 from rawaug.paper.baselines.upi import (
+    GAMMA,
     UPI,
     Moments,
     SmoothstepISP,
@@ -113,7 +115,8 @@ def test_of_three_frames_the_two_that_agree_are_followed_and_not_the_bright_one(
 
 def test_the_moments_give_the_error() -> None:
     samples, _ = sample_pixels([shot(0)], 4096, 0)
-    moments = Moments.of(samples)
+    linear = gamma_expand(inverse_smoothstep(samples.srgb), GAMMA)
+    moments = Moments.of(linear, samples.target, samples.known)
     product = torch.diag(1.0 / (1.3 * GAINS)) @ MATRIX
     predicted = Known(1.3 * GAINS).unprocess(samples.srgb)
     expected = ((predicted - samples.target) ** 2 * samples.known).sum() / samples.known.sum()
