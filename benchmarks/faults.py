@@ -228,7 +228,7 @@ def killed(folder: Path, name: str, number: signal.Signals, delay: float, whole:
     time.sleep(delay)
     child.send(number)
     status = child.wait()
-    if status not in (0, -number, 130) or "Traceback" in child.said():
+    if status not in (0, -number, 128 + number) or "Traceback" in child.said():
         return f"{name}, {number.name} after {delay:.2f} s: status {status}: {child.said()}"
     again = Child(folder, COMMANDS[name])
     if (status := again.wait()) or "Traceback" in again.said():

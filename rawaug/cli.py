@@ -11,9 +11,11 @@ import io
 import json
 import os
 import re
+import signal
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib.metadata import entry_points
 from importlib.util import module_from_spec, spec_from_file_location
 from inspect import signature
@@ -137,8 +139,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         words = [*words[: command + 2], "--keys"]
 
     try:
-        _add_plugins(words[command : command + 1])
-        app.meta(words, exit_on_error=False, print_error=False)
+        with _stopped_by_sigterm():
+            _add_plugins(words[command : command + 1])
+            app.meta(words, exit_on_error=False, print_error=False)
         return 0
     except BrokenPipeError:  # the reader has closed the pipe, as with `| head`
         return 0
@@ -149,12 +152,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if shortage is None:
             raise
         text = shortage
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
-        return 130
+        return 128 + (stop.args[0] if stop.args else signal.SIGINT)
 
     print(f"rawaug: {escape(_in_options(text, words[command : command + 1]))}", file=sys.stderr)
     return BAD_INPUT
+
+
+@contextmanager
+def _stopped_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM, as of a job scheduler, end a command in the way that Ctrl-C does."""
+
+    def stop(number: int, _: object) -> None:
+        raise KeyboardInterrupt(number)
+
+    if threading.current_thread() is not threading.main_thread():  # which alone receives signals
+        yield
+        return
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _in_options(text: str, names: Sequence[str]) -> str:

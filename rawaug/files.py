@@ -491,8 +491,14 @@ def cached(
     return result
 
 
-def require_same_settings(path: Path, settings: Mapping[str, object], overwrite: bool = False) -> None:
-    """Write the settings of a folder's files to ``path``, or require that they equal those stored there."""
+def require_same_settings(
+    path: Path, settings: Mapping[str, object], overwrite: bool = False, advice: str = "choose another folder"
+) -> None:
+    """Write the settings of a folder's files to ``path``, or require that they equal those stored there.
+
+    Raises:
+        ValueError: if they differ, with ``advice``.
+    """
     if overwrite or not path.is_file():
         write_json(dict(settings), path)
         return
@@ -504,7 +510,7 @@ def require_same_settings(path: Path, settings: Mapping[str, object], overwrite:
     for key in stored | dict(settings):
         before, now = stored.get(key), settings.get(key)
         if before != now:
-            raise ValueError(f"{path}: made with {key} {before}, not {now}; choose another folder")
+            raise ValueError(f"{path}: made with {key} {before}, not {now}; {advice}")
 
 
 def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iterator[Path]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
+import shlex
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -81,7 +82,7 @@ def as_options(text: str, arguments: Iterable[str]) -> str:
         if value in ("", "True"):
             return option
         if value.startswith("("):
-            value = f"'[{value[1:-1]}]'"
-        return f"{option} {value.strip(chr(34))}"
+            return f"{option} '[{value[1:-1]}]'"
+        return f"{option} {shlex.quote(value.strip(chr(34)))}"
 
     return _ARGUMENT.sub(replace, text)

@@ -11,7 +11,7 @@ from rawaug.commands import YAML, as_options, network_or_filter, require_results
 from rawaug.denoising.denoise import files_for, is_mixed
 from rawaug.denoising.files import DenoisedFolder, denoise_file, denoise_folder
 from rawaug.denoising.picture_files import PictureFiles
-from rawaug.denoising.raw_files import Greens
+from rawaug.denoising.raw_files import Denoised, Greens
 from rawaug.errors import count_of, escape
 from rawaug.files import write_json
 from rawaug.io.content import PICTURE_KINDS
@@ -35,6 +35,7 @@ def run(
     device: str = "auto",
     preview: str | None = None,
     json: str | None = None,
+    verbose: bool = False,
     overwrite: bool = False,
 ) -> None:
     """Denoise a RAW file to DNG, a JPEG, PNG or TIFF to another, or a folder of them.
@@ -67,6 +68,7 @@ def run(
         preview: also write the result, developed by LibRaw, as this .jpg or .png; for a folder, write a JPEG of each
             result to this folder.
         json: write what was done to each file to this file: noise levels and corrections of RAW, and seconds.
+        verbose: print noise levels, how they were found, and corrections of RAW files in numbers.
         overwrite: replace existing results.
     """
     spec = network_or_filter(denoiser, classical, self_ensemble, linear)
@@ -103,15 +105,16 @@ def run(
 
     if json is not None:
         write_json({"files": [asdict(done) for done in result.files], "broken": result.broken}, json)
-    print_denoised(result)
+    print_denoised(result, verbose)
     if result.broken:
         raise ValueError(f"{source}: {len(result.broken)} of its files could not be denoised; they are listed above")
 
 
-def print_denoised(result: DenoisedFolder[Any]) -> None:
+def print_denoised(result: DenoisedFolder[Any], verbose: bool = False) -> None:
     """Print what was done, and what was not."""
     for done in result.files:
-        print(done)
+        line = done.details if verbose and isinstance(done, Denoised) else str(done)
+        print(as_options(line, signature(run).parameters))
     if result.existing or result.broken:
         files = count_of(len(result.files), "file")
         print(f"Denoised {files}; {result.existing} already existed, {len(result.broken)} failed.")

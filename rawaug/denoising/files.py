@@ -208,7 +208,8 @@ def denoise_folder(
 
     require_folder(out)
     if kind.settings is not None:
-        require_same_settings(out / SETTINGS, kind.settings, overwrite)
+        advice = "choose another folder, or replace all results by overwrite=True"
+        require_same_settings(out / SETTINGS, kind.settings, overwrite, advice)
 
     result: DenoisedFolder[T] = DenoisedFolder(left_out=listing.lines(elsewhere))
     unknown = []

@@ -110,6 +110,9 @@ def _estimate(frame: RawFrame) -> tuple[float, float, str]:
     least = 0.0
     with suppress(ValueError):
         least = _published_levels(frame, frame.camera)[1] / 2
+    if estimate.r2 < LOOSE:
+        advice = f'compare strength=0.7 and noise="{frame.camera}"' if least else "compare strength=0.7"
+        source += f"; {advice} at 100 %"
     if estimate.read_var < least:
         source += "; read_var is half the camera's published one"
     return estimate.shot_var, max(estimate.read_var, least), source

@@ -13,6 +13,7 @@ A monochrome frame is denoised as the mosaic of a grey scene, which it is.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from copy import copy
@@ -42,6 +43,12 @@ from rawaug.io.content import RAW_EXTENSIONS, Listing
 from rawaug.io.dng import LINEAR_WHITE, cell_of_planes
 from rawaug.io.isolated import isolated
 from rawaug.io.raw import MONOCHROME, develop
+
+MID_GREY = 0.18
+"""The signal whose noise is stated for photographers, on the scale black 0, white 1."""
+
+_SOURCES = {"profile": "by its tag", "estimate": "estimated", "given": "as given", "camera": "by its camera's law"}
+"""Where noise levels come from, in the words of a line for photographers; others stand as they are."""
 
 OTHER_PATTERNS = "rawaug-xtrans"
 """The denoiser of X-Trans and Quad-Bayer frames if none is named."""
@@ -91,6 +98,7 @@ class Denoised:
         corrected: errors of the sensor that were taken out.
         blended: the mean share of the result in its blend with the input; 1 without the guard, or where it found none
             of the frame harmed.
+        strength: the share of the noise that was removed.
     """
 
     source: Path | None
@@ -104,10 +112,41 @@ class Denoised:
     iso: float | None
     corrected: Corrected
     blended: float = 1.0
+    strength: float = 1.0
 
     def __str__(self) -> str:
+        """A line for photographers: the deviation of the noise in per cent of mid grey, and where it is known from."""
+        removed = "removed"
+        if self.strength < 1.0:
+            removed = f"{self.strength:.0%} of it removed"
+
+        deviation = 100 * math.sqrt(self.shot_var * MID_GREY + self.read_var) / MID_GREY
+        source, *remarks = self.noise_source.split("; ")
+        is_uncertain = "uncertain" in source
+        source = source.partition(",")[0]
+        noise = f"noise of {deviation:.1f} % of mid grey, {_SOURCES.get(source, source)}, {removed}"
+        if not deviation:
+            noise = f"noise {removed}"
+
+        line = f"{escape(self.out)}: {noise}"
+        if self.corrected.balanced:
+            line += ", greens balanced"
+        line += f", {self.seconds:.1f} s"
+        if is_uncertain:
+            line += "; the estimate is uncertain"
+        for remark in remarks:
+            if not remark.startswith("read_var"):
+                line += f"; {remark}"
+        return line + self._losses()
+
+    @property
+    def details(self) -> str:
+        """The same in numbers: noise levels, how they were found, and what was corrected."""
         levels = f"shot_var {self.shot_var:.3g}, read_var {self.read_var:.3g} ({self.noise_source})"
-        line = f"{escape(self.out)}: {levels}{self.corrected}, {self.seconds:.1f} s"
+        return f"{escape(self.out)}: {levels}{self.corrected}, {self.seconds:.1f} s{self._losses()}"
+
+    def _losses(self) -> str:
+        line = ""
         if self.blended < 0.995:
             line += f"; blended with its input, {self.blended:.0%} of what was removed stays removed"
         if self.below_zero:
@@ -307,6 +346,7 @@ class RawFiles(Files[Denoised]):
             frame.iso,
             corrected,
             blended,
+            denoiser.strength,
         )
         return (frame if rgb is None else rgb), done
 

@@ -83,6 +83,8 @@ def train(
     model = state.set_up(fabric)
 
     is_first = fabric.is_global_zero
+    if start and is_first:
+        print(f"{label}: resumed after step {start} of {config.steps}")
     journal = Journal(folder, start) if is_first else None
     loader = _load_batches(stream, start, config, fabric)
     bar = progress(loader, label=label, unit="step", total=config.steps, initial=start, leave=True, shown=is_first)

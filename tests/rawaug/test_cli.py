@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -264,3 +265,14 @@ def test_benchmark_takes_a_law_of_ones_own_at_an_iso() -> None:
     shot_var, read_var = levels_at["ISO 800"].sample(1, torch.Generator())
     assert 5.0e-5 < float(shot_var) < 3.1e-3
     assert 1.7e-8 < float(read_var) < 3.8e-6
+
+
+def test_sigterm_ends_a_command_as_ctrl_c_does(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        monkeypatch.setattr("rawaug.cli._add_plugins", lambda _, number=number: signal.raise_signal(number))
+        assert main(["info"]) == 128 + number
+        assert "stopped; run the same command again" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) is before

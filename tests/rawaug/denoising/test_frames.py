@@ -20,9 +20,9 @@ import denoisers
 import rawaug
 from rawaug.bayer import CFA, mosaic, pack, unpack
 from rawaug.cli import main
-from rawaug.commands.denoise import run
+from rawaug.commands.denoise import print_denoised, run
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
-from rawaug.denoising.files import denoise_file, denoise_folder
+from rawaug.denoising.files import DenoisedFolder, denoise_file, denoise_folder
 from rawaug.denoising.levels import find_levels
 from rawaug.denoising.raw_files import OTHER_PATTERNS, RawFiles
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng, write_picture
@@ -122,7 +122,7 @@ def test_greens_that_differ_are_balanced_and_kept_on_request(
         assert main([*command[:2], str(out), *command[2:], "--greens", greens, "--overwrite"]) == 0
         done = json.loads((tmp_path / "done.json").read_text())["files"][0]["corrected"]
         assert done["balanced"] is (greens == "auto") and done["greens"]["share"] == pytest.approx(0.02, rel=0.2)
-        assert ("greens differed by 2" in capsys.readouterr().out) is (greens == "auto")
+        assert ("greens balanced" in capsys.readouterr().out) is (greens == "auto")
         packed = pack(read_raw(out).mosaic, CFA.RGGB)
         gaps[greens] = float((packed[1] - packed[2]).mean())
     assert abs(gaps["auto"]) < 0.1 * gaps["keep"]
@@ -179,6 +179,24 @@ def test_a_tag_that_the_frame_contradicts_or_lacks_gives_way_to_the_estimate(wro
     assert shot_var == pytest.approx(LEVELS[0], rel=0.1)
 
 
+def test_an_uncertain_estimate_says_what_to_compare(capsys: pytest.CaptureFixture[str]) -> None:
+    """On a line for photographers: half of the frame has four times the noise, so the variances follow no line."""
+    frame = dataclasses.replace(gradient(), camera="Nikon D5000", iso=200.0)
+    extra = torch.randn(frame.mosaic.shape, generator=torch.Generator().manual_seed(1))
+    extra[..., frame.mosaic.shape[-1] // 2 :] = 0
+    frame = dataclasses.replace(frame, mosaic=(frame.mosaic + 0.06 * extra).clamp(max=1.0))
+    _, done = RawFiles("NonLocalMeans", noise="estimate", strength=0.5).denoise(frame)
+    assert ", estimated, 50% of it removed" in str(done)
+    assert "uncertain" in str(done) and 'noise="Nikon D5000"' in str(done)
+    assert "shot_var" not in str(done) and "R^2" not in str(done)
+    assert "shot_var" in done.details and "R^2" in done.details
+
+    print_denoised(DenoisedFolder([done]))
+    assert "--strength 0.7 and --noise 'Nikon D5000'" in capsys.readouterr().out
+    _, sure = RawFiles("NonLocalMeans", noise="estimate").denoise(gradient())
+    assert "uncertain" not in str(sure) and ", estimated, removed" in str(sure)
+
+
 def gradient() -> RawFrame:
     """From dark to light, with noise of :data:`LEVELS` and no tag."""
     generator = torch.Generator().manual_seed(0)
@@ -229,14 +247,15 @@ def test_what_is_there_stays_without_overwrite(
     source, out, preview = shot(tmp_path / "a.dng", bayer_dng, orientation=6), tmp_path / "b.dng", tmp_path / "p.jpg"
     command = ["denoise", str(source), str(out), "--denoiser", str(identity), "--noise", "[0.002, 1e-5]"]
     assert main([*command, "--preview", str(preview)]) == 0
-    assert "shot_var 0.002, read_var 1e-05 (given)" in capsys.readouterr().out
+    assert "b.dng: noise of 10.7 % of mid grey, as given, removed" in capsys.readouterr().out
     assert read_picture(preview).shape == (3, 128, 96)  # upright
     before = out.stat().st_mtime_ns
     assert "b.dng: exists; give another name, or --overwrite" in refused(*command)
     assert "p.jpg: exists" in refused(*command[:2], tmp_path / "c.dng", *command[3:], "--preview", preview)
     assert not (tmp_path / "c.dng").exists() and out.stat().st_mtime_ns == before
-    assert main([*command, "--overwrite"]) == 0
+    assert main([*command, "--overwrite", "--verbose"]) == 0
     assert out.stat().st_mtime_ns > before
+    assert "shot_var 0.002, read_var 1e-05 (given)" in capsys.readouterr().out
 
 
 def test_a_full_disk_ends_a_folder_in_one_line(
@@ -274,7 +293,8 @@ def test_folders_are_resumed_and_fail_where_a_file_is_broken(
     (out / "sub" / "a.dng").unlink()
     again = denoise_folder(source, out, RawFiles(identity))
     assert (len(again.files), again.existing, len(again.broken)) == (1, 1, 1)
-    assert "denoise.json: made with noise auto, not estimate" in refused(*command, "--noise", "estimate")
+    other_noise = refused(*command, "--noise", "estimate")
+    assert "denoise.json: made with noise auto, not estimate" in other_noise and "--overwrite" in other_noise
     assert "made with strength None, not 0.5" in refused(*command, "--strength", "0.5")
     before = (out / "a.dng").stat().st_mtime_ns
     (source / "broken.nef").unlink()
@@ -492,7 +512,7 @@ def test_a_noise_profile_out_of_range_is_told_and_replaced(
     command = ["denoise", str(source), str(tmp_path / "b.dng"), "--denoiser", str(identity)]
     assert main(command) == 0
     said = capsys.readouterr().out
-    assert "NoiseProfile is out of range" in said and "(estimate" in said
+    assert "NoiseProfile is out of range" in said and ", estimated, removed" in said
     assert "out of range" in refused(*command, "--overwrite", "--noise", "profile")
 
 

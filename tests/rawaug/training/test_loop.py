@@ -78,14 +78,20 @@ class Dying(Supervised):
 
 
 def test_the_best_weights_survive_a_kill_after_which_scores_fall(
-    stream: TrainingStream, validation: list[Trial], tmp_path: Path, scored: Callable[..., Any]
+    stream: TrainingStream,
+    validation: list[Trial],
+    tmp_path: Path,
+    scored: Callable[..., Any],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     seen = scored(30.0, 40.0, 20.0, 10.0)
     config = replace(CONFIG, steps=8, validate_every=2, checkpoint_every=4)
     with pytest.raises(Killed):
         loop.train(stream, validation, NETWORK, config, tmp_path, device="cpu", estimator=Dying(5))
+    assert "resumed" not in capsys.readouterr().out
     kept = loop.train(stream, validation, NETWORK, config, tmp_path, device="cpu").state_dict()
     assert all(torch.equal(kept[key], value) for key, value in seen[1].items())
+    assert "resumed after step 4 of 8" in capsys.readouterr().out
 
 
 def test_a_checkpoint_of_other_settings_is_not_resumed_and_a_damaged_one_is_named(
