@@ -120,11 +120,12 @@ def run_d5000(folder: Path, photographs: Path, out: str, beside: Sequence[str]) 
     watched = [block_pair(block, short) for k, block in enumerate(left) if k not in chosen]
     print(f"{len(left)} blocks on the left, {len(watched)} of them validate; {len(right)} on the right")
 
-    # The ISP sees five squares of the longer shot's left half, two stops brighter, with its picture.
+    # The ISP sees the same places in the longer shot, two stops brighter, with its picture; a clipped sky says nothing.
     (frame,) = [pair for pair in open_pairs(folder) if pair.name == middle.frame.name]
     blur = measure_blur([(frame.raw[0, :, :half].numpy(), frame.cfa)])
     print(f"softness of the D5000: {blur:.2f} pixels")
     squares = [window(frame, left[k].top, left[k].left, bracket.BLOCK) for k in chosen]
+    squares = [square for square in squares if (square.srgb < 250).float().mean((1, 2)).min() > 0.5]
     file = Path(out) / "d5000.safetensors"
     file.parent.mkdir(parents=True, exist_ok=True)
     fit_isp(squares, FIT).save(file)
