@@ -55,7 +55,7 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 NETWORKS = ("benchmark", "denoise", "evaluate", "judge", "run")
 """These commands run networks. They take huge pages and keep them, as page faults took a third of their time."""
 
-_OWN = {*COMMANDS, "data", "completion"}
+_OWN = {*COMMANDS, "camera", "data", "completion"}
 """Commands of other packages have none of these names."""
 
 app = App(
@@ -72,6 +72,9 @@ app.command(data)
 data.command(
     "rawaug.commands.check_data:run", name="check", help="Identify a dataset, count its files and list damaged ones."
 )
+camera = App(name="camera", help="Commands about cameras.")
+app.command(camera)
+camera.command("rawaug.commands.measure_camera:run", name="measure", help="Measure a camera on dark and flat frames.")
 for _name, _summary in COMMANDS.items():
     app.command(f"rawaug.commands.{_name}:run", name=_name, help=_summary)
 

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, fields
+from dataclasses import KW_ONLY, asdict, dataclass, fields, replace
 from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -48,6 +48,7 @@ from rawaug.camera.lights import (
 )
 from rawaug.camera.matrices import camera_from_srgb, gains_in_light, load_cameras
 from rawaug.camera.softness import MTF50
+from rawaug.camera.transfer import measure_noise
 from rawaug.camera.tuning import read_tuning
 from rawaug.errors import count_of
 from rawaug.files import read_yaml
@@ -68,16 +69,21 @@ _MOST_GAIN = 100.0
 """Gains are between this and one over it."""
 _LONGEST_SHADING = 256
 """Most rows and columns of a table of lens shading."""
+_MOST_HOT = 0.1
 _LARGEST_VAR = 0.2
 """A shot_var above it means fewer than five electrons at white; such numbers are more likely in DN."""
 
 
 class Level(NamedTuple):
-    """The noise of a camera at one ISO, as variances with white = 1; the ISO is None if it is not stated."""
+    """The noise of a camera at one ISO, as variances with white = 1; what is not stated is None."""
 
     iso: float | None
     shot_var: float
     read_var: float
+    row_var: float | None = None
+    column_var: float | None = None
+    tukey_lambda: float | None = None
+    hot_share: float | None = None
 
 
 class Anchor(NamedTuple):
@@ -117,8 +123,10 @@ class Camera:
         white_level: DN at which the sensor saturates; by default the largest number of ``bits``.
         bits: depth of the RAW, 1 to 16; RAW is then rounded to whole DN. By default nothing is rounded.
         noise: levels by ISO. Each is ``(shot_var, read_var)``, variances on the scale white = 1, or ``(K, sigma)`` in
-            DN, as ``noise_in`` says; a mapping with these names needs no ``noise_in``. A single level without an ISO
-            may be given as it is. None if unknown.
+            DN, as ``noise_in`` says; a mapping with these names needs no ``noise_in``. It may also state banding,
+            ``row`` and ``column`` as deviations in DN, or ``row_var`` and ``column_var``; ``lambda``, Tukey's shape of
+            the read noise; and ``hot``, the share of hot pixels. A single level without an ISO may be given as it is.
+            None if unknown.
         noise_in: unit of levels without names, ``"variance"`` or ``"DN"``.
         tone: name of one of the ISP's tone curves, or points ``(linear light, value of the picture)``, both from 0 to 1
             and ascending. By default any of the ISP's curves is drawn.
@@ -145,7 +153,7 @@ class Camera:
         ...     bits=10,
         ...     noise={100: {"K": 0.12, "sigma": 1.1}, 800: {"K": 0.96, "sigma": 2.4}},
         ... )
-        >>> [f"{variance:.3g}" for variance in camera.levels[0][1:]]
+        >>> [f"{variance:.3g}" for variance in camera.levels[0][1:3]]
         ['0.000125', '1.32e-06']
     """
 
@@ -251,6 +259,9 @@ class Camera:
                 )
                 raise self._error("noise", f"{reason}, as no sensor has; is it a deviation?")
 
+        if len({tuple(value is None for value in level[3:]) for level in self.levels}) > 1:
+            raise self._error("noise", "states row, column, lambda or hot at some ISO values only; state it at all")
+
         rounding = self.quantum**2 / 12
         for level in self.levels:
             if level.shot_var < 0 or level.read_var < rounding:
@@ -312,8 +323,8 @@ class Camera:
         """The noise by ISO, ascending, as variances with white = 1; empty if it is not known."""
         if self.noise is None:
             return []
-        if not isinstance(self.noise, dict) or set(self.noise) <= {"shot_var", "read_var", "K", "sigma"}:
-            return [Level(None, *self._variances(self.noise, ""))]
+        if not isinstance(self.noise, dict) or set(self.noise) & {"shot_var", "read_var", "K", "sigma"}:
+            return [self._level(None, self.noise, "")]
 
         levels = []
         for iso, values in self.noise.items():
@@ -325,35 +336,53 @@ class Camera:
             if not 0 < number < math.inf:
                 raise self._error("noise", f"has levels by ISO, a positive number, got {iso!r:.100}")
 
-            levels.append(Level(number, *self._variances(values, f" at ISO {number:g}")))
+            levels.append(self._level(number, values, f" at ISO {number:g}"))
 
         return sorted(levels, key=lambda level: level.iso or 0.0)
 
-    def _variances(self, values: Any, where: str) -> tuple[float, float]:
+    def _level(self, iso: float | None, values: Any, where: str) -> Level:
+        """Read the level of one ISO."""
         in_dn = self.noise_in == "DN"
+        further: dict[str, Any] = {}
         if isinstance(values, dict):
-            in_dn = "K" in values or "sigma" in values
-            keys = ("K", "sigma") if in_dn else ("shot_var", "read_var")
-            if set(values) != set(keys):
-                raise self._error("noise", f"{where} is {{{keys[0]}, {keys[1]}}}, got {', '.join(map(str, values))}")
-            values = [values[keys[0]], values[keys[1]]]
+            in_dn = bool(set(values) & {"K", "sigma", "row", "column"})
+            pair = ("K", "sigma") if in_dn else ("shot_var", "read_var")
+            lines = ("row", "column") if in_dn else ("row_var", "column_var")
+            known = (*pair, *lines, "lambda", "hot")
+            if not set(pair) <= set(values) <= set(known):
+                further_keys = ", ".join(known[2:])
+                rule = f"is {{{pair[0]}, {pair[1]}}} and, if known, {further_keys}"
+                raise self._error("noise", f"{where} {rule}, got {', '.join(map(str, values))}")
+            further = {key: values[key] for key in known[2:] if key in values}
+            values = [values[pair[0]], values[pair[1]]]
 
-        if not isinstance(values, list) or len(values) != 2 or not all(map(_is_number, values)):
-            raise self._error("noise", f"{where} must be two numbers, got {values!r:.100}")
+        if not isinstance(values, list) or len(values) != 2 or not all(map(_is_number, [*values, *further.values()])):
+            raise self._error("noise", f"{where} must be two numbers, got {values!r:.100} {further or ''}".rstrip())
 
         first, second = float(values[0]), float(values[1])
-        if min(first, second) < 0:
-            raise self._error("noise", f"{where} must not be negative, got {first:g} and {second:g}")
+        row, column = further.get("row_var"), further.get("column_var")
+        if min(first, second, *[value for key, value in further.items() if key != "lambda"]) < 0:
+            raise self._error("noise", f"{where} must not be negative, got {first:g} and {second:g} {further or ''}")
         advice = "(K, sigma) in DN needs noise_in='DN'"
         if in_dn:
             if self.bits is None and self.white_level is None:
                 raise self._error("noise", f"{where} is in DN: give white_level or bits, and black_level")
             first, second = first / self.full_scale, (second / self.full_scale) ** 2
+            row, column = self._line_var(further.get("row")), self._line_var(further.get("column"))
             advice = "check K, sigma and the levels"
 
-        if max(first, second) > _LARGEST_VAR:
+        if max(first, second, row or 0.0, column or 0.0) > _LARGEST_VAR:
             raise self._error("noise", f"{where} has variances {first:g} and {second:g}, as no sensor has; {advice}")
-        return first, second
+        if not -0.5 < further.get("lambda", 0.0) <= 2.0 or further.get("hot", 0.0) > _MOST_HOT:
+            rule = f"has a lambda above -0.5 and at most 2, and at most {_MOST_HOT:g} of its pixels are hot"
+            raise self._error("noise", f"{where} {rule}, got {further}")
+        return Level(iso, first, second, row, column, further.get("lambda"), further.get("hot"))
+
+    def _line_var(self, deviation: float | None) -> float | None:
+        """The variance of banding of a deviation in DN."""
+        if deviation is None:
+            return None
+        return (deviation / self.full_scale) ** 2
 
     def noise_spec(self) -> dict[str, Any] | None:
         """The noise as a name with settings, which :func:`rawaug.noise.noise_model` reads; None if unknown.
@@ -365,8 +394,7 @@ class Camera:
 
         rows = []
         for level in self.levels:
-            row = {} if level.iso is None else {"iso": level.iso}
-            rows.append({**row, "shot_var": level.shot_var, "read_var": level.read_var})
+            rows.append({key: value for key, value in level._asdict().items() if value is not None})
 
         settings: dict[str, Any] = {"camera": self.name, "levels": rows}
         if self.quantum:
@@ -609,6 +637,46 @@ class Camera:
             0.00012461
         """
         return cls.from_json({**read_tuning(path), "cfa": cfa}, str(path))
+
+    @classmethod
+    def measure(cls, darks: Sequence[Any], flats: Sequence[Any], camera: Camera | None = None) -> Camera:
+        """Measure a camera on dark frames and pairs of flat ones: gain K, read noise sigma and row noise, by ISO.
+
+        Grid and pattern are those of the files. :mod:`rawaug.camera.transfer` has the formulas.
+
+        Args:
+            darks: frames with the lens capped, :class:`rawaug.io.RawFrame`, at least two at each ISO.
+            flats: frames of an even light, at least two at each level, and several levels below white at each ISO.
+            camera: name and colours to take; by default those that the files state.
+
+        Returns:
+            The camera. Its ``source`` says the intervals of 95 %, and what was left out and why.
+
+        Raises:
+            ValueError: if nothing can be measured, the frames differ, or no colours are known.
+
+        Example:
+            >>> camera = Camera.measure(darks, flats)  # doctest: +SKIP
+            >>> camera.noise[100]["K"]  # doctest: +SKIP
+            0.1203
+        """
+        noise, lines = measure_noise(darks, flats)
+        frame = flats[0]
+        figures: dict[str, Any] = {
+            "cfa": str(frame.cfa),
+            "black_level": float(np.mean(frame.black)),
+            "white_level": float(frame.white),
+            "bits": None if frame.floating else math.ceil(math.log2(frame.white + 1)),
+            "noise": noise.get(None, noise),
+            "noise_in": "variance",
+            "source": "\n".join(["measured by photon transfer (EMVA 1288)", *lines]),
+        }
+        if camera is not None:
+            return replace(camera, **figures)
+        if not frame.color_known:
+            raise ValueError(f"{frame.name}: states no colours; give a camera to take them from, by name or as a sheet")
+        colours = {"matrix": frame.color_matrix, "matrix_is": "camera_to_srgb", "white_balance": frame.daylight}
+        return cls(frame.camera, **colours, **figures)
 
     @classmethod
     def published(cls, name: str) -> Camera:

@@ -194,7 +194,11 @@ def describe_camera(camera: Camera) -> str:
         lines.append("  noise: not stated")
     for level in camera.levels:
         at = "any ISO" if level.iso is None else f"ISO {level.iso:g}"
-        lines.append(f"    {at:<10}  shot_var {level.shot_var:.4g}   read_var {level.read_var:.4g}")
+        values = []
+        for name, value in level._asdict().items():
+            if name != "iso" and value is not None:
+                values.append(f"{name} {value:.4g}")
+        lines.append(f"    {at:<10}  {'   '.join(values)}")
 
     for light, shares in camera.shading_by_light().items():
         height, width = shares.shape[1:]

@@ -1,6 +1,16 @@
 """The noise of real sensors: models, published levels, and estimation from a camera's own files."""
 
 from rawaug.noise.calibrated import CalibratedNoise
+from rawaug.noise.effects import (
+    BlackOffset,
+    ColourBias,
+    ColumnNoise,
+    DefectPixels,
+    GreenImbalance,
+    Quantisation,
+    RowNoise,
+    TukeyLambdaNoise,
+)
 from rawaug.noise.estimate import (
     NoiseEstimate,
     estimate_dark_noise,
@@ -13,19 +23,7 @@ from rawaug.noise.levels import EldLevels, FixedLevels, Iso, NoiseLevels, PmridL
 from rawaug.noise.measured import IsoLevel, MeasuredLevels, camera_law, sidd_levels
 from rawaug.noise.models import NOISE, NoiseModel, Params, PoissonGaussianNoise, ShotReadModel, ShotReadNoise
 from rawaug.noise.names import NoiseSpec, camera_laws, camera_names, noise_levels, noise_model, noise_names
-from rawaug.noise.sensor import (
-    BlackOffset,
-    ColourBias,
-    ColumnNoise,
-    Compose,
-    DefectPixels,
-    EldNoise,
-    GreenImbalance,
-    Quantisation,
-    RowNoise,
-    SensorNoise,
-    TukeyLambdaNoise,
-)
+from rawaug.noise.sensor import Compose, EldNoise, SensorNoise
 
 __all__ = [
     "NOISE", "BlackOffset", "CalibratedNoise", "ColourBias", "ColumnNoise", "Compose", "DefectPixels", "EldLevels",

@@ -11,9 +11,9 @@ from rawaug.bayer import pack
 from rawaug.files import files_in
 from rawaug.io import read_raw
 from rawaug.io.raw import RAW_EXTENSIONS
+from rawaug.noise.effects import Range, draw_between, require_not_negative
 from rawaug.noise.estimate import estimate_dark_noise
 from rawaug.noise.models import NOISE, Params, PoissonGaussianNoise, draw_seeds
-from rawaug.noise.sensor import Range, draw_between, require_not_negative
 
 
 @NOISE.register("DarkFrames")

@@ -37,6 +37,19 @@ class NoiseLevels(Protocol):
         ...
 
 
+EFFECTS = {"row_var": 0.0, "column_var": 0.0, "tukey_lambda": 0.14, "hot_share": 0.0}
+"""What a law may state beside shot_var and read_var, and its value in a camera that lacks it."""
+
+
+def draw_levels(levels: NoiseLevels, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
+    """Draw ``shot_var``, ``read_var``, ``iso`` where the law depends on it, and its :data:`EFFECTS`, ``(batch,)``."""
+    if hasattr(levels, "draw"):
+        drawn: dict[str, Tensor] = levels.draw(batch, generator)
+        return drawn
+    shot_var, read_var = levels.sample(batch, generator)
+    return {"shot_var": shot_var, "read_var": read_var}
+
+
 @cache
 def load_presets() -> dict[str, Any]:
     """Load the package's ``presets.json``: published levels, each with its source."""
@@ -67,12 +80,22 @@ def log_uniform(limits: tuple[float, float], batch: int, generator: torch.Genera
 
 
 class FixedLevels:
-    """The same levels for every picture, as for a camera at one ISO. ValueError if one is negative or not finite."""
+    """The same levels for every picture, as for a camera at one ISO.
 
-    def __init__(self, shot_var: float, read_var: float) -> None:
+    Args:
+        shot_var, read_var: variances, white = 1.
+        further: ``iso``, if it is known, and :data:`EFFECTS` by name.
+
+    Raises:
+        ValueError: if a variance is negative or not finite.
+    """
+
+    def __init__(self, shot_var: float, read_var: float, **further: float) -> None:
         if not (0 <= shot_var < math.inf and 0 <= read_var < math.inf):
             raise ValueError(f"noise variances must be finite and not negative, got {shot_var} and {read_var}")
         self.shot_var, self.read_var = float(shot_var), float(read_var)
+        self.further = further
+        self.effects = frozenset(further) - {"iso"}
 
     @classmethod
     def of(cls, pair: Any) -> FixedLevels:
@@ -86,6 +109,14 @@ class FixedLevels:
         levels = torch.tensor([self.shot_var, self.read_var], device=generator.device, dtype=torch.float32)
         return levels[0].repeat(batch), levels[1].repeat(batch)
 
+    def draw(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Repeat all that is known for each picture, as :func:`draw_levels` says."""
+        shot_var, read_var = self.sample(batch, generator)
+        drawn = {"shot_var": shot_var, "read_var": read_var}
+        for name, value in self.further.items():
+            drawn[name] = torch.full_like(shot_var, value)
+        return drawn
+
 
 class MixedLevels:
     """The levels of several laws; each picture draws one of the laws with equal probability."""
@@ -94,18 +125,32 @@ class MixedLevels:
         if not laws:
             raise ValueError("a mixture of noise levels needs at least one law")
         self.laws = laws
+        self.effects = frozenset().union(*[getattr(law, "effects", ()) for law in laws])
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw a law for each picture and its levels from that law, ``(batch,)``."""
+        drawn = self.draw(batch, generator)
+        return drawn["shot_var"], drawn["read_var"]
+
+    def draw(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draw a law for each picture and what it knows, as :func:`draw_levels` says; the ISO if all laws know it."""
         which = torch.randint(len(self.laws), (batch,), generator=generator, device=generator.device)
 
-        levels = []
+        drawn = []
         for law in self.laws:
-            levels.append(torch.stack(law.sample(batch, generator)))
+            drawn.append(draw_levels(law, batch, generator))
+        names = ["shot_var", "read_var", *sorted(self.effects)]
+        if all("iso" in levels for levels in drawn):
+            names.append("iso")
 
         pictures = torch.arange(batch, device=which.device)
-        shot_var, read_var = torch.stack(levels)[which, :, pictures].unbind(1)
-        return shot_var, read_var
+        mixed = {}
+        for name in names:
+            values = []
+            for levels in drawn:
+                values.append(levels.get(name, torch.full_like(levels["shot_var"], EFFECTS.get(name, 0.0))))
+            mixed[name] = torch.stack(values)[which, pictures]
+        return mixed
 
 
 class Preset:
@@ -171,6 +216,11 @@ class PmridLevels:
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw an ISO for each picture, log-uniformly, and compute its levels, ``(batch,)``."""
+        drawn = self.draw(batch, generator)
+        return drawn["shot_var"], drawn["read_var"]
+
+    def draw(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draw ``iso``, ``shot_var`` and ``read_var``, ``(batch,)``."""
         iso = log_uniform(self.iso, batch, generator)
         white = self.law["white_dn"]
         k1, k0 = self.law["K"]
@@ -178,7 +228,7 @@ class PmridLevels:
 
         gain = k1 * iso + k0
         read_var_dn = (s2 * iso + s1) * iso + s0
-        return gain / white, read_var_dn / white**2
+        return {"iso": iso, "shot_var": gain / white, "read_var": read_var_dn / white**2}
 
 
 class EldLevels:
@@ -214,5 +264,15 @@ class EldLevels:
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw a gain for each picture, and its levels, ``(batch,)``."""
+        drawn = self.draw(batch, generator)
+        return drawn["shot_var"], drawn["read_var"]
+
+    def draw(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draw ``iso``, ``shot_var`` and ``read_var``, ``(batch,)``."""
         gain = self.sample_gain(batch, generator)
-        return gain / self.white_dn, self.sample_scale("gaussian", gain, generator).square()
+        read_var = self.sample_scale("gaussian", gain, generator).square()
+        return {"iso": self.iso_of(gain), "shot_var": gain / self.white_dn, "read_var": read_var}
+
+    def iso_of(self, gain: Tensor) -> Tensor:
+        """Compute the ISO of gains in DN per electron."""
+        return gain * (self.lowest_iso / self.camera["Kmin"])

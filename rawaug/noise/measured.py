@@ -6,23 +6,28 @@ ISO outside the measured range is refused. Files without an ISO give one level f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from rawaug.noise.effects import ColumnNoise, DefectPixels, RowNoise, TukeyLambdaNoise
 from rawaug.noise.levels import (
+    EFFECTS,
     FixedLevels,
     Iso,
     MixedLevels,
     NoiseLevels,
+    draw_levels,
     interpolate_levels,
     iso_limits,
     load_presets,
     log_uniform,
 )
-from rawaug.noise.models import NOISE, Params, ShotReadNoise, per_picture
+from rawaug.noise.models import NOISE, NoiseModel, Params, ShotReadNoise, draw_seeds, per_picture
 
 _LEAST = 1e-12
 """Replaces a variance of 0 in logarithms."""
@@ -36,6 +41,7 @@ class IsoLevel(NamedTuple):
         shot_var, read_var: variances, white = 1.
         r2: R^2 of the line through the measured points; None if unknown.
         frames: number of frames that were measured; None if unknown.
+        row_var, column_var, tukey_lambda, hot_share: as in :class:`rawaug.noise.SensorNoise`; None for none.
     """
 
     iso: float | None
@@ -43,6 +49,20 @@ class IsoLevel(NamedTuple):
     read_var: float
     r2: float | None = None
     frames: int | None = None
+    row_var: float | None = None
+    column_var: float | None = None
+    tukey_lambda: float | None = None
+    hot_share: float | None = None
+
+    @property
+    def effects(self) -> dict[str, float]:
+        """What the level states beside shot_var and read_var."""
+        stated = {}
+        for name in EFFECTS:
+            value = getattr(self, name)
+            if value is not None:
+                stated[name] = value
+        return stated
 
 
 class MeasuredLevels:
@@ -68,6 +88,12 @@ class MeasuredLevels:
             raise ValueError(f"a noise law takes levels of different ISO values, or one without; got {values}")
         self.levels = sorted(levels, key=lambda level: level.iso or 0.0)
         self.camera = camera
+
+        self.effects = frozenset(self.levels[0].effects)
+        for level in self.levels:
+            if set(level.effects) != self.effects:
+                names = ", ".join(sorted(self.effects ^ set(level.effects)))
+                raise ValueError(f"a noise law states {names} at some ISO values and not at others; state it at all")
 
         rows = []
         for level in self.levels:
@@ -105,9 +131,39 @@ class MeasuredLevels:
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw an ISO for each picture, log-uniformly over the range, and its levels, ``(batch,)``."""
+        drawn = self.draw(batch, generator)
+        return drawn["shot_var"], drawn["read_var"]
+
+    def draw(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draw ``iso``, ``shot_var``, ``read_var`` and the camera's effects, ``(batch,)``."""
         if self.iso is None or len(self.levels) == 1:
-            return FixedLevels(*self.at(None)).sample(batch, generator)
-        return interpolate_levels(self.table.to(generator.device), log_uniform(self.iso, batch, generator))
+            return self._fixed(self.levels[0].iso).draw(batch, generator)
+
+        iso = log_uniform(self.iso, batch, generator)
+        shot_var, read_var = interpolate_levels(self.table.to(generator.device), iso)
+        drawn = {"iso": iso, "shot_var": shot_var, "read_var": read_var}
+        for name in sorted(self.effects):
+            drawn[name] = torch.from_numpy(self._interpolate(name, iso.cpu().numpy())).to(iso)
+        return drawn
+
+    def _interpolate(self, effect: str, iso: Any) -> np.ndarray[Any, Any]:
+        """Interpolate what the levels state of an effect, in logarithms but for the shape of tails."""
+        log_iso, values = [], []
+        for level in self.levels:
+            log_iso.append(math.log(level.iso or 1.0))
+            values.append(level.effects[effect])
+        if effect == "tukey_lambda":
+            return np.interp(np.log(iso), log_iso, values)
+        return np.exp(np.interp(np.log(iso), log_iso, np.log(np.maximum(values, _LEAST))))
+
+    def _fixed(self, iso: float | None) -> FixedLevels:
+        """The levels at an ISO, with all else that is known there."""
+        further = {}
+        for name in sorted(self.effects):
+            further[name] = float(self._interpolate(name, iso or self.levels[0].iso or 1.0))
+        if iso is not None:
+            further["iso"] = iso
+        return FixedLevels(*self.at(iso), **further)
 
     def within(self, iso: float | tuple[float, float]) -> NoiseLevels:
         """Restrict the law to one ISO, or to the range between two; ValueError outside the measured range.
@@ -120,7 +176,7 @@ class MeasuredLevels:
         """
         law = MeasuredLevels(self.levels, self.camera, iso)
         if law.iso is not None and law.iso[0] == law.iso[1]:
-            return FixedLevels(*self.at(law.iso[0]))
+            return self._fixed(law.iso[0])
         return law
 
     def spec(self) -> dict[str, Any]:
@@ -152,10 +208,11 @@ def sidd_levels(phone: str, iso: Iso = None) -> MeasuredLevels:
 
 
 class RoundedNoise(ShotReadNoise):
-    """Shot and read noise of RAW that is rounded to digital numbers.
+    """Shot and read noise of RAW that is rounded to digital numbers, and the other effects that the levels state.
 
     Args:
-        levels: levels whose ``read_var`` contains the rounding, as it does if it is measured on RAW files.
+        levels: levels whose ``read_var`` contains the rounding, as it does if it is measured on RAW files. Row and
+            column noise, heavy tails and hot pixels are added where they state :data:`rawaug.noise.levels.EFFECTS`.
         quantum: step of the digital numbers, white = 1; None rounds nothing.
         lowest: what 0 DN is on this scale, at most 0; files hold nothing below. None clips nothing.
 
@@ -171,9 +228,25 @@ class RoundedNoise(ShotReadNoise):
         self.quantum, self.lowest = quantum, lowest
         super().__init__(levels)
 
+        stated: frozenset[str] = getattr(levels, "effects", frozenset())
+        self.tails = TukeyLambdaNoise(levels, EFFECTS["tukey_lambda"]) if "tukey_lambda" in stated else None
+        self.effects: list[NoiseModel] = []
+        for name, effect in (
+            ("row_var", RowNoise(0.0)),
+            ("column_var", ColumnNoise(0.0)),
+            ("hot_share", DefectPixels()),
+        ):
+            if name in stated:
+                self.effects.append(effect)
+
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        """Draw ``shot_var``, ``read_var`` (without the rounding), ``seed``, and ``quantum``, ``lowest`` of whole DN."""
-        params = super().sample(batch, generator)
+        """Draw ``shot_var``, ``read_var`` (without the rounding), ``seed``, and ``quantum``, ``lowest`` of whole DN.
+
+        The effects of the levels are drawn with them, at the same ISO.
+        """
+        params = draw_levels(self.levels, batch, generator) | {"seed": draw_seeds(batch, generator)}
+        if "hot_share" in params:
+            params["dead_share"] = torch.zeros_like(params["hot_share"])
         if self.quantum is not None:
             quantum = torch.full_like(params["read_var"], self.quantum)
             params["read_var"] = (params["read_var"] - quantum.square() / 12).clamp_min(0.0)
@@ -184,24 +257,33 @@ class RoundedNoise(ShotReadNoise):
 
     def apply(self, clean: Tensor, params: Params) -> Tensor:
         """Make noisy RAW ``(B, 4, h, w)``, rounded if the camera rounds; see :meth:`NoiseModel.apply`."""
+        if self.tails is not None or self.effects:
+            return NoiseModel.apply(self, clean, params)
         noisy = super().apply(clean, params)
         return _round_to_quantum(noisy, params)
 
     def apply_with_variance(self, clean: Tensor, params: Params) -> tuple[Tensor, Tensor]:
         """Make noisy RAW and its variance map, both ``(B, 4, h, w)``."""
-        if "quantum" not in params:
+        if "quantum" not in params and self.tails is None and not self.effects:
             return super().apply_with_variance(clean, params)
         noisy = self.apply(clean, params)
         return noisy, self.variance(noisy, params)
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
         """Add the noise to ``clean`` ``(B, 4, h, w)`` without the clip at white."""
-        noisy = super().disturb(clean, params, out)
+        if self.tails is None:
+            noisy = super().disturb(clean, params, out)
+        else:
+            noisy = self.tails.disturb(clean, params, out)
+        for effect in self.effects:
+            effect.disturb(noisy, params, out=noisy)
         return _round_to_quantum(noisy, params)
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
-        """Compute ``shot_var max(clean, 0) + read_var``, ``(B, 4, h, w)``, where ``read_var`` contains the rounding."""
+        """Compute ``shot_var max(clean, 0) + read_var``, ``(B, 4, h, w)``, with rounding and the variance of lines."""
         variance = super().variance(clean, params)
+        for effect in self.effects:
+            variance += effect.variance(clean, params)
         if "quantum" in params:
             variance += per_picture(params["quantum"].square() / 12, clean)
         return variance

@@ -29,7 +29,7 @@ from rawaug.errors import count_of
 from rawaug.kernels import fastest
 from rawaug.kernels.reference import normals
 from rawaug.kernels.runtime import eager
-from rawaug.noise.levels import NoiseLevels
+from rawaug.noise.levels import NoiseLevels, draw_levels
 from rawaug.registry import Registry
 from rawaug.seeding import derive_seed, keyed_generator
 
@@ -137,9 +137,10 @@ class ShotReadModel(NoiseModel):
         self.levels = levels
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        """Draw ``shot_var``, ``read_var`` and ``seed``, each ``(batch,)``."""
-        shot_var, read_var = self.levels.sample(batch, generator)
-        return {"shot_var": shot_var, "read_var": read_var, "seed": draw_seeds(batch, generator)}
+        """Draw ``shot_var``, ``read_var`` and ``seed``, and ``iso`` if the levels depend on it, each ``(batch,)``."""
+        drawn = draw_levels(self.levels, batch, generator)
+        params = {name: drawn[name] for name in ("shot_var", "read_var", "iso") if name in drawn}
+        return params | {"seed": draw_seeds(batch, generator)}
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
         """Compute ``shot_var max(clean, 0) + read_var``, ``(B, 4, h, w)``."""

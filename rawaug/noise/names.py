@@ -32,7 +32,7 @@ from rawaug.camera.names import camera_key, find_camera
 from rawaug.camera.own import Camera, is_camera_file, own_cameras
 from rawaug.files import find_weights, parse_object, read_header
 from rawaug.noise.levels import EldLevels, FixedLevels, Iso, MixedLevels, NoiseLevels, PmridLevels, Preset, load_presets
-from rawaug.noise.measured import MeasuredLevels, MeasuredNoise, measured_noise, sidd_levels
+from rawaug.noise.measured import MeasuredLevels, MeasuredNoise, RoundedNoise, measured_noise, sidd_levels
 from rawaug.noise.models import NOISE, NoiseModel, PoissonGaussianNoise, ShotReadModel, ShotReadNoise
 from rawaug.noise.profiles import ANY_CAMERA, ProfileLevels, load_profiles
 from rawaug.registry import Spec, check_settings, split_spec, suggest
@@ -208,6 +208,11 @@ def _choose(iso: Iso = None, poisson: bool = False) -> None:
 
 
 def _shot_read(levels: NoiseLevels, poisson: bool) -> NoiseModel:
+    effects = sorted(getattr(levels, "effects", ()))
+    if poisson and effects:
+        raise ValueError(f"poisson: these levels state {', '.join(effects)}, which come with Gaussian counts; omit it")
+    if effects:
+        return RoundedNoise(levels)
     return PoissonGaussianNoise(levels) if poisson else ShotReadNoise(levels)
 
 

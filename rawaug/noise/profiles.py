@@ -133,6 +133,11 @@ class ProfileLevels:
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw a camera and an ISO for each picture, and interpolate its levels, ``(batch,)``."""
+        drawn = self.draw(batch, generator)
+        return drawn["shot_var"], drawn["read_var"]
+
+    def draw(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draw ``iso``, ``shot_var`` and ``read_var``, ``(batch,)``."""
         device = generator.device
         camera = torch.randint(len(self.cameras), (batch,), generator=generator, device=device)
         low, high = self.limits.to(device)[camera].unbind(1)
@@ -149,7 +154,7 @@ class ProfileLevels:
         if self.spread:
             shot_var = shot_var * log_uniform(SPREAD[0], batch, generator)
             read_var = read_var * log_uniform(SPREAD[1], batch, generator)
-        return shot_var, read_var
+        return {"iso": log_iso.exp().float(), "shot_var": shot_var, "read_var": read_var}
 
 
 def _interpolate(log_levels: Tensor, right: Tensor, weight: Tensor) -> Tensor:

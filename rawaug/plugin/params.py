@@ -55,8 +55,8 @@ class AugmentParams(NamedTuple):
             Tensors with a leading B if the parameters have one: ``AsShotNeutral`` ``(3,)``, the camera's colour of
             grey; ``white_balance`` ``(4,)``, the gains of R, Gr, Gb and B, green 1; ``camera_to_srgb`` ``(3, 3)``,
             white-balanced camera RGB to linear sRGB; ``BaselineExposure``, the stops by which the development
-            brightens; ``NoiseProfile`` ``(2,)``, shot_var and read_var, if the noise has these; ``BlackLevel`` 0 and
-            ``WhiteLevel`` 1.
+            brightens; ``NoiseProfile`` ``(2,)``, shot_var and read_var, if the noise has these; ``ISO``, if the noise
+            is that of a camera by ISO; ``BlackLevel`` 0 and ``WhiteLevel`` 1.
 
         Example:
             >>> from rawaug import DictionaryISP, RawAugment
@@ -77,6 +77,8 @@ class AugmentParams(NamedTuple):
         }
         if {"shot_var", "read_var"} <= self.noise.keys():
             values["NoiseProfile"] = torch.stack([self.noise["shot_var"], self.noise["read_var"]], dim=-1)
+        if "iso" in self.noise:
+            values["ISO"] = self.noise["iso"]
         return values
 
     def tensors(self) -> dict[str, Tensor]:

@@ -252,6 +252,41 @@ def test_levels_by_iso_are_those_of_the_law() -> None:
     assert float(params["shot_var"].max()) <= 1.001 * 0.96 / FULL_SCALE
 
 
+def test_a_sheet_states_banding_tails_and_hot_pixels() -> None:
+    further = {"row": 2.0, "column": 1.5, "lambda": -0.1, "hot": 1e-3}
+    noise = {100: {"K": 0.12, "sigma": 3.0, **further}, 400: {"K": 0.48, "sigma": 6.0, **further, "row": 8.0}}
+    camera = Camera(**{**SHEET, "noise": noise})
+    augment = RawAugment.from_pretrained("universal", camera=camera, iso=400)
+    params = augment.sample(torch.zeros(1, 3, 512, 512), torch.Generator().manual_seed(0))
+    assert float(params.camera()["ISO"]) == 400
+    noisy = augment.apply(torch.zeros(1, 3, 512, 512), params).noisy[0] * camera.full_scale
+    is_hot = noisy > 100
+    assert is_hot.float().mean() == pytest.approx(1e-3, rel=0.15)
+    dark = noisy.clamp(max=40.0)
+    rows = dark.unflatten(0, (2, 2)).mean((1, 3))
+    columns = torch.stack([dark[::2].mean((0, 1)), dark[1::2].mean((0, 1))])
+    assert rows.std() == pytest.approx(8.0, rel=0.06) and columns.std() == pytest.approx(1.5, rel=0.06)
+    read = dark - dark.mean(2, keepdim=True) - dark.mean(1, keepdim=True) + dark.mean((1, 2), keepdim=True)
+    assert read.std() == pytest.approx(6.0, rel=0.03)
+    assert (read.abs() > 4 * 6.0).float().mean() > 1e-3, "tails"
+
+    spec = camera.noise_spec()
+    assert spec is not None
+    isos = MeasuredNoise(**spec["settings"]).sample(200, torch.Generator().manual_seed(0))
+    row = isos["row_var"].sqrt() * camera.full_scale
+    assert row.tolist() == pytest.approx((2.0 * isos["iso"] / 100).tolist(), rel=1e-3), "between the ISO values"
+    with pytest.raises(ValueError, match="some ISO values only"):
+        Camera(**{**SHEET, "noise": {100: noise[100], 400: {"K": 0.48, "sigma": 6.0}}})
+
+
+@pytest.mark.parametrize("name", ["pmrid", "NikonD850", "Sony ILCE-7M3", "any camera", "iPhone 7"])
+def test_pairs_say_the_iso_of_their_noise(name: str) -> None:
+    augment = RawAugment.from_pretrained("universal", noise={"name": name, "settings": {"iso": (400, 800)}})
+    iso = augment(torch.rand(8, 3, 16, 16)).params.camera()["ISO"]
+    assert iso.shape == (8,) and bool(((iso > 399.9) & (iso < 800.1)).all())
+    assert "ISO" not in RawAugment.from_pretrained("universal", noise="upi")(torch.rand(1, 3, 16, 16)).params.camera()
+
+
 @pytest.mark.parametrize("count", [1])
 def test_a_fit_that_starts_from_a_camera_is_no_worse(count: int) -> None:
     matrix = torch.tensor(((1.66, -0.53, -0.13), (-0.21, 1.55, -0.34), (0.02, -0.47, 1.45)))  # of the demo's camera

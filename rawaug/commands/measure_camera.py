@@ -1,0 +1,54 @@
+"""``rawaug camera measure``: dark and flat frames in, a sheet out; in Python :meth:`rawaug.Camera.measure`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import yaml
+
+from rawaug.camera.own import Camera, as_camera
+from rawaug.errors import count_of, escape
+from rawaug.files import files_in, require_output, write_text
+from rawaug.io import RawFrame, read_raw
+from rawaug.io.raw import RAW_EXTENSIONS
+
+_SIDE = 1024
+"""The middle of a frame that is measured has at most this many rows and columns."""
+
+
+def run(*, dark: str, flat: str, out: str, camera: str | None = None, overwrite: bool = False) -> None:
+    """Measure gain, read noise and row noise by ISO, and write a camera's sheet.
+
+    Args:
+        dark: folder of RAW files with the lens capped, two or more at each ISO.
+        flat: folder of RAW files of an even light, two or more at each of several levels, at each ISO.
+        out: output .yaml file.
+        camera: name of a published camera, or a sheet, whose colours to take; by default the files state them.
+        overwrite: replace the output file if it exists.
+    """
+    require_output(out, overwrite, (".yaml", ".yml"), [dark, flat])
+    colours = None if camera is None else as_camera(camera)
+
+    measured = Camera.measure(_read(dark), _read(flat), colours)
+    write_text(yaml.safe_dump(measured.to_json(), sort_keys=False), out)
+    print(f"{out}: {escape(measured.name)}, {escape(measured.source or '')}")
+
+
+def _read(folder: str) -> list[RawFrame]:
+    """Read the middles of the RAW files of a folder; those that cannot be read are counted and named."""
+    frames, broken = [], []
+    for file in files_in(folder, "RAW", RAW_EXTENSIONS):
+        try:
+            frame = read_raw(file)
+        except (OSError, ValueError) as error:
+            broken.append(str(error))
+            continue
+
+        height, width = frame.mosaic.shape[-2:]
+        top, left = max(0, height - _SIDE) // 4 * 2, max(0, width - _SIDE) // 4 * 2
+        middle = frame.mosaic[:, top : top + _SIDE, left : left + _SIDE].clone()
+        frames.append(replace(frame, mosaic=middle))
+
+    if broken:
+        print(f"{escape(folder)}: {count_of(len(broken), 'file')} left out, {escape('; '.join(broken[:3]))}")
+    return frames
