@@ -30,10 +30,11 @@ from torch import Tensor
 
 from rawaug.camera.lights import sample_lights
 from rawaug.camera.matrices import camera_from_srgb, gains_in_light, load_cameras
+from rawaug.camera.samplers import PLAUSIBLE_GAINS
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.dictionary import CameraDictionary, is_plausible, nearest_in_hull
+from rawaug.isp.dictionary import CameraDictionary, GainDictionary, nearest_in_hull
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.tone import NODES, STEPS, srgb_to_linear
+from rawaug.isp.tone import NODES, STEPS, ToneDictionary, srgb_to_linear
 from rawaug.paper.baselines.upi import inverse_smoothstep
 from rawaug.seeding import keyed_generator
 
@@ -65,23 +66,16 @@ def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_at
     tone = chosen_atoms(tone_points(tables), len(names) if tone_atoms is None else tone_atoms)
     inverse = inverse_gains_in_any_light(distinct)
     gain = chosen_gains(inverse, gain_atoms)
-    isp = DictionaryISP(
-        ISPConfig(
-            colour_atoms=len(colour.atoms),
-            gain_atoms=len(gain.atoms),
-            stages=TONE_AND_CAMERAS,
-            tone_atoms=len(tone.atoms),
-            cameras=len(distinct),
-            knee=None,  # a sensor clips each channel at its own white
-        )
-    )
-    assert isinstance(isp.colour, CameraDictionary) and isp.tone is not None
-    isp.colour.set_cameras(distinct[colour.atoms], nearest_in_hull(points, points[colour.atoms])[0])
-    isp.tone.curves.copy_(tables[tone.atoms])
-    isp.tone.typical.copy_(tone.typical)
     with torch.no_grad():
         red, green, blue = (1.0 / inverse[gain.atoms]).unbind(1)
-        isp.gain.log_gains.copy_(torch.stack([green, red / green, blue / green], dim=1).float().log())
+        gains = torch.stack([green, red / green, blue / green], dim=1).float()
+    # A sensor clips each channel at its own white, so there is no knee.
+    isp = DictionaryISP(ISPConfig(stages=TONE_AND_CAMERAS, tone_atoms=1, knee=None)).with_atoms(
+        colour=CameraDictionary.from_xyz(distinct[colour.atoms], nearest_in_hull(points, points[colour.atoms])[0]),
+        gain=GainDictionary.from_gains(gains),
+        tone=ToneDictionary.from_curves(tables[tone.atoms], tone.typical),
+    )
+    assert isinstance(isp.colour, CameraDictionary)
     for encoders in (isp.reverse_encoders, isp.forward_encoders):
         encoders.colour.set_prior(isp.colour.typical)
         encoders.gain.set_prior(gain.typical)
@@ -146,7 +140,8 @@ def inverse_gains_in_any_light(xyz_to_camera: Tensor, key: str = "universal gain
     generator = keyed_generator(key)
     camera = xyz_to_camera[torch.randint(len(xyz_to_camera), (draws,), generator=generator)]
     balance = gains_in_light(camera, torch.from_numpy(sample_lights(draws, generator)))
-    balance = balance[torch.from_numpy(is_plausible(balance.numpy()))]
+    low, high = PLAUSIBLE_GAINS
+    balance = balance[((balance >= low) & (balance <= high)).all(dim=1)]
     return balance.amin(dim=1, keepdim=True) / balance
 
 

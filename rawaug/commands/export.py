@@ -25,6 +25,7 @@ from rawaug.data import demo_pairs
 from rawaug.errors import extra
 from rawaug.evaluation.trials import make_trial
 from rawaug.files import find_weights, read_header, replacing, require_output, write_text
+from rawaug.isp.description import reverse_table
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.progress import progress
@@ -159,7 +160,7 @@ def export_cube(isp: DictionaryISP, out: str | Path, white_balance: Sequence[flo
         "DOMAIN_MIN 0.0 0.0 0.0",
         "DOMAIN_MAX 1.0 1.0 1.0",
     ]
-    for red, green, blue in isp.reverse_table(setting, NODES).tolist():
+    for red, green, blue in reverse_table(isp, setting, NODES).tolist():
         lines.append(f"{red:.7f} {green:.7f} {blue:.7f}")
     write_text("\n".join(lines) + "\n", path)
 

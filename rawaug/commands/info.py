@@ -14,6 +14,7 @@ from rawaug.camera.names import camera_key, similar_cameras
 from rawaug.camera.own import Camera, is_camera_file
 from rawaug.errors import count_of
 from rawaug.files import find_weights, read_header, sha256
+from rawaug.isp.description import describe_isp, tone_table
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise.names import measured_ranges
 from rawaug.noise.profiles import SPREAD, load_profiles, profile_ends
@@ -110,7 +111,7 @@ def as_json(weights: str | Path) -> dict[str, Any]:
     path = find_weights(weights, FOLDER)
     content: dict[str, Any] = {"file": str(path), "sha256": sha256(path), "version": __version__}
     if read_header(path)["kind"] == "isp":
-        return content | DictionaryISP.from_pretrained(path).description()
+        return content | describe_isp(DictionaryISP.from_pretrained(path))
 
     model, info = denoisers.load(path)
     return content | {
@@ -158,15 +159,14 @@ def _describe_isp(path: Path) -> str:
     for matrix in isp.colour.atoms().tolist():
         lines.append("    " + " | ".join("{:6.3f} {:6.3f} {:6.3f}".format(*row) for row in matrix))
 
-    curve = isp.tone_curve().mean(dim=1)
+    curve = tone_table(isp).mean(dim=1)
     points = []
     for code in (16, 32, 64, 128, 192, 255):
         points.append(f"{code} {curve[code].item():.4f}")
     lines.append(f"  tone and gamma, grey code to linear: {', '.join(points)}")
     for stage in isp.ordered_stages:
-        text = stage.describe()
-        if text:
-            lines.append(f"  {text}")
+        if stage.extra_repr():
+            lines.append(f"  {stage.name}: {stage.extra_repr()}")
     for key, value in isp.info.items():
         lines.append(f"  {key}: {dumps(value)}")
     return "\n".join(lines)

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.data.pairs import Pair
-from rawaug.isp import staged
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.functional import as_float, frame_coordinates
+from rawaug.isp.fusion import Tone
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import PATCH, patch_psnr
 from rawaug.seeding import keyed_generator
@@ -25,7 +25,7 @@ def psnr_r(
     pair: Pair,
     white_balance: bool = False,
     patches: int | None = None,
-    tone: staged.Tone | None = None,
+    tone: Tone | None = None,
 ) -> float:
     """Measure PSNR_r of one frame; for an unregistered pair, that of block averages.
 
@@ -45,8 +45,8 @@ def psnr_r(
         as_shot = pair.white_balance
 
     def choose(srgb: Tensor) -> ISPParams:
-        params = staged.with_white_balance(isp, isp.choose(srgb), as_shot, None)
-        return staged.with_tone(isp, params, tone)
+        params = isp.with_white_balance(isp.choose(srgb), as_shot)
+        return isp.with_tone(params, tone)
 
     if pair.registered:
         params = choose(pair.srgb[None])

@@ -14,6 +14,7 @@ from rawaug.bayer import CFA
 from rawaug.errors import extra
 from rawaug.io import encode_srgb
 from rawaug.isp.config import ISPParams
+from rawaug.isp.description import tone_table
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.tone import STEPS
 from rawaug.plugin.augment import RawAugment
@@ -212,5 +213,5 @@ def _pixels(figure: Any) -> np.ndarray:
 def grey_curve(isp: DictionaryISP, setting: ISPParams) -> Tensor:
     """Compute the linear values ``(256,)`` of the 256 greys of sRGB under a setting without B."""
     if isp.tone is None:
-        return isp.tone_curve().mean(dim=1)
+        return tone_table(isp).mean(dim=1)
     return isp.tone.combine(setting.tone_weights[None])[0, ::STEPS]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 from torch import Tensor
 
@@ -93,6 +93,58 @@ class ISPConfig:
 
 SMALL = ISPConfig(colour_atoms=8, gain_atoms=8, encoder_widths=(16, 32, 64))
 """The size with at most 0.2 M parameters."""
+
+
+class ISPInfo(TypedDict, total=False):
+    """What the file of an ISP says of itself, in plain values; whatever does not apply is left out.
+
+    Args:
+        frames: names of the frames that it was fitted to.
+        data: the folders or data sets of these frames, as they were given.
+        registered: number of frames whose picture and mosaic agree pixel by pixel.
+        unreadable: a line for each frame that could not be read.
+        steps, seed, seconds: the settings and the duration of the fit.
+        key: a hash of everything that an ISP in a recipe was made of.
+        rendering: what the pictures of the pairs are.
+        started_from: name of the camera whose figures the fit started from.
+        curve_gain_db: by how many dB a tone curve is better than a learned tone, where both were compared.
+        encoders_gain_db: by how many dB encoders are better than constants on frames left out.
+        joint: end-to-end training: ``steps``, ``kept_step``, ``gain_db`` and the ``curve`` of its score.
+        gain_errors: the covariances S_e and S_n of :mod:`rawaug.isp.fusion`, two 3 x 3 matrices.
+        held_out: PSNR_r on the held-out frames in the course of the fit, ``blind`` and ``as_shot``.
+        noise: the noise of the camera, as :func:`rawaug.noise.noise_model` takes it.
+        noise_not_measured: the reason, if it could not be measured.
+        blur: standard deviation in pixels of the blur of the frames.
+        cameras: names of the colour atoms, of an ISP of known cameras.
+        own_cameras: the figures of the data sheets that it was made of, as :meth:`rawaug.Camera.from_json` takes them.
+        tones: names of the tone curves.
+        pattern: the pattern of the sensor, if it is not Bayer's.
+        holds: share of all cameras, gains and curves that the atoms' hulls hold within 45 dB.
+    """
+
+    frames: list[str]
+    data: list[str]
+    registered: int
+    unreadable: list[str]
+    steps: int
+    seed: int
+    seconds: float
+    key: str
+    rendering: str
+    started_from: str
+    curve_gain_db: float
+    encoders_gain_db: float
+    joint: dict[str, Any]
+    gain_errors: list[list[list[float]]]
+    held_out: list[dict[str, float]]
+    noise: dict[str, Any]
+    noise_not_measured: str
+    blur: float
+    cameras: list[str]
+    own_cameras: list[dict[str, Any]]
+    tones: list[str]
+    pattern: str
+    holds: dict[str, float]
 
 
 class ISPParams(NamedTuple):

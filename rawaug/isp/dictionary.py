@@ -5,39 +5,27 @@ r"""Dictionaries of camera parameters: atoms, their convex hull, and settings dr
 are row vectors) has l1 norm 1. The atoms of published cameras have rows of sum 1 instead, with or without negative
 entries.
 
-*Sampling.* One draw is a camera in a light, not a colour matrix and gains independently of each other:
+*Sampling.* One draw is a camera in a light (:mod:`rawaug.camera.samplers`), a mixture of tone curves and an exposure,
 
-.. math:: y = h(C\,T(x);\, g \, 2^{-e}), \qquad g = \mathrm{wb}(M, L) / \min \mathrm{wb}(M, L),
-    \quad (C, M) = D_\mathrm{cam} w, \quad T = \textstyle\sum_k v_k T_k
+.. math:: y = h(C\,T(x);\, g \, 2^{-e}), \quad T = \textstyle\sum_k v_k T_k
 
-with h Brooks' highlight-preserving inverse gains, w a mixture of two of the cameras that the hull was made for, a light
-L (:mod:`rawaug.camera.lights`), a mixture v of up to three inverse tone curves, and e an exposure in stops. The
-smallest gain is 1, so that clipped RAW develops to white. Shares of a mixture follow the Dirichlet distribution of
-concentration 1/2, so that most draws are near one camera. Flat weights would crowd the middle of the hull, where
-cameras are rare.
+with h Brooks' highlight-preserving inverse gains, a mixture v of up to three inverse tone curves, and e in stops.
 """
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rawaug.camera.lights import XYZ_TO_SRGB, Array, LightRange, sample_lights
+from rawaug.camera.lights import XYZ_TO_SRGB
 from rawaug.camera.matrices import camera_from_srgb, daylight_gains
-from rawaug.isp.config import ISPParams
-from rawaug.seeding import Generators, draw_rows, take_generators
+from rawaug.seeding import Generators, draw_rows
 
-PLAUSIBLE_GAINS = (0.4, 6.0)
-"""Range of red and blue gains over green that are kept; a D65 matrix says nothing about light that needs more."""
 EXPOSURE = (-0.5, 1.0)
 """Limits of the uniform draw in stops. The headroom that cameras leave between the white of RAW and that of their
 pictures is not published. With these the mean RAW of photographs is 0.136, and 71 % of the cells whose green is clipped
 have red to spare, as in real files; with a ceiling of 1.5 stops it is 45 %."""
-CAMERAS_MIXED, _TONES_MIXED = 2, 3
-_ROUNDS = 100
 _STEPS = 400
 
 
@@ -100,12 +88,26 @@ class CameraDictionary(ColourDictionary):
         """The weights ``(N,)`` to use if the camera is unknown: the mean over the known ones."""
         return self.known.mean(dim=0)
 
+    @classmethod
     @torch.no_grad()
-    def set_cameras(self, xyz_to_camera: Tensor, known: Tensor) -> None:
-        """Set the atoms from matrices ``(N, 3, 3)`` from XYZ to camera, and the known cameras by weights ``(P, N)``."""
-        self.matrices.copy_(camera_from_srgb(xyz_to_camera))
-        self.light.copy_(log_light(daylight_gains(xyz_to_camera)))
-        self.known.copy_(known)
+    def from_atoms(cls, matrices: Tensor, light: Tensor, known: Tensor) -> CameraDictionary:
+        """Make a dictionary of known cameras.
+
+        Args:
+            matrices: ``(N, 3, 3)``, from linear sRGB to white-balanced camera RGB, rows of sum 1.
+            light: ``(N, 2)``, :func:`log_light` of the atoms' white balance in D65.
+            known: ``(P, N)``, each known camera as a mixture of the atoms.
+        """
+        cameras = cls(len(matrices), len(known))
+        cameras.matrices.copy_(matrices)
+        cameras.light.copy_(light)
+        cameras.known.copy_(known)
+        return cameras
+
+    @classmethod
+    def from_xyz(cls, xyz_to_camera: Tensor, known: Tensor) -> CameraDictionary:
+        """Make a dictionary of matrices ``(N, 3, 3)`` from XYZ to camera, and known cameras as weights ``(P, N)``."""
+        return cls.from_atoms(camera_from_srgb(xyz_to_camera), log_light(daylight_gains(xyz_to_camera)), known)
 
     def atoms(self) -> Tensor:
         """The matrices ``(N, 3, 3)``, rows of sum 1."""
@@ -139,6 +141,14 @@ class GainDictionary(nn.Module):
     def __init__(self, atoms: int) -> None:
         super().__init__()
         self.log_gains = nn.Parameter((1.0 + torch.rand(atoms, 3)).log())
+
+    @classmethod
+    @torch.no_grad()
+    def from_gains(cls, gains: Tensor) -> GainDictionary:
+        """Make a dictionary of triplets g_d, g_r, g_b ``(M, 3)``."""
+        dictionary = cls(len(gains))
+        dictionary.log_gains.copy_(gains.log())
+        return dictionary
 
     def atoms(self) -> Tensor:
         """The triplets g_d, g_r, g_b, ``(M, 3)``."""
@@ -187,25 +197,6 @@ def convex_weights(batch: int, atoms: int, generator: Generators) -> Tensor:
     return exponential / exponential.sum(dim=1, keepdim=True)
 
 
-def sparse_shares(batch: int, atoms: int, mixed: int, generator: Generators) -> tuple[Tensor, Tensor]:
-    """Draw a few atoms for each picture, with replacement, and their Dirichlet(1/2) shares.
-
-    Args:
-        batch: number of pictures B.
-        atoms: number of atoms to draw from.
-        mixed: number of atoms to draw for each picture.
-        generator: a generator on the CPU, or one for each picture.
-
-    Returns:
-        Indices and float64 shares, both ``(batch, mixed)``.
-    """
-    # Squares of normals, divided by their sum, crowd the corners and edges of a hull.
-    indices = draw_rows(generator, batch, lambda g, rows: torch.randint(atoms, (rows, mixed), generator=g))
-    normals = draw_rows(generator, batch, lambda g, rows: torch.randn(rows, mixed, generator=g, dtype=torch.float64))
-    squares = normals**2
-    return indices, squares / squares.sum(dim=1, keepdim=True)
-
-
 def nearest_in_hull(points: Tensor, atoms: Tensor) -> tuple[Tensor, Tensor]:
     """Find the convex combinations of ``atoms`` ``(..., N, D)``, one hull or several, nearest to points ``(P, D)``.
 
@@ -230,79 +221,3 @@ def nearest_in_hull(points: Tensor, atoms: Tensor) -> tuple[Tensor, Tensor]:
         weights, momentum = new, later
 
     return weights, (weights @ atoms - points).square().sum(dim=-1)
-
-
-class CameraSampler:
-    """Draws settings of an ISP whose colour atoms are published cameras, on the CPU.
-
-    Args:
-        cameras: the atoms; later changes to them do not affect the sampler.
-        tone_atoms: number of tone curves, 0 if the tone is learned.
-        lights: the lights to draw from.
-        consistent: whether colour and gains are of one camera in one light; if not, the gains are drawn separately.
-    """
-
-    def __init__(self, cameras: CameraDictionary, tone_atoms: int, lights: LightRange, consistent: bool = True) -> None:
-        self.known = _as_array(cameras.known)
-        self.atoms = _as_array(cameras.atoms().flatten(1))
-        self.responses = _as_array(cameras.responses())
-        self.tone_atoms, self.lights, self.consistent = tone_atoms, lights, consistent
-
-    def sample(self, batch: int, generator: Generators, device: torch.device | str = "cpu") -> ISPParams:
-        """Draw the settings of ``batch`` pictures from a generator on the CPU, or one each, as tensors on ``device``.
-
-        Their gain weights are ``(batch, 0)``, as the gains follow from the light.
-        """
-        weights, balance = self._cameras_in_light(batch, generator)
-        if not self.consistent:
-            _, balance = self._cameras_in_light(batch, generator)
-
-        colour_weights = torch.from_numpy(weights).to(device, torch.float32)
-        matrices = torch.from_numpy(_row_by_row(weights, self.atoms).reshape(-1, 3, 3)).to(device, torch.float32)
-        gains = torch.from_numpy(balance / balance.min(axis=1, keepdims=True)).to(device, torch.float32)
-
-        tones = none = gains[:, :0]
-        if self.tone_atoms:
-            atoms, shares = sparse_shares(batch, self.tone_atoms, _TONES_MIXED, generator)
-            tones = shares.new_zeros(batch, self.tone_atoms).scatter_add_(1, atoms, shares).to(gains)
-        return ISPParams(colour_weights, none, matrices, gains, tones)
-
-    def _cameras_in_light(self, batch: int, generator: Generators) -> tuple[Array, Array]:
-        """Draw weights ``(B, N)`` and balances ``(B, 3)``, and repeat the draw if the gains are implausible."""
-        weights, balance = np.empty((batch, self.known.shape[1])), np.empty((batch, 3))
-        rest = np.arange(batch)
-        for _ in range(_ROUNDS):
-            drawn_by = take_generators(generator, rest)
-            cameras, shares = sparse_shares(len(rest), len(self.known), CAMERAS_MIXED, drawn_by)
-            mixtures = (shares.numpy()[..., None] * self.known[cameras.numpy()]).sum(axis=1)
-            light = sample_lights(len(rest), drawn_by, self.lights)
-            weights[rest] = mixtures
-            balance[rest] = self.balance(mixtures, light)
-
-            rest = rest[~is_plausible(balance[rest])]
-            if not len(rest):
-                return weights, balance
-
-        raise ValueError(f"no light of {self.lights.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}")
-
-    def balance(self, weights: Array, light: Array) -> Array:
-        """Compute the white balance ``(B, 3)``, green 1, of mixtures ``(B, N)`` in light of white points ``(B, 3)``."""
-        linear = light @ XYZ_TO_SRGB.numpy().T
-        matrices = _row_by_row(weights, self.atoms).reshape(-1, 3, 3)
-        response = _row_by_row(weights, self.responses) * (matrices * linear[:, None]).sum(axis=2)
-        return np.asarray(response[:, 1:2] / response)
-
-
-def _row_by_row(rows: Array, matrix: Array) -> Array:
-    """Multiply rows ``(B, N)`` by a matrix, with the same bits however many there are, which BLAS does not promise."""
-    return np.concatenate([rows[number : number + 1] @ matrix for number in range(len(rows))])
-
-
-def _as_array(tensor: Tensor) -> Array:
-    return np.asarray(tensor.detach().to("cpu", torch.float64).numpy())
-
-
-def is_plausible(balance: Array) -> NDArray[np.bool_]:
-    """Say which white balances ``(B, 3)`` lie within :data:`PLAUSIBLE_GAINS`: booleans ``(B,)``."""
-    low, high = PLAUSIBLE_GAINS
-    return np.asarray(((balance >= low) & (balance <= high)).all(axis=1))

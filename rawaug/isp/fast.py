@@ -318,14 +318,11 @@ def _tables(isp: DictionaryISP, nodes: int, forward: bool = False) -> tuple[Tens
         raise ValueError(f"augmentation needs the ISP's stages in the usual order, got {order}; fit it anew")
     cube = node_colours(nodes)
     with torch.autocast(isp.gain.log_gains.device.type, enabled=False):
+        tables, stages = Tables(cube, cube), isp.ordered_stages
         if forward:
-            tables = Tables(cube, cube.square())
-            for stage in reversed(isp.ordered_stages):
-                tables = stage.bake_forward(tables)
-        else:
-            tables = Tables(cube, cube)
-            for stage in isp.ordered_stages:
-                tables = stage.bake(tables)
+            tables, stages = Tables(cube, cube.square()), stages[::-1]
+        for stage in stages:
+            tables = stage.bake(tables, forward)
 
     attention = torch.empty(0, 0, 0, 4)
     if tables.attention is not None:
@@ -364,8 +361,9 @@ def _place_gain(
     Returns:
         ``(B, 1 or 3, H, W)``, or None without any.
     """
-    gaining = [stage for stage in stages if stage.has_place_gain]
-    if not gaining:
+    factors = [stage.place_gain(forward) for stage in stages]
+    place_gains = [factor for factor in factors if factor is not None]
+    if not place_gains:
         return None
 
     height, width = size
@@ -389,8 +387,8 @@ def _place_gain(
         edge = edges[number : number + 1]
         setting = ISPParams(*[tensor[number : number + 1] for tensor in params])
         gain = torch.ones_like(picture[:, :1])
-        for stage in gaining:
-            gain = gain * stage.place_gain(picture, edge, setting, forward)
+        for place_gain in place_gains:
+            gain = gain * place_gain(picture, edge, setting)
         gains.append(gain)
     gain = torch.cat(gains)
     return F.interpolate(gain, size, mode="bilinear", align_corners=True)

@@ -3,42 +3,54 @@ r"""The dictionary ISP: sRGB to RAW and back, in six stages whose parameters com
 ``y = f6^-1 . f5^-1 . f4^-1 . f3^-1 . f2^-1 . f1^-1 (x)`` and ``x = f1 . f2 . f3 . f4 . f5 . f6 (y)``
 
 Source: Conde et al., "Model-Based Image Signal Processors via Learnable Dictionaries", AAAI 2022. The stages are in
-:mod:`rawaug.isp.stages`, the dictionaries in :mod:`rawaug.isp.dictionary`, the mosaic in :mod:`rawaug.bayer`.
+:mod:`rawaug.isp.stages`, the dictionaries in :mod:`rawaug.isp.dictionary`, the encoders that choose their atoms in
+:mod:`rawaug.isp.encoders`, what a file states of a shot in :mod:`rawaug.isp.fusion`, the mosaic in :mod:`rawaug.bayer`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from torch import Tensor, nn
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.camera.lights import D65, compute_mired, light_range, weights_in_light, white_point
-from rawaug.camera.matrices import gains_in_light, load_cameras
+from rawaug.camera.lights import light_range
+from rawaug.camera.matrices import load_cameras
 from rawaug.camera.names import find_camera
 from rawaug.camera.own import Camera, as_camera, is_camera_file, own_cameras
+from rawaug.camera.samplers import CameraSampler, DataSheetSampler
 from rawaug.errors import count_of
 from rawaug.files import find_weights, parse_object, read_tensors, to_json, write_tensors
-from rawaug.isp import functional, staged, stages
-from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
-from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weights, log_light
-from rawaug.isp.own_sampler import OwnCameraSampler
-from rawaug.isp.staged import StagedISP, Tone, thumbnail
-from rawaug.registry import suggest
-from rawaug.seeding import Generators
+from rawaug.isp import functional, fusion
+from rawaug.isp.cameras import data_sheet_atoms, data_sheet_shading, data_sheet_tones, published_atoms
+from rawaug.isp.config import ISPConfig, ISPInfo, ISPParams, ISPResult
+from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, GainDictionary, convex_weights
+from rawaug.isp.encoders import AtomEncoder, Encoders, thumbnail
+from rawaug.isp.fusion import Tone
+from rawaug.isp.stages import STAGES, FallOff, Stage
+from rawaug.isp.tone import ToneCurve, ToneDictionary
+from rawaug.seeding import Generators, derive_seed, initialise_from
 
 _ADVICE = "fit or copy it again"
 _INFINITE = ("colour.spread",)
 """Tensors that may hold infinity: the width is infinite if the light does not limit the colour."""
 
+S = TypeVar("S", bound=Stage)
 
-class DictionaryISP(StagedISP):
-    """A learned, interpretable camera: ``config`` says what it consists of, ``seed`` sets its initial values.
+
+class DictionaryISP(nn.Module):
+    """A learned, interpretable camera.
+
+    Args:
+        config: the parts that it consists of.
+        seed: sets the initial values.
 
     Example:
         >>> isp = DictionaryISP()
@@ -46,6 +58,27 @@ class DictionaryISP(StagedISP):
         >>> isp.reverse(srgb).raw.shape
         torch.Size([2, 1, 64, 96])
     """
+
+    def __init__(self, config: ISPConfig | None = None, seed: int = 0) -> None:
+        super().__init__()
+        self.info: ISPInfo = {}
+        """The record of the fit."""
+        self.config = config or ISPConfig()
+        """The parts that the ISP consists of; :meth:`configure` and :meth:`use_encoders` change them."""
+
+        with initialise_from(seed):
+            self.colour = ColourDictionary(self.config.colour_atoms)
+            if self.config.cameras:
+                self.colour = CameraDictionary(self.config.colour_atoms, self.config.cameras)
+            self.gain = GainDictionary(self.config.gain_atoms)
+
+            self.stages = nn.ModuleDict()
+            for name in self.config.stages:
+                stage = STAGES[name](self.config)
+                self.stages[stage.name] = stage
+
+            self.reverse_encoders, self.forward_encoders = Encoders(self.config), Encoders(self.config)
+        self.use_encoders(self.config.encoders, seed)
 
     def __repr__(self) -> str:
         """Describe the pattern, the stages and the sizes of the dictionaries in a line."""
@@ -56,6 +89,105 @@ class DictionaryISP(StagedISP):
 
         atoms = f"{colours}, {config.gain_atoms} gain and {config.tone_atoms} tone atoms"
         return f"DictionaryISP, {self.cfa}, stages {' '.join(self.stages)}: {atoms}"
+
+    @property
+    def cfa(self) -> CFA:
+        """The pattern of the RAW that this ISP makes."""
+        return CFA(self.config.cfa)
+
+    @property
+    def ordered_stages(self) -> list[Stage]:
+        """The stages in reverse order."""
+        return [cast(Stage, stage) for stage in self.stages.values()]
+
+    def find(self, kind: type[S]) -> S | None:
+        """The stage of this class, or None."""
+        for stage in self.ordered_stages:
+            if isinstance(stage, kind):
+                return stage
+        return None
+
+    def with_atoms(
+        self,
+        *,
+        colour: ColourDictionary,
+        gain: GainDictionary | None = None,
+        tone: ToneDictionary | None = None,
+        falloff: Tensor | None = None,
+    ) -> DictionaryISP:
+        """Make an ISP of other atoms, whose constants weigh them equally; it has no encoders that look at the picture.
+
+        Args:
+            colour: the colour atoms.
+            gain: the gain atoms; by default those of this ISP, with their constants.
+            tone: the tone curves, for an ISP with the stage ``curve``; by default those of this ISP.
+            falloff: the shares of light ``(N, 3, 33, 33)`` that arrive with each colour atom; by default all does.
+        """
+        isp = deepcopy(self)
+        isp.use_encoders(False)
+        isp.colour = colour
+        cameras = len(colour.known) if isinstance(colour, CameraDictionary) else 0
+        isp.configure(colour_atoms=len(colour.matrices), cameras=cameras)
+        for encoders in (isp.reverse_encoders, isp.forward_encoders):
+            encoders.colour = AtomEncoder(len(colour.matrices))
+
+        if gain is not None:
+            isp.gain = gain
+            isp.configure(gain_atoms=len(gain.log_gains))
+            for encoders in (isp.reverse_encoders, isp.forward_encoders):
+                encoders.gain = AtomEncoder(len(gain.log_gains))
+
+        if tone is not None:
+            cast(ToneCurve, isp.stages["curve"]).dictionary = tone
+            isp.configure(tone_atoms=len(tone.curves))
+
+        stages = [name for name in isp.stages if name != FallOff.name]
+        if falloff is not None:
+            stages.append(FallOff.name)
+            stage = FallOff(isp.config)
+            stage.tables.copy_(falloff)
+            isp.stages[FallOff.name] = stage
+        isp.configure(stages=tuple(stages))
+        return isp
+
+    def configure(self, **changes: Any) -> None:
+        """Change settings that need no new parameters: ``cfa``, ``knee``, or ``stages`` to fewer of them."""
+        config = replace(self.config, **changes)
+        for name in config.stages:
+            if name not in self.stages:
+                raise ValueError(f"stages: {name!r} is not in this ISP, which has {' '.join(self.stages)}")
+
+        self.config = config
+        self.stages = nn.ModuleDict({name: self.stages[name] for name in config.stages})
+        for stage in self.ordered_stages:
+            stage.config = config
+
+    def use_encoders(self, enabled: bool, seed: int = 0) -> None:
+        """Make the encoders' networks, drawn from ``seed``, or remove them; existing networks stay as they are."""
+        with initialise_from(derive_seed(seed, "encoders")):
+            for module in list(self.modules()):
+                if not isinstance(module, AtomEncoder):
+                    continue
+                if not enabled:
+                    module.layers = None
+                elif module.layers is None:
+                    module.add_layers(self.config.encoder_widths)
+
+        self.configure(encoders=enabled)
+
+    @property
+    def tone(self) -> ToneDictionary | None:
+        """The dictionary of tone curves; None if the curve is learned."""
+        stage = self.find(ToneCurve)
+        if stage is None:
+            return None
+        return stage.dictionary
+
+    def typical_tones(self) -> Tensor:
+        """Weights ``(K,)`` of the tone curves for a picture of which nothing is known; none if the curve is learned."""
+        if self.tone is None:
+            return self.colour.matrices.new_zeros(0)
+        return self.tone.typical
 
     # -- settings ---------------------------------------------------------------------------------------------------
 
@@ -74,21 +206,30 @@ class DictionaryISP(StagedISP):
             tone_weights = self.typical_tones().expand(len(matrix), -1)
         return ISPParams(colour_weights, gain_weights, matrix, gains, tone_weights)
 
-    def draw_setting(self, batch: int, generator: Generators) -> ISPParams:
-        """Draw the settings of ``batch`` pictures from a generator on the CPU, or one each, without looking at them.
+    def draw_setting(self, batch: int, generator: Generators, cameras: CameraSampler | None = None) -> ISPParams:
+        """Draw the settings of ``batch`` pictures without looking at them.
 
         If the atoms are published cameras, it draws a camera in a light, else mixtures of atoms with uniform weights.
+
+        Args:
+            batch: number of pictures.
+            generator: a generator on the CPU, or one for each picture.
+            cameras: what :meth:`camera_sampler` has made, to draw from it many times.
         """
         config, device = self.config, self.colour.matrices.device
-        sampler = self.camera_sampler()
-        if sampler is not None:
-            return sampler.sample(batch, generator, device)
+        cameras = cameras or self.camera_sampler()
+        if cameras is None:
+            weights = []
+            for atoms in (config.colour_atoms, config.gain_atoms, config.tone_atoms):
+                if atoms:
+                    weights.append(convex_weights(batch, atoms, generator).to(device))
+            return self.params_from_weights(*weights)
 
-        weights = []
-        for atoms in (config.colour_atoms, config.gain_atoms, config.tone_atoms):
-            if atoms:
-                weights.append(convex_weights(batch, atoms, generator).to(device))
-        return self.params_from_weights(*weights)
+        colour_weights, matrix, gains = (tensor.to(device) for tensor in cameras.sample(batch, generator))
+        tones = no_weights = gains[:, :0]  # the gains follow from the light
+        if self.tone is not None:
+            tones = self.tone.draw(batch, generator)
+        return ISPParams(colour_weights, no_weights, matrix, gains, tones)
 
     def camera_sampler(self, consistent: bool = True, light: float | str | None = None) -> CameraSampler | None:
         """Make the sampler that draws cameras in a light; None unless the colour atoms are published cameras.
@@ -101,10 +242,12 @@ class DictionaryISP(StagedISP):
         """
         if not isinstance(self.colour, CameraDictionary):
             return None
-        own = own_cameras(self.info)
-        if own:
-            return OwnCameraSampler(self.colour, own, self.config.tone_atoms, light, consistent)
-        return CameraSampler(self.colour, self.config.tone_atoms, light_range(light), consistent)
+
+        atoms = self.colour.known, self.colour.atoms(), self.colour.responses()
+        sheets = own_cameras(self.info)
+        if sheets:
+            return DataSheetSampler(sheets, *atoms, light, consistent)
+        return CameraSampler(*atoms, light_range(light), consistent)
 
     def choose(self, srgb: Tensor) -> ISPParams:
         """Choose the settings of pictures ``(B, 3, H, W)`` by the reverse encoders, or by their constants."""
@@ -132,6 +275,97 @@ class DictionaryISP(StagedISP):
         candidates = torch.einsum("nij,bjhw->bnihw", torch.linalg.pinv(self.colour.atoms()), x3)
         return self.params_from_weights(self.forward_encoders.colour(candidates), gain_weights)
 
+    # -- what is known of a shot ------------------------------------------------------------------------------------
+
+    def gain_errors(self) -> Tensor:
+        """The covariances S_e and S_n of the errors of the gains of grey, float64 ``(2, 3, 3)``; see the fusion.
+
+        They are those that the fit has measured. An ISP without any believes the file, but for the digital gain if that
+        is stated as well.
+        """
+        measured = self.info.get("gain_errors")
+        if measured is not None:
+            return torch.tensor(measured, dtype=torch.float64)
+        return torch.stack([torch.eye(3), torch.full((3, 3), fusion.DIGITAL_SLACK)]).double()
+
+    def with_white_balance(
+        self,
+        params: ISPParams,
+        white_balance: Tensor | tuple[float, ...] | None,
+        digital_gain: Tensor | float | None = None,
+    ) -> ISPParams:
+        """Fuse the gains and the colour atoms that were chosen for pictures with what the camera states.
+
+        Args:
+            params: the settings chosen for B pictures.
+            white_balance, digital_gain: as for :meth:`reverse`.
+
+        Raises:
+            ValueError: if a multiplier is not positive, or the shapes are for another number of pictures.
+        """
+        params, _ = fusion.fuse_stated(self.colour, self.gain_errors(), params, white_balance, digital_gain)
+        return params
+
+    def with_tone(self, params: ISPParams, tone: Tone | None) -> ISPParams:
+        """Replace the tone curves of a setting by a known one, or by a mixture.
+
+        Args:
+            params: the settings of B pictures.
+            tone: a name of ``isp.info["tones"]`` such as ``"linear"``, shares by name such as
+                ``{"linear": 0.5, "upi": 0.5}``, or weights ``(K,)`` or ``(B, K)``. Shares and weights are divided by
+                their sum. None keeps the setting's own.
+
+        Raises:
+            ValueError: if the ISP has no such curve, or a share is negative.
+        """
+        if tone is None:
+            return params
+        if self.tone is None:
+            raise ValueError("tone: this ISP has learned a curve of its own; only one with a dictionary takes it")
+
+        like = params.gains.new_empty(len(params.gains), len(self.tone.curves))
+        return params._replace(tone_weights=fusion.weigh_tones(tone, self.info.get("tones", ()), like))
+
+    def with_raw_samples(
+        self,
+        params: ISPParams,
+        x: Tensor,
+        raw_samples: Tensor,
+        coordinates: Tensor,
+        white_balance: Tensor | tuple[float, ...] | None = None,
+        digital_gain: Tensor | float | None = None,
+    ) -> ISPParams:
+        """Fuse the chosen gains with RAW readings and what the camera states.
+
+        The readings' light weighs the colour atoms. Clipped readings do not count.
+
+        Args:
+            params: the settings chosen for the pictures.
+            x: sRGB as float ``(B, 3, H, W)``.
+            raw_samples: ``(B, K, 3)`` of row, column and RAW value.
+            coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame.
+            white_balance, digital_gain: as for :meth:`reverse`.
+
+        Raises:
+            ValueError: if a reading is NaN or lies outside the picture.
+        """
+        fusion.require_places(raw_samples, x)
+
+        # The pixels, coordinates and channels of the readings.
+        rows, columns, value = raw_samples[..., 0].long(), raw_samples[..., 1].long(), raw_samples[..., 2]
+        batch = torch.arange(len(x), device=x.device)[:, None]
+        pixels = x[batch, :, rows, columns].transpose(1, 2)[:, :, None]
+        places = coordinates.expand(len(x), -1, -1, -1)[batch, :, rows, columns].transpose(1, 2)[:, :, None]
+        channel = torch.tensor(self.cfa.channels, device=x.device)[rows % 2, columns % 2]
+        site = F.one_hot(channel, 3).transpose(1, 2).to(x)
+
+        def reverse(setting: ISPParams) -> Tensor:
+            return self.reverse_pixels(pixels, setting, places)[:, :, 0]
+
+        stated = fusion.fuse_stated(self.colour, self.gain_errors(), params, white_balance, digital_gain)
+        chosen = params.colour_weights
+        return fusion.fuse_readings(reverse, self.colour, self.tone, chosen, *stated, pixels, site, value)
+
     # -- passes -----------------------------------------------------------------------------------------------------
 
     def reverse(
@@ -152,14 +386,14 @@ class DictionaryISP(StagedISP):
             srgb: ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides.
             params: the settings of the pictures; by default the encoders, or their constants, choose them.
             white_balance: the camera's as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``, scaled so that green is 1.
-                They are fused with what the ISP would choose, by the errors of both (:mod:`rawaug.isp.staged`), and
+                They are fused with what the ISP would choose, by the errors of both (:mod:`rawaug.isp.fusion`), and
                 weigh the colour atoms by how near their light is.
             digital_gain: the factor on all channels, scalar or ``(B,)``, if it is known.
             tone: the tone curve that the picture was rendered with, if the ISP has a dictionary of them
                 (``isp.info["tones"]``): a name such as ``"linear"``, which is LibRaw's rendering, or a mixture
-                (:func:`rawaug.isp.staged.with_tone`). By default the ISP chooses it.
+                (:meth:`with_tone`). By default the ISP chooses it.
             raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains follow from these few readings
-                (:func:`rawaug.isp.staged.with_raw_samples`).
+                (:meth:`with_raw_samples`).
             coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame
                 (:func:`rawaug.isp.functional.frame_coordinates`); by default the picture is taken for a full frame.
             intermediates: also return x1 ... x5.
@@ -177,16 +411,15 @@ class DictionaryISP(StagedISP):
         with self._float32(srgb):
             x = functional.as_display_referred(srgb)
 
-            params = staged.with_tone(self, params or self.choose(x), tone)
+            params = self.with_tone(params or self.choose(x), tone)
             if len(params.gains) != len(x):
                 pictures = count_of(len(params.gains), "picture")
                 raise ValueError(f"the parameters are for {pictures}, but the batch has {len(x)}")
             if raw_samples is None:
-                params = staged.with_white_balance(self, params, white_balance, digital_gain)
+                params = self.with_white_balance(params, white_balance, digital_gain)
             else:
-                where = functional.coordinates_or_full(x, coordinates)
-                stated = white_balance, digital_gain
-                params = staged.with_raw_samples(self, x, params, raw_samples, where, *stated)
+                places = functional.coordinates_or_full(x, coordinates)
+                params = self.with_raw_samples(params, x, raw_samples, places, white_balance, digital_gain)
 
             images: dict[str, Tensor] = {}
             x5 = self.reverse_pixels(x, params, coordinates, images if intermediates else None)
@@ -194,11 +427,11 @@ class DictionaryISP(StagedISP):
 
     def _float32(self, like: Tensor) -> torch.autocast:
         """Keep the pass in float32, also in mixed precision; ValueError if the ISP has another type or device."""
-        own = self.gain.log_gains
-        if own.dtype != torch.float32:
-            raise ValueError(f"RAW is float32, but this ISP was converted to {own.dtype}; call isp.float()")
-        if own.device != like.device:
-            raise ValueError(f"the picture is on {like.device} but the ISP is on {own.device}; call isp.to(...)")
+        dtype, device = self.gain.log_gains.dtype, self.gain.log_gains.device
+        if dtype != torch.float32:
+            raise ValueError(f"RAW is float32, but this ISP was converted to {dtype}; call isp.float()")
+        if device != like.device:
+            raise ValueError(f"the picture is on {like.device} but the ISP is on {device}; call isp.to(...)")
         return torch.autocast(like.device.type, enabled=False)
 
     def forward(
@@ -231,8 +464,8 @@ class DictionaryISP(StagedISP):
             x5 = bayer.demosaic(_require_mosaic(raw), self.cfa)
             if params is None:
                 params = self.choose_forward(self.remove_shading(x5, coordinates))
-            params = staged.with_white_balance(self, params, white_balance, None)
-            params = staged.with_tone(self, params, tone)
+            params = self.with_white_balance(params, white_balance)
+            params = self.with_tone(params, tone)
 
             if not intermediates:
                 srgb = self.forward_pixels(x5, params, coordinates)
@@ -241,6 +474,60 @@ class DictionaryISP(StagedISP):
             images: dict[str, Tensor] = {"x5": x5}
             srgb = self.forward_pixels(x5, params, coordinates, images)
             return ISPResult(srgb.clamp(0.0, 1.0), params, images)
+
+    def reverse_pixels(
+        self, x: Tensor, params: ISPParams, coordinates: Tensor | None = None, seen: dict[str, Tensor] | None = None
+    ) -> Tensor:
+        """Run the reverse pass without its mosaic.
+
+        Args:
+            x: sRGB as float ``(B, 3, H, W)``; or P pixels of it ``(B, 3, 1, P)``, as the pass is pointwise.
+            params: the settings of the pictures.
+            coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame; by default the picture is the frame.
+            seen: a dict to fill with x1 ... x5 by name.
+
+        Returns:
+            Linear camera colour x5, of the shape of ``x``.
+        """
+        for stage in self.ordered_stages:
+            x = stage.reverse(x, params, coordinates)
+            if seen is not None:
+                seen[f"x{stage.makes}"] = x
+        return x
+
+    def forward_pixels(
+        self, x: Tensor, params: ISPParams, coordinates: Tensor | None = None, seen: dict[str, Tensor] | None = None
+    ) -> Tensor:
+        """Run the forward pass after demosaicing; the result is not clipped.
+
+        Args:
+            x: linear camera colour x5 ``(B, 3, H, W)``.
+            params: the settings of the pictures.
+            coordinates: as in :meth:`reverse_pixels`.
+            seen: a dict to fill with x4 ... x1 by name.
+
+        Returns:
+            sRGB, of the shape of ``x``.
+        """
+        for stage in reversed(self.ordered_stages):
+            x = stage.forward(x, params, coordinates)
+            if seen is not None and stage.makes > 1:
+                seen[f"x{stage.makes - 1}"] = x
+        return x
+
+    def linear(self, x: Tensor) -> Tensor:
+        """Compute x2 from sRGB, both ``(B, 3, H, W)``, by the stages in their usual order; it needs no setting."""
+        for stage in sorted(self.ordered_stages, key=lambda stage: stage.makes):
+            if stage.makes <= 2:
+                x = stage.reverse(x, None)
+        return x
+
+    def remove_shading(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
+        """Compute x4 from x5, both ``(B, 3, H, W)``; the forward encoders look at x4."""
+        for stage in reversed(self.ordered_stages):
+            if stage.makes >= 5:
+                x = stage.forward(x, None, coordinates)
+        return x
 
     # -- as numbers -------------------------------------------------------------------------------------------------
 
@@ -258,53 +545,7 @@ class DictionaryISP(StagedISP):
         balance = torch.tensor([tuple(white_balance)]).to(params.gains)
         balance = balance / balance[:, 1:2]
         weights = self.colour.weights_for(balance, colour_weights)
-        return staged.with_grey(self, params, weights, balance.log() + weights @ self.colour.neutral)
-
-    @torch.no_grad()
-    def reverse_table(self, setting: ISPParams, nodes: int = 33) -> Tensor:
-        """Tabulate the reverse pass up to the mosaic, at the centre of the shading, with ``nodes`` sRGB values an axis.
-
-        Returns:
-            Linear camera RGB ``(nodes ** 3, 3)``, black 0 and white 1, red changing fastest.
-        """
-        cube = stages.node_colours(nodes)
-        shading = self.find(stages.LensShading)
-        centre = torch.zeros(2)
-        if shading is not None:
-            centre = shading.mask.mean
-
-        coordinates = centre[None, :, None, None].expand(1, 2, *cube.shape[-2:])
-        return self.reverse_pixels(cube, setting, coordinates)[0].flatten(1).T.contiguous()
-
-    @torch.no_grad()
-    def tone_curve(self) -> Tensor:
-        """Compute linear x2 of the 256 greys of sRGB, ``(256, 3)``: tone and gamma in one curve per channel."""
-        return self.linear(torch.linspace(0.0, 1.0, 256).expand(1, 3, 1, -1))[0, :, 0].T.contiguous()
-
-    @torch.no_grad()
-    def description(self) -> dict[str, Any]:
-        """Describe the ISP as JSON: its atoms, curves and mask, :meth:`typical_setting`, and the record of the fit."""
-        setting, shading, info = self.typical_setting(), self.find(stages.LensShading), dict(self.info)
-        mask = shading and {"mean": shading.mask.mean.tolist(), "precision": shading.mask.precision.tolist()}
-        return {
-            "kind": "isp",
-            "cfa": str(self.cfa),
-            "config": asdict(self.config),
-            "parameters": sum(p.numel() for p in self.parameters()),
-            "rendering": info.pop("rendering", None),
-            "colour_atoms": self.colour.atoms().tolist(),
-            "gain_atoms": self.gain.atoms().tolist(),
-            "setting": {
-                "colour_weights": setting.colour_weights[0].tolist(),
-                "gain_weights": setting.gain_weights[0].tolist(),
-                "matrix": setting.matrix[0].tolist(),
-                "gains": setting.gains[0].tolist(),
-            },
-            "tone_curve": self.tone_curve().tolist(),
-            "shading": mask,
-            "noise": info.pop("noise", None),
-            "info": info,
-        }
+        return fusion.with_grey(self.colour, params, weights, balance.log() + weights @ self.colour.neutral)
 
     # -- files ------------------------------------------------------------------------------------------------------
 
@@ -338,13 +579,16 @@ class DictionaryISP(StagedISP):
             raise ValueError(f"{path}: contains {header.get('kind', 'no rawaug weights')}, not an ISP")
         try:
             isp = cls(ISPConfig(**parse_object(header["config"])))
-            _require_shapes(state, isp.state_dict())
+            expected = isp.state_dict()
+            for key in sorted({*state, *expected}):
+                if key not in state or key not in expected or state[key].shape != expected[key].shape:
+                    raise ValueError(f"tensor {key} does not fit")
             isp.load_state_dict(state)
 
             for part, atoms in (("colour", isp.colour.atoms()), ("gain", isp.gain.channel_gains())):
                 if not atoms.isfinite().all():
                     raise ValueError(f"its {part} atoms are not finite")
-            isp.info = parse_object(header.get("info", "{}"))
+            isp.info = cast(ISPInfo, parse_object(header.get("info", "{}")))
         except (LookupError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise ValueError(f"{path}: its configuration is damaged ({reason}); {_ADVICE}") from error
@@ -370,126 +614,43 @@ def restrict_to_cameras(
     if isinstance(names, (str, Path, Camera)):
         names = [names]
 
-    own = []
-    published = []
+    sheets: list[Camera] = []
+    published: list[str] = []
     for name in names:
         if isinstance(name, Camera) or is_camera_file(name):
-            own.append(as_camera(name))
+            sheets.append(as_camera(name))
         else:
-            published.append(str(name))
+            published.append(find_camera(str(name), load_cameras().names))
 
-    if own:
-        for name in published:
-            camera = Camera.published(name)
-            own.append(replace(camera, cfa=own[0].cfa))  # the table of published cameras has no patterns
-        return _with_own_cameras(isp, own)
+    if not sheets:
+        narrowed = isp.with_atoms(colour=published_atoms(published))
+        narrowed.info = {**isp.info, "cameras": published}
+        return narrowed.to(isp.colour.matrices.device).eval()
 
-    listed = load_cameras()
-    cameras = [find_camera(name, listed.names) for name in published]
-    narrowed = _without_colour(isp, colour_atoms=len(cameras), cameras=len(cameras))
-    assert isinstance(narrowed.colour, CameraDictionary)
-    narrowed.colour.set_cameras(listed.select(cameras), torch.eye(len(cameras)))
-    narrowed.info = {**isp.info, "cameras": cameras}
-    return narrowed.to(isp.colour.matrices.device).eval()
-
-
-def _without_colour(isp: DictionaryISP, **changes: Any) -> DictionaryISP:
-    """Copy an ISP with other colour atoms, and with ``tone_atoms`` other tone curves; both have yet to be set."""
-    other = DictionaryISP(replace(isp.config, encoders=False, **changes))
-    state = other.state_dict()
-    for key, value in isp.state_dict().items():
-        is_tone = key.startswith("stages.curve.")
-        if not _of_colour(key) and not (is_tone and "tone_atoms" in changes):
-            state[key] = value
-    other.load_state_dict(state)
-    return other
-
-
-def _with_own_cameras(isp: DictionaryISP, cameras: Sequence[Camera]) -> DictionaryISP:
-    """Make an ISP of the user's own cameras, with an atom for each light of a camera."""
-    anchors = [camera.anchors() for camera in cameras]
-    count = sum(map(len, anchors))
-
-    patterns = {camera.cfa for camera in cameras}
+    # The table of published cameras has no patterns.
+    cfa = sheets[0].cfa
+    sheets += [replace(Camera.published(name), cfa=cfa) for name in published]
+    patterns = sorted({camera.cfa for camera in sheets})
     if len(patterns) > 1:
-        raise ValueError(f"cameras have several patterns, {', '.join(sorted(patterns))}; give those of one pattern")
-    (mosaic,) = patterns
+        raise ValueError(f"cameras have several patterns, {', '.join(patterns)}; give those of one pattern")
 
-    tones, curves = _tones_of(isp, cameras)
-    pipeline = isp.config.stages
-    if any(camera.shading is not None for camera in cameras):
-        pipeline = (*pipeline, stages.FallOff.name)
-    own = _without_colour(
-        isp,
-        stages=pipeline,
-        colour_atoms=count,
-        cameras=len(cameras),
-        tone_atoms=len(curves),
-        cfa=mosaic if mosaic in CFA.__members__ else isp.config.cfa,
-    )
-    assert own.tone is not None
-    own.tone.curves.copy_(curves)
-
-    assert isinstance(own.colour, CameraDictionary)
-    falloff = own.find(stages.FallOff)
-    daylight = white_point(D65)
-    camera_weights = torch.zeros(len(cameras), count)
-    atom = 0
-    for row, in_lights in enumerate(anchors):
-        by_day = weights_in_light([anchor.mired for anchor in in_lights], compute_mired(daylight[None].numpy()))
-        camera_weights[row, atom : atom + len(in_lights)] = torch.from_numpy(by_day)[0].float()
-        for anchor in in_lights:
-            own.colour.matrices[atom] = anchor.matrix.float()
-            own.colour.light[atom] = log_light(gains_in_light(anchor.from_xyz, daylight)[None])[0].float()
-            shares = cameras[row].shading_in(anchor.light)
-            if falloff is not None and shares is not None:
-                falloff.set(atom, shares)
-            atom += 1
-    own.colour.known.copy_(camera_weights)
-
-    own.info = {**isp.info, "cameras": [camera.name for camera in cameras]}
-    own.info["own_cameras"] = [camera.to_json() for camera in cameras]
-    own.info["tones"] = tones
-    own.info.pop("holds", None)
-    if mosaic not in CFA.__members__:
-        own.info["pattern"] = mosaic
-    if len(cameras) == 1 and cameras[0].noise_spec() is not None:
-        own.info["noise"] = cameras[0].noise_spec()
-    return own.to(isp.colour.matrices.device).eval()
-
-
-def _tones_of(isp: DictionaryISP, cameras: Sequence[Camera]) -> tuple[list[str], Tensor]:
-    """The names and inverse curves ``(K, 1021)`` to draw cameras with: their own, or the ISP's if one has none.
-
-    Raises:
-        ValueError: if a camera names a curve that the ISP does not have.
-    """
     assert isp.tone is not None
-    names = list(isp.info["tones"])
-    curves = dict(zip(names, isp.tone.curves, strict=True))
-    tones: dict[str, Tensor] = {}
-    for camera in cameras:
-        table = camera.inverse_curve(isp.tone.curves.shape[1])
-        if camera.tone is None:
-            tones |= curves
-        elif table is not None:
-            tones[camera.name] = table
-        elif camera.tone in curves:
-            tones[camera.tone] = curves[camera.tone]
-        else:
-            unknown = f"camera {camera.name!r}: tone {camera.tone!r:.80} is unknown"
-            raise ValueError(f"{unknown}; use points or one of {', '.join(names)}{suggest(camera.tone, names)}")
-    return list(tones), torch.stack(list(tones.values()))
+    curves = dict(zip(isp.info["tones"], isp.tone.curves, strict=True))
+    tones = data_sheet_tones(sheets, curves)
+    tone = ToneDictionary.from_curves(torch.stack(list(tones.values())))
+    narrowed = isp.with_atoms(colour=data_sheet_atoms(sheets), tone=tone, falloff=data_sheet_shading(sheets))
 
-
-def _require_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-    for key in sorted({*tensors, *expected}):
-        if key not in tensors or key not in expected or tensors[key].shape != expected[key].shape:
-            raise ValueError(f"tensor {key} does not fit")
-
-
-def _of_colour(key: str) -> bool:
-    return key.startswith("colour.") or ("_encoders." in key and ".gain.prior" not in key)
+    narrowed.info = {**isp.info, "cameras": [camera.name for camera in sheets], "tones": list(tones)}
+    narrowed.info["own_cameras"] = [camera.to_json() for camera in sheets]
+    narrowed.info.pop("holds", None)
+    if cfa in CFA.__members__:
+        narrowed.configure(cfa=cfa)
+    else:
+        narrowed.info["pattern"] = cfa
+    noise = sheets[0].noise_spec()
+    if len(sheets) == 1 and noise is not None:
+        narrowed.info["noise"] = noise
+    return narrowed.to(isp.colour.matrices.device).eval()
 
 
 def _require_mosaic(raw: Tensor) -> Tensor:

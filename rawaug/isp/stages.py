@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -56,6 +57,10 @@ _LEAST_SHARE = 0.01
 """Less light arrives nowhere in a frame."""
 STAGES = Registry("stage", "rawaug.stages", "rawaug.isp")
 """The stages of an ISP by name: subclasses of :class:`Stage`."""
+
+
+PlaceGain = Callable[[Tensor, Tensor, ISPParams], Tensor]
+"""What :meth:`Stage.place_gain` returns."""
 
 
 class Tables(NamedTuple):
@@ -117,17 +122,15 @@ class Stage(nn.Module, ABC):
     def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute ``x_(k-1)`` from ``x_k``, both ``(B, 3, H, W)``; arguments as in :meth:`reverse`."""
 
-    def bake(self, tables: Tables) -> Tables:
-        """Add the part of this stage that is the same for every picture to the tables of the reverse pass."""
-        if self.makes > 2:
-            return tables
-        return tables._replace(x2=self.reverse(tables.x2, None))
+    def bake(self, tables: Tables, forward: bool = False) -> Tables:
+        """Add the part of this stage that is the same for every picture to the tables of a pass.
 
-    def bake_forward(self, tables: Tables) -> Tables:
-        """Add the part of this stage that is the same for every picture to the forward tables, whose x2 is sRGB."""
+        The x2 of the forward pass's tables becomes sRGB.
+        """
         if self.makes > 2:
             return tables
-        return tables._replace(x2=self.forward(tables.x2, None))
+        convert = self.forward if forward else self.reverse
+        return tables._replace(x2=convert(tables.x2, None))
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         """Add the part of this stage that depends on these pictures to ``batch``.
@@ -142,59 +145,19 @@ class Stage(nn.Module, ABC):
         """
         return batch
 
-    def describe(self) -> str:
-        """Describe the stage's parameters in one line; the line is empty if the settings hold them all."""
-        return ""
-
-    @property
-    def has_place_gain(self) -> bool:
-        """Whether this stage multiplies RAW by the result of :meth:`place_gain`."""
-        return False
-
-    def place_gain(self, coordinates: Tensor, edge: Tensor, params: ISPParams, forward: bool) -> Tensor:
-        """Compute the gains of this stage that depend on place and setting, and that no table holds; they multiply RAW.
+    def place_gain(self, forward: bool) -> PlaceGain | None:
+        """The gains of this stage that depend on place and setting, and that no table holds; they multiply RAW.
 
         Args:
-            coordinates: ``(B, 2, H, W)`` of pixels in the full frame.
-            edge: ``(B, 2)`` coordinates of the frame's bottom and right edge.
-            params: the settings of the pictures.
             forward: True for the forward pass, which multiplies RAW before everything else; False for the reverse pass,
                 which does so after everything else.
 
         Returns:
-            ``(B, 1, H, W)``, or ``(B, 3, H, W)`` for R, G and B; ones by default.
+            A function of coordinates ``(B, 2, H, W)`` of pixels in the full frame, coordinates ``(B, 2)`` of the
+            frame's bottom and right edge, and the settings, which gives ``(B, 1, H, W)``, or ``(B, 3, H, W)`` for R, G
+            and B. None without any.
         """
-        return torch.ones_like(coordinates[:, :1])
-
-    # -- fitting ----------------------------------------------------------------------------------------------------
-
-    def coarse_parameters(self) -> dict[str, Tensor]:
-        """The few numbers, by name, that :meth:`coarse` depends on."""
-        return {}
-
-    def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
-        """Compute the reverse pass ``(B, 3, H, W)`` from a few numbers, with which a fit starts.
-
-        A stage whose parameters differ from frame to frame does nothing here.
-        """
-        return x
-
-    def start_coarse(self, gamma: float, toe: float) -> None:
-        """Start as the curve ``(x + toe (1 - x))^gamma``."""
-
-    def start_fine(self) -> None:
-        """Start :meth:`reverse` from :meth:`coarse`."""
-
-    def start_forward(self) -> None:
-        """Start :meth:`forward` from :meth:`reverse`."""
-
-    def parameters_of(self, forward: bool) -> dict[str, Tensor]:
-        """The parameters that a fit of the forward or of the reverse pass changes, as ``stage.name``."""
-        parameters: dict[str, Tensor] = {}
-        for key, parameter in self.named_parameters():
-            if key.startswith("forward_") == forward:
-                parameters[f"{self.name}.{key}"] = parameter
-        return parameters
+        return None
 
 
 def node_colours(nodes: int) -> Tensor:
@@ -209,13 +172,11 @@ class ToneMap(Stage):
     """f1: one tone network for each direction."""
 
     name, makes = "tone", 1
-    toe: Tensor
 
     def __init__(self, config: ISPConfig) -> None:
         super().__init__(config)
         self.reverse_network = ToneNetwork()
         self.forward_network = ToneNetwork()
-        self.register_buffer("toe", torch.zeros(()), persistent=False)
 
     def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x1 from sRGB, both ``(B, 3, H, W)``, by the reverse network."""
@@ -224,22 +185,6 @@ class ToneMap(Stage):
     def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute sRGB from x1, both ``(B, 3, H, W)``, by the forward network."""
         return self.forward_network(x)
-
-    def coarse_parameters(self) -> dict[str, Tensor]:
-        """The toe of the curve."""
-        return {"toe": self.toe}
-
-    def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
-        """Compute ``x + toe (1 - x)``, ``(B, 3, H, W)``; followed by a gamma this is the curve of sRGB."""
-        return x + self.toe * (1.0 - x)
-
-    def start_coarse(self, gamma: float, toe: float) -> None:
-        """Use the toe of the curve; the stage gamma uses its power."""
-        self.toe.fill_(toe)
-
-    def start_fine(self) -> None:
-        """Start the reverse network as the curve with the toe."""
-        self.reverse_network.start_from(float(self.toe))
 
 
 @STAGES.register("gamma")
@@ -261,27 +206,9 @@ class Gamma(Stage):
         """Compute x1 from x2, both ``(B, 3, H, W)``, by the forward power."""
         return gamma_compress(x, self.forward_gamma)
 
-    def describe(self) -> str:
+    def extra_repr(self) -> str:
         """Describe both powers."""
-        return f"gamma: {self.reverse_gamma.item():.3f} reverse, {self.forward_gamma.item():.3f} forward"
-
-    def coarse_parameters(self) -> dict[str, Tensor]:
-        """The reverse power."""
-        return {"gamma": self.reverse_gamma}
-
-    def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
-        """Compute the reverse pass itself, ``(B, 3, H, W)``, which is a single number already."""
-        return self.reverse(x, None)
-
-    @torch.no_grad()
-    def start_coarse(self, gamma: float, toe: float) -> None:
-        """Use the power of the curve; the stage tone uses its toe."""
-        self.reverse_gamma.fill_(gamma)
-
-    @torch.no_grad()
-    def start_forward(self) -> None:
-        """Start the forward power from the reverse one."""
-        self.forward_gamma.copy_(self.reverse_gamma)
+        return f"{self.reverse_gamma.item():.3f} reverse, {self.forward_gamma.item():.3f} forward"
 
 
 @STAGES.register("colour")
@@ -358,13 +285,12 @@ class LensShading(Stage):
         x = x * self.forward_attention.of_place(where) / self.mask(where)
         return x * self.forward_attention.of_colour(x)
 
-    def bake(self, tables: Tables) -> Tables:
-        """Put the colour-dependent reverse attention mask into the tables."""
-        return _bake_attention(tables, self.reverse_attention)
-
-    def bake_forward(self, tables: Tables) -> Tables:
-        """Put the colour-dependent forward attention mask into the tables."""
-        return _bake_attention(tables, self.forward_attention)
+    def bake(self, tables: Tables, forward: bool = False) -> Tables:
+        """Put the colour-dependent attention mask of the requested direction into the tables."""
+        attention = self.forward_attention if forward else self.reverse_attention
+        if attention is None:
+            return tables
+        return tables._replace(attention=attention.of_colour(tables.cube))
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         """Put the mask's exponents and each picture's frame ``(B, 6)`` into ``batch``.
@@ -382,34 +308,18 @@ class LensShading(Stage):
         shading = torch.stack([precision[0, 0], 2.0 * precision[0, 1], precision[1, 1]])
         return batch._replace(frame=frame, shading=shading)
 
-    @property
-    def has_place_gain(self) -> bool:
-        """Whether there is an attention mask."""
-        return self.reverse_attention is not None
-
-    def place_gain(self, coordinates: Tensor, edge: Tensor, params: ISPParams, forward: bool) -> Tensor:
-        """Compute the attention's place-dependent gains ``(B, 1, H, W)``, in the requested direction."""
-        attention = self.reverse_attention
-        if forward:
-            attention = self.forward_attention
-
+    def place_gain(self, forward: bool) -> PlaceGain | None:
+        """The attention's place-dependent gains ``(B, 1, H, W)`` in the requested direction."""
+        attention = self.forward_attention if forward else self.reverse_attention
         if attention is None:
-            return super().place_gain(coordinates, edge, params, forward)
-        return attention.of_place(coordinates)
+            return None
+        return lambda coordinates, edge, params: attention.of_place(coordinates)
 
-    def describe(self) -> str:
+    def extra_repr(self) -> str:
         """Describe the mask by its mean and precision."""
         mean = self.mask.mean.tolist()
         precision = [round(entry, 3) for entry in self.mask.precision.flatten().tolist()]
-        return f"shading: mean {mean}, precision {precision}"
-
-    def coarse_parameters(self) -> dict[str, Tensor]:
-        """The five numbers of the mask."""
-        return {f"mask.{key}": p for key, p in self.mask.named_parameters()}
-
-    def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
-        """Multiply ``x`` ``(B, 3, H, W)`` by the Gaussian mask alone."""
-        return x * self.mask(coordinates_or_full(x, coordinates))
+        return f"mean {mean}, precision {precision}"
 
 
 @STAGES.register("falloff")
@@ -426,20 +336,6 @@ class FallOff(Stage):
     def __init__(self, config: ISPConfig) -> None:
         super().__init__(config)
         self.register_buffer("tables", torch.ones(config.colour_atoms, 3, FALLOFF_NODES, FALLOFF_NODES))
-
-    @torch.no_grad()
-    def set(self, atom: int, shares: Tensor) -> None:
-        """Set the table of an atom to the shares ``(3, rows, columns)`` of the cells of a grid over the frame."""
-        for axis in (1, 2):  # half a cell further to the edges of the frame, as it goes on
-            lines = list(shares.unbind(axis))
-            lines = [2 * lines[0] - lines[1], *lines, 2 * lines[-1] - lines[-2]]
-            shares = torch.stack(lines, dim=axis).clamp_min(_LEAST_SHARE)
-
-        rows, columns = shares.shape[1] - 2, shares.shape[2] - 2
-        y = torch.linspace(-rows / (rows + 2), rows / (rows + 2), FALLOFF_NODES)
-        x = torch.linspace(-columns / (columns + 2), columns / (columns + 2), FALLOFF_NODES)
-        nodes = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], dim=-1)[None]
-        self.tables[atom] = F.grid_sample(shares.float()[None], nodes, align_corners=False)[0]
 
     def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x5 from x4, both ``(B, 3, H, W)``; the frame of given ``coordinates`` has sides of 3 and 4."""
@@ -460,17 +356,14 @@ class FallOff(Stage):
             weights = params.colour_weights
         return self._look_up(coordinates_or_full(x, coordinates), edge, weights)
 
-    @property
-    def has_place_gain(self) -> bool:
-        """It always has."""
-        return True
-
-    def place_gain(self, coordinates: Tensor, edge: Tensor, params: ISPParams, forward: bool) -> Tensor:
+    def place_gain(self, forward: bool) -> PlaceGain:
         """Look up the shares of light ``(B, 3, H, W)``, or one over them for the forward pass."""
-        shares = self._look_up(coordinates, edge, params.colour_weights)
-        if forward:
-            return 1.0 / shares
-        return shares
+
+        def gain(coordinates: Tensor, edge: Tensor, params: ISPParams) -> Tensor:
+            shares = self._look_up(coordinates, edge, params.colour_weights)
+            return 1.0 / shares if forward else shares
+
+        return gain
 
     def _look_up(self, coordinates: Tensor, edge: Tensor, weights: Tensor) -> Tensor:
         """Mix the tables by weights ``(B, N)``, and look up ``coordinates`` ``(1 or B, 2, H, W)``: ``(B, 3, H, W)``."""
@@ -479,16 +372,28 @@ class FallOff(Stage):
         place = place.expand(len(tables), -1, -1, -1)
         return F.grid_sample(tables, place, padding_mode="border", align_corners=True)
 
-    def describe(self) -> str:
+    def extra_repr(self) -> str:
         """Describe the tables by the light that they leave in the corners."""
         corners = self.tables[:, 1, :: FALLOFF_NODES - 1, :: FALLOFF_NODES - 1].mean()
-        return f"falloff: tables of {len(self.tables)} atoms, {float(corners):.2f} of the light in the corners"
+        return f"tables of {len(self.tables)} atoms, {float(corners):.2f} of the light in the corners"
 
 
-def _bake_attention(tables: Tables, mask: AttentionMask | None) -> Tables:
-    if mask is None:
-        return tables
-    return tables._replace(attention=mask.of_colour(tables.cube))
+def interpolate_shares(shares: Tensor) -> Tensor:
+    """Interpolate shares of light ``(3, rows, columns)``, of cells over the frame, to the nodes of a table.
+
+    Returns:
+        float32 ``(3, 33, 33)``.
+    """
+    for axis in (1, 2):  # half a cell further to the edges of the frame, as it goes on
+        lines = list(shares.unbind(axis))
+        lines = [2 * lines[0] - lines[1], *lines, 2 * lines[-1] - lines[-2]]
+        shares = torch.stack(lines, dim=axis).clamp_min(_LEAST_SHARE)
+
+    rows, columns = shares.shape[1] - 2, shares.shape[2] - 2
+    y = torch.linspace(-rows / (rows + 2), rows / (rows + 2), FALLOFF_NODES)
+    x = torch.linspace(-columns / (columns + 2), columns / (columns + 2), FALLOFF_NODES)
+    nodes = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], dim=-1)[None]
+    return F.grid_sample(shares.float()[None], nodes, align_corners=False)[0]
 
 
 def _require_params(params: ISPParams | None) -> ISPParams:

@@ -22,15 +22,18 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor, nn
 
+from rawaug.camera.samplers import sparse_shares
 from rawaug.isp.config import ISPConfig, ISPParams
 from rawaug.isp.stages import STAGES, BatchParams, Stage
 from rawaug.kernels.reference import apply_curves
+from rawaug.seeding import Generators
 
 STEPS = 4
 """Number of entries of a table for each 8-bit level."""
 NODES = 255 * STEPS + 1
-_PIECES = 51
+PIECES = 51
 """Number of pieces of a curve whose slopes a fit scales."""
+_TONES_MIXED = 3
 
 
 def srgb_to_linear(code: Tensor) -> Tensor:
@@ -67,6 +70,20 @@ class ToneDictionary(nn.Module):
         self.register_buffer("curves", standard.repeat(atoms, 1))
         self.register_buffer("typical", torch.full((atoms,), 1.0 / atoms))
 
+    @classmethod
+    def from_curves(cls, curves: Tensor, typical: Tensor | None = None) -> ToneDictionary:
+        """Make a dictionary of curves ``(K, 1021)`` and their typical weights ``(K,)``, by default equal ones."""
+        tone = cls(len(curves))
+        tone.curves.copy_(curves)
+        if typical is not None:
+            tone.typical.copy_(typical)
+        return tone
+
+    def draw(self, batch: int, generator: Generators) -> Tensor:
+        """Draw weights ``(batch, K)``: mixtures of up to three curves, most of them near one curve."""
+        atoms, shares = sparse_shares(batch, len(self.curves), _TONES_MIXED, generator)
+        return shares.new_zeros(batch, len(self.curves)).scatter_add_(1, atoms, shares).to(self.curves)
+
     def combine(self, weights: Tensor) -> Tensor:
         """Mix the curves by weights ``(B, K)`` into tables ``(B, 1021)``, with the same bits in a batch of any size."""
         table = weights.new_zeros(len(weights), self.curves.shape[1])
@@ -101,7 +118,8 @@ class ToneCurve(Stage):
             raise ValueError(f"stages: 'curve' replaces tone and gamma, got {' '.join(config.stages)}")
 
         self.dictionary = ToneDictionary(config.tone_atoms)
-        self.slopes: Tensor | None = None  # (K, _PIECES), l, during a fit
+        self.slopes: Tensor | None = None
+        """l, the logarithms of the slopes on each piece, ``(K, PIECES)``, during a fit; None else."""
 
     def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x2 from sRGB, both ``(B, 3, H, W)``, by each picture's curve."""
@@ -116,49 +134,18 @@ class ToneCurve(Stage):
         weights = params.tone_weights.to(batch.matrix)
         return batch._replace(curves=self.dictionary.combine(weights))
 
-    def describe(self) -> str:
+    def extra_repr(self) -> str:
         """Describe the number of curves, and their light at code 128."""
         light = self.dictionary.curves[:, 128 * STEPS].tolist()
         values = " ".join(f"{value:.3f}" for value in light)
-        return f"tone curves: {self.config.tone_atoms}, at code 128 {values}"
+        return f"{self.config.tone_atoms} curves, at code 128 {values}"
 
-    def coarse_parameters(self) -> dict[str, Tensor]:
-        """The logarithms of the slopes on each piece, during a fit."""
-        if self.slopes is None:
-            return {}
-        return {"slopes": self.slopes}
-
-    def coarse(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
-        """Compute the reverse pass itself, ``(B, 3, H, W)``, under the slopes of the fit."""
-        return self.reverse(x, None)
-
-    @torch.no_grad()
-    def start_coarse(self, gamma: float, toe: float) -> None:
-        """Start all curves as ``(x + toe (1 - x))^gamma``, minus its value at black, and all slopes as 1."""
-        code = torch.linspace(0.0, 1.0, NODES, dtype=torch.float64)
-        curve = (code + toe * (1.0 - code)) ** gamma
-        self.dictionary.curves.copy_((curve - curve[0]) / (1.0 - curve[0]))
-
-        self.slopes = torch.zeros(self.config.tone_atoms, _PIECES)
-
-    @torch.no_grad()
-    def start_forward(self) -> None:
-        """Keep the fitted curves for both directions."""
-        self.dictionary.curves.copy_(self._bend())
-        self.slopes = None
-
-    def parameters_of(self, forward: bool) -> dict[str, Tensor]:
-        """The slopes for a fit of the reverse pass, nothing for a fit of the forward pass."""
-        if forward or self.slopes is None:
-            return {}
-        return {f"{self.name}.slopes": self.slopes}
-
-    def _bend(self) -> Tensor:
-        """Bend the curves by the slopes of a fit, ``(K, 1021)``."""
+    def bend(self) -> Tensor:
+        """The curves ``(K, 1021)``, bent by the slopes of a fit."""
         if self.slopes is None:
             return self.dictionary.curves
 
-        factors = self.slopes.exp().repeat_interleave((NODES - 1) // _PIECES, dim=1)
+        factors = self.slopes.exp().repeat_interleave((NODES - 1) // PIECES, dim=1)
         rises = self.dictionary.curves.diff(dim=1) * factors
         heights = torch.nn.functional.pad(rises.cumsum(dim=1), (1, 0))
         return heights / heights[:, -1:]
@@ -171,5 +158,5 @@ class ToneCurve(Stage):
         weights = weights.expand(batch, -1)
 
         if self.slopes is not None:
-            return weights @ self._bend()
+            return weights @ self.bend()
         return self.dictionary.combine(weights)

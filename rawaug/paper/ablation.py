@@ -27,7 +27,6 @@ from rawaug.evaluation.tables import print_rows
 from rawaug.experiment.folder import claim, require_free
 from rawaug.experiment.recipe import EXPERIMENTS
 from rawaug.files import write_json
-from rawaug.isp import staged
 from rawaug.isp.config import POINTWISE_STAGES
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import block_averages
@@ -176,7 +175,7 @@ def stage_psnr(isp: DictionaryISP, pair: Pair, white_balance: bool) -> list[list
     srgb, raw, coordinates, unclipped = _comparable_pixels(pair)
     params = isp.choose(pair.srgb[None])
     if white_balance:
-        params = staged.with_white_balance(isp, params, pair.white_balance, None)
+        params = isp.with_white_balance(params, pair.white_balance)
 
     images: dict[str, Tensor] = {}
     isp.reverse_pixels(srgb, params, coordinates, images)

@@ -21,7 +21,6 @@ from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.psnr_r import block_psnr, draw_windows, psnr_r, windows_psnr
 from rawaug.files import find_weights
-from rawaug.isp import staged
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.descent import cycle_error
@@ -245,7 +244,7 @@ def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
     blind = isp.choose(pair.srgb[None])
     rows = {"blind": blind}
     if pair.balance_known:
-        rows["as-shot"] = staged.with_white_balance(isp, blind, pair.white_balance, None)
+        rows["as-shot"] = isp.with_white_balance(blind, pair.white_balance)
     rows["samples"] = _from_samples(isp, pair, blind)
     return rows
 
@@ -258,7 +257,7 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
 
     readings = torch.stack([rows.float(), columns.float(), pair.raw[0, rows, columns]], dim=1)[None]
     x = as_float(pair.srgb[None])
-    return staged.with_raw_samples(isp, x, blind, readings, coordinates_or_full(x, None))
+    return isp.with_raw_samples(blind, x, readings, coordinates_or_full(x, None))
 
 
 # -- sRGB from RAW, and the cycle -------------------------------------------------------------------------------------

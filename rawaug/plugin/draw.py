@@ -190,10 +190,8 @@ class SettingSampler:
             if self.draw.sampling == "perturb":
                 setting = self._perturb(setting, generator)
             return setting
-        if self._cameras is None:
-            return self.isp.draw_setting(len(srgb), generator)
 
-        setting = self._cameras.sample(len(srgb), generator, srgb.device)
+        setting = self.isp.draw_setting(len(srgb), generator, self._cameras)
         if self._tone is None:
             return setting
         return setting._replace(tone_weights=self._tone.to(setting.tone_weights).expand_as(setting.tone_weights))

@@ -33,7 +33,6 @@ from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.samples import FitFrames, FrameSummary, PixelSamples
 from rawaug.isp.fit.start import measure_lights
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.staged import with_white_balance
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
 
@@ -91,7 +90,7 @@ def mean_psnr(isp: DictionaryISP, frames: FitFrames, as_shot: bool = False) -> f
     values = []
     for number, shot in enumerate(frames.shots):
         balance = shot.white_balance if as_shot else None
-        params = with_white_balance(isp, isp.choose(shot.srgb), balance, None)
+        params = isp.with_white_balance(isp.choose(shot.srgb), balance)
         values.append(mean_square(isp, frames.some([number]).pixels, params))
 
     return float(-10.0 * torch.cat(values).log10().mean())

@@ -8,7 +8,7 @@
 4. Encoders, if frames that were left out of stages 1 to 3 as well show that they help.
 5. Forward. The forward networks, given the reverse pass: l2 on sRGB and on every intermediate image.
 6. Joint. With many frames, everything at once, kept as far as frames left out of it gain.
-7. Errors. How far off the chosen and the as-shot gains are, so that they can be fused (:mod:`rawaug.isp.staged`).
+7. Errors. How far off the chosen and the as-shot gains are, so that they can be fused (:mod:`rawaug.isp.fusion`).
 
 Model and losses are those of Conde et al., AAAI 2022; a global and a per-frame part make the fit work with a handful of
 frames.
@@ -29,6 +29,7 @@ from rawaug.files import digest
 from rawaug.isp import functional, stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.config import FitConfig
+from rawaug.isp.fit.curve import StartCurve, start_forward, trained_tensors
 from rawaug.isp.fit.descent import (
     Descent,
     adam,
@@ -50,7 +51,7 @@ from rawaug.isp.fit.start import (
     set_dictionaries,
 )
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import LensShading, Stage
+from rawaug.isp.stages import LensShading
 from rawaug.isp.tone import to_linear
 from rawaug.kernels.runtime import one_thread
 from rawaug.progress import progress as progress_of
@@ -116,7 +117,7 @@ def fit_isp(
         fit = _Fit(frames, config, descent, camera=camera)
         fit.fit_reverse(report)
         train_encoders(fit.isp, frames, config, descent, refit)
-        fit.forward()
+        fit.fit_forward()
         held_out = train_jointly(fit.isp, frames, config, descent, held_out)
         measure_gain_errors(fit.isp, held_out)
 
@@ -206,6 +207,7 @@ class _Fit:
 
         self.config, self.descent, self.part = config, descent, part
         self.isp = _new_isp(self.shots, config)
+        self.curve = StartCurve(self.isp)
         self.tie = Tie(self.shots)
         self.colour = self._start()
 
@@ -214,61 +216,55 @@ class _Fit:
         """Solve by least squares under the curve of the standard that fits best."""
         tried = []
         for curve in _STANDARD_CURVES:
-            self._start_coarse(*curve)
+            self.curve.set(*curve)
             self.colour = FrameColour.from_product(self._least_squares())
             tried.append((self._error(), curve, self.colour))
 
         _, curve, colour = min(tried, key=lambda one: one[0])
-        self._start_coarse(*curve)
+        self.curve.set(*curve)
         return colour
 
     def _least_squares(self) -> Tensor:
         return least_squares(self._apply_curve(self.samples), self.samples, self.known_matrix)
 
-    def _start_coarse(self, gamma: float, toe: float) -> None:
-        for stage in self.isp.ordered_stages:
-            stage.start_coarse(gamma, toe)
-
     def fit_reverse(self, report: Callable[[DictionaryISP], str] | None = None) -> DictionaryISP:
         """Run stages 1 to 3, which fit the reverse pass, without encoders."""
-        self.curve()
-        self.tone(report)
-        self.atoms(self.isp)
+        self.fit_curve()
+        self.fit_tone(report)
+        self.set_atoms(self.isp)
         return self.isp
 
     # -- stage 1 ----------------------------------------------------------------------------------------------------
 
-    def curve(self) -> None:
+    def fit_curve(self) -> None:
         """Run stage 1 without the mask and, if the readings fall off towards the corners, with it as well."""
         shading = self.isp.find(LensShading)
         mode = self.config.shading if shading else "off"
         if mode != "on":
-            self._descend_on_curve("curve", without=shading)
-        if shading is None or mode == "off":
-            self._remove(shading)
+            self._descend_on_curve("curve", with_mask=False)
+        if shading is None:
+            return
+        without_shading = tuple(name for name in self.isp.config.stages if name != shading.name)
+        if mode == "off":
+            self.isp.configure(stages=without_shading)
             return
 
         mean, precision = fit_fall_off(self._apply_curve(self.samples), self.samples, self.colour.product())
         if mode == "auto" and not _darkens_corners(mean, precision):
-            self._remove(shading)
+            self.isp.configure(stages=without_shading)
             return
 
         error = self._error()
         before = {}
-        for name, tensor in self._few_numbers(without=shading).items():
+        for name, tensor in self._few_numbers(with_mask=False).items():
             before[name] = tensor.detach().clone()
 
         shading.mask.set(mean, precision)
         self._descend_on_curve("curve and shading")
         if mode == "auto" and self._error() > _SHADING_PAYS * error:
-            self._remove(shading)
+            self.isp.configure(stages=without_shading)
             for name, tensor in self._few_numbers().items():
                 tensor.data.copy_(before[name])
-
-    def _remove(self, stage: Stage | None) -> None:
-        if stage is not None:
-            names = [name for name in self.isp.config.stages if name != stage.name]
-            self.isp.configure(stages=tuple(names))
 
     @torch.no_grad()
     def _error(self) -> float:
@@ -277,13 +273,10 @@ class _Fit:
 
     def _apply_curve(self, part: PixelSamples) -> Tensor:
         """Compute x2 by the curve, times the mask, which a frame's matrix takes to RAW."""
-        x = part.srgb
-        for stage in self.isp.ordered_stages:
-            x = stage.coarse(x, part.coordinates)
-        return x
+        return self.curve.apply(part.srgb, part.coordinates)
 
-    def _descend_on_curve(self, stage: str, without: Stage | None = None) -> None:
-        tensors = self._few_numbers(without)
+    def _descend_on_curve(self, stage: str, with_mask: bool = True) -> None:
+        tensors = self._few_numbers(with_mask)
 
         def loss(generator: torch.Generator) -> Tensor:
             frames, part = self._draw(generator)
@@ -295,17 +288,13 @@ class _Fit:
 
     # -- stage 2 ----------------------------------------------------------------------------------------------------
 
-    def tone(self, report: Callable[[DictionaryISP], str] | None) -> None:
+    def fit_tone(self, report: Callable[[DictionaryISP], str] | None) -> None:
         """Run stage 2, the tone and each frame's colour; ``report`` gets the ISP as it would be now."""
-        for stage in self.isp.ordered_stages:
-            stage.start_fine()
-
+        self.curve.start_networks()
         if self.config.start is not None:
             self._start_from(DictionaryISP.from_pretrained(self.config.start))
 
-        tensors: dict[str, Tensor] = self._colours()
-        for stage in self.isp.ordered_stages:
-            tensors |= stage.parameters_of(forward=False)
+        tensors = self._colours() | trained_tensors(self.isp, forward=False)
 
         def loss(generator: torch.Generator) -> Tensor:
             frames, part = self._draw(generator)
@@ -317,7 +306,7 @@ class _Fit:
                 return ""
 
             isp = deepcopy(self.isp)  # as it would be if this stage ended now
-            self.atoms(isp)
+            self.set_atoms(isp)
             return report(isp.eval())
 
         name = f"sRGB to RAW{self.part}"
@@ -327,10 +316,7 @@ class _Fit:
         """Start the tone from that of another ISP, or the best of its curves, if that improves the frames."""
         greys = torch.linspace(0.0, 1.0, 256).expand(1, 3, 1, -1)
         colours = torch.cat([greys, stages.node_colours(9).flatten(2)[:, :, None]], dim=3)
-        tensors: list[Tensor] = []
-        for stage in self.isp.ordered_stages:
-            if stage.makes <= 2:
-                tensors += stage.parameters_of(forward=False).values()
+        tensors = list(trained_tensors(self.isp, forward=False, up_to=2).values())
 
         before = [tensor.detach().clone() for tensor in tensors]
         colour = self.colour
@@ -382,14 +368,8 @@ class _Fit:
         colour = FrameColour.from_product(least_squares(x, self.samples, self.known_matrix))
         return float(reading_error(functional.correct_colour(x, colour.product()), self.samples)), colour
 
-    def _few_numbers(self, without: Stage | None = None) -> dict[str, Tensor]:
-        tensors = {}
-        for stage in self.isp.ordered_stages:
-            if stage is without:
-                continue
-            for key, parameter in stage.coarse_parameters().items():
-                tensors[f"{stage.name}.{key}"] = parameter
-        return tensors | self._colours()
+    def _few_numbers(self, with_mask: bool = True) -> dict[str, Tensor]:
+        return self.curve.numbers(with_mask) | self._colours()
 
     def _colours(self) -> dict[str, Tensor]:
         return {"log_scale": self.colour.log_scale, "matrix": self.colour.matrix}
@@ -406,19 +386,17 @@ class _Fit:
 
     # -- stage 3 ----------------------------------------------------------------------------------------------------
 
-    def atoms(self, isp: DictionaryISP) -> None:
+    def set_atoms(self, isp: DictionaryISP) -> None:
         """Run stage 3: make the frames' colours the atoms of ``isp``."""
         set_dictionaries(isp, self.colour, self.samples, self.shots, self.config)
 
     # -- stage 5 ----------------------------------------------------------------------------------------------------
 
-    def forward(self) -> None:
+    def fit_forward(self) -> None:
         """Run stage 5: fit the forward networks to the reverse pass."""
         isp = self.isp
-        tensors: dict[str, Tensor] = {}
-        for stage in isp.ordered_stages:
-            stage.start_forward()
-            tensors |= stage.parameters_of(forward=True)
+        start_forward(isp)
+        tensors = trained_tensors(isp, forward=True)
 
         def loss(generator: torch.Generator) -> Tensor:
             frames, part = self._draw(generator)

@@ -18,8 +18,8 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.errors import extra
+from rawaug.isp.encoders import thumbnail
 from rawaug.isp.functional import as_float, frame_coordinates
-from rawaug.isp.staged import thumbnail
 from rawaug.seeding import keyed_generator
 
 _CLIPPED_SRGB = 0.98

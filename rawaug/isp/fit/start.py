@@ -25,8 +25,8 @@ from rawaug.isp.config import ISPParams
 from rawaug.isp.dictionary import l1_normalise, log_light
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.samples import FitFrames, FrameSummary, PixelSamples, as_shot
+from rawaug.isp.fusion import DIGITAL_SLACK, log_grey
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.staged import DIGITAL_SLACK, log_grey
 from rawaug.seeding import derive_seed
 
 TIE = 1e-1

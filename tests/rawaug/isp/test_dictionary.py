@@ -8,13 +8,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rawaug.camera import samplers
 from rawaug.camera.lights import D65, LightRange, sample_lights, white_point
 from rawaug.camera.matrices import camera_from_srgb, gains_in_light, load_cameras
+from rawaug.camera.samplers import CameraSampler
 from rawaug.data import demo_pictures
-from rawaug.isp import dictionary
 from rawaug.isp.dictionary import (
     CameraDictionary,
-    CameraSampler,
     ColourDictionary,
     GainDictionary,
     convex_weights,
@@ -91,6 +91,10 @@ def test_a_mixture_is_found_and_a_point_outside_is_projected() -> None:
     torch.testing.assert_close(error, torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64), atol=1e-6, rtol=0)
 
 
+def sampler_of(cameras: CameraDictionary, lights: LightRange, consistent: bool = True) -> CameraSampler:
+    return CameraSampler(cameras.known, cameras.atoms(), cameras.responses(), lights, consistent)
+
+
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
@@ -145,14 +149,15 @@ def test_independent_gains_are_those_of_other_light(universal: DictionaryISP, mo
     assert isinstance(universal.colour, CameraDictionary)
     camera = restrict_to_cameras(universal, ["Nikon D750", "Leica S3"]).colour
     assert isinstance(camera, CameraDictionary)
-    monkeypatch.setattr(dictionary, "CAMERAS_MIXED", 1)
+    monkeypatch.setattr(samplers, "CAMERAS_MIXED", 1)
 
     def error(consistent: bool) -> torch.Tensor:
-        sampler = CameraSampler(camera, 0, LightRange((6504.0, 6504.0), lamps=0.0), consistent)
-        setting = sampler.sample(64, generator())
-        balance = gains_in_light(camera.xyz_to_camera(setting.colour_weights), white_point(D65))
+        weights, _, gains = sampler_of(camera, LightRange((6504.0, 6504.0), lamps=0.0), consistent).sample(
+            64, generator()
+        )
+        balance = gains_in_light(camera.xyz_to_camera(weights), white_point(D65))
         own = balance / balance.amin(dim=1, keepdim=True)
-        return (setting.gains / own).log().abs().amax(dim=1)
+        return (gains / own).log().abs().amax(dim=1)
 
     assert error(consistent=True).max() < 0.1, "a little off the locus, but the camera's"
     assert 0.2 < (error(consistent=False) > 0.1).float().mean() < 0.8, "half of the draws have the other camera's gains"
@@ -176,17 +181,17 @@ def test_one_named_camera_has_its_own_matrix_and_balance(universal: DictionaryIS
 
 
 def test_what_cannot_be_drawn_is_refused() -> None:
-    green_only = CameraDictionary(1, 1)
-    green_only.set_cameras(torch.tensor([[[0.01, 0, 0], [0, 1.0, 0], [0, 0, 0.01]]]), torch.ones(1, 1))
+    matrices = torch.tensor([[[0.01, 0, 0], [0, 1.0, 0], [0, 0, 0.01]]])
+    green_only = CameraDictionary.from_xyz(matrices, torch.ones(1, 1))
     with pytest.raises(ValueError, match="gains within"):
-        CameraSampler(green_only, 0, LightRange()).sample(1, generator())
+        sampler_of(green_only, LightRange()).sample(1, generator())
 
 
 def test_a_camera_that_is_drawn_again_brings_its_own_gains(monkeypatch: pytest.MonkeyPatch) -> None:
     """Gains that are implausible are drawn again, camera and light together, not the light alone."""
     cameras = DictionaryISP.from_pretrained("universal-small").colour
     assert isinstance(cameras, CameraDictionary)
-    sampler = CameraSampler(cameras, 0, LightRange((2800.0, 7500.0), lamps=0.0))
+    sampler = sampler_of(cameras, LightRange((2800.0, 7500.0), lamps=0.0))
 
     rounds: list[np.ndarray] = []
 
@@ -201,10 +206,10 @@ def test_a_camera_that_is_drawn_again_brings_its_own_gains(monkeypatch: pytest.M
         mixtures.append(weights)
         return balance(weights, light)
 
-    monkeypatch.setattr("rawaug.isp.dictionary.is_plausible", plausible_at_last)
+    monkeypatch.setattr(sampler, "is_plausible", plausible_at_last)
     monkeypatch.setattr(sampler, "balance", recorded)
-    setting = sampler.sample(5, torch.Generator().manual_seed(0))
+    weights, _, drawn = sampler.sample(5, torch.Generator().manual_seed(0))
     assert len(mixtures) == 3 and not np.allclose(mixtures[0], mixtures[2])
-    assert np.allclose(setting.colour_weights.numpy(), mixtures[2], atol=1e-6)
-    gains = setting.gains.numpy()
+    assert np.allclose(weights.numpy(), mixtures[2], atol=1e-6)
+    gains = drawn.numpy()
     assert np.allclose(gains / gains[:, 1:2], rounds[2], rtol=1e-5)

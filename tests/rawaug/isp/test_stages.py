@@ -127,8 +127,8 @@ class Squeeze(Stage):
         b = 1.0 - self.strength
         return ((b * b + 4.0 * self.strength * x).sqrt() - b) / (2.0 * self.strength)
 
-    def bake(self, tables: Tables) -> Tables:
-        return tables._replace(x2=self.reverse(tables.x2, None))
+    def bake(self, tables: Tables, forward: bool = False) -> Tables:
+        return tables._replace(x2=(self.forward if forward else self.reverse)(tables.x2, None))
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from rawaug.data.pairs import Pair
+from rawaug.isp.description import tone_table
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.descent import Descent, with_better_tone
@@ -160,7 +161,7 @@ def test_a_fit_starts_from_the_tone_of_another_isp(start: str, exact_pair: Calla
     started = fit_isp(pairs, replace(short, start=start), progress=False)
 
     def distance(isp: DictionaryISP) -> float:
-        curve, wanted = (one.tone_curve()[:, 1] / one.tone_curve()[200, 1] for one in (isp, other))
+        curve, wanted = (tone_table(one)[:, 1] / tone_table(one)[200, 1] for one in (isp, other))
         return float((curve - wanted)[:220].square().mean().sqrt())
 
     if start == "universal":

@@ -28,7 +28,6 @@ from rawaug.isp.fit.start import (
     set_priors,
 )
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.staged import with_white_balance
 from rawaug.metrics import psnr
 
 QUICK = FitConfig(steps=0, curve_steps=20, pixels=2048, batch=512, shading="off")  # the curve is the start's
@@ -77,7 +76,7 @@ def test_two_cameras_in_one_fit_are_reported_apart_by_their_light(
         known = isp.reverse(unseen.srgb[None], white_balance=light)
         isp_of_all = isp.colour.spread.clone()
         isp.colour.spread.fill_(torch.inf)
-        alike = isp.reverse(unseen.srgb[None], with_white_balance(isp, isp.choose(unseen.srgb[None]), light, None))
+        alike = isp.reverse(unseen.srgb[None], isp.with_white_balance(isp.choose(unseen.srgb[None]), light))
         isp.colour.spread.copy_(isp_of_all)
         scores = [psnr(result.raw, unseen.raw[None]).item() for result in (known, alike)]
         assert scores[0] > 48.0 and scores[0] > scores[1] + 10.0

@@ -9,8 +9,8 @@ import torch
 
 from rawaug.data.pairs import Pair
 from rawaug.isp.config import ISPParams
+from rawaug.isp.encoders import THUMBNAIL, AtomEncoder, thumbnail
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.staged import THUMBNAIL, Encoder, thumbnail
 from rawaug.isp.tone import srgb_to_linear
 from rawaug.metrics import psnr
 
@@ -20,7 +20,7 @@ def images() -> torch.Tensor:
 
 
 def test_an_encoder_gives_its_constant_and_with_trained_layers_looks_at_the_picture() -> None:
-    encoder = Encoder(3)
+    encoder = AtomEncoder(3)
     encoder.set_prior(torch.tensor([0.2, 0.3, 0.5]))
     torch.testing.assert_close(encoder(images()), torch.tensor([[0.2, 0.3, 0.5]] * 2))
     encoder.add_layers((4, 4, 4))
@@ -34,7 +34,7 @@ def test_an_encoder_gives_its_constant_and_with_trained_layers_looks_at_the_pict
 
 
 def test_an_atom_of_no_weight_can_come_back() -> None:
-    encoder = Encoder(2)
+    encoder = AtomEncoder(2)
     encoder.set_prior(torch.tensor([1.0, 0.0]))
     weights = encoder(images()[:, :2])
     assert (weights[:, 1] > 0).all() and (weights[:, 1] < 1e-5).all()
