@@ -4,6 +4,9 @@ A pixel is a defect if it lies beyond all its neighbours of the same colour, whi
 other colours, agree with their own neighbours: an edge changes several colours at once, and a lens spreads the smallest
 light over the pixels around it (a spread of 0.4 pixels puts an eighth of the peak into each of the four beside it), but
 a defect changes one pixel. It is replaced by the mean of its neighbours, leaving out the lowest and the highest.
+
+Texture that is as fine as pixels has single ones that pass for defects, and many more that nearly do; defects stand out
+clearly. An image in which more than twice as many nearly do as do is therefore left alone.
 """
 
 from __future__ import annotations
@@ -20,6 +23,8 @@ SHARE = 0.15
 """This share of the neighbours' value is added to that distance."""
 ALONE = 4.0
 """A defect departs from its neighbours at least this many times as far as the pixels that touch it, one excepted."""
+NEARLY_ALONE = 2.0
+"""Where many pixels depart this many times as far, those that depart further are the finest texture, not defects."""
 SPREAD = 0.1
 """The four pixels beside a light depart with it by this share, on average, or more; those beside a defect do not."""
 
@@ -45,14 +50,18 @@ def mend_planes(signal: Tensor) -> Tensor:
         distance = neighbour.abs()
         second_largest = torch.maximum(second_largest, torch.minimum(largest, distance))
         largest = torch.maximum(largest, distance)
-    is_alone = departure.abs() > ALONE * second_largest
-
     above, left, right, below = touching[1], touching[3], touching[4], touching[6]
     beside = (above + left + right + below) / 4
     is_spread = beside * departure.sign() >= SPREAD * departure.abs()
 
-    is_defect = F.pixel_unshuffle((is_alone & ~is_spread).to(signal.dtype), 2) > 0
-    return torch.where(_is_beyond(signal, low, high) & is_defect, mean, signal)
+    is_candidate = ~is_spread & (F.pixel_shuffle(_is_beyond(signal, low, high).to(signal.dtype), 2) > 0)
+    is_defect = is_candidate & (departure.abs() > ALONE * second_largest)
+    is_nearly = is_candidate & (departure.abs() > NEARLY_ALONE * second_largest)
+    count, count_nearly = (mask.to(signal.dtype).sum((1, 2, 3), keepdim=True) for mask in (is_defect, is_nearly))
+    is_texture = count_nearly > 2 * count + 1
+
+    replaced = F.pixel_unshuffle((is_defect & ~is_texture).to(signal.dtype), 2) > 0
+    return torch.where(replaced, mean, signal)
 
 
 def mend_mosaic(signal: Tensor, planes: Tensor) -> Tensor:

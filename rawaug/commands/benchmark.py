@@ -20,6 +20,7 @@ def run(
     noise: Annotated[str | list[str] | tuple[float, float] | dict[str, Any] | None, YAML] = None,
     iso: list[float] | None = None,
     seed: int = 0,
+    harm: bool = False,
     device: str = "cpu",
     json: str | None = None,
     report: str | None = None,
@@ -45,6 +46,8 @@ def run(
             camera's .yaml sheet, or a law of your own as {name: MeasuredNoise, levels: ...}.
         iso: ISO values of that camera or law, one column for each.
         seed: seed of the noise.
+        harm: also measure where denoisers harm: at the base ISO of a full-frame camera, at small lights, by width and
+            place, and beside hot pixels.
         device: device for networks: cpu, cuda, ...
         json: write the result as JSON to this file.
         report: write an HTML page with tables and crops to this file.
@@ -60,7 +63,7 @@ def run(
             require_output(path, overwrite, extensions, inputs)
 
     comparison = BenchmarkSettings(
-        denoisers, data, bin, count, crop, noise, iso, seed, device, json, report, table, figure
+        denoisers, data, bin, count, crop, noise, iso, seed, device, json, report, table, figure, harm
     )
     for option, value in (("count", count), ("crop", crop)):
         if value is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from rawaug.evaluation.benchmark import (
 )
 from rawaug.evaluation.evaluate import named_denoiser
 from rawaug.evaluation.figures import plot_costs, save_picture
+from rawaug.evaluation.harm import harm_tables, measure_harm
 from rawaug.evaluation.page import Figure, Page, command_line
 from rawaug.evaluation.picture_trials import picture_scores, print_pictures
 from rawaug.evaluation.table_files import benchmark_table
@@ -60,6 +61,7 @@ class BenchmarkSettings:
         device: device on which networks run.
         json: file to write the result to; None for none.
         report: page to write tables and crops to; None for none.
+        harm: whether the conditions of :mod:`rawaug.evaluation.harm` are measured, too.
         table: LaTeX file to write the table of known levels to; None for none.
         figure: file to draw crops of some frames into, .pdf or .png; None for none.
     """
@@ -77,6 +79,7 @@ class BenchmarkSettings:
     report: str | None = None
     table: str | None = None
     figure: str | None = None
+    harm: bool = False
 
 
 def compare_raw(comparison: BenchmarkSettings) -> None:
@@ -102,8 +105,10 @@ def compare_raw(comparison: BenchmarkSettings) -> None:
         "weights_sha256": _hash_weights(denoisers),
     }
     result = {**facts, **benchmark(denoisers, cases)}
+    if comparison.harm:
+        result["harm"] = measure_harm(denoisers, frames, crop, comparison.seed)
 
-    for title, head, cells in tables(result):
+    for title, head, cells in _all_tables(result):
         print_cells(title, ["denoiser", *head], cells)
 
     for line in ranking(result):
@@ -133,7 +138,7 @@ def compare_pictures(comparison: BenchmarkSettings) -> None:
         ValueError: if a setting is not the default that has no meaning for pictures.
     """
     usual = BenchmarkSettings(comparison.denoisers, comparison.data)
-    for key in ("bin", "noise", "iso", "seed", "report", "table", "figure"):
+    for key in ("bin", "noise", "iso", "seed", "report", "table", "figure", "harm"):
         if getattr(comparison, key) != getattr(usual, key):
             raise ValueError(f"{comparison.data}: has developed pictures; --{key} is for RAW")
 
@@ -173,6 +178,13 @@ def _hash_weights(denoisers: Sequence[RawDenoiser]) -> dict[str, str]:
     return hashes
 
 
+def _all_tables(result: dict[str, Any]) -> Iterator[tuple[str, list[str], dict[str, list[str]]]]:
+    """Yield the tables of the strengths, and those of where denoisers harm if that was measured."""
+    yield from tables(result)
+    if "harm" in result:
+        yield from harm_tables(result["harm"])
+
+
 def _make_notes(result: dict[str, Any]) -> list[str]:
     """Make the lines below the tables."""
     summaries = {}
@@ -181,6 +193,9 @@ def _make_notes(result: dict[str, Any]) -> list[str]:
             continue
         for strength, scores in row["scores"][TOLD].items():
             summaries[f"{name} ({strength})"] = scores
+        if "harm" in result:
+            for column, scores in result["harm"][name]["frames"].items():
+                summaries[f"{name} ({column})"] = scores
 
     frames = count_of(len(result["frames"]), "frame")
     notes = [f"{frames}; GMAC and seconds are per megapixel of the mosaic; sRGB scores follow one fixed development."]
@@ -201,7 +216,7 @@ def _make_page(
     """Make the page: tables, quality over cost, and crops of some frames by every denoiser."""
     page = Page(f"Denoisers on {comparison.data}", result["noise"])
     page.add(texts=notes)
-    for title, head, cells in tables(result):
+    for title, head, cells in _all_tables(result):
         page.add(title, head=["", *head], rows=cells)
 
     strength = display_strength(choose_strengths(comparison.noise, comparison.iso))
