@@ -31,7 +31,7 @@ def run(
     self_ensemble: bool = False,
     greens: Greens = "auto",
     defects: str = "mend",
-    guard: Literal["on", "off"] = "off",
+    guard: Literal["auto", "on", "off"] = "auto",
     device: str = "auto",
     preview: str | None = None,
     json: str | None = None,
@@ -62,8 +62,9 @@ def run(
         defects: mend replaces single hot and dead pixels, as every shipped network does; keep leaves such sites as they
             are, for small stars; or a map of the sensor's defects, of rawaug defects or dcraw's .badpixels, whose sites
             are replaced while all others are kept.
-        guard: on blends the result of a Bayer mosaic with its input where it is estimated to be worse, as at a camera's
-            base ISO or at a small light; it takes two more passes over a sample of the frame.
+        guard: on blends the result of a Bayer mosaic with its input, and with NonLocalMeans, where it is estimated to
+            be worse, as at a camera's base ISO or at a small light; it takes two more passes over a sample of the
+            frame; auto does so for networks, off for none.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         preview: also write the result, developed by LibRaw, as this .jpg or .png; for a folder, write a JPEG of each
             result to this folder.
@@ -82,7 +83,7 @@ def run(
         self_ensemble=self_ensemble,
         greens=greens,
         defects=defects,
-        guard=guard == "on",
+        guard=None if guard == "auto" else guard == "on",
         device=device,
     )
 

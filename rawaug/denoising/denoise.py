@@ -25,7 +25,7 @@ def denoise(
     self_ensemble: bool = False,
     greens: Greens = "auto",
     defects: str | Path = "mend",
-    guard: bool = False,
+    guard: bool | None = None,
     device: str = "auto",
     preview: str | Path | None = None,
     overwrite: bool = False,
@@ -47,7 +47,8 @@ def denoise(
         defects: ``"mend"`` leaves single hot and dead pixels to the denoiser, which replaces them; ``"keep"`` keeps
             them, as stars are; or the file of a map of defects, whose sites are replaced while others are kept, see
             :func:`rawaug.find_defects`.
-        guard: blend the result of a Bayer mosaic with its input where it is estimated to be worse than that.
+        guard: blend the result of a Bayer mosaic with its input, and with non-local means, where it is estimated to be
+            worse than that; None guards networks.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         preview: a .jpg or .png of the result of RAW to write as well, developed by LibRaw.
         overwrite: replace ``out`` and ``preview`` if they exist.
@@ -96,7 +97,7 @@ def files_for(
     self_ensemble: bool = False,
     greens: Greens = "auto",
     defects: str | Path = "mend",
-    guard: bool = False,
+    guard: bool | None = None,
     device: str = "auto",
 ) -> Files[Any]:
     """Say how the files of a source are denoised: by its content; a folder is of pictures if it has no RAW file.
@@ -124,7 +125,7 @@ def files_for(
         ("linear", linear),
         ("greens", greens != "auto"),
         ("defects", defects != "mend"),
-        ("guard", guard),
+        ("guard", guard is not None),
         ("noise", noise != "auto"),
     ):
         if is_set:

@@ -1,12 +1,16 @@
 r"""A denoised frame that is never estimated to be worse than its input.
 
-.. math:: g = y + w (f(y) - y), \qquad w = \rho \frac{\sum_i \sigma_i^2 (1 - \partial f_i / \partial y_i)}
-          {\sum_i (f_i(y) - y_i)^2}, \quad 0 \le w \le 1
+.. math:: g = y + \sum_k w_k (f_k(y) - y), \qquad w = \arg\min_{w_k \ge 0,\; \sum w_k \le 1} \; w^T G w
+          - 2 \rho\, b^T w
 
-w is where the estimated squared error of g (:mod:`rawaug.denoising.risk`) is least. A denoiser that removes nothing but
-noise has w = 1; one that removes texture as well removes more energy than noise explains, and w falls. The ratio is
-taken over the frame, from a sample of it, and again over small places: where what was removed is more than ten times
-what noise explains, as at a light that was taken for a defect, the place has its own w.
+.. math:: G_{kl} = \sum_i \frac{(f_{k,i} - y_i)(f_{l,i} - y_i)}{\sigma_i^2}, \qquad
+          b_k = \sum_i \Big(1 - \frac{\partial f_{k,i}}{\partial y_i}\Big)
+
+Here the estimated squared error of g (:mod:`rawaug.denoising.risk`), in units of the noise's variance, is least. A
+denoiser that removes nothing but noise has :math:`w = \rho b / G = 1` and is left as it is; one that removes texture as
+well removes more energy than noise explains, and is blended with its input and with non-local means, which spare weak
+texture. The sums are over a sample of the frame. Where more than ten times what noise explains was removed, as at a
+light that was taken for a defect, the place has its own, smaller share.
 
 Stated levels may be wrong, and then w would be. :math:`\rho` is the variance of the noise in units of the stated one,
 from places that are flat; texture that is as fine and as even as noise passes for it, and then w is too high. Single
@@ -16,6 +20,7 @@ defective pixels are mended first, for they are no texture.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,16 +30,20 @@ from denoisers.defects import mend_planes
 from denoisers.domains import DOMAINS
 from rawaug.bayer import noise_variance
 from rawaug.denoising.base import Noisy
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.denoising.risk import Probe, probe_denoiser
 
-SAMPLE = 4, 128
-"""The frame is probed at as many places down and across, of this side in cells: a megapixel of the mosaic."""
+SECOND = "NonLocalMeans"
+"""The filter with which a denoiser that removes texture is blended."""
+
+SAMPLE = 3, 128
+"""The frame is probed at as many places down and across, of this side in cells: 0.6 megapixels of the mosaic."""
 
 TRUSTED = 0.92
-"""A denoiser with a larger w is trusted with all of the frame: the estimate is not more precise than that."""
+"""A denoiser with a larger w is left as it is: the estimate is not more precise than that."""
 
 EXCESS = 10.0
-"""A place has its own w if the energy that was removed is more than this many times what noise explains."""
+"""A place has its own share if the energy that was removed is more than this many times what noise explains."""
 
 MOST_DEFECTS = 1e-3
 """More single pixels than this share are no defects but texture."""
@@ -42,66 +51,107 @@ MOST_DEFECTS = 1e-3
 FLAT_CONTRAST = 0.25
 """A flat place has less contrast than this share of the noise's variance after denoising."""
 
+_STEPS = 40
+"""Weights are multiples of one part in as many."""
+_NOTHING = 1e-3
+"""A denoiser that removes less than this part of the noise's energy is left as it is."""
 _PLACE = 4
 _FLAT = 8
 _LEAST_FLAT = 10
 
 
+class _Blend(NamedTuple):
+    """The weights of the denoiser and of the filter, and the energy per value that noise explains."""
+
+    first: float
+    second: float
+    expected: float
+
+
 @torch.no_grad()
-def guard_result(denoise: Callable[[Noisy], Tensor], noisy: Noisy, denoised: Tensor) -> tuple[Tensor, float]:
-    """Blend a denoised frame with its input where it is estimated to be worse.
+def guard_result(
+    denoise: Callable[[Noisy], Tensor], noisy: Noisy, denoised: Tensor, strength: float = 1.0
+) -> tuple[Tensor, float]:
+    """Blend a denoised frame with its input, and with non-local means, where it is estimated to be worse.
 
     Args:
         denoise: the denoiser, which is called twice on a sample of the frame.
         noisy: packed RAW ``(1, 4, h, w)`` with the levels of its noise.
         denoised: its result, ``(1, 4, h, w)``.
+        strength: what share of the noise it removes.
 
     Returns:
-        The blend, and the mean of w over the frame.
+        The blend, and the mean share of the denoiser in it.
 
     Raises:
         ValueError: if the levels of the noise are not known.
     """
     if noisy.levels is None:
         raise ValueError("guard: needs the levels of the noise")
-    share, expected = _compute_share(denoise, noisy)
+    second = RawDenoiser.of(SECOND, strength=strength)
+    blend = _choose_blend(denoise, second, noisy)
+
+    mended = _mend(noisy, denoised)
+    change = blend.first * (denoised - mended)
+    if blend.second > 0.0:
+        change += blend.second * (second(noisy) - mended)
 
     # Where more was removed than noise can explain, the place is nearly as its input.
-    mended = _mend(noisy, denoised)
     variance = noise_variance(denoised, *noisy.levels).clamp_min(1e-12)
-    removed = ((denoised - mended).square() / variance).mean(1, keepdim=True)
+    removed = (change.square() / variance).mean(1, keepdim=True)
     energy = F.avg_pool2d(removed, _PLACE, ceil_mode=True, count_include_pad=False)
-    of_place = (expected / energy.clamp_min(1e-6)).clamp(max=share)
-    shares = of_place.where(energy > EXCESS * expected, torch.tensor(share))
-    shares = F.interpolate(shares, size=removed.shape[-2:], mode="bilinear")
-    return mended + shares * (denoised - mended), float(shares.mean())
+    share = (blend.expected / energy.clamp_min(1e-6)).clamp(max=1.0)
+    share = share.where(energy > EXCESS * blend.expected, torch.tensor(1.0))
+    share = F.interpolate(share, size=removed.shape[-2:], mode="bilinear")
+    return mended + share * change, blend.first * float(share.mean())
 
 
-def _compute_share(denoise: Callable[[Noisy], Tensor], noisy: Noisy) -> tuple[float, float]:
-    """Compute w of the frame, and the energy that noise explains per value, in units of the stated variance."""
-    assert noisy.levels is not None
-    removed = explained = count = flat_removed = flat_explained = 0.0
+def _choose_blend(denoise: Callable[[Noisy], Tensor], second: Callable[[Noisy], Tensor], noisy: Noisy) -> _Blend:
+    """Choose the weights for a frame; the filter is run only if the denoiser cannot be trusted alone."""
+    parts = []
+    count = flat_removed = flat_explained = 0.0
+    product = torch.zeros(2, 2)
+    explained = torch.zeros(2)
+
     for patch in _sample(noisy.image):
+        assert noisy.levels is not None
         part = Noisy.of(patch, noisy.levels, noisy.cfa)
         probe = probe_denoiser(denoise, part)
         mended = _mend(part, probe.denoised)
-        energy = (probe.denoised - mended).square() / probe.variance
+        removed = probe.denoised - mended
         is_whole = (probe.denoised < 1.0 - 4.0 * probe.variance.sqrt()) & (mended == patch)
+        weight = is_whole / probe.variance
+        parts.append((part, mended, removed, weight, is_whole))
+
         count += float(is_whole.sum())
-        removed += float((energy * is_whole).sum())
-        explained += float(((1.0 - probe.kept) * is_whole).sum())
+        product[0, 0] += (removed.square() * weight).sum()
+        explained[0] += ((1.0 - probe.kept) * is_whole).sum()
 
         is_flat = _flat_places(probe)
-        flat_removed += float(_pool(energy)[is_flat].sum())
+        flat_removed += float(_pool(removed.square() / probe.variance)[is_flat].sum())
         flat_explained += float(_pool(1.0 - probe.kept)[is_flat].sum())
 
     scale = 1.0
     if flat_explained >= _LEAST_FLAT:
         scale = flat_removed / flat_explained
-    share = min(1.0, max(0.0, scale * explained / max(removed, 1e-12)))
-    if share > TRUSTED:
-        share = 1.0
-    return share, scale * min(1.0, max(0.05, explained / max(count, 1.0)))
+    expected = scale * min(1.0, max(0.05, float(explained[0]) / max(count, 1.0)))
+    is_trusted = scale * explained[0] > TRUSTED * product[0, 0]
+    if is_trusted or product[0, 0] < _NOTHING * count:
+        return _Blend(1.0, 0.0, expected)
+
+    for part, mended, removed, weight, is_whole in parts:
+        probe = probe_denoiser(second, part)
+        removed_by_second = probe.denoised - mended
+        product[0, 1] += (removed * removed_by_second * weight).sum()
+        product[1, 1] += (removed_by_second.square() * weight).sum()
+        explained[1] += ((1.0 - probe.kept) * is_whole).sum()
+    product[1, 0] = product[0, 1]
+
+    steps = torch.cartesian_prod(torch.arange(_STEPS + 1), torch.arange(_STEPS + 1))
+    weights = steps[steps.sum(1) <= _STEPS] / _STEPS
+    risk = ((weights @ product) * weights).sum(1) - 2.0 * scale * (weights @ explained)
+    first, filtered = weights[risk.argmin()].tolist()
+    return _Blend(first, filtered, expected)
 
 
 def _sample(image: Tensor) -> list[Tensor]:

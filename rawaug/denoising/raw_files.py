@@ -34,7 +34,7 @@ from rawaug.denoising.base import Noisy
 from rawaug.denoising.defects import find_lone_sites, mend_sites, read_defects
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.denoising.files import Files
-from rawaug.denoising.guard import guard_result
+from rawaug.denoising.guard import SECOND, guard_result
 from rawaug.denoising.levels import Noise, as_json, find_levels, load_noise
 from rawaug.errors import count_of, escape
 from rawaug.files import sha256
@@ -148,7 +148,7 @@ class Denoised:
     def _losses(self) -> str:
         line = ""
         if self.blended < 0.995:
-            line += f"; blended with its input, {self.blended:.0%} of what was removed stays removed"
+            line += f"; blended with its input and {SECOND}, the denoiser has {self.blended:.0%}"
         if self.below_zero:
             line += f"; {self.below_zero:.2%} below digital number 0, written as 0"
         return line
@@ -168,7 +168,7 @@ class RawFiles(Files[Denoised]):
             them as they are; or the file of a map (:mod:`rawaug.denoising.defects`), whose sites are replaced while
             all others are kept.
         guard: whether a result that is estimated to be worse than its input is blended with it
-            (:mod:`rawaug.denoising.guard`); for Bayer mosaics with known levels.
+            (:mod:`rawaug.denoising.guard`); for Bayer mosaics with known levels. None guards networks.
         device: where a network runs: auto, cpu, cuda, ...
 
     Raises:
@@ -194,7 +194,7 @@ class RawFiles(Files[Denoised]):
         self_ensemble: bool = False,
         greens: Greens = "auto",
         defects: str | Path = "mend",
-        guard: bool = False,
+        guard: bool | None = None,
         device: str = "auto",
     ) -> None:
         if greens not in get_args(Greens):
@@ -228,6 +228,8 @@ class RawFiles(Files[Denoised]):
         self.sites: Tensor | None = None
         if defects not in ("mend", "keep"):
             self.sites = read_defects(defects)
+        if guard is None:
+            guard = denoiser.reads_levels and not denoiser.demosaics and "classical" not in denoiser.settings
         self.guard = guard
         self.noise = load_noise(noise, denoiser)
 
@@ -245,8 +247,8 @@ class RawFiles(Files[Denoised]):
             settings["defects_sha256"] = sha256(Path(self.defects))
         elif self.defects != "mend":
             settings["defects"] = self.defects
-        if self.guard:
-            settings["guard"] = True
+        if not self.denoiser.demosaics:
+            settings["guard"] = self.guard
         if self.denoiser.strength != 1.0:
             settings["strength"] = self.denoiser.strength
         return settings
@@ -307,9 +309,10 @@ class RawFiles(Files[Denoised]):
         # The result: full colour, or a mosaic that digital numbers can hold, with the noise that is left.
         image = denoiser.frame(mosaic, levels)
         blended = 1.0
-        if self.guard and levels is not None and mosaic.cfa in CFA.__members__:
+        if self.guard and denoiser.strength > 0 and levels is not None and mosaic.cfa in CFA.__members__:
             noisy = Noisy.of(bayer.pack(mosaic.mosaic[None], mosaic.cfa), levels, mosaic.cfa)
-            guarded, blended = guard_result(denoiser, noisy, bayer.pack(image[None], mosaic.cfa))
+            packed = bayer.pack(image[None], mosaic.cfa)
+            guarded, blended = guard_result(denoiser, noisy, packed, denoiser.strength)
             image = bayer.unpack(guarded, mosaic.cfa)[0].clamp(max=1.0)
         if self.defects != "mend" and levels is not None:
             lone = find_lone_sites(mosaic, levels)

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import rawaug
+from denoisers.defects import mend_planes
 from rawaug import RawDenoiser, bayer
 from rawaug.denoising.base import Noisy
 from rawaug.denoising.guard import guard_result
@@ -76,15 +77,40 @@ def test_a_light_is_given_back_and_a_hot_pixel_is_not() -> None:
     assert guarded[0, 1, 90, 90] < 0.5
 
 
-def test_a_frame_is_guarded_on_request() -> None:
+def test_a_denoiser_that_changes_nothing_is_left_alone() -> None:
+    noisy = noisy_of(textured(0.08))
+    guarded, share = guard_result(lambda part: part.image.clone(), noisy, noisy.image)
+    assert share == 1.0
+    torch.testing.assert_close(guarded, noisy.image)
+
+
+def test_where_texture_is_removed_non_local_means_help() -> None:
+    clean = flat()
+    clean[..., 24::3] += 0.05  # stripes, which the filter finds again
+    noisy = noisy_of(clean)
+    second = RawDenoiser.of("NonLocalMeans")(noisy)
+    guarded, share = guard_result(mean, noisy, mean(noisy))
+    assert share < 0.5
+    assert error(guarded, clean) < 1.02 * min(
+        error(noisy.image, clean), error(second, clean), error(mean(noisy), clean)
+    )
+
+
+def test_lone_pixels_of_texture_stay_texture() -> None:
+    clean = textured(0.15).clamp(max=0.9)
+    signal = clean / 0.01  # hardly any noise
+    assert torch.equal(mend_planes(signal), signal)
+
+
+def test_a_frame_is_guarded_unless_told_otherwise() -> None:
     clean = textured(0.08)
     mosaic = bayer.unpack(noisy_of(clean).image, "RGGB")[0].clamp(max=1.0)
     frame = RawFrame(mosaic, "RGGB", floating=True)
-    denoiser = RawDenoiser.of(lambda noisy: mean(Noisy(noisy)), name="mean")
+    denoiser = RawDenoiser.of(lambda noisy, variance: mean(Noisy(noisy)), name="mean")
     results = {}
-    for guard in (False, True):
+    for guard in (False, True, None):
         result = rawaug.denoise(frame, denoiser=denoiser, noise=LEVELS, guard=guard)
         results[guard] = error(bayer.pack(result.mosaic[None], "RGGB"), clean)
-    assert results[True] < 0.5 * results[False]
+    assert results[None] == results[True] < 0.5 * results[False]
     with pytest.raises(ValueError, match="levels"):
         guard_result(mean, Noisy(clean), clean)
