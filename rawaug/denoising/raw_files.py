@@ -77,6 +77,12 @@ class Corrected:
         words = ""
         if self.greens is not None and self.balanced:
             words += f", greens differed by {self.greens.share:.2%} +- {self.greens.error:.2%}, balanced"
+        return words + self.defects
+
+    @property
+    def defects(self) -> str:
+        """What was done about single sites, for the line of the file."""
+        words = ""
         if self.mended:
             words += f", {count_of(self.mended, 'defect')} of the map mended"
         if self.kept:
@@ -131,6 +137,7 @@ class Denoised:
         line = f"{escape(self.out)}: {noise}"
         if self.corrected.balanced:
             line += ", greens balanced"
+        line += self.corrected.defects
         line += f", {self.seconds:.1f} s"
         if is_uncertain:
             line += "; the estimate is uncertain"
