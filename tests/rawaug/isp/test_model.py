@@ -196,9 +196,9 @@ def test_the_forward_encoders_are_asked_after_the_shading_is_corrected() -> None
 
 def test_atoms_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
     isp = DictionaryISP(ISPConfig(colour_atoms=2, gain_atoms=2))
-    isp.info["held_out"] = [float("nan")]
+    isp.info["held_out"] = [{"blind": float("nan")}]
     isp.save(tmp_path / "a.safetensors")
-    assert DictionaryISP.from_pretrained(tmp_path / "a.safetensors").info["held_out"] == [None]
+    assert DictionaryISP.from_pretrained(tmp_path / "a.safetensors").info["held_out"] == [{"blind": None}]
     with torch.no_grad():
         isp.gain.log_gains.fill_(1000.0)  # finite, but their exponentials are not
     isp.save(tmp_path / "a.safetensors")
