@@ -250,7 +250,7 @@ class DRUNet(ResidualUNet):
         self.patch = patch
         self.light = light or not self.reads_variance
         if self.light:
-            self.turns = 2
+            self.views = 2
 
         planes = self.channels * patch**2
         self.add_layers(self.inputs * patch**2 + self.light * planes, planes, planes)

@@ -88,7 +88,7 @@ class Denoiser(nn.Module, ABC):
     """These settings may be larger than those of the network whose weights a training starts from."""
     layerless: ClassVar[frozenset[str]] = frozenset()
     """No layer depends on these settings, so a training may start from weights that have others."""
-    turns: int = 1
+    views: int = 1
     """This many turned views of a developed picture, 1, 2, 4 or 8, are averaged if nothing else is asked for."""
     upscale: ClassVar[int] = 1
     """The result's sides are this many times those of packed RAW: 2 if it is demosaiced, ``(B, 3, 2h, 2w)``."""

@@ -23,11 +23,11 @@ from rawaug.bayer.cfa import (
 from rawaug.bayer.demosaicing import DIRECTIONAL, METHODS, STENCILS, demosaic, demosaicing_stencils, require_method
 from rawaug.bayer.greens import GreenDifference, balance_greens, measure_greens
 from rawaug.bayer.patterns import PATTERNS, Pattern, canonical_cfa, pattern, pattern_name, plane_indices
-from rawaug.bayer.transforms import Pack, RandomCrop, RandomTurn
+from rawaug.bayer.transforms import Pack, RandomCrop, RandomView
 
 __all__ = [
     "CFA", "DIRECTIONAL", "METHODS", "N_VIEWS", "PATTERNS", "STENCILS", "GreenDifference", "Halving", "Pack",
-    "Pattern", "RandomCrop", "RandomTurn", "balance_greens", "bin_mosaic", "bin_mosaic_variance", "bin_packed",
+    "Pattern", "RandomCrop", "RandomView", "balance_greens", "bin_mosaic", "bin_mosaic_variance", "bin_packed",
     "canonical_cfa", "crop", "crop_to_cfa", "demosaic", "demosaicing_stencils", "measure_greens", "mosaic",
     "noise_variance", "pack", "pack_if_bayer", "pack_rgb", "pattern", "pattern_name", "plane_indices",
     "require_method", "sites_per_value", "to_bayer", "turn", "turn_back", "unpack", "unpack_if_packed",

@@ -87,7 +87,7 @@ class RandomCrop(_Transform):
         return self._apply_params(raw, self.sample(raw.shape[-2], raw.shape[-1], self._own(generator)))
 
 
-class RandomTurn(_Transform):
+class RandomView(_Transform):
     """Flips or turns mosaics ``(..., H, W)`` in one of eight ways, the same for the whole tensor.
 
     Args:
@@ -97,7 +97,7 @@ class RandomTurn(_Transform):
         seed: of its own draws, where no generator is passed.
 
     Example:
-        >>> turn = RandomTurn("GRBG")
+        >>> turn = RandomView("GRBG")
         >>> turn.apply(torch.rand(1, 1, 8, 12), torch.tensor(2)).shape
         torch.Size([1, 1, 6, 12])
     """

@@ -70,7 +70,7 @@ class ImageDenoiser(ABC):
         network: the network that computes, if it is a PyTorch network.
         info: what its file says of its training.
         reads_levels: whether noise levels make a difference.
-        views: number of turns of the image that are averaged, at that many times the work.
+        views: number of views of the image that are averaged, at that many times the work.
         strength: how much of the noise is removed, 1 by default.
         device: where it runs.
         mixed: whether it computes in bfloat16.

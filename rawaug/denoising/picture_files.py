@@ -46,7 +46,7 @@ class PictureFiles(Files[DenoisedPicture]):
     Args:
         denoiser: whatever :meth:`rawaug.denoising.pictures.PictureDenoiser.of` takes; None for the shipped one.
         strength: a factor on the estimated level of the noise.
-        self_ensemble: whether eight turns are averaged.
+        self_ensemble: whether eight views are averaged.
         device: where a network runs: auto, cpu, cuda, ...
 
     Raises:

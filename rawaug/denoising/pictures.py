@@ -7,7 +7,7 @@ applied. Both are estimated from the picture, see :mod:`rawaug.denoising.picture
 user says otherwise.
 
 A network that estimates the level sees the picture twice, upright and turned by a quarter, and the two results are
-averaged. This gains half of what the self-ensemble does, which is the mean of eight turns, as for RAW.
+averaged. This gains half of what the self-ensemble does, which is the mean of eight views, as for RAW.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _TILE = 1024
 """Side of a tile; without tiles, the default denoiser needs more than 2 GB for 12 megapixels."""
 _LOWEST = 1e-4
 """The lowest level that a filter is told, since it divides by it."""
-TURNS = {1: (0,), 2: (0, 5), 4: range(4), 8: range(bayer.N_VIEWS)}
+VIEWS = {1: (0,), 2: (0, 5), 4: range(4), 8: range(bayer.N_VIEWS)}
 """The views that are averaged, by the number of views."""
 
 
@@ -48,7 +48,8 @@ class PictureDenoiser(ImageDenoiser):
         run: ``run(srgb, noise) -> srgb``, called on ``device`` with the noise that is told or estimated.
         estimate: estimates the level of a picture where none is told.
         level: the level that it is told every time; None for the estimate.
-        views: 1, 2, 4 or 8 turns of the picture; by default as many as the network asks for.
+        views: number of flips and quarter turns of the picture that are averaged, 1, 2, 4 or 8; by default as many as
+            the network asks for.
         strength: factor on the estimated level, 0 to 10: 2 removes more, 0.5 less, 0 nothing.
 
     The other attributes are those of :class:`rawaug.denoising.base.ImageDenoiser`.
@@ -68,7 +69,7 @@ class PictureDenoiser(ImageDenoiser):
     level: float | None = None
 
     def __post_init__(self) -> None:
-        if self.views not in TURNS:
+        if self.views not in VIEWS:
             raise ValueError(f"views must be 1, 2, 4 or 8, got {self.views!r}")
         if not 0.0 <= self.strength <= 10.0:
             raise ValueError(f"strength must be between 0 and 10, got {self.strength}")
@@ -99,7 +100,7 @@ class PictureDenoiser(ImageDenoiser):
         srgb = noisy.image.to(self.device)
         total = torch.zeros_like(srgb)
         with self._precision():
-            for view in TURNS[self.views]:
+            for view in VIEWS[self.views]:
                 denoised = self._denoise(bayer.turn(srgb, view).contiguous())
                 total += bayer.turn_back(denoised, view)
 
@@ -107,7 +108,7 @@ class PictureDenoiser(ImageDenoiser):
         return self._require_sound(mean, noisy.image, noisy.image.shape)
 
     def _denoise(self, srgb: Tensor) -> Tensor:
-        """One turn of the picture at the level that is told, or at the one that is estimated."""
+        """One view of the picture at the level that is told, or at the one that is estimated."""
         if not self.reads_levels:
             return self.run(srgb, PictureLevel(0.0, 1.0))
         if self.level is None and self.strength == 0.0:
@@ -142,7 +143,7 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> Pictu
         run=partial(run, network),
         estimate=partial(estimate_level, network),
         reads_levels=reads_levels,
-        views=getattr(network, "turns", 1),
+        views=getattr(network, "views", 1),
     )
 
 

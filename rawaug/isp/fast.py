@@ -32,7 +32,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import BatchParams, Stage, Tables, node_colours
 from rawaug.isp.tone import STEPS, to_code
 from rawaug.kernels import fastest
-from rawaug.kernels.reference import Camera, Display, blur_taps, fall_off, look_up, mask_frame, render, unprocess
+from rawaug.kernels.reference import Display, Unprocessing, blur_taps, fall_off, look_up, mask_frame, render, unprocess
 from rawaug.kernels.runtime import one_thread
 
 NODES = 65
@@ -90,7 +90,7 @@ class BakedISP(nn.Module):
         """
         _require_batch(srgb, params, place, blur)
 
-        camera = self._camera(srgb, params, place, blur)
+        camera = self._unprocessing(srgb, params, place, blur)
         size = srgb.shape[-2], srgb.shape[-1]
         gain = _place_gain(self.isp.ordered_stages, params, place, size, self.table, forward=False)
         if gain is None:
@@ -126,7 +126,7 @@ class BakedISP(nn.Module):
         """
         _require_batch(srgb, params, place, blur)
 
-        camera = self._camera(srgb, params, place, blur)
+        camera = self._unprocessing(srgb, params, place, blur)
         gain = None
         if shaded:
             size = srgb.shape[-2], srgb.shape[-1]
@@ -151,7 +151,7 @@ class BakedISP(nn.Module):
     @torch.no_grad()
     def shade(self, x4: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor:
         """Apply the shading and attention of the lens to x4 ``(B, 3, H, W)``; the result is x5."""
-        camera = self._camera(x4, params, place)
+        camera = self._unprocessing(x4, params, place)
         x5 = x4
 
         mask = fall_off(camera, 0, *x4.shape[-2:])
@@ -166,7 +166,9 @@ class BakedISP(nn.Module):
             x5 = x5 * gain
         return x5
 
-    def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None, blur: Tensor | None = None) -> Camera:
+    def _unprocessing(
+        self, srgb: Tensor, params: ISPParams, place: Tensor | None, blur: Tensor | None = None
+    ) -> Unprocessing:
         table = self.table
         matrix, floor, frame, curves, shading = _batch_params(self.isp.ordered_stages, srgb, params, place, table)
         if curves.numel():
@@ -185,7 +187,9 @@ class BakedISP(nn.Module):
         taps = table.new_empty(len(srgb), 0)
         if blur is not None:
             taps = blur_taps(blur.to(table))
-        return Camera(table, curves, self.attention, colour, knee or 0.0, frame, shading, torch.tensor(sites), taps)
+        return Unprocessing(
+            table, curves, self.attention, colour, knee or 0.0, frame, shading, torch.tensor(sites), taps
+        )
 
 
 class FastForward(nn.Module):
@@ -394,7 +398,7 @@ def _place_gain(
     return F.interpolate(gain, size, mode="bilinear", align_corners=True)
 
 
-def _pass(srgb: Tensor, camera: Camera, white: float) -> Tensor:
+def _pass(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
     if srgb.dtype != torch.uint8:
         srgb = srgb.float()
     return fastest("unprocess", srgb, camera, white, otherwise=lambda: unprocess(srgb, camera, white))

@@ -83,7 +83,7 @@ class BatchParams(NamedTuple):
     Args:
         matrix: ``(B, 3, 3)``, x2 to x3.
         floor: ``(B, 1, 3)``, one over the gains.
-        frame: ``(B, 6)``, where the picture lies; see :class:`rawaug.kernels.reference.Camera`.
+        frame: ``(B, 6)``, where the picture lies; see :class:`rawaug.kernels.reference.Unprocessing`.
         curves: ``(B, T)``, inverse tone curves, or ``(B, 0)`` if the tone is in the tables.
         shading: ``(3,)``, exponents of the mask, or ``(0,)`` without one.
     """

@@ -24,7 +24,7 @@ from torch import Tensor
 from rawaug.bayer import CFA, demosaicing_stencils
 from rawaug.kernels.planes import demosaic_directional as demosaic_directional
 from rawaug.kernels.planes import smooth as smooth
-from rawaug.kernels.reference import INCREMENTS, MULTIPLIERS, ROUNDS, Camera, Display
+from rawaug.kernels.reference import INCREMENTS, MULTIPLIERS, ROUNDS, Display, Unprocessing
 from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
 
 _TILE = 256
@@ -63,7 +63,7 @@ _SINE = _polynomial(1.5167854e-4, -4.6741581e-3, 0.079689927, -0.64596379, 1.570
 """This approximates sin(pi / 2 sqrt(s)) / sqrt(s), within 6.7e-9 on [0, 1]."""
 
 
-def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
+def unprocess(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
     """Convert sRGB ``(B, 3, H, W)``, uint8 or float32 on the CPU, to RAW ``(B, 4, H/2, W/2)`` up to ``white``."""
     batch, _, height, width = srgb.shape
     raw = torch.empty(batch, 4, height // 2, width // 2, dtype=torch.float32)

@@ -12,13 +12,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from rawaug.kernels.reference import Camera
+from rawaug.kernels.reference import Unprocessing
 
 _RAW_BLOCK = 256
 _NOISE_BLOCK = 512
 
 
-def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
+def unprocess(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
     """Convert sRGB ``(B, 3, H, W)``, uint8 or float32 in [0, 1], to packed RAW ``(B, 4, H/2, W/2)`` up to ``white``."""
     batch, _, height, width = srgb.shape
     h, w = height // 2, width // 2

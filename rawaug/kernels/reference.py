@@ -43,8 +43,8 @@ BAND = 2**19
 """A CPU works on this many pixels at a time, which bounds its memory."""
 
 
-class Camera(NamedTuple):
-    """The settings of the reverse pass, float32 on the device of the pictures; an absent part is an empty tensor.
+class Unprocessing(NamedTuple):
+    """The numbers of the reverse pass, float32 on the device of the pictures; an absent part is an empty tensor.
 
     Args:
         table: ``(N, N, N, 4)`` x2 over the sRGB cube, axes B, G, R; the last of the four is not used. Empty if the
@@ -72,7 +72,7 @@ class Camera(NamedTuple):
 
 
 def mask_frame(place: list[int], height: int, width: int, centre: tuple[float, float]) -> list[float]:
-    """Compute one row of :attr:`Camera.frame`.
+    """Compute one row of :attr:`Unprocessing.frame`.
 
     Args:
         place: top, left, height and width of the full frame, and, if the crop was turned or enlarged, its view and how
@@ -104,7 +104,7 @@ def mask_frame(place: list[int], height: int, width: int, centre: tuple[float, f
 
 
 def blur_taps(deviation: Tensor) -> Tensor:
-    """Compute :attr:`Camera.taps` ``(B, 3)`` of deviations ``(B,)`` from 0 to 1 pixel."""
+    """Compute :attr:`Unprocessing.taps` ``(B, 3)`` of deviations ``(B,)`` from 0 to 1 pixel."""
     variance = deviation.square()
     near = 0.5 * variance / (1.0 + variance * variance * variance)
     far = (variance - 2.0 * near) / 8.0
@@ -124,7 +124,7 @@ def blur(light: Tensor, taps: Tensor) -> Tensor:
     return a * left[2] + b * (left[1] + left[3]) + c * (left[0] + left[4])
 
 
-def unprocess(srgb: Tensor, camera: Camera, white: float, band: int = BAND) -> Tensor:
+def unprocess(srgb: Tensor, camera: Unprocessing, white: float, band: int = BAND) -> Tensor:
     """Convert sRGB to packed RAW.
 
     Args:
@@ -200,7 +200,7 @@ class Display(NamedTuple):
         attention: of the same form as ``table``, a gain in the first of the four over the cube of x5; or empty.
         matrix: ``(B, 3, 3)`` x3 to x2.
         gains: ``(B, 4)`` of R, G and B, then the least of them.
-        frame, shading: as of :class:`Camera`.
+        frame, shading: as of :class:`Unprocessing`.
     """
 
     table: Tensor
@@ -243,7 +243,7 @@ def render(linear: Tensor, display: Display) -> Tensor:
     return look_up(display.table, root)[:, :3].clamp(0.0, 1.0)
 
 
-def _linear_light(srgb: Tensor, camera: Camera, top: int, bottom: int) -> Tensor:
+def _linear_light(srgb: Tensor, camera: Unprocessing, top: int, bottom: int) -> Tensor:
     """Compute rows ``top`` to ``bottom`` of x2, blurred."""
     margin = 2 if camera.taps.numel() else 0
     first = max(top - margin, 0)
@@ -258,7 +258,7 @@ def _linear_light(srgb: Tensor, camera: Camera, top: int, bottom: int) -> Tensor
     return x2[:, :, top - first : bottom - first]
 
 
-def _develop(x2: Tensor, camera: Camera, top: int, raw: Tensor) -> None:
+def _develop(x2: Tensor, camera: Unprocessing, top: int, raw: Tensor) -> None:
     """Convert rows of linear light from ``top`` on, and write them to ``raw``."""
     mask = fall_off(camera, top, *x2.shape[-2:])
 
@@ -274,7 +274,7 @@ def _develop(x2: Tensor, camera: Camera, top: int, raw: Tensor) -> None:
             raw[:, plane] = _channels(here, camera, slice(channel, channel + 1), shade)[:, 0]
 
 
-def _channels(x2: Tensor, camera: Camera, channels: slice, mask: Tensor | None) -> Tensor:
+def _channels(x2: Tensor, camera: Unprocessing, channels: slice, mask: Tensor | None) -> Tensor:
     """Compute some channels of x4 times the mask."""
     rows, mean = camera.colour[:, :3], camera.colour[:, 3:4]
     floor, rise = camera.colour[:, 4], camera.colour[:, 5]
@@ -287,7 +287,7 @@ def _channels(x2: Tensor, camera: Camera, channels: slice, mask: Tensor | None) 
     return x4
 
 
-def fall_off(camera: Camera | Display, top: int, height: int, width: int) -> Tensor | None:
+def fall_off(camera: Unprocessing | Display, top: int, height: int, width: int) -> Tensor | None:
     """Compute the mask ``(B, 1, H, W)`` of ``height`` rows of ``width`` pixels from ``top`` on; None without shading.
 
     ``camera`` holds the frames of the pictures and the exponents.

@@ -67,7 +67,7 @@ class Compose(NoiseModel):
 
 _ABSENT = {
     "row_var": 0.0, "column_var": 0.0, "black_offset": 0.0, "colour_bias": 0.0, "dead_share": 0.0, "hot_share": 0.0,
-    "quantum": 0.0, "told": 1.0, "tukey_lambda": 0.14, "green_imbalance": 0.0,
+    "quantum": 0.0, "conditioning": 1.0, "tukey_lambda": 0.14, "green_imbalance": 0.0,
 }  # fmt: skip
 """The values of :class:`SensorNoise`'s parameters if an effect is absent; a shape of 0.14 is near the normal."""
 
@@ -87,7 +87,8 @@ class SensorNoise(Compose):
         dead, hot: shares of defective pixels, or ranges of them; see :class:`DefectPixels`.
         clusters: share of the defects, 0 to 1, whose whole 2 x 2 cell is defective.
         bits, black_level: the grid of digital numbers; see :class:`Quantisation`.
-        told: range of the factor by which the variance map is wrong, as the levels in a file's tags can be.
+        conditioning: range of the factor by which the variance map, which conditions a network, is wrong, as the levels
+            in a file's tags can be.
         share: share of the pictures that have an effect, 0 to 1, drawn for each effect separately. All pictures have
             shot and read noise. Below 1 a denoiser learns real sensors without forgetting ideal ones.
 
@@ -115,12 +116,12 @@ class SensorNoise(Compose):
         clusters: float = 0.0,
         bits: int | tuple[int, ...] | None = None,
         black_level: int = 0,
-        told: tuple[float, float] = (1.0, 1.0),
+        conditioning: tuple[float, float] = (1.0, 1.0),
         share: float = 1.0,
     ) -> None:
-        require_not_negative(told=told)
+        require_not_negative(conditioning=conditioning)
         require_between("share", share, 0.0, 1.0)
-        self.told, self.share = told, share
+        self.conditioning, self.share = conditioning, share
         if isinstance(levels, (str, Sequence, Mapping)):
             levels = noise_levels(levels)
 
@@ -153,8 +154,8 @@ class SensorNoise(Compose):
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         """Draw the parameters of all effects; those that a picture lacks keep their value of absence."""
         params = super().sample(batch, generator)
-        if self.told != (1.0, 1.0):
-            params["told"] = log_uniform(self.told, batch, generator)
+        if self.conditioning != (1.0, 1.0):
+            params["conditioning"] = log_uniform(self.conditioning, batch, generator)
         if self.share < 1:
             for name, absence in _ABSENT.items():
                 if name in params:
@@ -163,11 +164,11 @@ class SensorNoise(Compose):
         return params
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
-        """Add up the variances ``(B, 4, h, w)``, then multiply by the factor ``told``, as a file's tag may be wrong."""
+        """Add up the variances ``(B, 4, h, w)``, then multiply by the factor ``conditioning``."""
         variance = super().variance(clean, params)
-        if "told" not in params:
+        if "conditioning" not in params:
             return variance
-        return variance.mul_(per_picture(params["told"], clean))
+        return variance.mul_(per_picture(params["conditioning"], clean))
 
 
 @NOISE.register("EldNoise")

@@ -159,7 +159,7 @@ class MadeCrops:
         self.cfa = cfa
         self.noise = noise
         self.crop = bayer.RandomCrop(crop)
-        self.turn = bayer.RandomTurn(cfa, keep_cfa=False)
+        self.turn = bayer.RandomView(cfa, keep_cfa=False)
 
     @torch.no_grad()
     def draw(self, generator: torch.Generator) -> Sample:

@@ -147,7 +147,7 @@ def run_paper(paper: Paper, overwrite: bool = False) -> dict[str, Any]:
     write_json({"settings": asdict(paper), "tables": tables}, folder / "paper.json")
     page = write_page(folder, tables, asdict(paper))
     for name, table in tables.items():
-        print_table(TITLES[name], table)
+        print_paper_table(TITLES[name], table)
     print(f"page: {page}")
     return tables
 
@@ -450,7 +450,7 @@ def text_rows(table: Table) -> dict[str, list[str]]:
     return rows
 
 
-def print_table(title: str, table: Table) -> None:
+def print_paper_table(title: str, table: Table) -> None:
     """Print a table with the paper's figures."""
     rows = []
     for name, cells in text_rows(table).items():

@@ -412,13 +412,13 @@ class RawAugment(PairMaker):
         self,
         whole: Any,
         size: tuple[int, int] | None,
-        turns: bool,
+        views: bool,
         generator: torch.Generator,
         zoom: float = 1.0,
         bgr: bool = False,
     ) -> tuple[Tensor, Tensor]:
         """Draw a crop of a picture, and cut it out; see :func:`rawaug.plugin.crops.draw_patch`."""
-        return draw_patch(whole, size, turns, generator, zoom, bgr)
+        return draw_patch(whole, size, views, generator, zoom, bgr)
 
     def cut_patch(self, whole: Any, place: Tensor, size: tuple[int, int] | None, bgr: bool = False) -> Tensor:
         """Cut the patch of a drawn place out of a picture; see :func:`rawaug.plugin.crops.cut_patch`."""

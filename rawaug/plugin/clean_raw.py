@@ -155,7 +155,7 @@ class RawNoise(PairMaker):
         self,
         whole: Any,
         size: tuple[int, int] | None,
-        turns: bool,
+        views: bool,
         generator: torch.Generator,
         zoom: float = 1.0,
         bgr: bool = False,
@@ -165,7 +165,7 @@ class RawNoise(PairMaker):
         Args:
             whole: a frame, in any form that the class lists.
             size: height and width of the crop in pixels of the sensor; None for the whole frame.
-            turns: whether to draw flips and, for a square, quarter turns. A crop that fills its frame is not turned.
+            views: whether to draw flips and, for a square, quarter turns. A crop that fills its frame is not turned.
             generator: a generator on the CPU.
             zoom: must be 1 (ValueError), as RAW cannot be enlarged.
             bgr: must be false (ValueError), as RAW has no such order.
@@ -178,7 +178,7 @@ class RawNoise(PairMaker):
         if zoom != 1.0:
             raise ValueError(f"zoom enlarges pictures, not RAW; got {zoom}")
         mosaic, name = self.read(whole)
-        place = _draw_place(mosaic, pattern(name).period, size, turns, generator)
+        place = _draw_place(mosaic, pattern(name).period, size, views, generator)
         return self.cut_patch(whole, place, size), place
 
     def cut_patch(self, whole: Any, place: Tensor, size: tuple[int, int] | None, bgr: bool = False) -> Tensor:
@@ -231,17 +231,17 @@ class RawNoise(PairMaker):
 
 
 def _draw_place(
-    mosaic: Tensor, period: int, size: tuple[int, int] | None, turns: bool, generator: torch.Generator
+    mosaic: Tensor, period: int, size: tuple[int, int] | None, views: bool, generator: torch.Generator
 ) -> Tensor:
     """Draw top, left, H, W and view ``(5,)`` of a crop that begins at a whole cell of ``period`` lines."""
     height, width = mosaic.shape[-2:]
     rows, columns = size or (height, width)
 
     view = torch.tensor(0)
-    if turns and size is not None:
+    if views and size is not None:
         larger = _with_a_cell(size, period)
         if larger[0] <= height and larger[1] <= width:
-            view = bayer.RandomTurn(CFA.RGGB, quarter=rows == columns).sample(generator)
+            view = bayer.RandomView(CFA.RGGB, quarter=rows == columns).sample(generator)
             if int(view):
                 rows, columns = larger
 
@@ -285,7 +285,7 @@ def _require_raw(raw: Tensor, packed: bool = False) -> Tensor:
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
-class RawFiles(Dataset[Any]):
+class CleanRawFiles(Dataset[Any]):
     """The RAW files of a folder and its subfolders, sorted by path, each a :class:`rawaug.io.RawFrame`.
 
     Args:
@@ -320,5 +320,5 @@ def _open_clean_raw(path: str | Path) -> Any:
     from rawaug.data import open_pairs
 
     if Path(path).exists():
-        return RawFiles(path)
+        return CleanRawFiles(path)
     return open_pairs(str(path))

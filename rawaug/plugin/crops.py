@@ -39,7 +39,7 @@ def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
 def draw_crop(
     frame: tuple[int, int],
     size: tuple[int, int] | None,
-    turns: bool,
+    views: bool,
     generator: torch.Generator,
     zoom: float = 1.0,
 ) -> Tensor:
@@ -48,7 +48,7 @@ def draw_crop(
     Args:
         frame: height and width of the picture, even.
         size: height and width of the crop; None for the whole picture.
-        turns: whether to draw flips and, for a square, quarter turns.
+        views: whether to draw flips and, for a square, quarter turns.
         generator: a generator on the CPU.
         zoom: half of the crops are enlarged by up to this factor.
 
@@ -63,20 +63,20 @@ def draw_crop(
         rows = size[0]
         if share >= 0.5:
             rows = math.ceil(size[0] / 2 * zoom**-exponent) * 2
-        smaller = draw_crop(frame, _region(size, rows), turns, generator)
+        smaller = draw_crop(frame, _region(size, rows), views, generator)
         return torch.cat([smaller, torch.tensor([rows])])
 
     corner = bayer.RandomCrop(region).sample(height, width, generator)
     view = torch.tensor(0)
-    if turns:
-        view = bayer.RandomTurn(bayer.CFA.RGGB, quarter=region[0] == region[1]).sample(generator)
+    if views:
+        view = bayer.RandomView(bayer.CFA.RGGB, quarter=region[0] == region[1]).sample(generator)
     return torch.cat([corner, torch.tensor([height, width]), view[None]])
 
 
 def draw_patch(
     picture: Any,
     size: tuple[int, int] | None,
-    turns: bool,
+    views: bool,
     generator: torch.Generator,
     zoom: float = 1.0,
     bgr: bool = False,
@@ -86,14 +86,14 @@ def draw_patch(
     Args:
         picture: in any form that :mod:`rawaug.plugin.pictures` lists.
         size: height and width of the crop; None for the whole picture.
-        turns, generator, zoom: as for :func:`draw_crop`.
+        views, generator, zoom: as for :func:`draw_crop`.
         bgr: whether the picture's channels are in the order B, G, R.
 
     Returns:
         The patch ``(3, *size)``, uint8 or float32, and its crop ``(5,)`` or ``(6,)``.
     """
     whole = trim_to_even(to_rgb_tensor(picture, bgr))
-    place = draw_crop((whole.shape[-2], whole.shape[-1]), size, turns, generator, zoom)
+    place = draw_crop((whole.shape[-2], whole.shape[-1]), size, views, generator, zoom)
     return cut_patch(whole, place, size), place
 
 
@@ -101,7 +101,7 @@ def read_patch(
     pictures: Any,
     index: int,
     size: tuple[int, int],
-    turns: bool,
+    views: bool,
     generator: torch.Generator,
     zoom: float = 1.0,
     bgr: bool = False,
@@ -111,7 +111,7 @@ def read_patch(
     Args:
         pictures: a dataset with ``read_part``, such as :class:`rawaug.data.PictureFolder`.
         index: of the picture.
-        size, turns, generator, zoom, bgr: as for :func:`draw_patch`, which draws the same crop.
+        size, views, generator, zoom, bgr: as for :func:`draw_patch`, which draws the same crop.
     """
     start = generator.get_state()
     place = torch.zeros(0, dtype=torch.int64)
@@ -121,7 +121,7 @@ def read_patch(
         nonlocal place, fault
         generator.set_state(start)  # another file may stand in for one that turns out to be damaged
         try:
-            place = draw_crop((height // 2 * 2, width // 2 * 2), size, turns, generator, zoom)
+            place = draw_crop((height // 2 * 2, width // 2 * 2), size, views, generator, zoom)
         except ValueError as error:  # the crop is at fault, not the file
             fault = error
             return 0, 0, 2, 2

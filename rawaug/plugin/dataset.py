@@ -52,7 +52,7 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
         *,
         seed: int = 0,
         key: str | int | None = None,
-        turns: bool = True,
+        views: bool = True,
         keys: Keys | None = None,
         fields: Sequence[str] | None = None,
         order: str | Sequence[str] | None = None,
@@ -65,7 +65,7 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
         self.augment = as_augment(augment)
         self.crop = crop_size(crop)
         self.form = pair_form(keys, fields, order)
-        self.seed, self.key, self.turns, self.bgr, self.zoom = seed, key, turns, bgr, zoom
+        self.seed, self.key, self.views, self.bgr, self.zoom = seed, key, views, bgr, zoom
         self.dataset = self._open(dataset)
         self._epochs = self._make_epochs(self.dataset)
 
@@ -187,7 +187,7 @@ class RawPairs(_Pairs[Sample]):
             packed pixels is a crop of 256.
         seed: decides all draws, together with the epoch and the index.
         key: name of the picture in samples that are mappings, its index in tuples (0 by default).
-        turns: whether to draw flips and quarter turns; a crop that is not square is only flipped.
+        views: whether to draw flips and quarter turns; a crop that is not square is only flipped.
         keys: names for the pair's noisy, clean, variance and params, in this order, as many as are wanted. The pair is
             then a dict of these; in samples that are mappings they replace the picture. Or a mapping from names to
             these fields, to ``name`` (the picture's name), ``level`` (the strength of its noise) or ``picture`` (the
@@ -227,7 +227,7 @@ class RawPairs(_Pairs[Sample]):
         *,
         seed: int = 0,
         key: None = None,
-        turns: bool = True,
+        views: bool = True,
         keys: None = None,
         fields: None = None,
         order: str | Sequence[str] | None = None,
@@ -243,7 +243,7 @@ class RawPairs(_Pairs[Sample]):
         *,
         seed: int = 0,
         key: None = None,
-        turns: bool = True,
+        views: bool = True,
         keys: Keys,
         fields: None = None,
         order: str | Sequence[str] | None = None,
@@ -259,7 +259,7 @@ class RawPairs(_Pairs[Sample]):
         *,
         seed: int = 0,
         key: str | int | None = None,
-        turns: bool = True,
+        views: bool = True,
         keys: Keys | None = None,
         fields: Sequence[str] | None = None,
         order: str | Sequence[str] | None = None,
@@ -274,7 +274,7 @@ class RawPairs(_Pairs[Sample]):
         *,
         seed: int = 0,
         key: str | int | None = None,
-        turns: bool = True,
+        views: bool = True,
         keys: Keys | None = None,
         fields: Sequence[str] | None = None,
         order: str | Sequence[str] | None = None,
@@ -287,7 +287,7 @@ class RawPairs(_Pairs[Sample]):
             crop,
             seed=seed,
             key=key,
-            turns=turns,
+            views=views,
             keys=keys,
             fields=fields,
             order=order,
@@ -386,12 +386,12 @@ class RawPairs(_Pairs[Sample]):
             chosen: ISPParams | None = None
             try:
                 if self._reads_parts and self.crop is not None:
-                    cut = read_patch(self.dataset, index, self.crop, self.turns, generator, self.zoom, self.bgr)
+                    cut = read_patch(self.dataset, index, self.crop, self.views, generator, self.zoom, self.bgr)
                 else:
                     sample = self.dataset[index]
                     where = find_picture(sample, self.key)
                     picture = get_picture(sample, where)
-                    cut = self.augment.draw_patch(picture, self.crop, self.turns, generator, self.zoom, self.bgr)
+                    cut = self.augment.draw_patch(picture, self.crop, self.views, generator, self.zoom, self.bgr)
                     chosen = self.augment.look(picture, self.bgr)
             except ValueError as error:
                 raise ValueError(f"picture {index}: {error}") from error
@@ -433,7 +433,7 @@ class RawPairStream(_Pairs[Any], IterableDataset[Any]):
     Args:
         dataset: an iterable of samples, which are as for :class:`RawPairs`. It divides itself between workers, as
             datasets of WebDataset and Hugging Face do, or ``divide`` does. Or the path of a folder of pictures.
-        augment, crop, seed, key, turns, keys, fields, order, bgr, zoom: as for :class:`RawPairs`.
+        augment, crop, seed, key, views, keys, fields, order, bgr, zoom: as for :class:`RawPairs`.
         identity: name or index of the field that identifies a sample, such as ``"__key__"``; it keys the draws.
         divide: give sample i to worker i mod W, for a dataset that every worker would otherwise go through in full.
 
@@ -454,7 +454,7 @@ class RawPairStream(_Pairs[Any], IterableDataset[Any]):
         *,
         seed: int = 0,
         key: str | int | None = None,
-        turns: bool = True,
+        views: bool = True,
         keys: Keys | None = None,
         fields: Sequence[str] | None = None,
         order: str | Sequence[str] | None = None,
@@ -469,7 +469,7 @@ class RawPairStream(_Pairs[Any], IterableDataset[Any]):
             crop,
             seed=seed,
             key=key,
-            turns=turns,
+            views=views,
             keys=keys,
             fields=fields,
             order=order,
@@ -518,7 +518,7 @@ class RawPairStream(_Pairs[Any], IterableDataset[Any]):
         picture = get_picture(sample, where)
 
         try:
-            patch, place = self.augment.draw_patch(picture, self.crop, self.turns, generator, self.zoom, self.bgr)
+            patch, place = self.augment.draw_patch(picture, self.crop, self.views, generator, self.zoom, self.bgr)
             chosen = self.augment.look(picture, self.bgr)
             batch = self.augment.make_pair(patch[None], generator, place[None], chosen)
         except ValueError as error:

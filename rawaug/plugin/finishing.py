@@ -121,14 +121,14 @@ def _between(limits: tuple[float, float], share: Tensor, by_logarithm: bool) -> 
 def _finish(pictures: Tensor, finish: Tensor) -> Tensor:
     """Finish noisy and clean pictures ``(B, 6, H, W)``, colour by colour, as ``finish`` ``(B, 8)`` says."""
     softness, window, share, edge, chroma_blur, mix, amount, radius = finish.cpu().unbind(1)
-    pictures = blur(pictures, softness)
+    pictures = gaussian_blur(pictures, softness)
     red, green, blue = pictures[:, 0::3], pictures[:, 1::3], pictures[:, 2::3]
 
     luma = (0.299 * red).add_(green, alpha=0.587).add_(blue, alpha=0.114)
     chroma = torch.cat([red - luma, blue - luma], dim=1)
-    chroma.lerp_(blur(chroma, chroma_blur), per_picture(mix, chroma))
+    chroma.lerp_(gaussian_blur(chroma, chroma_blur), per_picture(mix, chroma))
     luma = _reduce_noise(luma, window, per_picture(share, luma), per_picture(edge, luma))
-    luma.addcmul_(per_picture(amount, luma), luma - blur(luma, radius))
+    luma.addcmul_(per_picture(amount, luma), luma - gaussian_blur(luma, radius))
 
     torch.add(chroma[:, :2], luma, out=red)
     torch.add(chroma[:, 2:], luma, out=blue)
@@ -148,7 +148,7 @@ def _reduce_noise(luma: Tensor, window: Tensor, share: Tensor, edge: Tensor) -> 
     return luma + share * (flat - (1.0 - mean_weights) * luma)
 
 
-def blur(image: Tensor, deviation: Tensor) -> Tensor:
+def gaussian_blur(image: Tensor, deviation: Tensor) -> Tensor:
     """Blur ``(B, N, H, W)`` with Gaussians of deviations ``(B,)`` in pixels; the edge is repeated outwards."""
     reach = _REACH * deviation[:, None].cpu()
     distance = torch.arange(math.ceil(float(reach.max())) + 1)

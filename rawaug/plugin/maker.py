@@ -73,7 +73,7 @@ class PairMaker(nn.Module, ABC):
         self,
         whole: Any,
         size: tuple[int, int] | None,
-        turns: bool,
+        views: bool,
         generator: torch.Generator,
         zoom: float = 1.0,
         bgr: bool = False,

@@ -76,7 +76,7 @@ class Origin:
     version: str = __version__
 
 
-class PairMaker:
+class Synthesiser:
     """Makes the pairs of pictures under fixed settings; a picture of more than ``max_pixels`` is refused."""
 
     def __init__(self, settings: Settings, max_pixels: int = MAX_PIXELS) -> None:
@@ -183,7 +183,7 @@ class PictureTask:
         self.existing = self.per_image - len(self.numbers)
         self.todo = bool(self.numbers)
 
-    def make(self, maker: PairMaker) -> tuple[int, dict[str, str]]:
+    def make(self, maker: Synthesiser) -> tuple[int, dict[str, str]]:
         """Write the missing pairs; return their number, and the reason if the picture cannot be read."""
         try:
             origin, pairs = maker.pairs(self.picture, self.key, self.numbers)

@@ -29,7 +29,7 @@ from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.config import AugmentConfig
 from rawaug.progress import progress
 from rawaug.synthesis import shards
-from rawaug.synthesis.files import TARGETS, Format, PairMaker, PictureTask, Settings, picture_tasks
+from rawaug.synthesis.files import TARGETS, Format, PictureTask, Settings, Synthesiser, picture_tasks
 from rawaug.synthesis.shards import PER_SHARD, ShardTask
 
 Task = PictureTask | ShardTask
@@ -106,7 +106,7 @@ def synth(
         raise ValueError(f"workers must be at least 0, got {workers}")
     part, parts = parse_shard(shard)
     run_settings = _settings(format, per_image, seed, AugmentConfig(**settings))
-    PairMaker(run_settings, max_pixels)  # raises an error for a wrong name here, not in a worker
+    Synthesiser(run_settings, max_pixels)  # raises an error for a wrong name here, not in a worker
 
     lock = LOCK
     if parts != 1:
@@ -182,7 +182,7 @@ def _run(out: Path, tasks: Sequence[Task], settings: Settings, max_pixels: int, 
 
 # -- processes --------------------------------------------------------------------------------------------------------
 
-_maker: PairMaker
+_maker: Synthesiser
 
 
 def _run_tasks(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[_Outcome]:
@@ -229,7 +229,7 @@ def _end_with(parent: BaseProcess) -> None:
 
 def _prepare(settings: Settings, max_pixels: int) -> None:
     global _maker
-    _maker = PairMaker(settings, max_pixels)
+    _maker = Synthesiser(settings, max_pixels)
 
 
 def _make(task: Task) -> _Outcome:

@@ -30,7 +30,7 @@ from rawaug.bayer import CFA
 from rawaug.files import digest, fingerprint, parse_object, replacing, sha256, write_json, write_text
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.targets import Burst
-from rawaug.synthesis.files import Origin, PairMaker, Settings, pair_levels, replay_pair
+from rawaug.synthesis.files import Origin, Settings, Synthesiser, pair_levels, replay_pair
 
 PER_SHARD = 500
 """Default number of pictures in a shard, which has two gigabytes if they have half a megapixel each."""
@@ -79,7 +79,7 @@ class ShardTask:
                 hashes.append("")
         return fingerprint(hashes)
 
-    def make(self, maker: PairMaker) -> tuple[int, dict[str, str]]:
+    def make(self, maker: Synthesiser) -> tuple[int, dict[str, str]]:
         """Write the shard; return the number of its pairs, and the reason for each picture that cannot be read."""
         count = 0
         broken: dict[str, str] = {}
@@ -170,7 +170,7 @@ def _names(pictures: Sequence[Path], source: Path) -> tuple[str, ...]:
     return tuple(picture.relative_to(source).as_posix() for picture in pictures)
 
 
-def _describe(pair: RawPair, maker: PairMaker, origin: Origin, name: str, number: int) -> dict[str, Any]:
+def _describe(pair: RawPair, maker: Synthesiser, origin: Origin, name: str, number: int) -> dict[str, Any]:
     """Describe a sample as JSON; paths are relative, so that machines with other folders write the same bytes."""
     sample = asdict(origin) | {"picture": name, "number": number, "cfa": maker.augment.cfa}
     sample["settings"]["isp"] = Path(sample["settings"]["isp"]).name

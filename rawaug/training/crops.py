@@ -65,7 +65,7 @@ def add_noise(clean: Tensor, noise: NoiseModel, generator: torch.Generator) -> S
 
 
 class RealCrops:
-    """Crops of real RAW pairs, in eight turns that keep the CFA.
+    """Crops of real RAW pairs, in eight views that keep the CFA.
 
     Args:
         pairs: clean frames, with or without a noisy capture.
@@ -114,7 +114,7 @@ class PictureCrops:
 
 
 class OwnPictureCrops:
-    """The real pairs' own pictures as RAW, in eight turns.
+    """The real pairs' own pictures as RAW, in eight views.
 
     A rendering is as sharp as the readings at the sites of its sensor and as soft as its demosaicing between them. So
     crops begin where, once turned, the RAW lies at the sites that were read.
@@ -206,7 +206,7 @@ class MosaicCrops:
 def packed_crop(
     name: str, mosaics: Sequence[Tensor], own: CFA, crop: int, cfa: CFA, generator: torch.Generator
 ) -> Tensor:
-    """Cut one random part out of all mosaics of a frame, in one of eight turns, and pack it.
+    """Cut one random part out of all mosaics of a frame, in one of eight views, and pack it.
 
     Args:
         name: name of the frame.

@@ -212,7 +212,7 @@ class FrozenPictures(Lazy[NoisyFrame]):
 
 
 class NoisyCrops:
-    """Crops of noisy frames, in eight turns that keep the CFA, as an estimator's training samples.
+    """Crops of noisy frames, in eight views that keep the CFA, as an estimator's training samples.
 
     Args:
         frames: frames of any patterns.

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from rawaug.noise.levels import uniform
 from rawaug.noise.models import Params, draw_normals, draw_seeds, per_picture, poisson
-from rawaug.plugin.finishing import blur
+from rawaug.plugin.finishing import gaussian_blur
 from rawaug.plugin.targets import compress_jpeg
 from rawaug.registry import Spec, check_settings, require_between, split_spec, suggest
 from rawaug.seeding import keyed_generator
@@ -204,7 +204,7 @@ class ColouredNoise:
 
 def _unit_noise(srgb: Tensor, generators: list[torch.Generator], deviation: Tensor, grey: Tensor) -> Tensor:
     """Draw normals of the shape of ``srgb``, blur them, mix a share of their mean into all colours, and scale to 1."""
-    noise = blur(draw_normals(srgb, generators), deviation)
+    noise = gaussian_blur(draw_normals(srgb, generators), deviation)
     noise = noise.lerp(noise.mean(1, keepdim=True), per_picture(grey, srgb))
     return noise / noise.square().mean((1, 2, 3), keepdim=True).sqrt()
 

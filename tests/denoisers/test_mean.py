@@ -39,7 +39,7 @@ def test_it_is_saved_and_loaded_and_takes_one_turn_where_a_single_network_takes_
     unknown = torch.zeros_like(noisy)
     assert again.config == network.config
     assert torch.equal(again(noisy, unknown), network(noisy, unknown))
-    assert (network.turns, network.first.turns) == (1, 2)
+    assert (network.views, network.first.views) == (1, 2)
 
 
 def test_a_share_beyond_one_is_refused() -> None:

@@ -81,7 +81,7 @@ def test_a_random_crop_keeps_the_pattern_and_replays(cfa: CFA, seed: int, size: 
 def test_a_random_turn_keeps_the_pattern_unless_asked(
     cfa: CFA, seed: int, height: int, width: int, keep: bool, quarter: bool
 ) -> None:
-    transform = bayer.RandomTurn(cfa, keep_cfa=keep, quarter=quarter)
+    transform = bayer.RandomView(cfa, keep_cfa=keep, quarter=quarter)
     view = transform.sample(torch.Generator().manual_seed(seed))
     assert quarter or view < 4
     turned = transform.apply(colour_map(cfa, height, width), view)
@@ -91,7 +91,7 @@ def test_a_random_turn_keeps_the_pattern_unless_asked(
 
 def test_random_crops_reach_every_place_and_turns_every_view() -> None:
     generator = torch.Generator().manual_seed(0)
-    crop, turn = bayer.RandomCrop((2, 4)), bayer.RandomTurn("RGGB")
+    crop, turn = bayer.RandomCrop((2, 4)), bayer.RandomView("RGGB")
     places = {tuple(crop.sample(6, 8, generator).tolist()) for _ in range(200)}
     assert places == {(top, left) for top in (0, 2, 4) for left in (0, 2, 4)}
     assert {int(turn.sample(generator)) for _ in range(200)} == set(range(bayer.N_VIEWS))
@@ -99,7 +99,7 @@ def test_random_crops_reach_every_place_and_turns_every_view() -> None:
 
 def test_transforms_are_modules_among_modules() -> None:
     seen: list[torch.nn.Module] = []
-    torch.nn.Sequential(bayer.RandomTurn("RGGB"), bayer.Pack("RGGB")).apply(seen.append)
+    torch.nn.Sequential(bayer.RandomView("RGGB"), bayer.Pack("RGGB")).apply(seen.append)
     assert len(seen) == 3
 
 

@@ -25,17 +25,17 @@ from rawaug.paper.baselines.invisp import CompressedISP
 from rawaug.seeding import derive_seed, initialise_from
 
 
-def conv(inputs: int, outputs: int, stride: int = 1) -> nn.Conv2d:
+def conv3x3(inputs: int, outputs: int, stride: int = 1) -> nn.Conv2d:
     """Make a 3 x 3 convolution that keeps the size at a stride of 1."""
     return nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1)
 
 
-class ResidualBlock(nn.Module):
+class GreyBlock(nn.Module):
     """``x + conv(relu(conv(x)))`` of features ``(B, C, H, W)``."""
 
     def __init__(self, features: int) -> None:
         super().__init__()
-        self.layers = nn.Sequential(conv(features, features), nn.ReLU(), conv(features, features))
+        self.layers = nn.Sequential(conv3x3(features, features), nn.ReLU(), conv3x3(features, features))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map features ``(B, C, H, W)`` to features of the same shape."""
@@ -44,12 +44,12 @@ class ResidualBlock(nn.Module):
 
 def residual_blocks(features: int, count: int) -> nn.Sequential:
     """Make ``count`` residual blocks in a row."""
-    return nn.Sequential(*[ResidualBlock(features) for _ in range(count)])
+    return nn.Sequential(*[GreyBlock(features) for _ in range(count)])
 
 
 def scale_change(inputs: int, outputs: int, stride: int) -> nn.Sequential:
     """Make layers that change the size and the number of features."""
-    return nn.Sequential(conv(inputs, outputs, stride), conv(outputs, outputs), nn.ReLU())
+    return nn.Sequential(conv3x3(inputs, outputs, stride), conv3x3(outputs, outputs), nn.ReLU())
 
 
 class Encoder(nn.Module):
@@ -58,13 +58,13 @@ class Encoder(nn.Module):
     def __init__(self, features: int) -> None:
         super().__init__()
         fine, middle, coarse = features, 2 * features, 4 * features
-        self.first = nn.Sequential(conv(3, fine), residual_blocks(fine, 2))
+        self.first = nn.Sequential(conv3x3(3, fine), residual_blocks(fine, 2))
         self.to_middle = scale_change(fine, middle, stride=2)
         self.to_coarse = scale_change(middle, coarse, stride=2)
         self.centre = residual_blocks(coarse, 4)
         self.back_to_middle = scale_change(coarse, middle, stride=1)
         self.back_to_fine = scale_change(middle, fine, stride=1)
-        self.last = nn.Sequential(residual_blocks(fine, 2), conv(fine, 3))
+        self.last = nn.Sequential(residual_blocks(fine, 2), conv3x3(fine, 3))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map ``(B, 3, H, W)`` to ``(B, 3, H, W)``; sides are padded to multiples of 4 inside."""
@@ -99,9 +99,9 @@ class InvertibleGrey(CompressedISP):
         with initialise_from(derive_seed(seed, "baseline")):
             self.encoder = Encoder(features)
             self.reverse_network = nn.Sequential(
-                conv(3, features),
+                conv3x3(3, features),
                 residual_blocks(features, blocks),
-                conv(features, 4 * features),
+                conv3x3(features, 4 * features),
                 nn.ReLU(),
                 nn.Conv2d(4 * features, 3, 1),
             )

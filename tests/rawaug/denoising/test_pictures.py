@@ -26,7 +26,7 @@ from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.evaluation.comparison import BenchmarkSettings, compare_pictures
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, register
 from rawaug.io.pictures import read_picture, write_picture
-from rawaug.plugin.finishing import blur
+from rawaug.plugin.finishing import gaussian_blur
 
 pytest.importorskip("OpenImageIO")
 
@@ -102,8 +102,8 @@ class _RemovesAll:
 def test_grain_that_reaches_beyond_neighbours_asks_for_a_higher_level() -> None:
     generator = torch.Generator().manual_seed(0)
     white, other = torch.randn(2, 1, 3, 256, 256, generator=generator)
-    of_neighbours = blur(white, torch.tensor([0.6]))
-    wide = blur(other, torch.tensor([3.0]))
+    of_neighbours = gaussian_blur(white, torch.tensor([0.6]))
+    wide = gaussian_blur(other, torch.tensor([3.0]))
     reaching_far = white + wide / wide.std()
     removes_all = _RemovesAll()
 

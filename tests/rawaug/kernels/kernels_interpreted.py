@@ -23,7 +23,7 @@ FLOATS = ("all stages", "curves")
 """Configurations for float pictures too: a table or curves are what looks a pixel up."""
 
 
-def camera_of(srgb: torch.Tensor, blur: torch.Tensor | None, **settings: Any) -> reference.Camera:
+def camera_of(srgb: torch.Tensor, blur: torch.Tensor | None, **settings: Any) -> reference.Unprocessing:
     isp = full_isp(**settings)
     place = torch.tensor([[6, 34, 40, 60, 5], [0, 0, *srgb.shape[-2:], 0]])
     return BakedISP(isp)._camera(srgb, isp.choose(srgb), place, blur)

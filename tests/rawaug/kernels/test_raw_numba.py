@@ -11,16 +11,18 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from rawaug.kernels import cpu
-from rawaug.kernels.reference import Camera, apply_curves, blur_taps, mask_frame, unprocess
+from rawaug.kernels.reference import Unprocessing, apply_curves, blur_taps, mask_frame, unprocess
 
 NODES = 9
 
 
-def camera(batch: int, attention: bool, shading: bool, seed: int = 0, entries: int = 0, blurs: bool = False) -> Camera:
+def camera(
+    batch: int, attention: bool, shading: bool, seed: int = 0, entries: int = 0, blurs: bool = False
+) -> Unprocessing:
     generator = torch.Generator().manual_seed(seed)
     table = torch.rand(NODES, NODES, NODES, 4, generator=generator)
     frames = [mask_frame([2 * k, 4, 200, 300, k], 10, 12, (0.1, -0.05)) for k in range(batch)]
-    return Camera(
+    return Unprocessing(
         table=torch.empty(0, 0, 0, 4) if entries else table,
         curves=torch.rand(batch, entries, generator=generator).sort(dim=1).values,
         attention=2.0 * table.flip(0) if attention else torch.empty(0, 0, 0, 4),
@@ -86,7 +88,7 @@ def test_a_curve_has_every_code_of_a_byte() -> None:
     torch.testing.assert_close(between.flatten()[1], curve[0, 100] + 0.25 * (curve[0, 101] - curve[0, 100]))
 
 
-def one_of(setting: Camera, picture: int) -> Camera:
+def one_of(setting: Unprocessing, picture: int) -> Unprocessing:
     own = slice(picture, picture + 1)
     return setting._replace(curves=setting.curves[own], colour=setting.colour[own], frame=setting.frame[own])
 

@@ -125,13 +125,13 @@ def test_several_depths_are_drawn_per_picture() -> None:
 
 def test_a_share_of_the_pictures_has_an_effect_and_the_others_ideal_noise() -> None:
     every = {"row_var": 1e-4, "column_var": 1e-4, "black_offset_sd": 1e-2, "colour_bias_sd": 1e-2, "dead": 1e-2}
-    model = SensorNoise((1e-3, 1e-5), **every, hot=1e-2, bits=6, told=(0.5, 2.0), share=0.25)  # type: ignore[arg-type]
+    model = SensorNoise((1e-3, 1e-5), **every, hot=1e-2, bits=6, conditioning=(0.5, 2.0), share=0.25)  # type: ignore[arg-type]
     params = model.sample(2000, generator())
     switched = ("row_var", "column_var", "black_offset", "colour_bias", "dead_share", "hot_share", "quantum")
     present = torch.stack([params[name].reshape(2000, -1)[:, 0] != 0 for name in switched])
     torch.testing.assert_close(present.float().mean(1), torch.full((7,), 0.25), atol=0.04, rtol=0)
     assert torch.corrcoef(present.float()).triu(1).abs().max() < 0.1  # each on its own
-    told = params["told"]
+    told = params["conditioning"]
     assert (told != 1).float().mean() == pytest.approx(0.25, abs=0.04) and 0.5 <= told.min() < told.max() <= 2
     ideal, clean = SensorNoise((1e-3, 1e-5), **every, bits=6, share=0.0), torch.rand(2, 4, 32, 32)  # type: ignore[arg-type]
     drawn = ideal.sample(2, generator())
@@ -140,7 +140,7 @@ def test_a_share_of_the_pictures_has_an_effect_and_the_others_ideal_noise() -> N
 
 
 def test_told_levels_are_wrong_by_their_factor() -> None:
-    clean, wrong = torch.rand(2, 4, 8, 8, generator=generator()), SensorNoise((1e-3, 1e-5), told=(0.5, 0.5))
+    clean, wrong = torch.rand(2, 4, 8, 8, generator=generator()), SensorNoise((1e-3, 1e-5), conditioning=(0.5, 0.5))
     params = wrong.sample(2, generator())
     assert torch.equal(wrong.apply(clean, params), SensorNoise((1e-3, 1e-5)).apply(clean, params))
     torch.testing.assert_close(wrong.variance(clean, params), 0.5 * (1e-3 * clean + 1e-5))

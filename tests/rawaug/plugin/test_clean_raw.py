@@ -62,7 +62,7 @@ def test_a_crop_that_fills_its_frame_is_not_turned(sites: Tensor) -> None:
 
 def test_the_noise_is_that_which_was_asked_for() -> None:
     clean = torch.tensor([0.05, 0.2, 0.4, 0.6])[:, None, None].expand(4, 256, 256)
-    noisy, same, variance, _ = RawPairs([clean], RawNoise(LEVELS), crop=None, turns=False)[0]
+    noisy, same, variance, _ = RawPairs([clean], RawNoise(LEVELS), crop=None, views=False)[0]
     assert torch.equal(same, clean) and variance.shape == clean.shape
     expected = LEVELS[0] * clean.mean((1, 2)) + LEVELS[1]
     assert ((noisy - clean).var((1, 2)) / expected - 1).abs().max() < 0.03

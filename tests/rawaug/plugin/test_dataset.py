@@ -82,7 +82,7 @@ def test_patches_are_cropped_then_turned_as_the_parameters_say(augment: RawAugme
         assert torch.equal(augment.apply(patch, pairs[i].params).noisy, pairs[i].noisy)
         views.add(view)
     assert len(views) > 3
-    upright = RawPairs(pictures, augment, crop=16, turns=False)
+    upright = RawPairs(pictures, augment, crop=16, views=False)
     assert {int(upright[i].params.crop[4]) for i in range(COUNT)} == {0}
 
 

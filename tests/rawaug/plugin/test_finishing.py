@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rawaug.plugin import finishing
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.finishing import Finish, blur, box_mean
+from rawaug.plugin.finishing import Finish, box_mean, gaussian_blur
 from rawaug.plugin.targets import Srgb, compress_jpeg
 
 SIDE = 96
@@ -32,11 +32,11 @@ def step_and_noise(seed: int = 0, deviation: float = 0.02) -> tuple[Tensor, Tens
 @pytest.mark.parametrize("deviation", [1.0, 2.5])
 def test_blur_divides_the_variance_of_white_noise_by_4_pi_s_squared(deviation: float) -> None:
     noise = torch.randn(8, 1, 128, 128, generator=torch.Generator().manual_seed(0))
-    inner = blur(noise, torch.full((8,), deviation))[..., 16:-16, 16:-16]
+    inner = gaussian_blur(noise, torch.full((8,), deviation))[..., 16:-16, 16:-16]
     assert inner.var().item() == pytest.approx(1.0 / (4.0 * math.pi * deviation**2), rel=0.06)
     flat = torch.full((1, 2, 20, 20), 0.4)
-    assert torch.allclose(blur(flat, torch.tensor([deviation])), flat)
-    assert torch.equal(blur(flat, torch.tensor([0.0])), flat)
+    assert torch.allclose(gaussian_blur(flat, torch.tensor([deviation])), flat)
+    assert torch.equal(gaussian_blur(flat, torch.tensor([0.0])), flat)
 
 
 def test_a_window_of_whole_pixels_is_a_mean_and_a_part_of_one_counts_in_part() -> None:
@@ -51,11 +51,11 @@ def test_a_window_of_whole_pixels_is_a_mean_and_a_part_of_one_counts_in_part() -
 def test_each_picture_has_its_own_filter_in_pytorch_and_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     image = torch.rand(3, 2, 21, 40, generator=torch.Generator().manual_seed(0))
     deviations = torch.tensor([0.0, 0.7, 6.0])
-    together = blur(image, deviations)
+    together = gaussian_blur(image, deviations)
     for k in range(3):
-        assert torch.equal(blur(image[k : k + 1], deviations[k : k + 1])[0], together[k])
+        assert torch.equal(gaussian_blur(image[k : k + 1], deviations[k : k + 1])[0], together[k])
     monkeypatch.setattr(finishing, "fastest", lambda *_, otherwise: otherwise())
-    assert torch.allclose(blur(image, deviations), together, atol=1e-6)
+    assert torch.allclose(gaussian_blur(image, deviations), together, atol=1e-6)
 
 
 def test_noise_reduction_that_spares_edges_leaves_the_noise_there() -> None:
