@@ -48,8 +48,8 @@ FIT = FitConfig(method="published", steps=60, joint_steps=400, pixels=16384, bat
 def window(pair: Pair, top: int, left: int, side: int) -> Pair:
     """Cut a square out of a pair, at even coordinates so that the pattern stays."""
     rows, columns = slice(top, top + side), slice(left, left + side)
-    images = {"srgb": pair.srgb[:, rows, columns], "raw": pair.raw[:, rows, columns]}
-    return replace(pair, name=f"{pair.name}_{top}_{left}", **{key: image.contiguous() for key, image in images.items()})
+    raw, srgb = (image[:, rows, columns].contiguous() for image in (pair.raw, pair.srgb))
+    return replace(pair, name=f"{pair.name}_{top}_{left}", raw=raw, srgb=srgb)
 
 
 def make_recipe(name: str, photographs: Path, out: str, blur: float, **settings: Any) -> Recipe:
@@ -100,7 +100,7 @@ def block_pair(block: bracket.Block, shot: bracket.Shot) -> Pair:
     """Make the pair of a block: the reference that was moved onto it, and the shot with its own noise."""
     frame = shot.frame
     rows, columns = (slice(at, at + bracket.BLOCK) for at in (block.top, block.left))
-    mosaic = bayer.unpack(block.target.float(), frame.cfa)[0]  # type: ignore[arg-type]
+    mosaic = bayer.unpack(block.target.float(), frame.cfa)[0]
     noisy = frame.mosaic[:, rows, columns].contiguous()
     picture = torch.zeros(3, *mosaic.shape[-2:], dtype=torch.uint8)
     pair = Pair.of_frame(f"{frame.name}_{block.top}_{block.left}", replace(frame, mosaic=mosaic), picture)

@@ -46,6 +46,7 @@ from rawaug.paper.methods import (
     mosaic_only_psnr,
     score_rows,
 )
+from rawaug.paper.pictures import draw_frame
 from rawaug.plugin.pictures import trim_to_even
 from rawaug.progress import progress
 from rawaug.registry import check_settings
@@ -340,6 +341,9 @@ class ComparisonRun:
             else:
                 others = [other for other in self.pairs if other is not pair]
                 method = self._fit(family, others, seed)
+
+            if frame == 0 and seed == settings.seed and pair.registered:
+                draw_frame(family.replace("/", "_"), method.model, pair, self.folder / "shown")
 
             figures = score_rows(method, pair, settings.patches, settings.balanced)
             figures |= {"seconds": method.seconds, "parameters": method.parameters}

@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from itertools import combinations
 from pathlib import Path
-from statistics import fmean, stdev
 from typing import Any, NamedTuple
 
 from rawaug.evaluation.page import Figure, Page, command_line
@@ -26,6 +23,7 @@ from rawaug.files import write_json
 from rawaug.paper import published
 from rawaug.paper.ablation import SPACES, Ablation, ablate
 from rawaug.paper.ablation import TITLES as STAGES
+from rawaug.paper.order import compare_order
 from rawaug.paper.reconstruction import Comparison, compare
 
 PARTS = ("table1", "table2_nikon", "table2_canon", "table3", "few", "unsupervised", "ablation")
@@ -340,82 +338,6 @@ def still_falling(curve: Sequence[float] | None) -> float | None:
 # -- the page ----------------------------------------------------------------------------------------------------------
 
 
-class Order(NamedTuple):
-    """How the rows of a table are ordered in the paper and here: pairs of rows that are alike, refuted, and open.
-
-    A pair is open if its rows differ by no more than two standard errors over the seeds, or by less than
-    :data:`TENTH` where there is one seed, of which no spread is known.
-    """
-
-    same: int
-    reversed: list[str]
-    undecided: list[str]
-
-    def sentence(self) -> str:
-        """Say in a sentence whether the paper's order is found again."""
-        total = self.same + len(self.reversed) + len(self.undecided)
-        if not total:
-            return ""
-        if self.same == total:
-            return f"The paper's order is found again in all {total} pairs of rows."
-
-        sentence = f"The paper's order is found again in {self.same} of {total} pairs of rows"
-        for answer, pairs in (("refuted", self.reversed), ("not decided", self.undecided)):
-            if pairs:
-                sentence += f"; {answer}: {', '.join(pairs)}"
-        return f"{sentence}."
-
-
-def compare_order(table: Table, column: str) -> Order:
-    """Compare the order of the rows by a column with that of the paper's figures."""
-    figures = {}
-    for name, cells in table.items():
-        ours, paper = mean_of(cells.get(column)), cells.get(f"{column}, paper")
-        if ours is not None and paper is not None:
-            figures[name] = (ours, _standard_error(cells[column]), paper)
-
-    order = Order(0, [], [])
-    for (first, (a, error_a, b)), (second, (c, error_c, d)) in combinations(figures.items(), 2):
-        pair = f"{first} above {second}" if b > d else f"{second} above {first}"
-        margin = TENTH
-        if error_a is not None and error_c is not None:
-            margin = 2.0 * math.hypot(error_a, error_c)
-
-        if abs(a - c) <= margin:
-            order.undecided.append(pair)
-        elif (a - c) * (b - d) > 0:
-            order = order._replace(same=order.same + 1)
-        else:
-            order.reversed.append(pair)
-    return order
-
-
-TENTH = 0.1
-"""Least difference in dB that a table of one seed is believed."""
-
-
-def _standard_error(value: Any) -> float | None:
-    """Compute the standard error of a figure that is given for several seeds; None of one."""
-    if not isinstance(value, list):
-        return None
-
-    numbers = [number for number in value if number is not None]
-    if len(numbers) < 2:
-        return None
-    return stdev(numbers) / math.sqrt(len(numbers))
-
-
-def mean_of(value: Any) -> float | None:
-    """Average a figure, which may be one for each seed; return None without it."""
-    if not isinstance(value, list):
-        return value
-
-    numbers = [number for number in value if number is not None]
-    if not numbers:
-        return None
-    return fmean(numbers)
-
-
 def cell(column: str, value: Any) -> str:
     """Write a figure as text."""
     if value is None or value == [None]:
@@ -470,6 +392,48 @@ NOTES = {
 ORDERED_BY = {"table1": ["PSNR_r", "PSNR_d"], "table2": ["Nikon PSNR_r", "Canon PSNR_r"], "table3": ["PSNR"]}
 
 
+PARTS_OF = {
+    "table1": ("table1",),
+    "table2": ("table2_nikon", "table2_canon"),
+    "table3": ("table3", "few", "unsupervised"),
+    "ablation": ("ablation",),
+}
+"""The parts that a table is made of."""
+
+
+def add_pictures(page: Page, folder: Path, part: str) -> None:
+    """Add the pictures that a part left in its folder: RAW of each method and samples, or those of its run."""
+    shown = folder / part / "shown"
+    rows = (read_part(folder, part, "table") or {}).get("rows", {})
+    captions = {"RGB": "RGB", "RAW": "RAW"}
+    for name, row in rows.items():
+        captions[name] = row_name(name)
+        if "frames" in row:
+            first_frame, *_ = row["frames"].values()
+            captions[name] += f", {first_frame[0]:.2f} dB"
+
+    side_by_side = read_figures(shown, "{}.png", captions, "window")
+    if side_by_side:
+        page.add(texts=[f"{part}: the most detailed part of its first test frame."], figures=side_by_side)
+    samples = read_figures(shown, "{}-samples.png", captions)
+    if samples:
+        page.add(texts=["RAWs that are drawn of this one picture."], figures=samples)
+
+    of_run = read_figures(folder / part, "{}.png", {"picture": f"{part}: crops", "ablation": "the same as curves"})
+    if of_run:
+        page.add(figures=of_run)
+
+
+def read_figures(folder: Path, form: str, captions: Mapping[str, str], style: str = "") -> list[Figure]:
+    """Read the pictures whose names, put into ``form``, are files of the folder."""
+    figures = []
+    for name, caption in captions.items():
+        file = folder / form.format(name.replace("/", "_"))
+        if file.is_file():
+            figures.append(Figure(file.read_bytes(), caption, style, caption))
+    return figures
+
+
 def write_page(folder: Path, tables: Mapping[str, Table], settings: Mapping[str, Any]) -> Path:
     """Write ``report.html`` and return its path."""
     page = Page("The paper's tables", "The figures of Conde et al., AAAI 2022, beside those of this run.")
@@ -483,9 +447,7 @@ def write_page(folder: Path, tables: Mapping[str, Table], settings: Mapping[str,
             if sentence:
                 texts.append(f"{column}: {sentence}")
 
-        content: dict[str, Any] = {"texts": texts, "head": ["", *columns_of(table)], "rows": text_rows(table)}
-        picture = folder / "ablation" / "ablation.png"
-        if name == "ablation" and picture.is_file():
-            content["figures"] = [Figure(picture.read_bytes(), "the ablation's curves")]
-        page.add(TITLES[name], **content)
+        page.add(TITLES[name], texts=texts, head=["", *columns_of(table)], rows=text_rows(table))
+        for part in PARTS_OF[name]:
+            add_pictures(page, folder, part)
     return page.write(folder / "report.html", settings)

@@ -8,11 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from rawaug.commands.run import with_values
 from rawaug.experiment.recipe import find_recipe, read_recipe
+from rawaug.files import write_bytes
+from rawaug.io.pictures import encode_png
 from rawaug.paper import published
-from rawaug.paper.tables import PARTS, Paper, compare_order, read_tables, run_paper, still_falling
+from rawaug.paper.order import compare_order
+from rawaug.paper.tables import PARTS, Paper, read_tables, run_paper, still_falling
 
 ROW = {"parameters": 590_000, "seconds": 1.0, "mpix_s": 1.0}
 
@@ -91,11 +95,14 @@ def test_an_order_is_found_again_refuted_or_not_decided() -> None:
 
 def test_one_page_and_one_file_have_all_of_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paper = Paper(out=str(folder.parent), parts=[])
+    for picture in ("table1/shown/RAW", "table1/shown/unet", "few/picture"):
+        write_bytes(encode_png(torch.rand(3, 8, 8)), folder / f"{picture}.png")
     (folder / "run.json").write_text(json.dumps(asdict(paper)))
     result = run_paper(paper)
     page = (folder / "report.html").read_text()
     for text in ("Table 1", "Table 2", "Table 3", "Ablation", "45.21", "WNNM", "42.00"):
         assert text in page
+    assert page.count("<img") == 3 and "unet (U-Net)</figcaption>" in page
     assert json.loads((folder / "paper.json").read_text())["tables"] == json.loads(json.dumps(result))
 
 
