@@ -41,7 +41,7 @@ from rawaug.training.config import DenoiserConfig, TrainConfig
 
 CROP, WINDOW = 96, 256
 """Sides of a training square, and of the windows of the Canons that validate and test."""
-STEPS, SEEDS = 2000, 3
+STEPS, SEEDS = {"canon": 2000, "d5000": 1000}, 3
 FIT = FitConfig(method="published", steps=60, joint_steps=400, pixels=16384, batch=512)
 
 
@@ -68,7 +68,9 @@ def make_recipe(name: str, photographs: Path, out: str, blur: float, **settings:
         ),
         fit=FIT,
         denoiser=DenoiserConfig("UNet", {"width": 8, "scales": 3, "domain": "anscombe"}),
-        train=TrainConfig(steps=STEPS, batch=8, crop=64, learning_rate=1e-3, weigh="stabilised", validate_every=200),
+        train=TrainConfig(
+            steps=STEPS[name], batch=8, crop=64, learning_rate=1e-3, weigh="stabilised", validate_every=200
+        ),
         arms=arms,
         self_ensemble=False,
         seeds=SEEDS,
