@@ -68,6 +68,7 @@ class ResumableLoader(Generic[Batch]):
         self._has_pool = False
         self._resumed_generator: Tensor | None = None
         self._loaded: Mapping[str, Any] | None = None
+        self._resumes = False  # whether the next pass is that of a state
 
     @property
     def share(self) -> Any:
@@ -86,12 +87,14 @@ class ResumableLoader(Generic[Batch]):
 
         Without a call every pass counts as the next epoch. Call it with ``start`` if the wrapped loader itself resumes
         in the middle of an epoch. The epoch is forwarded to the wrapped loader's own ``set_epoch``, if there is one. It
-        does nothing after :meth:`freeze`.
+        does nothing after :meth:`freeze`, nor for the epoch of a state that was just loaded: libraries call it before
+        every pass, and the pass goes on where the state was saved.
         """
         position = Position(require_epoch(epoch), require_epoch(start))
-        if self._frozen is not None:
+        if self._frozen is not None or (self._resumes and not start and position.epoch == self._next.epoch):
             return
 
+        self._resumes = False
         self._next = self._at = position
         self._loaded = None
         if self._order is not None:
@@ -176,6 +179,7 @@ class ResumableLoader(Generic[Batch]):
         loader, order = self._prepare()
         self._require_same(state, "seeds")
         self._loaded = None
+        self._resumes = True
 
         if order is not None:
             self._load_order(order, state, batch)
@@ -280,6 +284,7 @@ class ResumableLoader(Generic[Batch]):
     def __iter__(self) -> Iterator[Batch]:
         loader, order = self._prepare()
         self._loaded = None
+        self._resumes = False
         epoch, start, passed = self._at = self._next
         self._next = Position(epoch + 1, 0)
         if self._frozen is not None:

@@ -198,6 +198,22 @@ def test_orders_of_two_processes_go_on_in_two_alone(make: Callable[..., Any], sa
             make(sampler, "subset", 0, 0, processes).load_state_dict(states[0])
 
 
+def test_the_epoch_of_the_state_may_be_told_again(make: Callable[..., Any]) -> None:
+    state, _, rest = broken_off(make("enlarged"))
+    resumed = make("enlarged")
+    resumed.load_state_dict(state)
+    resumed.set_epoch(1)  # as Hugging Face's Trainer does before each pass
+    assert same(noises(resumed), rest)
+
+    resumed.load_state_dict(state)
+    resumed.set_epoch(2)
+    assert not same(noises(resumed), rest)
+    resumed.load_state_dict(state)
+    list(resumed)
+    resumed.set_epoch(1)
+    assert len(noises(resumed)) > len(rest), "later it is the whole pass"
+
+
 @pytest.mark.parametrize("batch_size", [1, 3, 4])
 def test_batches_of_another_size_go_on_with_the_samples_that_are_left(
     make: Callable[..., Any], batch_size: int
