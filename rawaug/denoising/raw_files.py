@@ -39,10 +39,11 @@ from rawaug.denoising.levels import Noise, as_json, find_levels, load_noise
 from rawaug.errors import count_of, escape
 from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
+from rawaug.io.cells import MONOCHROME
 from rawaug.io.content import RAW_EXTENSIONS, Listing
 from rawaug.io.dng import LINEAR_WHITE, cell_of_planes
 from rawaug.io.isolated import isolated
-from rawaug.io.raw import MONOCHROME, develop
+from rawaug.io.raw import develop
 
 MID_GREY = 0.18
 """The signal whose noise is stated for photographers, on the scale black 0, white 1."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 _SIGNATURE = b"HEAPCCDR"
 _SHOT_INFO = 0x102A
@@ -20,36 +20,32 @@ _F_NUMBER, _SECONDS = 21, 22
 _MOST_ENTRIES, _DEEPEST = 1000, 4
 
 
-class ShotInfo(NamedTuple):
-    """The exposure that the camera made; a value is None if the camera does not say."""
+def read_crw_exposure(path: Path) -> tuple[float | None, float | None]:
+    """Read seconds and f-number of the exposure in a CRW file; None for those that the file does not state.
 
-    seconds: float | None
-    f_number: float | None
-
-
-def read_shot_info(path: Path) -> ShotInfo | None:
-    """Read the exposure in a CRW file; return None for another kind of file, or if it does not say."""
+    A file of another kind states neither.
+    """
     with path.open("rb") as file:
         header = file.read(14)
         if header[6:] != _SIGNATURE or header[:2] not in (b"II", b"MM"):
-            return None
+            return None, None
 
         order = "<" if header[:2] == b"II" else ">"
         (start,) = struct.unpack_from(order + "I", header, 2)
         try:
             values = _find_shot_info(file, order, start, path.stat().st_size, 0)
         except struct.error:  # a damaged heap; only the mosaic matters
-            return None
+            return None, None
 
     if values is None or len(values) <= _SECONDS:
-        return None
+        return None, None
 
     seconds, f_number = None, None
     if values[_SECONDS]:
         seconds = 2.0 ** -_stops(values[_SECONDS])
     if values[_F_NUMBER]:
         f_number = 2.0 ** (_stops(values[_F_NUMBER]) / 2)
-    return ShotInfo(seconds, f_number)
+    return seconds, f_number
 
 
 def _find_shot_info(file: BinaryIO, order: str, start: int, end: int, depth: int) -> tuple[int, ...] | None:

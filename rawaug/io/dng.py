@@ -50,11 +50,12 @@ from rawaug.io.carried import (
     Tags,
     read_carried,
 )
+from rawaug.io.cells import MONOCHROME
 from rawaug.io.damage import tiled_digest
 from rawaug.io.directories import INTEROPERABILITY, Tag, pack_directory, pointer_tag
 from rawaug.io.gain_map import GainMap, of_planes, opcode_list
 from rawaug.io.opcodes import OPCODE_LIST_1, OPCODE_LIST_2, OPCODE_LIST_3
-from rawaug.io.raw import MONOCHROME, XYZ_FROM_SRGB, RawFrame
+from rawaug.io.raw import XYZ_FROM_SRGB, RawFrame
 from rawaug.io.tiff import CFA_PHOTOMETRIC, DNG_VERSION, LINEAR_PHOTOMETRIC, tag_damage
 from rawaug.version import __version__
 

@@ -13,7 +13,6 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +108,11 @@ class TiffTags:
     crop: tuple[float, float, float, float] | None = None
     cfa: tuple[str, ...] | None = None
 
+    @property
+    def floating(self) -> bool:
+        """Whether the mosaic holds floating point."""
+        return self.mosaic is not None and self.mosaic.floating
+
 
 def read_tiff_tags(path: Path) -> TiffTags:
     """Read the tags of the first page, and of the pages of a DNG that hold the mosaic and its noise."""
@@ -117,36 +121,61 @@ def read_tiff_tags(path: Path) -> TiffTags:
 
     try:
         with opened_tiff(path) as tiff:
-            return _tags_of(all_pages(tiff))
+            return _read_tags(all_pages(tiff))
     except tifffile.TiffFileError:
         return TiffTags()
 
 
-def _tags_of(pages: list[Any]) -> TiffTags:
+def _read_tags(pages: list[Any]) -> TiffTags:
     if not pages:
         return TiffTags()
 
     make = pages[0].tags.valueof(MAKE)
     model = pages[0].tags.valueof(MODEL)
-    orientations = []
-    for page in pages:
-        if ORIENTATION in page.tags:
-            orientations.append(int(page.tags.valueof(ORIENTATION)))
+    orientations = tuple(int(page.tags.valueof(ORIENTATION)) for page in pages if ORIENTATION in page.tags)
     if not is_dng(pages):
-        return TiffTags(make, model, orientations=tuple(orientations))
+        return TiffTags(make, model, orientations=orientations)
 
-    compressions = []
-    for page in pages:
-        compressions.append(int(page.compression))
+    compressions = tuple(int(page.compression) for page in pages)
     profile, fault = _noise_profile(pages)
-    tags = TiffTags(make, model, profile, fault, tuple(orientations), tuple(compressions))
-
+    tags = TiffTags(make, model, profile, fault, orientations, compressions)
     page = main_mosaic(pages)
     if page is None:
         return tags
 
-    row_mean, rows = _deltas(page, _BLACK_ROWS)
-    column_mean, columns = _deltas(page, _BLACK_COLUMNS)
+    # How the mosaic is stored.
+    digests: list[bytes | None] = []
+    for code in (_RAW_DIGEST, _NEW_RAW_DIGEST):
+        digest = bytes(pages[0].tags.valueof(code, b""))
+        is_complete = len(digest) == _DIGEST_BYTES and any(digest)  # GoPro cameras write zeros
+        digests.append(digest if is_complete else None)
+
+    floating = page.sampleformat == _FLOATING_POINT
+    has_integers = page.sampleformat == 1 and 8 < page.bitspersample <= 16
+    stored = StoredMosaic(
+        size=(page.imagelength, page.imagewidth),
+        compression=int(page.compression),
+        segments=tuple(zip(page.dataoffsets, page.databytecounts, strict=True)),
+        tiled=bool(page.is_tiled),
+        floating=floating,
+        plain=has_integers and _LINEARIZATION not in page.tags,
+        digest=digests[0],
+        tiled_digest=digests[1],
+    )
+
+    # Its levels, its pattern in the letters R, G and B, and its corrections.
+    black, rows, columns = _black_levels(page)
+    white = 1.0 if floating else None
+    if _WHITE in page.tags:
+        white = float(np.max(_numbers(page.tags[_WHITE])))
+
+    cfa = None
+    height, width = page.tags.valueof(_CFA_REPEATS, (0, 0))[:2]
+    colours = page.tags.valueof(_CFA_PATTERN, b"")
+    if height and len(colours) == height * width and set(colours) <= {0, 1, 2}:
+        letters = "".join("RGB"[colour] for colour in colours)
+        cfa = tuple(letters[start : start + width] for start in range(0, len(letters), width))
+
     opcodes = {}
     for code in OPCODE_LISTS:
         if page.tags.valueof(code):
@@ -154,15 +183,15 @@ def _tags_of(pages: list[Any]) -> TiffTags:
 
     return replace(
         tags,
-        mosaic=_stored_mosaic(page, pages[0]),
-        black=_black(page, row_mean + column_mean),
-        white=_white(page),
+        mosaic=stored,
+        black=black,
+        white=white,
         opcodes=opcodes,
         black_rows=rows,
         black_columns=columns,
         area=active_area(page),
-        crop=_crop(page),
-        cfa=_cfa(page),
+        crop=_default_crop(page),
+        cfa=cfa,
     )
 
 
@@ -171,45 +200,15 @@ def is_dng(pages: list[Any]) -> bool:
     return any(DNG_VERSION in page.tags for page in pages)
 
 
-def _stored_mosaic(page: Any, first: Any) -> StoredMosaic:
-    has_integers = page.sampleformat == 1 and 8 < page.bitspersample <= 16
-    return StoredMosaic(
-        size=(page.imagelength, page.imagewidth),
-        compression=int(page.compression),
-        segments=tuple(zip(page.dataoffsets, page.databytecounts, strict=True)),
-        tiled=bool(page.is_tiled),
-        floating=page.sampleformat == _FLOATING_POINT,
-        plain=has_integers and _LINEARIZATION not in page.tags,
-        digest=_digest(first, _RAW_DIGEST),
-        tiled_digest=_digest(first, _NEW_RAW_DIGEST),
-    )
-
-
-def _digest(page: Any, code: int) -> bytes | None:
-    value = page.tags.valueof(code)
-    if value is None:
-        return None
-
-    digest = bytes(value)
-    is_empty = not any(digest)  # GoPro cameras write zeros
-    if len(digest) != _DIGEST_BYTES or is_empty:
-        return None
-    return digest
-
-
 @contextmanager
 def opened_tiff(path: Path) -> Iterator[Any]:
-    """Open a TIFF; damage becomes an OSError that names the file."""
+    """Open a TIFF; damage becomes an OSError that names the file.
+
+    tifffile's log messages from this thread are silenced, since rawaug reports problems through its own errors.
+    """
     with extra("raw"):
         import tifffile
 
-    with _quiet_tifffile(), tag_damage(path), tifffile.TiffFile(path) as tiff:
-        yield tiff
-
-
-@contextmanager
-def _quiet_tifffile() -> Iterator[None]:
-    """Silence tifffile's log messages from this thread; rawaug reports problems through its own errors."""
     logger = logging.getLogger("tifffile")
     thread = threading.get_ident()
 
@@ -218,7 +217,8 @@ def _quiet_tifffile() -> Iterator[None]:
 
     logger.addFilter(is_from_another_thread)
     try:
-        yield
+        with tag_damage(path), tifffile.TiffFile(path) as tiff:
+            yield tiff
     finally:
         logger.removeFilter(is_from_another_thread)
 
@@ -233,16 +233,19 @@ def tag_damage(path: Path) -> AbstractContextManager[None]:
 
 def all_pages(tiff: Any) -> list[Any]:
     """List all pages of a file; the pages of a SubIFD follow their parent."""
-    pages = list(islice(_pages(tiff.pages), MOST_PAGES + 1))
-    if len(pages) > MOST_PAGES:
-        raise ValueError(f"it has more than {MOST_PAGES} directories, or they point at one another in a circle")
+    pages: list[Any] = []
+    waiting = [iter(tiff.pages)]
+    while waiting:
+        page = next(waiting[-1], None)
+        if page is None:
+            waiting.pop()
+            continue
+
+        pages.append(page)
+        waiting.append(iter(getattr(page, "pages", None) or ()))
+        if len(pages) > MOST_PAGES:
+            raise ValueError(f"it has more than {MOST_PAGES} directories, or they point at one another in a circle")
     return pages
-
-
-def _pages(pages: Any) -> Iterator[Any]:
-    for page in pages:
-        yield page
-        yield from _pages(getattr(page, "pages", None) or ())
 
 
 def main_mosaic(pages: list[Any]) -> Any:
@@ -253,11 +256,7 @@ def main_mosaic(pages: list[Any]) -> Any:
     mosaics = [page for page in pages if page.photometric == CFA_PHOTOMETRIC]
     if not mosaics:
         mosaics = [page for page in pages if page.photometric == LINEAR_PHOTOMETRIC and page.samplesperpixel == 1]
-
-    def area(page: Any) -> int:
-        return int(page.imagelength * page.imagewidth)
-
-    return max(mosaics, key=area, default=None)
+    return max(mosaics, key=lambda page: int(page.imagelength * page.imagewidth), default=None)
 
 
 def active_area(mosaic: Any) -> tuple[int, int, int, int]:
@@ -269,7 +268,7 @@ def active_area(mosaic: Any) -> tuple[int, int, int, int]:
     return int(top), int(left), int(bottom), int(right)
 
 
-def _crop(mosaic: Any) -> tuple[float, float, float, float] | None:
+def _default_crop(mosaic: Any) -> tuple[float, float, float, float] | None:
     """Read top, left, height and width of the default crop; return None if the file states none, or nonsense."""
     origin, size = mosaic.tags.get(_CROP_ORIGIN), mosaic.tags.get(_CROP_SIZE)
     if origin is None or size is None:
@@ -315,7 +314,30 @@ def _numbers(tag: Any) -> Any:
         return values[0::2] / values[1::2]
 
 
-def _deltas(mosaic: Any, code: int) -> tuple[float, list[float]]:
+def _black_levels(mosaic: Any) -> tuple[np.ndarray | None, list[float], list[float]]:
+    """Read the black levels of the cell that repeats, ``(rows, columns)``, and what each row and column adds to them.
+
+    The cell is None if the file states none. Rows or columns that all add the same are counted to the cell.
+    """
+    row_mean, rows = _deviations(mosaic, _BLACK_ROWS)
+    column_mean, columns = _deviations(mosaic, _BLACK_COLUMNS)
+    offset = row_mean + column_mean
+
+    if _BLACK not in mosaic.tags:
+        cell = np.full((1, 1), offset) if offset else None
+        return cell, rows, columns
+
+    levels = _numbers(mosaic.tags[_BLACK]) + offset
+    if not np.isfinite(levels).all():
+        raise ValueError("BlackLevel: levels that are not finite")
+
+    height, width = mosaic.tags.valueof(_BLACK_REPEATS) or (1, 1)
+    if len(levels) != height * width:
+        return None, rows, columns
+    return np.asarray(levels.reshape(height, width)), rows, columns
+
+
+def _deviations(mosaic: Any, code: int) -> tuple[float, list[float]]:
     """Compute the mean of the black level offsets of all rows or columns, and the deviation of each from it.
 
     There are no deviations if the tag is missing or its values are equal.
@@ -335,32 +357,6 @@ def _deltas(mosaic: Any, code: int) -> tuple[float, list[float]]:
     return mean, deviations
 
 
-def _black(mosaic: Any, offset: float) -> np.ndarray | None:
-    """Read the black levels of the repeating cell, ``(rows, columns)``, plus ``offset``; return None without any."""
-    tag = mosaic.tags.get(_BLACK)
-    if tag is None and not offset:
-        return None
-    if tag is None:
-        return np.full((1, 1), offset)
-
-    levels = _numbers(tag) + offset
-    if not np.isfinite(levels).all():
-        raise ValueError("BlackLevel: levels that are not finite")
-
-    rows, columns = mosaic.tags.valueof(_BLACK_REPEATS) or (1, 1)
-    if len(levels) != rows * columns:
-        return None
-    return np.asarray(levels.reshape(rows, columns))
-
-
-def _white(mosaic: Any) -> float | None:
-    """Read the white level, the highest of several; floating point has 1 without one."""
-    tag = mosaic.tags.get(_WHITE)
-    if tag is not None:
-        return float(np.max(_numbers(tag)))
-    return 1.0 if mosaic.sampleformat == _FLOATING_POINT else None
-
-
 def read_floats(path: Path) -> np.ndarray:
     """Read the floating-point numbers of a DNG's mosaic, margins included, float32 ``(H, W)``.
 
@@ -371,21 +367,3 @@ def read_floats(path: Path) -> np.ndarray:
     if not np.isfinite(numbers).all():
         raise OSError(f"{path}: is damaged inside (its mosaic holds numbers that are not finite); copy it again")
     return np.asarray(numbers, np.float32).reshape(numbers.shape[:2])
-
-
-def _cfa(mosaic: Any) -> tuple[str, ...] | None:
-    """Return the rows of the pattern's cell in the letters R, G and B; return None if the cell has other colours."""
-    size = mosaic.tags.valueof(_CFA_REPEATS)
-    colours = mosaic.tags.valueof(_CFA_PATTERN)
-    if size is None or colours is None:
-        return None
-
-    height, width = size[0], size[1]
-    if len(colours) != height * width or not set(colours) <= {0, 1, 2}:
-        return None
-
-    letters = "".join("RGB"[colour] for colour in colours)
-    rows = []
-    for start in range(0, len(letters), width):
-        rows.append(letters[start : start + width])
-    return tuple(rows)

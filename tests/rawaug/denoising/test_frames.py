@@ -26,7 +26,7 @@ from rawaug.denoising.files import DenoisedFolder, denoise_file, denoise_folder
 from rawaug.denoising.levels import find_levels
 from rawaug.denoising.raw_files import OTHER_PATTERNS, RawFiles
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng, write_picture
-from rawaug.io.raw import MONOCHROME
+from rawaug.io.cells import MONOCHROME
 from rawaug.noise import noise_levels
 
 LEVELS = (1e-3, 1e-5)

@@ -19,9 +19,10 @@ from torch import Tensor
 from rawaug.bayer import CFA, mosaic, pattern, plane_indices
 from rawaug.io import GainMap, RawFrame, develop, dng, read_raw, read_raw_and_develop, write_dng
 from rawaug.io.carried import read_carried
+from rawaug.io.cells import MONOCHROME
 from rawaug.io.directories import Tag
 from rawaug.io.gain_map import parse_gain_maps
-from rawaug.io.raw import MONOCHROME, Exposure
+from rawaug.io.raw import Exposure
 
 MATRIX = torch.tensor([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.6, 1.6]])
 WHITE_BALANCE = (2.1, 1.0, 1.4)
