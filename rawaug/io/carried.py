@@ -16,7 +16,7 @@ import warnings
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -104,16 +104,13 @@ def read_carried(path: Path, size: tuple[int, int], offset: tuple[int, int] | No
     with extra("raw"):
         import tifffile
 
+    carried, source_is_dng = Carried(), False
     try:
-        with opened_tiff(path) as pages_of_file, path.open("rb") as file:
-            pages = all_pages(pages_of_file)
+        with opened_tiff(path) as opened, path.open("rb") as file:
+            pages = all_pages(opened)
             source_is_dng = is_dng(pages)
-            carried = _read_tiff(pages, file, source_is_dng)
-            mosaic = main_mosaic(pages) if source_is_dng else None
-            if mosaic is not None:
-                _move_opcodes(path, carried.tags, mosaic, size, offset)
+            carried = _read_tiff(path, pages, TiffFile(file), size, offset)
     except tifffile.TiffFileError:
-        carried = Carried()
         source_is_dng = False
 
     if not source_is_dng:
@@ -121,61 +118,46 @@ def read_carried(path: Path, size: tuple[int, int], offset: tuple[int, int] | No
     return carried
 
 
-def _read_tiff(pages: list[Any], file: BinaryIO, source_is_dng: bool) -> Carried:
-    tiff = TiffFile(file)
+def _read_tiff(
+    path: Path, pages: list[Any], tiff: TiffFile, size: tuple[int, int], offset: tuple[int, int] | None
+) -> Carried:
+    # The tags of the first page and of the mosaic; text that is not ASCII is written as its bytes in UTF-8.
+    source_is_dng = is_dng(pages)
     mosaic = main_mosaic(pages) if source_is_dng else None
-
     tags: Tags = {}
     for page in (pages[0], mosaic):
-        if page is not None:
-            tags |= _tags_of(page, source_is_dng)
+        for tag in () if page is None else page.tags:
+            if tag.code in _DROPPED if source_is_dng else tag.code not in _OF_ANY_TIFF:
+                continue
+            value = tag.value
+            if tag.dtype == ASCII and isinstance(value, str) and not value.isascii():
+                value = value.encode() + b"\0"
+            tags[tag.code] = (int(tag.dtype), tag.count, value)
 
+    # The directories of EXIF and GPS, without the tags of EXIF that point into the old file.
     first = tiff.directory(tiff.first)
     directories = {}
     for name, code in SUB_DIRECTORIES.items():
         if code in first.entries:
-            directories[name] = _read_directory(tiff, tiff.number(first, code))
+            entries = tiff.directory(tiff.number(first, code)).entries
+            directories[name] = tiff.tags(entries.values())
 
-    exif = directories.get("ExifTag", [])
-    interoperability = _take_pointers(tiff, exif, _is_safe_to_move(pages[0]))
-    previews = _previews(pages, tiff) if source_is_dng else []
-    return Carried(tiff.order, tags, directories, interoperability, previews)
-
-
-def _tags_of(page: Any, source_is_dng: bool) -> Tags:
-    """Select the tags of a page that another file may have."""
-    tags: Tags = {}
-    for tag in page.tags:
-        is_copied = tag.code in _OF_ANY_TIFF
-        if source_is_dng:
-            is_copied = tag.code not in _DROPPED
-        if is_copied:
-            tags[tag.code] = (int(tag.dtype), tag.count, _value(tag))
-    return tags
-
-
-def _is_safe_to_move(page: Any) -> bool:
-    return page.tags.valueof(_MAKER_NOTE_SAFETY) == 1
-
-
-def _take_pointers(tiff: TiffFile, exif: list[Tag], is_note_safe: bool) -> list[Tag]:
-    """Remove the tags of EXIF that point into the old file; return the interoperability directory."""
+    is_note_safe = pages[0].tags.valueof(_MAKER_NOTE_SAFETY) == 1
     interoperability: list[Tag] = []
-    for tag in list(exif):
-        if tag.code == INTEROPERABILITY:
-            exif.remove(tag)
-            (place,) = struct.unpack_from(tiff.order + "I", tag.data.ljust(4, b"\0"))
-            interoperability = _read_directory(tiff, place)
-        elif tag.code == MAKER_NOTE and not is_note_safe:
-            exif.remove(tag)
-    return interoperability
+    exif = []
+    for entry in directories.get("ExifTag", []):
+        if entry.code == INTEROPERABILITY:
+            (place,) = struct.unpack_from(tiff.order + "I", entry.data.ljust(4, b"\0"))
+            interoperability = tiff.tags(tiff.directory(place).entries.values())
+        elif entry.code != MAKER_NOTE or is_note_safe:
+            exif.append(entry)
+    if "ExifTag" in directories:
+        directories["ExifTag"] = exif
 
-
-def _value(tag: Any) -> Any:
-    """Give the value of a tag as tifffile writes it: ASCII text as a string, other text as its bytes in UTF-8."""
-    if tag.dtype == ASCII and isinstance(tag.value, str) and not tag.value.isascii():
-        return tag.value.encode() + b"\0"
-    return tag.value
+    previews = _read_previews(pages, tiff) if source_is_dng else []
+    if mosaic is not None:
+        _move_opcodes(path, tags, mosaic, size, offset)
+    return Carried(tiff.order, tags, directories, interoperability, previews)
 
 
 def _move_opcodes(path: Path, tags: Tags, mosaic: Any, size: tuple[int, int], offset: tuple[int, int] | None) -> None:
@@ -199,50 +181,35 @@ def _move_opcodes(path: Path, tags: Tags, mosaic: Any, size: tuple[int, int], of
             warnings.warn(f"{path}: its DNG is written without {what}", stacklevel=2)
 
 
-def _read_directory(tiff: TiffFile, place: int) -> list[Tag]:
-    return tiff.tags(tiff.directory(place).entries.values())
-
-
 # -- previews ----------------------------------------------------------------------------------------------------------
 
 
-def _previews(pages: list[Any], tiff: TiffFile) -> list[Preview]:
-    """Read the reduced pictures of a DNG, sorted by size."""
-
-    def area(page: Any) -> int:
-        return int(page.imagelength * page.imagewidth)
-
+def _read_previews(pages: list[Any], tiff: TiffFile) -> list[Preview]:
+    """Read the reduced pictures of a DNG with their data, sorted by size; those that are incomplete are left out."""
     previews = []
     remaining = _MOST_PREVIEW_BYTES
-    for page in sorted(pages, key=area):
+    for page in sorted(pages, key=lambda page: int(page.imagelength * page.imagewidth)):
         is_reduced = int(page.tags.valueof(_SUBFILE_TYPE) or 0) & _REDUCED
         if not is_reduced or int(page.photometric) not in _PREVIEW_PHOTOMETRICS:
             continue
 
-        preview = _preview(page, tiff)
-        if preview is None:
+        codes = next((codes for codes in _SEGMENTS if codes[0] in page.tags and codes[1] in page.tags), None)
+        segments = None
+        if codes is not None:
+            segments = _read_segments(page, tiff, codes)
+        if codes is None or segments is None:
             continue
-        remaining -= sum(map(len, preview.segments))
-        if remaining >= 0:
-            previews.append(preview)
-    return previews
-
-
-def _preview(page: Any, tiff: TiffFile) -> Preview | None:
-    """Read a page with its data; return None if its data are missing or incomplete."""
-    for codes in _SEGMENTS:
-        if codes[0] not in page.tags or codes[1] not in page.tags:
-            continue
-        segments = _read_segments(page, tiff, codes)
-        if segments is None:
-            return None
 
         entries = []
         for code, entry in tiff.directory(page.offset).entries.items():
             if code in _PREVIEW_TAGS and code not in codes:
                 entries.append(entry)
-        return Preview(tiff.tags(entries), segments, codes)
-    return None
+        preview = Preview(tiff.tags(entries), segments, codes)
+
+        remaining -= sum(map(len, segments))
+        if remaining >= 0:
+            previews.append(preview)
+    return previews
 
 
 def _read_segments(page: Any, tiff: TiffFile, codes: tuple[int, int]) -> list[bytes] | None:
@@ -266,7 +233,9 @@ def _decoded_preview(path: Path, order: str) -> list[Preview]:
     if preview is None:
         return []
     if isinstance(preview, np.ndarray):
-        return [_bitmap_preview(preview, order)]
+        height, width = preview.shape[:2]
+        data = np.ascontiguousarray(preview, np.uint8).tobytes()
+        return [_one_strip(_layout(height, width, compression=1, photometric=2), data, order)]
 
     with extra("raw"):
         from PIL import Image
@@ -284,13 +253,6 @@ def _decoded_preview(path: Path, order: str) -> list[Preview]:
         numbers = _layout(picture.height, picture.width, compression=7, photometric=_YCBCR)
         numbers[530] = (across, down)
     return [_one_strip(numbers, preview, order)]
-
-
-def _bitmap_preview(bitmap: np.ndarray, order: str) -> Preview:
-    """Make a preview of uncompressed RGB, ``(H, W, 3)``."""
-    height, width = bitmap.shape[:2]
-    data = np.ascontiguousarray(bitmap, np.uint8).tobytes()
-    return _one_strip(_layout(height, width, compression=1, photometric=2), data, order)
 
 
 def _layout(height: int, width: int, compression: int, photometric: int) -> dict[int, tuple[int, ...]]:

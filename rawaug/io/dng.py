@@ -20,9 +20,8 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
 from itertools import product
 from os import SEEK_END
 from pathlib import Path
@@ -52,7 +51,7 @@ from rawaug.io.carried import (
 )
 from rawaug.io.cells import MONOCHROME
 from rawaug.io.damage import tiled_digest
-from rawaug.io.directories import INTEROPERABILITY, Tag, pack_directory, pointer_tag
+from rawaug.io.directories import INTEROPERABILITY, Tag, TiffFile, pack_directory, pointer_tag
 from rawaug.io.gain_map import GainMap, of_planes, opcode_list
 from rawaug.io.opcodes import OPCODE_LIST_1, OPCODE_LIST_2, OPCODE_LIST_3
 from rawaug.io.raw import XYZ_FROM_SRGB, RawFrame
@@ -109,13 +108,18 @@ def write_dng(
     """
     path = Path(path)
     _require_colour(frame, path)
-    if rgb is not None:
-        layout, numbers = _FULL_COLOUR, linear_numbers(frame, rgb, path)
-    elif frame.floating:
-        layout, numbers = _LAYOUTS.get(frame.cfa, _MOSAIC), floating_numbers(frame, path)
-    else:
-        layout, numbers = _LAYOUTS.get(frame.cfa, _MOSAIC), digital_numbers(frame, path)
 
+    # The pixels, and what they mean.
+    photometric = _GREY if frame.cfa == MONOCHROME else CFA_PHOTOMETRIC
+    if rgb is not None:
+        photometric = LINEAR_PHOTOMETRIC
+        numbers = linear_numbers(frame, rgb, path)
+    elif frame.floating:
+        numbers = floating_numbers(frame, path)
+    else:
+        numbers = digital_numbers(frame, path)
+
+    # The tags and directories, those of the source first.
     carried = Carried()
     if source is not None:
         carried = read_carried(Path(source), (numbers.shape[0], numbers.shape[1]), frame.offset)
@@ -125,31 +129,53 @@ def write_dng(
         directories["ExifTag"] = _exif(frame, carried.byte_order)
     directories = {name: entries for name, entries in directories.items() if entries}
 
-    tags = _tags(frame, layout, numbers, carried, baseline_exposure)
+    tags = _tags(frame, photometric, numbers, carried, baseline_exposure)
     extra_tags: list[tuple[Any, ...]] = [(code, *tag, True) for code, tag in sorted(tags.items())]
     extra_tags += [(name, LONG, 1, 0, True) for name in directories]
 
     with replacing(path) as partial:
         with tag_damage(Path(source)) if source is not None else nullcontext():
-            _write_pixels(partial, numbers, layout.photometric, carried, extra_tags)
+            _write_pixels(partial, numbers, photometric, carried, extra_tags)
         _append_directories(partial, directories, carried)
 
 
-def _tags(frame: RawFrame, layout: _Layout, numbers: np.ndarray, carried: Carried, baseline_exposure: float) -> Tags:
-    tags = _camera(frame)
+def _tags(frame: RawFrame, photometric: int, numbers: np.ndarray, carried: Carried, baseline_exposure: float) -> Tags:
+    make, _, model = frame.camera.partition(" ")
+    tags: Tags = {}
+    for code, name in ((271, make), (272, model or make), (_UNIQUE_CAMERA_MODEL, frame.camera)):
+        # tifffile takes text of 7 bits, whereas DNG allows UTF-8
+        tags[code] = (ASCII, 0, name if name.isascii() else name.encode())
+
+    # What a source that is a DNG states itself.
     if DNG_VERSION not in carried.tags:
-        tags |= _converted(frame, baseline_exposure) | layout.colour(frame)
+        needed = 3 if frame.gain_maps else 1
+        tags[DNG_VERSION] = (BYTE, 4, bytes((1, 4, 0, 0)))
+        tags[_BACKWARD_VERSION] = (BYTE, 4, bytes((1, needed, 0, 0)))
+        tags[50730] = (SRATIONAL, 1, _rationals([baseline_exposure]))
+        tags |= _opcodes(OPCODE_LIST_2, [m for m in frame.gain_maps if m.on_mosaic])
+        tags |= _opcodes(OPCODE_LIST_3, [m for m in frame.gain_maps if not m.on_mosaic])
+        if frame.exposure.date:
+            tags[306] = (ASCII, 0, frame.exposure.date)
+        if photometric != _GREY:
+            tags[_COLOR_MATRIX] = (SRATIONAL, 9, _rationals(xyz_to_camera(frame).ravel()))
+            tags[_AS_SHOT_NEUTRAL] = (RATIONAL, 3, _rationals([1 / gain for gain in frame.white_balance]))
+            tags[_ILLUMINANT] = (SHORT, 1, _D65)
+
+    # What describes the new pixels.
     tags |= carried.tags
     tags[_SUBFILE_TYPE] = (LONG, 1, 0)
     tags[_ORIENTATION] = (SHORT, 1, _EXIF_ORIENTATIONS[frame.orientation])
-
     tags |= _crop(frame, *numbers.shape[:2])
     if numbers.ndim == 2 and numbers.dtype == np.uint16:
         tags[_NEW_RAW_DIGEST] = (BYTE, 16, tiled_digest(numbers))
+    if photometric == CFA_PHOTOMETRIC:
+        return tags | _mosaic_levels(frame)
 
-    for code in layout.inapplicable:
+    for code in _OF_MOSAICS:
         tags.pop(code, None)
-    return tags | layout.tags(frame)
+    if photometric == LINEAR_PHOTOMETRIC:
+        return tags | _full_colour_levels(frame)
+    return tags | _mosaic_levels(frame)
 
 
 def _crop(frame: RawFrame, height: int, width: int) -> Tags:
@@ -277,45 +303,6 @@ def linear_numbers(frame: RawFrame, rgb: Tensor, path: Path) -> np.ndarray:
 # -- tags --------------------------------------------------------------------------------------------------------------
 
 
-def _camera(frame: RawFrame) -> Tags:
-    make, _, model = frame.camera.partition(" ")
-    names = {271: make, 272: model or make, _UNIQUE_CAMERA_MODEL: frame.camera}
-    tags: Tags = {}
-    for code, name in names.items():
-        # tifffile takes text of 7 bits, whereas DNG allows UTF-8
-        tags[code] = (ASCII, 0, name if name.isascii() else name.encode())
-    return tags
-
-
-def _converted(frame: RawFrame, baseline_exposure: float) -> Tags:
-    """Make the tags, besides those of colour, for a frame whose source is not a DNG."""
-    needed = 3 if frame.gain_maps else 1
-    tags: Tags = {
-        DNG_VERSION: (BYTE, 4, bytes((1, 4, 0, 0))),
-        _BACKWARD_VERSION: (BYTE, 4, bytes((1, needed, 0, 0))),
-        50730: (SRATIONAL, 1, _rationals([baseline_exposure])),
-        **_opcodes(OPCODE_LIST_2, [m for m in frame.gain_maps if m.on_mosaic]),
-        **_opcodes(OPCODE_LIST_3, [m for m in frame.gain_maps if not m.on_mosaic]),
-    }
-    if frame.exposure.date:
-        tags[306] = (ASCII, 0, frame.exposure.date)
-    return tags
-
-
-def _colour(frame: RawFrame) -> Tags:
-    """Make the matrix and the white balance for a frame whose source is not a DNG."""
-    return {
-        _COLOR_MATRIX: (SRATIONAL, 9, _rationals(xyz_to_camera(frame).ravel())),
-        _AS_SHOT_NEUTRAL: (RATIONAL, 3, _rationals([1 / gain for gain in frame.white_balance])),
-        _ILLUMINANT: (SHORT, 1, _D65),
-    }
-
-
-def _no_colour(frame: RawFrame) -> Tags:
-    """Give a monochrome picture neither matrix nor white balance."""
-    return {}
-
-
 def _opcodes(code: int, maps: Sequence[GainMap]) -> Tags:
     if not maps:
         return {}
@@ -323,43 +310,38 @@ def _opcodes(code: int, maps: Sequence[GainMap]) -> Tags:
     return {code: (UNDEFINED, len(opcodes), opcodes)}
 
 
-def _of_mosaic(frame: RawFrame) -> Tags:
-    known = pattern(frame.cfa)
-    size = known.period
-    kinds = plane_indices(frame.cfa).flatten().tolist()
-    # LibRaw states one level of X-Trans if there is only one
-    repeats = size if size == 2 or len(set(frame.black)) > 1 else 1
-    levels = [frame.black[kind] for kind in kinds[: repeats**2]]
-    return {
-        33421: (SHORT, 2, (size, size)),
-        33422: (BYTE, size**2, bytes("RGB".index(colour) for colour in "".join(known.rows))),
-        50710: (BYTE, 3, bytes((0, 1, 2))),
-        50711: (SHORT, 1, 1),
-        **_levels(frame, repeats, levels),
-    }
+def _mosaic_levels(frame: RawFrame) -> Tags:
+    """Make the pattern, the levels and the noise of a mosaic, or of the one plane of a monochrome picture."""
+    tags: Tags = {}
+    repeats, black = 1, [frame.black[0]]
+    if frame.cfa != MONOCHROME:
+        cell = pattern(frame.cfa)
+        size = cell.period
+        colours = bytes("RGB".index(colour) for colour in "".join(cell.rows))
+        tags[33421] = (SHORT, 2, (size, size))
+        tags[33422] = (BYTE, size**2, colours)
+        tags[50710] = (BYTE, 3, bytes((0, 1, 2)))
+        tags[50711] = (SHORT, 1, 1)
 
+        # LibRaw states one level of X-Trans if there is only one
+        repeats = size if size == 2 or len(set(frame.black)) > 1 else 1
+        sites = plane_indices(frame.cfa).flatten().tolist()
+        black = [frame.black[site] for site in sites[: repeats**2]]
 
-def _of_one_plane(frame: RawFrame) -> Tags:
-    """Make the levels of a monochrome picture."""
-    return _levels(frame, 1, [frame.black[0]])
-
-
-def _levels(frame: RawFrame, repeats: int, black: Sequence[float]) -> Tags:
-    tags: Tags = {
-        50713: (SHORT, 2, (repeats, repeats)),
-        50714: (RATIONAL, len(black), _rationals(black, 2**14)),
-        50717: (LONG, 1, round(frame.white)),
-    }
+    white = round(frame.white)
     if frame.floating:
-        tags[50714] = (RATIONAL, len(black), _rationals([0.0] * len(black)))
-        tags[50717] = (LONG, 1, 1)
+        black, white = [0.0] * len(black), 1
         tags[_BACKWARD_VERSION] = (BYTE, 4, bytes((1, 4, 0, 0)))
+
+    tags[50713] = (SHORT, 2, (repeats, repeats))
+    tags[50714] = (RATIONAL, len(black), _rationals(black, 10**6 if frame.floating else 2**14))
+    tags[50717] = (LONG, 1, white)
     if frame.noise_profile is not None:
         tags[_NOISE_PROFILE] = (DOUBLE, 2, frame.noise_profile)
     return tags
 
 
-def _of_full_colour(frame: RawFrame) -> Tags:
+def _full_colour_levels(frame: RawFrame) -> Tags:
     """Make the levels by colour; shading maps of the mosaic's sites become maps of the planes."""
     maps = []
     for gain_map in frame.gain_maps:
@@ -372,30 +354,6 @@ def _of_full_colour(frame: RawFrame) -> Tags:
         50717: (LONG, 3, (1 if frame.floating else LINEAR_WHITE,) * 3),
         **_opcodes(OPCODE_LIST_2, maps),
     }
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """How one kind of pixels is stored.
-
-    Attributes:
-        photometric: what the pixels mean, in TIFF's numbers.
-        tags: the levels and the pattern of a frame.
-        colour: the tags of its colours.
-        inapplicable: tags of a source that do not apply to such pixels.
-    """
-
-    photometric: int
-    tags: Callable[[RawFrame], Tags]
-    colour: Callable[[RawFrame], Tags] = _colour
-    inapplicable: Sequence[int] = ()
-
-
-_MOSAIC = _Layout(CFA_PHOTOMETRIC, _of_mosaic)
-_ONE_PLANE = _Layout(_GREY, _of_one_plane, _no_colour, _OF_MOSAICS)
-_FULL_COLOUR = _Layout(LINEAR_PHOTOMETRIC, _of_full_colour, inapplicable=_OF_MOSAICS)
-_LAYOUTS = {MONOCHROME: _ONE_PLANE}
-"""Frames that are not mosaics have these layouts, by their patterns."""
 
 
 def xyz_to_camera(frame: RawFrame) -> np.ndarray:
@@ -442,37 +400,37 @@ def _rationals(values: Iterable[float], denominator: int = 10**6) -> tuple[int, 
 def _append_directories(path: Path, directories: dict[str, list[Tag]], carried: Carried) -> None:
     """Write sub-directories and previews after the pixels, and let the first directory point at them."""
     with path.open("r+b") as file:
-        order = "<" if file.read(2) == b"II" else ">"
+        tiff = TiffFile(file)
+        first = tiff.directory(tiff.first).entries
+        pointers: dict[int, list[int]] = {}
         for name, entries in directories.items():
             if name == "ExifTag" and carried.interoperability:
-                place = _append(file, order, carried.interoperability)
-                entries = [*entries, pointer_tag(order, INTEROPERABILITY, place)]
-            place = _append(file, order, entries)
-            _point(file, order, SUB_DIRECTORIES[name], [place])
-
+                place = _append_directory(file, tiff.order, carried.interoperability)
+                entries = [*entries, pointer_tag(tiff.order, INTEROPERABILITY, place)]
+            pointers[SUB_DIRECTORIES[name]] = [_append_directory(file, tiff.order, entries)]
         if carried.previews:
-            places = [_append_preview(file, order, preview) for preview in carried.previews]
-            _point(file, order, _SUB_IFDS, places)
+            pointers[_SUB_IFDS] = [_append_preview(file, tiff.order, preview) for preview in carried.previews]
 
-        first = _entry(file, order, _PHOTOMETRIC)
-        if _unpack(file, order + "H", first + _VALUE) == (_GREY,):  # tifffile writes linear RAW only of three planes
-            file.seek(first + _VALUE)
-            file.write(struct.pack(order + "H", LINEAR_PHOTOMETRIC))
+        # The first directory has room for the places.
+        for code, places in pointers.items():
+            file.seek(first[code].place)
+            file.write(struct.pack(f"{tiff.order}{len(places)}I", *places))
+        if tiff.numbers(first[_PHOTOMETRIC]) == (_GREY,):  # tifffile writes linear RAW only of three planes
+            file.seek(first[_PHOTOMETRIC].place)
+            file.write(struct.pack(tiff.order + "H", LINEAR_PHOTOMETRIC))
 
 
-def _append(file: BinaryIO, order: str, entries: Sequence[Tag]) -> int:
+def _append_directory(file: BinaryIO, order: str, entries: Sequence[Tag]) -> int:
     """Write a directory at the end of a file and return its place."""
-    start = _even_end(file)
-    file.seek(start)
-    file.write(pack_directory(order, entries, start))
-    return start
+    place = _even_end(file)
+    file.write(pack_directory(order, entries, place))
+    return place
 
 
 def _append_preview(file: BinaryIO, order: str, preview: Preview) -> int:
     places = []
     for segment in preview.segments:
         places.append(_even_end(file))
-        file.seek(places[-1])
         file.write(segment)
 
     entries = [entry for entry in preview.entries if entry.code != _SUBFILE_TYPE]
@@ -480,39 +438,12 @@ def _append_preview(file: BinaryIO, order: str, preview: Preview) -> int:
     lengths = [len(segment) for segment in preview.segments]
     for code, numbers in zip(preview.codes, (places, lengths), strict=True):
         entries.append(Tag(code, LONG, len(numbers), struct.pack(f"{order}{len(numbers)}I", *numbers)))
-    return _append(file, order, entries)
+    return _append_directory(file, order, entries)
 
 
 def _even_end(file: BinaryIO) -> int:
+    """Go to the end of a file, which is made even, and return its place."""
     end = file.seek(0, SEEK_END)
     if end % 2:
-        file.write(b"\0")
-    return end + end % 2
-
-
-def _point(file: BinaryIO, order: str, code: int, places: Sequence[int]) -> None:
-    """Write the places of directories into a tag of the first directory, which has room for them."""
-    at = _entry(file, order, code) + _VALUE
-    if len(places) > 1:
-        (at,) = _unpack(file, order + "I", at)
-    file.seek(at)
-    file.write(struct.pack(f"{order}{len(places)}I", *places))
-
-
-_VALUE = 8
-"""An entry has its value, or the pointer to it, at this offset."""
-
-
-def _entry(file: BinaryIO, order: str, code: int) -> int:
-    """Find the place of the entry of tag ``code`` in the first directory."""
-    (first,) = _unpack(file, order + "I", 4)
-    (count,) = _unpack(file, order + "H", first)
-    for place in range(first + 2, first + 2 + 12 * count, 12):
-        if _unpack(file, order + "H", place) == (code,):
-            return place
-    raise ValueError(f"tag {code} is not in the first directory")
-
-
-def _unpack(file: BinaryIO, form: str, place: int) -> tuple[Any, ...]:
-    file.seek(place)
-    return struct.unpack(form, file.read(struct.calcsize(form)))
+        end += file.write(b"\0")
+    return end

@@ -20,7 +20,7 @@ from rawaug.bayer import CFA, mosaic, pattern, plane_indices
 from rawaug.io import GainMap, RawFrame, develop, dng, read_raw, read_raw_and_develop, write_dng
 from rawaug.io.carried import read_carried
 from rawaug.io.cells import MONOCHROME
-from rawaug.io.directories import Tag
+from rawaug.io.directories import Tag, TiffFile
 from rawaug.io.gain_map import parse_gain_maps
 from rawaug.io.raw import Exposure
 
@@ -358,16 +358,19 @@ def test_makers_notes_and_interoperability(safe: bool, tmp_path: Path, bayer_dng
                 if tag.code in (33421, 33422) or tag.code > 50000]  # fmt: skip
     tifffile.imwrite(source, numbers, photometric=32803, metadata=None, extratags=[*kept, *extra])
     with source.open("r+b") as file:
-        inner = dng._append(file, "<", [Tag(1, 2, 4, b"R98\0"), Tag(2, 7, 4, b"0100")])
+        inner = dng._append_directory(file, "<", [Tag(1, 2, 4, b"R98\0"), Tag(2, 7, 4, b"0100")])
         entries = [
             Tag(37500, 7, 12, b"maker's note"),
             Tag(40965, 4, 1, struct.pack("<I", inner)),
             Tag(42036, 2, 8, b"EF 50mm\0"),
         ]
-        dng._point(file, "<", 34665, [dng._append(file, "<", entries)])
+        place = dng._append_directory(file, "<", entries)
+        tiff = TiffFile(file)
+        file.seek(tiff.directory(tiff.first).entries[34665].place)
+        file.write(struct.pack("<I", place))
     write_dng(tmp_path / "a.dng", read_raw(source), source)
-    with tifffile.TiffFile(tmp_path / "a.dng") as tiff:
-        exif = tiff.pages.first.tags["ExifTag"].value
+    with tifffile.TiffFile(tmp_path / "a.dng") as written:
+        exif = written.pages.first.tags["ExifTag"].value
     assert exif["LensModel"] == "EF 50mm"
     interoperability = read_carried(tmp_path / "a.dng", (32, 48)).interoperability
     assert [entry.data for entry in interoperability] == [b"R98\0", b"0100"]
