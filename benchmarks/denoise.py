@@ -23,8 +23,8 @@ from benchmarks.measure import arguments, fastest, finish, memory_used, show, st
 from denoisers.files import DEFAULT
 from rawaug import bayer
 from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.denoising.files import denoise_file
-from rawaug.denoising.raw_files import RawFiles
+from rawaug.denoising.folder import denoise_file
+from rawaug.denoising.raw import RawFiles
 from rawaug.io import write_dng
 
 

@@ -23,7 +23,7 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pairs import centre
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
-from rawaug.denoising.raw_files import balance_greens
+from rawaug.denoising.raw import equalise_greens
 from rawaug.evaluation.scores import Denoiser, NoisyInput
 from rawaug.evaluation.tables import print_rows
 from rawaug.io import RawFrame
@@ -66,7 +66,7 @@ def noisy_shots(
         noisy = noise.apply(clean, params)
         if balance:
             frame = RawFrame(bayer.unpack(noisy, CFA.RGGB)[0], CFA.RGGB)
-            noisy = bayer.pack(balance_greens(frame)[0].mosaic[None], CFA.RGGB)
+            noisy = bayer.pack(equalise_greens(frame)[0].mosaic[None], CFA.RGGB)
         yield clean, Noisy.of(noisy, (told * levels[0], told * levels[1]), CFA.RGGB)
 
 

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 
 from rawaug.commands import YAML, as_options, network_or_filter, require_results
 from rawaug.denoising.denoise import files_for, is_mixed
-from rawaug.denoising.files import DenoisedFolder, denoise_file, denoise_folder
-from rawaug.denoising.picture_files import PictureFiles
-from rawaug.denoising.raw_files import Denoised, Greens
+from rawaug.denoising.folder import DenoisedFolder, denoise_file, denoise_folder
+from rawaug.denoising.pictures import PictureFiles
+from rawaug.denoising.raw import Denoised, Greens
 from rawaug.errors import count_of, escape
 from rawaug.files import write_json
 from rawaug.io.content import PICTURE_KINDS

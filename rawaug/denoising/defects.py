@@ -22,10 +22,10 @@ from denoisers.defects import find_outliers, mend_mosaic, mend_planes
 from denoisers.domains import DOMAINS
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.denoising.base import Levels
+from rawaug.denoising.denoiser import Levels
 from rawaug.denoising.levels import Noise, find_levels
 from rawaug.io import RawFrame, read_raw
-from rawaug.io.raw import MONOCHROME
+from rawaug.io.cells import MONOCHROME
 
 MOST_DEFECTS = 0.01
 """A larger share of the sites is no map of defects: the frames show the same scene, or hardly any signal but noise."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from rawaug.denoising.files import Files, denoise_file
+from rawaug.denoising.folder import Files, denoise_file
 from rawaug.denoising.levels import Noise
-from rawaug.denoising.picture_files import LINEAR, PictureFiles
-from rawaug.denoising.raw_files import Greens, RawFiles
+from rawaug.denoising.pictures import LINEAR, PictureFiles
+from rawaug.denoising.raw import Greens, RawFiles
 from rawaug.files import files_below, require_output
 from rawaug.io import RawFrame
 from rawaug.io.content import ALL_PICTURE_EXTENSIONS, RAW_EXTENSIONS, content_of, picture_extensions
@@ -87,50 +87,26 @@ def denoise(
     return image
 
 
-def files_for(
-    source: str | Path | RawFrame,
-    denoiser: Any = None,
-    *,
-    noise: Noise = "auto",
-    strength: float = 1.0,
-    linear: bool = False,
-    self_ensemble: bool = False,
-    greens: Greens = "auto",
-    defects: str | Path = "mend",
-    guard: bool | None = None,
-    device: str = "auto",
-) -> Files[Any]:
+def files_for(source: str | Path | RawFrame, denoiser: Any = None, **settings: Any) -> Files[Any]:
     """Say how the files of a source are denoised: by its content; a folder is of pictures if it has no RAW file.
 
-    The arguments are those of :func:`denoise`.
+    Args:
+        source: a file, a folder or a frame.
+        denoiser: None for the shipped one.
+        settings: those of :class:`RawFiles`; a picture takes only those of :class:`PictureFiles`.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is a file of no kind, or a setting does not fit it.
     """
     if _is_raw(source):
-        return RawFiles(
-            denoiser,
-            noise=noise,
-            strength=strength,
-            linear=linear,
-            self_ensemble=self_ensemble,
-            greens=greens,
-            defects=defects,
-            guard=guard,
-            device=device,
-        )
+        return RawFiles(denoiser, **settings)
 
-    for argument, is_set in (
-        ("linear", linear),
-        ("greens", greens != "auto"),
-        ("defects", defects != "mend"),
-        ("guard", guard is not None),
-        ("noise", noise != "auto"),
-    ):
-        if is_set:
+    for_raw = {"linear": False, "greens": "auto", "defects": "mend", "guard": None, "noise": "auto"}
+    for argument, default in for_raw.items():
+        if settings.pop(argument, default) != default:
             raise ValueError(f"{source}: is a developed picture; {argument}= is for RAW")
-    return PictureFiles(denoiser, strength=strength, self_ensemble=self_ensemble, device=device)
+    return PictureFiles(denoiser, **settings)
 
 
 def is_mixed(folder: Path) -> bool:

@@ -1,20 +1,25 @@
-r"""Denoisers of RAW, whatever they are made of.
+r"""Denoisers of every kind of image, and those of RAW, whatever they are made of.
 
     d = f(y, v),    v = shot_var max(y, 0) + read_var,    result = y + s (d - y)
 
-:class:`RawDenoiser` holds what is the same for a network, an ONNX file, a filter and a function f: tiles, the CFA that
-f was trained for, the self-ensemble, device and precision, and the strength s. A mosaic with a pattern other than f's
-is extended by a mirrored line on the sides where the patterns differ, and the result is cropped.
+A denoiser is made by ``of`` from a name, a file, a filter, a network or a function f. It says which kind of image it
+takes, and is called with a noisy one. :class:`RawDenoiser` takes RAW, and
+:class:`rawaug.denoising.pictures.PictureDenoiser` takes developed pictures.
+
+:class:`RawDenoiser` holds what is the same for everything of RAW: tiles, the CFA that f was trained for, the
+self-ensemble, device and precision, and the strength s. A mosaic with a pattern other than f's is extended by a
+mirrored line on the sides where the patterns differ, and the result is cropped.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -26,21 +31,177 @@ from denoisers.mosaic import BayerAdapter, MosaicDRUNet, denoise_mosaic
 from denoisers.network import DENOISERS
 from denoisers.onnx import STRIDE, OnnxNetwork
 from denoisers.patterns import crop_to_pattern, extend_to_pattern
-from denoisers.published import Image
+from denoisers.published import Image, NetworkFile, find_image_kind, read_network
 from denoisers.tiles import TILE
 from rawaug import bayer
-from rawaug.bayer import CFA
-from rawaug.denoising.base import ImageDenoiser, progress_by, read_named
-from rawaug.denoising.base import Levels as Levels
-from rawaug.denoising.base import Noisy as Noisy
+from rawaug.bayer import CFA, noise_variance
 from rawaug.files import read_header, sha256
 from rawaug.io import RawFrame
-from rawaug.registry import Spec, spec_label, split_spec
+from rawaug.kernels.runtime import find_device, has_fast_bfloat16
+from rawaug.progress import progress
+from rawaug.registry import Spec, spec_label, split_spec, suggest
 
+Levels = tuple[float, float]
+"""Levels of noise: (shot_var, read_var)."""
+CPU = torch.device("cpu")
+IMAGES: dict[Image, str] = {"raw": "RAW", "srgb": "developed pictures"}
+"""The names of the kinds of image in messages."""
 Model = Callable[[Tensor, Tensor | None], Tensor]
 """``model(noisy, variance) -> denoised``, each ``(B, 4, h, w)``, perhaps with a ``stride`` and an ``upscale``."""
 FILTER_TILES = (512, 32)
 """The side and overlap of a filter's tiles, in packed pixels; the filters reach 8 pixels, and BM3D reaches 20."""
+D = TypeVar("D", bound="ImageDenoiser")
+
+
+class Noisy(NamedTuple):
+    """The input of a denoiser: an image, and whatever is known of its noise.
+
+    Attributes:
+        image: packed RAW ``(1, 4, h, w)``, white at 1, not clipped at black; for patterns other than Bayer's, the
+            mosaic ``(1, 1, H, W)``; or developed sRGB ``(1, 3, H, W)``.
+        variance: variance of the noise of each value, with the shape of ``image``; None if it is not known.
+        levels: (shot_var, read_var) if the variance is ``shot_var max(image, 0) + read_var``.
+        cfa: the pattern of packed RAW or of the mosaic.
+    """
+
+    image: Tensor
+    variance: Tensor | None = None
+    levels: Levels | None = None
+    cfa: str = CFA.RGGB
+
+    @classmethod
+    def of(cls, image: Tensor, levels: Levels, cfa: CFA | str) -> Noisy:
+        """Make one of packed RAW ``(1, 4, h, w)`` or a mosaic ``(1, 1, H, W)``, with the variance of these levels."""
+        return cls(image, noise_variance(image, *levels), levels, bayer.canonical_cfa(cfa))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageDenoiser(ABC):
+    """Anything that denoises one kind of image; made by :meth:`of`, and changed by :func:`dataclasses.replace`.
+
+    Attributes:
+        name: in tables.
+        network: the network that computes, if it is a PyTorch network.
+        info: what its file says of its training.
+        reads_levels: whether noise levels make a difference.
+        views: number of views of the image that are averaged, at that many times the work.
+        strength: how much of the noise is removed, 1 by default.
+        device: where it runs.
+        mixed: whether it computes in bfloat16.
+        checked: whether a result that is not finite is an error; a training that diverged is scored as it is.
+        settings: everything that its results depend on, as JSON.
+    """
+
+    takes: ClassVar[Image]
+    """The kind of image that it takes."""
+
+    default: ClassVar[str]
+    """The shipped denoiser if none is named."""
+
+    files: ClassVar[str]
+    """The files of networks that can be named, for messages."""
+
+    name: str
+    network: nn.Module | None = field(default=None, repr=False)
+    info: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    reads_levels: bool = True
+    views: int = 1
+    strength: float = 1.0
+    device: torch.device = CPU
+    mixed: bool = False
+    checked: bool = True
+    settings: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(
+        cls: type[D],
+        spec: Any,
+        device: str | torch.device = "cpu",
+        precision: Literal["full", "auto"] = "full",
+        **changes: Any,
+    ) -> D:
+        """Make the denoiser that a name, a file or an object stands for. Nothing is imported by name.
+
+        Args:
+            spec: see the class.
+            device: auto, cpu, cuda, ...: where a PyTorch network runs. Everything else runs on the CPU.
+            precision: ``"auto"`` computes in bfloat16 where that is fast and costs the network less than 0.05 dB.
+            changes: attributes in place of those of the denoiser, such as ``name``, ``views``, ``strength``.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if there is no such denoiser, it takes another kind of image, or its file is damaged.
+            ImportError: if a library that it needs is not installed.
+        """
+        denoiser = spec if isinstance(spec, cls) else cls._resolve(spec, changes.get("name"))
+        network = denoiser.network
+        if network is not None:
+            where = find_device(str(device))
+            network.to(where, memory_format=torch.channels_last)  # type: ignore[call-overload]
+            mixed = precision == "auto" and getattr(network, "mixed", False) and has_fast_bfloat16(where)
+            changes = {"device": where, "mixed": mixed, **changes}
+
+        return replace(denoiser, **changes)
+
+    @classmethod
+    @abstractmethod
+    def _resolve(cls: type[D], spec: Any, name: str | None) -> D:
+        """Find the denoiser of an object or a name, on the CPU; it will be called ``name``, if that is given."""
+
+    @classmethod
+    def shipped(cls) -> list[str]:
+        """List the names of the shipped networks that take this kind of image."""
+        names = []
+        for name in list_shipped():
+            if find_image_kind(read_header(find_denoiser(name))) == cls.takes:
+                names.append(name)
+        return names
+
+    @abstractmethod
+    def __call__(self, noisy: Noisy) -> Tensor:
+        """Denoise the image; the result is on the CPU."""
+
+    def _compute(self, run: Callable[..., Tensor], *inputs: Tensor | None) -> Tensor:
+        """Call ``run`` on the device and in the precision of this denoiser; the result is on the CPU."""
+        inputs = tuple(value if value is None else value.to(self.device) for value in inputs)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
+            return run(*inputs).cpu()
+
+    def _require_sound(self, denoised: Tensor, noisy: Tensor, expected: Sequence[int]) -> Tensor:
+        """Return the result for a noisy image if it has the expected shape and is finite; else raise an error."""
+        if tuple(denoised.shape) != tuple(expected) or (self.checked and not denoised.isfinite().all()):
+            shapes = f"{tuple(denoised.shape)} for {tuple(noisy.shape)}"
+            raise ValueError(f"{self.name}: the result is not finite, or of another shape: {shapes}")
+        return denoised
+
+
+def read_named(spec: str | Path, kind: type[ImageDenoiser]) -> NetworkFile:
+    """Read the network of a ``.safetensors`` file or of a shipped name, for denoisers of this kind.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if there is no such name, or the network takes another kind of image.
+    """
+    if not Path(spec).suffix and str(spec) not in list_shipped():
+        names = [*kind.shipped(), *FILTERS]
+        nearest = suggest(str(spec), names)
+        raise ValueError(f"{spec}: no such denoiser{nearest}; give one of {', '.join(names)}, {kind.files}")
+
+    file = read_network(find_denoiser(spec))
+    if file.image != kind.takes:
+        names = kind.shipped()
+        raise ValueError(
+            f"{spec}: denoises {IMAGES[file.image]}, not {IMAGES[kind.takes]}; give one of {', '.join(names)}"
+        )
+    return file
+
+
+def each_with_progress(parts: Sequence[Any], unit: str = "tile") -> Iterable[Any]:
+    """Iterate over the parts of a frame, with progress if there are several."""
+    if len(parts) == 1:
+        return parts
+    bar: Iterable[Any] = progress(parts, label="frame", unit=unit)
+    return bar
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +218,9 @@ class RawDenoiser(ImageDenoiser):
         model: ``model(levels)`` is the function f that denoises a piece of packed RAW; levels may be None.
         network: the network that computes, if it is a PyTorch network.
         cfa: the pattern that it was trained for; None if it works on any of Bayer's.
+        any_pattern: the network of mosaics of any pattern, such as X-Trans, with the planes of their colours; packed
+            RAW goes through ``model``. None if it denoises only Bayer mosaics.
+        demosaics: whether the result for packed RAW is linear camera RGB ``(1, 3, 2h, 2w)``.
         info: what its file says of its training.
         reads_levels: whether noise levels make a difference.
         tiles: side and overlap of the pieces, in packed pixels, where None is the default of
@@ -77,16 +241,17 @@ class RawDenoiser(ImageDenoiser):
     takes: ClassVar[Image] = "raw"
     default: ClassVar[str] = DEFAULT
     files: ClassVar[str] = "a .safetensors or an .onnx"
-    demosaics: ClassVar[bool] = False
-    """Whether the result is linear camera RGB instead of a mosaic."""
-
     model: Callable[[Levels | None], Model] = field(repr=False)
     cfa: CFA | None = None
+    any_pattern: MosaicDRUNet | None = field(default=None, repr=False)
+    demosaics: bool = False
     tiles: tuple[int, int | None] | None = (TILE, None)
 
     def __post_init__(self) -> None:
         if self.views not in (1, 4, 8):
             raise ValueError(f"views must be 1, 4 or 8, got {self.views!r}")
+        if self.demosaics and self.strength != 1.0:
+            raise ValueError(f"{self.name}: takes no strength=; the noisy frame has no full colour to mix in")
         if not 0.0 <= self.strength <= 1.0:
             raise ValueError(f"strength must be between 0 and 1, got {self.strength}; noise= takes higher levels")
 
@@ -101,69 +266,71 @@ class RawDenoiser(ImageDenoiser):
         return _of_file(spec)
 
     def takes_pattern(self, cfa: str) -> bool:
-        """Tell whether it takes mosaics of a pattern: any of Bayer's; a :class:`MosaicDenoiser` also takes others."""
-        return cfa in CFA.__members__
+        """Tell whether it takes mosaics of a pattern: any of Bayer's, and others with ``any_pattern``."""
+        return cfa in CFA.__members__ or self.any_pattern is not None
 
     def require_mosaic(self) -> RawDenoiser:
         """Return this denoiser; raise ValueError if it gives full colour, which cannot be compared with a mosaic."""
+        if self.demosaics:
+            raise ValueError(f"{self.name}: demosaics, too; rawaug run demosaic --denoiser.start {self.name} scores it")
         return self
 
     @torch.inference_mode()
     def __call__(self, noisy: Noisy) -> Tensor:
-        """Denoise packed RAW ``(1, 4, h, w)`` to a result on the CPU; a :class:`JointDenoiser` gives full colour.
+        """Denoise packed RAW ``(1, 4, h, w)`` to a result on the CPU; full colour if it ``demosaics``.
 
         A mosaic ``(1, 1, H, W)`` of a pattern other than Bayer's remains one. ValueError is raised if this denoiser
         takes none, or if the result has another shape or, with ``checked``, is not finite.
         """
         if noisy.image.shape[1] == 1:
-            denoised = self._of_mosaic(noisy)
+            denoised = self._denoise_mosaic(noisy)
         else:
-            denoised = self._of_packed(noisy)
+            denoised = self._denoise_packed(noisy)
 
         if self.strength == 1.0:
             return denoised.to(noisy.image.dtype)
         return noisy.image.lerp(denoised.clamp(max=1.0), self.strength)
 
-    def _of_packed(self, noisy: Noisy) -> Tensor:
+    def _denoise_packed(self, noisy: Noisy) -> Tensor:
+        # The pattern that it was trained for.
         cfa = CFA(noisy.cfa)
-        own = self.cfa or cfa
-        image = extend_to_pattern(noisy.image, cfa, own)
+        trained_for = self.cfa or cfa
+        image = extend_to_pattern(noisy.image, cfa, trained_for)
         variance = noisy.variance
         if variance is not None:
-            variance = extend_to_pattern(variance, cfa, own)
+            variance = extend_to_pattern(variance, cfa, trained_for)
 
-        run = self._whole(self.model(noisy.levels), own)
-        denoised = self._run(run, image, variance, self._result_shape(image))
-        return crop_to_pattern(denoised, own, cfa)
-
-    def _result_shape(self, packed: Tensor) -> tuple[int, ...]:
-        """Return the shape of the result for packed RAW."""
-        return tuple(packed.shape)
-
-    def _of_mosaic(self, noisy: Noisy) -> Tensor:
-        advice = "use rawaug-xtrans, or weights of rawaug run any"
-        raise ValueError(f"{self.name}: is for Bayer mosaics, not {noisy.cfa}; {advice}")
-
-    def _run(self, run: Model, image: Tensor, variance: Tensor | None, expected: Sequence[int]) -> Tensor:
-        """Call ``run`` on the device and in the precision of this denoiser, and check its result."""
-        if variance is not None:
-            variance = variance.to(self.device)
-        with self._precision():
-            denoised = run(image.to(self.device), variance).cpu()
-        return self._require_sound(denoised, image, expected)
-
-    def _whole(self, model: Model, cfa: CFA) -> Model:
-        """Wrap the model in tiles, and those in the self-ensemble."""
-        run = model
+        # Tiles, and views of them.
+        run = self.model(noisy.levels)
         if self.tiles is not None:
             tile, overlap = self.tiles
-            run = partial(denoisers.denoise_tiles, model, tile=tile, overlap=overlap, each=progress_by("tile"))
+            run = partial(denoisers.denoise_tiles, run, tile=tile, overlap=overlap, each=each_with_progress)
         if self.views > 1:
-            run = denoisers.SelfEnsemble(run, cfa, views=self.views, each=progress_by("view group"))
-        return run
+            each = partial(each_with_progress, unit="view group")
+            run = denoisers.SelfEnsemble(run, trained_for, views=self.views, each=each)
+        denoised = self._compute(run, image, variance)
+
+        shape = tuple(image.shape)
+        if self.demosaics:
+            shape = (1, 3, 2 * shape[2], 2 * shape[3])
+        self._require_sound(denoised, image, shape)
+        return crop_to_pattern(denoised, trained_for, cfa)
+
+    def _denoise_mosaic(self, noisy: Noisy) -> Tensor:
+        if self.any_pattern is None:
+            advice = "use rawaug-xtrans, or weights of rawaug run any"
+            raise ValueError(f"{self.name}: is for Bayer mosaics, not {noisy.cfa}; {advice}")
+        if self.views > 1 or self.tiles is None:
+            raise ValueError(f"the self-ensemble: is for Bayer mosaics, not {noisy.cfa}; omit it")
+        if noisy.variance is None:
+            raise ValueError(f"{self.name}: needs the variance of the noise")
+
+        tiles = partial(denoisers.denoise_tiles, self.any_pattern, tile=2 * self.tiles[0], each=each_with_progress)
+        denoised = self._compute(partial(denoise_mosaic, tiles, cfa=noisy.cfa), noisy.image, noisy.variance)
+        return self._require_sound(denoised, noisy.image, noisy.image.shape)
 
     def frame(self, frame: RawFrame, levels: Levels | None) -> Tensor:
-        """Denoise the mosaic ``(1, H, W)`` of a frame, to at most 1; a :class:`JointDenoiser` gives full colour.
+        """Denoise the mosaic ``(1, H, W)`` of a frame, to at most 1; full colour ``(3, H, W)`` if it ``demosaics``.
 
         ``levels`` may be None where :attr:`reads_levels` is False.
         """
@@ -174,56 +341,6 @@ class RawDenoiser(ImageDenoiser):
 
         denoised = bayer.unpack_if_packed(self(noisy), frame.cfa)
         return denoised[0].clamp(max=1.0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class MosaicDenoiser(RawDenoiser):
-    """A denoiser for mosaics of every pattern, including X-Trans and Quad-Bayer.
-
-    Attributes:
-        of_any: the network, which takes a mosaic with the planes of its colours. Packed RAW goes through ``network``.
-
-    The other attributes are those of :class:`RawDenoiser`, whose ``of`` makes it.
-    """
-
-    of_any: MosaicDRUNet = field(repr=False)
-
-    def takes_pattern(self, cfa: str) -> bool:
-        """Tell whether it denoises mosaics of a pattern: it takes every pattern."""
-        return True
-
-    def _of_mosaic(self, noisy: Noisy) -> Tensor:
-        if self.views > 1 or self.tiles is None:
-            raise ValueError(f"the self-ensemble: is for Bayer mosaics, not {noisy.cfa}; omit it")
-        if noisy.variance is None:
-            raise ValueError(f"{self.name}: needs the variance of the noise")
-
-        pieces = partial(denoisers.denoise_tiles, self.of_any, tile=2 * self.tiles[0], each=progress_by("tile"))
-        run = partial(denoise_mosaic, pieces, cfa=noisy.cfa)
-        return self._run(run, noisy.image, noisy.variance, noisy.image.shape)
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointDenoiser(RawDenoiser):
-    """A denoiser that also demosaics, from packed RAW ``(1, 4, h, w)`` to linear camera RGB ``(1, 3, 2h, 2w)``.
-
-    The attributes are those of :class:`RawDenoiser`, whose ``of`` makes it.
-    """
-
-    demosaics: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.strength != 1.0:
-            raise ValueError(f"{self.name}: takes no strength=; the noisy frame has no full colour to mix in")
-
-    def require_mosaic(self) -> RawDenoiser:
-        """Raise ValueError, since its results cannot be compared with a mosaic."""
-        raise ValueError(f"{self.name}: demosaics, too; rawaug run demosaic --denoiser.start {self.name} scores it")
-
-    def _result_shape(self, packed: Tensor) -> tuple[int, ...]:
-        height, width = packed.shape[-2:]
-        return 1, 3, 2 * height, 2 * width
 
 
 # -- by what it is made of ---------------------------------------------------------------------------------------------
@@ -272,8 +389,7 @@ def _of_file(spec: str | Path) -> RawDenoiser:
 def _of_network(name: str, network: nn.Module, info: Mapping[str, Any], cfa: CFA | None) -> RawDenoiser:
     """Make the denoiser of a network; unless it says so, it takes a variance if its ``forward`` has two arguments."""
     if isinstance(network, MosaicDRUNet):
-        packed = _of_network(name, BayerAdapter(network), info, cfa)
-        return MosaicDenoiser(of_any=network, **vars(packed))
+        return replace(_of_network(name, BayerAdapter(network), info, cfa), any_pattern=network)
 
     reads = getattr(network, "reads_variance", None)
     if reads is None:
@@ -281,13 +397,13 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any], cfa: CFA
         network = _Foreign(network, reads)
 
     evaluated = network.eval()
-    kind = RawDenoiser if getattr(evaluated, "upscale", 1) == 1 else JointDenoiser
-    return kind(
+    return RawDenoiser(
         name=name,
         model=lambda levels: evaluated,
         network=evaluated,
         cfa=cfa,
         info=info,
+        demosaics=getattr(evaluated, "upscale", 1) != 1,
         reads_levels=bool(reads),
         tiles=(getattr(evaluated, "tile", TILE), None),
     )

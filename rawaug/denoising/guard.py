@@ -29,8 +29,7 @@ from torch.nn import functional as F
 from denoisers.defects import mend_planes
 from denoisers.domains import DOMAINS
 from rawaug.bayer import noise_variance
-from rawaug.denoising.base import Noisy
-from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.denoising.risk import Probe, probe_denoiser
 
 SECOND = "NonLocalMeans"

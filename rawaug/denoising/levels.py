@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import Any
 
 from rawaug.camera.own import is_camera_file
-from rawaug.denoising.base import ImageDenoiser
+from rawaug.denoising.denoiser import ImageDenoiser
 from rawaug.io import RawFrame
 from rawaug.noise import (
     EldLevels,

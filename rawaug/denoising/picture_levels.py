@@ -24,7 +24,7 @@ photographs stay as they are.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,42 +45,43 @@ _SMALLEST = 1e-3 / 255.0
 """The smallest deviation that enters a logarithm."""
 
 
-class PictureLevel(NamedTuple):
-    """The noise of one picture.
-
-    Args:
-        level: its standard deviation, on the scale where white is 1.
-        share: how much of the correction is applied, from 0 for a clean picture to 1 for a noisy one.
-    """
-
-    level: float
-    share: float
-
-
 @torch.inference_mode()
-def estimate_level(network: Any, srgb: Tensor) -> PictureLevel:
+def estimate_level(network: Any, srgb: Tensor) -> tuple[float, float]:
     """Estimate the noise of a picture ``(1, 3, H, W)`` in [0, 1] for a network of pictures that reads a level.
 
     Networks that were trained without an unknown level, such as FFDNet, are told scikit-image's estimate.
+
+    Returns:
+        The standard deviation, on the scale where white is 1; and the share of the correction that is applied, from 0
+        for a clean picture to 1 for a noisy one.
     """
     if not getattr(network, "light", False):
-        return PictureLevel(white_level(srgb), 1.0)
+        return white_level(srgb), 1.0
 
-    squares = _removed_squares(network, srgb)
+    # What it removes at an unknown level: its power, and products of pixels one and two apart, by squares ``(N,)``.
+    side = min(_SQUARE, *srgb.shape[-2:])
+    squares = []
+    for part in _spread_parts(srgb):
+        removed = (part - network(part, torch.zeros_like(part))).float()
+        power = removed.square().mean(1, keepdim=True)
+        products = [power, _times_shifted(removed, 1), _times_shifted(removed, 2)]
+        squares.append(F.avg_pool2d(torch.cat(products, dim=1), side).flatten(2))
+    powers, one_apart, two_apart = torch.cat(squares, dim=2)[0]
+
     percentiles = torch.tensor([0.25, 0.5], device=srgb.device)
-    quartile, median = squares.power.sqrt().quantile(percentiles).clamp_min(_SMALLEST)
+    quartile, median = powers.sqrt().quantile(percentiles).clamp_min(_SMALLEST)
 
-    even = squares.power <= median.square()
-    power = squares.power[even].sum().clamp_min(_SMALLEST**2)
-    neighbours = squares.one_apart[even].sum() / power
-    second_neighbours = squares.two_apart[even].sum().clamp_min(0.0) / power
+    even = powers <= median.square()
+    power = powers[even].sum().clamp_min(_SMALLEST**2)
+    neighbours = one_apart[even].sum() / power
+    second_neighbours = two_apart[even].sum().clamp_min(0.0) / power
 
     log_level = LEVEL + BY_REMOVED * (255.0 * median).log()
     log_level = log_level - BY_NEIGHBOURS * neighbours + BY_SECOND_NEIGHBOURS * second_neighbours
     level = log_level.exp().clamp_min(_LOWEST) / 255.0
 
     share = SHARE - SHARE_BY_UNEVENNESS * (median / quartile).log()
-    return PictureLevel(float(level), float(share.sigmoid()))
+    return float(level), float(share.sigmoid())
 
 
 def white_level(srgb: Tensor) -> float:
@@ -89,35 +90,6 @@ def white_level(srgb: Tensor) -> float:
         from skimage.restoration import estimate_sigma
 
     return float(estimate_sigma(srgb[0].cpu().numpy(), channel_axis=0, average_sigmas=True))
-
-
-class _Squares(NamedTuple):
-    """Means over small squares, each ``(N,)``, of products of what a network removes.
-
-    Attributes:
-        power: the square of what is removed, the mean of the colours.
-        one_apart: the product of neighbours, the mean of rows and columns and of the colours.
-        two_apart: the same for pixels that are two apart.
-    """
-
-    power: Tensor
-    one_apart: Tensor
-    two_apart: Tensor
-
-
-def _removed_squares(network: Any, srgb: Tensor) -> _Squares:
-    """Measure what the network removes at an unknown level, in squares of the parts of a picture."""
-    side = min(_SQUARE, *srgb.shape[-2:])
-
-    parts = []
-    for part in _spread_parts(srgb):
-        removed = (part - network(part, torch.zeros_like(part))).float()
-        power = removed.square().mean(1, keepdim=True)
-
-        products = [power, _times_shifted(removed, 1), _times_shifted(removed, 2)]
-        parts.append(F.avg_pool2d(torch.cat(products, dim=1), side).flatten(2))
-
-    return _Squares(*torch.cat(parts, dim=2)[0])
 
 
 def _times_shifted(removed: Tensor, distance: int) -> Tensor:

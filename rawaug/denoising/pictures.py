@@ -8,13 +8,18 @@ user says otherwise.
 
 A network that estimates the level sees the picture twice, upright and turned by a quarter, and the two results are
 averaged. This gains half of what the self-ensemble does, which is the mean of eight views, as for RAW.
+
+Files are denoised to pictures of the same kind, with their EXIF, ICC profile and orientation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -24,16 +29,27 @@ import denoisers
 from denoisers.classical import FILTERS
 from denoisers.published import Image
 from rawaug import bayer
-from rawaug.denoising.base import ImageDenoiser, Noisy, progress_by, read_named
-from rawaug.denoising.picture_levels import PictureLevel, estimate_level, white_level
+from rawaug.denoising.denoiser import ImageDenoiser, Noisy, each_with_progress, read_named
+from rawaug.denoising.folder import Files
+from rawaug.denoising.picture_levels import estimate_level, white_level
+from rawaug.errors import escape
+from rawaug.files import files_below
+from rawaug.io import RawFrame
+from rawaug.io.content import RAW_EXTENSIONS, Listing, list_files, picture_extensions
+from rawaug.io.isolated import isolated
+from rawaug.io.stored import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
 from rawaug.registry import Spec, spec_label
 
 _TILE = 1024
 """Side of a tile; without tiles, the default denoiser needs more than 2 GB for 12 megapixels."""
-_LOWEST = 1e-4
+_LOWEST_OF_FILTERS = 1e-4
 """The lowest level that a filter is told, since it divides by it."""
 VIEWS = {1: (0,), 2: (0, 5), 4: range(4), 8: range(bayer.N_VIEWS)}
 """The views that are averaged, by the number of views."""
+LINEAR = (".exr",)
+"""The extensions of pictures of linear light."""
+_SUBSTITUTE = ".png"
+"""The format of results of pictures whose own format is read but not written; it loses nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,14 +61,15 @@ class PictureDenoiser(ImageDenoiser):
     is told this level, in units of 1/255, every time.
 
     Attributes:
-        run: ``run(srgb, noise) -> srgb``, called on ``device`` with the noise that is told or estimated.
-        estimate: estimates the level of a picture where none is told.
+        run: ``run(srgb, level) -> srgb``, called on ``device`` with the level that is told or estimated.
+        estimate: ``estimate(srgb) -> level, share`` where no level is told, see
+            :func:`rawaug.denoising.picture_levels.estimate_level`.
         level: the level that it is told every time; None for the estimate.
         views: number of flips and quarter turns of the picture that are averaged, 1, 2, 4 or 8; by default as many as
             the network asks for.
         strength: factor on the estimated level, 0 to 10: 2 removes more, 0.5 less, 0 nothing.
 
-    The other attributes are those of :class:`rawaug.denoising.base.ImageDenoiser`.
+    The other attributes are those of :class:`rawaug.denoising.denoiser.ImageDenoiser`.
 
     Example:
         >>> denoiser = PictureDenoiser.of("NonLocalMeans@10")
@@ -64,8 +81,8 @@ class PictureDenoiser(ImageDenoiser):
     default: ClassVar[str] = "rawaug-srgb"
     files: ClassVar[str] = "or a .safetensors of rawaug run srgb or of FFDNet's authors"
 
-    run: Callable[[Tensor, PictureLevel], Tensor] = field(repr=False)
-    estimate: Callable[[Tensor], PictureLevel] = field(repr=False)
+    run: Callable[[Tensor, float], Tensor] = field(repr=False)
+    estimate: Callable[[Tensor], tuple[float, float]] = field(repr=False)
     level: float | None = None
 
     def __post_init__(self) -> None:
@@ -97,34 +114,29 @@ class PictureDenoiser(ImageDenoiser):
     @torch.inference_mode()
     def __call__(self, noisy: Noisy) -> Tensor:
         """sRGB ``(1, 3, H, W)`` denoised, on the CPU, cut to [0, 1]."""
-        srgb = noisy.image.to(self.device)
-        total = torch.zeros_like(srgb)
-        with self._precision():
-            for view in VIEWS[self.views]:
-                denoised = self._denoise(bayer.turn(srgb, view).contiguous())
-                total += bayer.turn_back(denoised, view)
-
-        mean = total.div_(self.views).cpu().clamp_(0.0, 1.0)
+        mean = self._compute(self._average_views, noisy.image).clamp_(0.0, 1.0)
         return self._require_sound(mean, noisy.image, noisy.image.shape)
+
+    def _average_views(self, srgb: Tensor) -> Tensor:
+        total = torch.zeros_like(srgb)
+        for view in VIEWS[self.views]:
+            denoised = self._denoise(bayer.turn(srgb, view).contiguous())
+            total += bayer.turn_back(denoised, view)
+        return total.div_(self.views)
 
     def _denoise(self, srgb: Tensor) -> Tensor:
         """One view of the picture at the level that is told, or at the one that is estimated."""
-        if not self.reads_levels:
-            return self.run(srgb, PictureLevel(0.0, 1.0))
-        if self.level is None and self.strength == 0.0:
+        if self.reads_levels and self.level is None and self.strength == 0.0:
             return srgb
 
-        if self.level is None:
-            noise = self.estimate(srgb)
-            noise = noise._replace(level=self.strength * noise.level)
-        else:
-            noise = PictureLevel(self.level, 1.0)
-
-        denoised = self.run(srgb, noise)
-        return torch.lerp(srgb, denoised, noise.share, out=denoised)  # in place, since pictures are large
-
-
-# -- by what it is made of ---------------------------------------------------------------------------------------------
+        level, share = self.level or 0.0, 1.0
+        if self.reads_levels and self.level is None:
+            level, share = self.estimate(srgb)
+            level *= self.strength
+        denoised = self.run(srgb, level)
+        if self.reads_levels:
+            torch.lerp(srgb, denoised, share, out=denoised)  # in place, since pictures are large
+        return denoised
 
 
 def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> PictureDenoiser:
@@ -132,15 +144,18 @@ def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> Pictu
     network = network.eval()
     reads_levels = bool(getattr(network, "reads_variance", False))
 
-    run: Callable[..., Tensor] = _denoise_blindly
-    if reads_levels:
-        run = _denoise_at
+    def run(srgb: Tensor, level: float) -> Tensor:
+        """Denoise in tiles; a network that reads levels is told the deviation of the noise, 0 for unknown."""
+        if not reads_levels:
+            return denoisers.denoise_tiles(network, srgb, each=each_with_progress)
+        variance = srgb.new_full((1, 1, 1, 1), level**2).expand_as(srgb)
+        return denoisers.denoise_tiles(network, srgb, variance, tile=_TILE, each=each_with_progress).float()
 
     return PictureDenoiser(
         name=name,
         network=network,
         info=info,
-        run=partial(run, network),
+        run=run,
         estimate=partial(estimate_level, network),
         reads_levels=reads_levels,
         views=getattr(network, "views", 1),
@@ -151,15 +166,12 @@ def _of_filter(spec: Spec) -> PictureDenoiser:
     """A classical filter of white noise on the three colours, which is told scikit-image's estimate of its level."""
     denoiser = FILTERS.make(spec)
 
-    def run(srgb: Tensor, noise: PictureLevel) -> Tensor:
-        deviation = max(_LOWEST, noise.level)
+    def run(srgb: Tensor, level: float) -> Tensor:
+        deviation = max(_LOWEST_OF_FILTERS, level)
         planes = (srgb[0] / deviation).permute(1, 2, 0).contiguous().numpy()
         return torch.from_numpy(deviation * denoiser.denoise(planes)).permute(2, 0, 1)[None].float()
 
-    def estimate(srgb: Tensor) -> PictureLevel:
-        return PictureLevel(white_level(srgb), 1.0)
-
-    return PictureDenoiser(name=spec_label(spec), run=run, estimate=estimate)
+    return PictureDenoiser(name=spec_label(spec), run=run, estimate=lambda srgb: (white_level(srgb), 1.0))
 
 
 def _split_level(spec: str) -> tuple[str, float | None]:
@@ -177,12 +189,108 @@ def _split_level(spec: str) -> tuple[str, float | None]:
     return name, level
 
 
-def _denoise_blindly(network: nn.Module, srgb: Tensor, noise: PictureLevel) -> Tensor:
-    """The picture denoised by a network that reads no level."""
-    return denoisers.denoise_tiles(network, srgb, each=progress_by("tile"))
+# -- files -------------------------------------------------------------------------------------------------------------
 
 
-def _denoise_at(network: nn.Module, srgb: Tensor, noise: PictureLevel) -> Tensor:
-    """The picture denoised by a network that is told the deviation of its noise, 0 for unknown."""
-    variance = srgb.new_full((1, 1, 1, 1), noise.level**2).expand_as(srgb)
-    return denoisers.denoise_tiles(network, srgb, variance, tile=_TILE, each=progress_by("tile")).float()
+@dataclass(frozen=True)
+class DenoisedPicture:
+    """What was done to a picture; ``deviation`` is the removed noise's, in units of 1/255."""
+
+    source: Path
+    out: Path | None
+    deviation: float
+    seconds: float
+
+    def __str__(self) -> str:
+        return f"{escape(self.out)}: noise of {self.deviation:.1f} in 255 removed, {self.seconds:.1f} s"
+
+
+class PictureFiles(Files[DenoisedPicture]):
+    """Developed pictures, which are denoised to pictures with their EXIF, ICC profile and orientation.
+
+    Args:
+        denoiser: whatever :meth:`rawaug.denoising.pictures.PictureDenoiser.of` takes; None for the shipped one.
+        strength: a factor on the estimated level of the noise.
+        self_ensemble: whether eight views are averaged.
+        device: where a network runs: auto, cpu, cuda, ...
+
+    Raises:
+        FileNotFoundError: if a file is missing.
+        ValueError: if there is no such denoiser, or a setting does not fit it.
+    """
+
+    what = "picture"
+    formats = PICTURE_FORMATS
+    format_advice = f"the source is a developed picture; its output is one of {', '.join(PICTURE_FORMATS)}"
+
+    def __init__(
+        self, denoiser: Any = None, *, strength: float = 1.0, self_ensemble: bool = False, device: str = "auto"
+    ) -> None:
+        changes: dict[str, Any] = {}
+        if strength != 1.0:
+            changes["strength"] = strength
+        if self_ensemble:
+            changes["views"] = 8
+
+        if denoiser is None:
+            denoiser = PictureDenoiser.default
+        if not isinstance(denoiser, PictureDenoiser) or changes or device != "auto":
+            denoiser = PictureDenoiser.of(denoiser, device, "auto", **changes)
+        self.denoiser: PictureDenoiser = denoiser
+
+    def listing(self, folder: Path) -> Listing:
+        """List the pictures; one with the stem of a RAW file is left out, as the camera's own rendering of it."""
+        extensions = tuple(extension for extension in picture_extensions() if extension not in LINEAR)
+        listing = list_files(folder, extensions, "not a picture that is known")
+        raw = {file.with_suffix("") for file in files_below(folder) if file.suffix.lower() in RAW_EXTENSIONS}
+        beside = [file for file in listing.files if file.with_suffix("") in raw]
+        for file in beside:
+            advice = "pictures of the camera's own, beside the RAW files that they show; name one to denoise it"
+            listing.leave_out("rendering", advice, file.suffix.lower())
+            listing.files.remove(file)
+
+        if "picture" in listing.left_out:
+            listing.left_out["picture"].advice = "linear light; save it as a developed picture"
+        return self.require_files(folder, listing, extensions)
+
+    def target(self, file: Path) -> Path:
+        """Keep the name of the file, with ``.png`` appended if its format is read but not written."""
+        if file.suffix.lower() in PICTURE_FORMATS:
+            return file
+        return file.with_name(file.name + _SUBSTITUTE)
+
+    def remarks(self, files: Sequence[Path]) -> list[str]:
+        counts = Counter(file.suffix.lower() for file in files if self.target(file) != file)
+        if not counts:
+            return []
+
+        listed = ", ".join(f"{extension} {count}" for extension, count in counts.most_common())
+        plural = "s have" if counts.total() > 1 else " has"
+        return [f"{counts.total()} result{plural} another format than the source, {_SUBSTITUTE}: {listed}"]
+
+    def require_preview(self, preview: Path) -> None:
+        raise ValueError(f"preview={preview}: is for RAW files")
+
+    def denoise(
+        self, source: Path | RawFrame, out: Path | None = None, preview: Path | None = None, isolate: bool = True
+    ) -> tuple[Tensor, DenoisedPicture]:
+        """Denoise a picture; see :meth:`rawaug.denoising.folder.Files.denoise`.
+
+        Returns:
+            sRGB ``(3, H, W)`` in [0, 1], upright or turned as the file stores it; and what was done.
+        """
+        if isinstance(source, RawFrame):
+            raise ValueError(f"{source.name}: is a RAW frame, not a developed picture")
+        start = time.perf_counter()
+        picture: StoredPicture = isolated(read_stored, source)
+        srgb = picture.srgb
+        height, width = srgb.shape[-2:]
+        if min(height, width) < 2:
+            raise ValueError(f"{source}: is {width} x {height} pixels; at least 2 x 2 needed")
+
+        denoised = self.denoiser(Noisy(srgb[None]))[0]
+        deviation = 255.0 * (denoised - srgb).square().mean().sqrt().item()
+
+        if out is not None:
+            write_stored(out, denoised, picture)
+        return denoised, DenoisedPicture(source, out, deviation, time.perf_counter() - start)

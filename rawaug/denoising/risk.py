@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import noise_variance
-from rawaug.denoising.base import Levels, Noisy
+from rawaug.denoising.denoiser import Levels, Noisy
 
 PROBE = 0.1
 """Size of the change e in standard deviations of the noise: small for f, large for float32."""

@@ -22,8 +22,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA, noise_variance
 from rawaug.data.pairs import Pair
-from rawaug.denoising.base import Levels
-from rawaug.denoising.denoiser import Noisy
+from rawaug.denoising.denoiser import Levels, Noisy
 from rawaug.evaluation.scores import NOISY, Denoiser, group_rows, score, summary
 from rawaug.evaluation.trials import Trial, freeze_noise, raw_trial
 from rawaug.metrics import psnr

@@ -33,10 +33,9 @@ from torch.nn import functional as F
 
 from rawaug import bayer
 from rawaug.data.development import render_raw
-from rawaug.denoising.base import Levels, Noisy
-from rawaug.denoising.denoiser import RawDenoiser, shipped_of_mosaics
+from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.levels import Noise, find_levels
-from rawaug.denoising.raw_files import balance_greens
+from rawaug.denoising.raw import equalise_greens
 from rawaug.denoising.risk import Probe, estimate_risk, probe_denoiser
 from rawaug.evaluation.figures import new_figure, save_figure
 from rawaug.evaluation.tables import print_rows
@@ -158,7 +157,7 @@ def judge(
     frame = source if isinstance(source, RawFrame) else read_raw(source)
     if frame.cfa not in bayer.CFA.__members__:
         raise ValueError(f"{frame.name}: judge takes Bayer mosaics, not {frame.cfa}")
-    frame, _ = balance_greens(frame)
+    frame, _ = equalise_greens(frame)
     shot_var, read_var, noise_source = find_levels(frame, noise)
 
     specs = ["NonLocalMeans", *shipped_of_mosaics()] if denoisers is None else denoisers

@@ -23,8 +23,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA, pattern
-from rawaug.denoising.base import ImageDenoiser, Noisy
-from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import ImageDenoiser, Noisy, RawDenoiser
 from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.explore import figures
 from rawaug.explore.figures import Example

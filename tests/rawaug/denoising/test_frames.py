@@ -22,9 +22,9 @@ from rawaug.bayer import CFA, mosaic, pack, unpack
 from rawaug.cli import main
 from rawaug.commands.denoise import print_denoised, run
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
-from rawaug.denoising.files import DenoisedFolder, denoise_file, denoise_folder
+from rawaug.denoising.folder import DenoisedFolder, denoise_file, denoise_folder
 from rawaug.denoising.levels import find_levels
-from rawaug.denoising.raw_files import OTHER_PATTERNS, RawFiles
+from rawaug.denoising.raw import OTHER_PATTERNS, RawFiles
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng, write_picture
 from rawaug.io.cells import MONOCHROME
 from rawaug.noise import noise_levels
@@ -120,7 +120,7 @@ def test_greens_that_differ_are_balanced_and_kept_on_request(
     for greens in ("auto", "keep"):
         out = tmp_path / f"{greens}.dng"
         assert main([*command[:2], str(out), *command[2:], "--greens", greens, "--overwrite"]) == 0
-        done = json.loads((tmp_path / "done.json").read_text())["files"][0]["corrected"]
+        done = json.loads((tmp_path / "done.json").read_text())["files"][0]
         assert done["balanced"] is (greens == "auto") and done["greens"]["share"] == pytest.approx(0.02, rel=0.2)
         assert ("greens balanced" in capsys.readouterr().out) is (greens == "auto")
         packed = pack(read_raw(out).mosaic, CFA.RGGB)
@@ -222,7 +222,7 @@ def test_a_strength_below_1_leaves_that_much_of_the_noise(
 def test_in_bfloat16_a_network_of_dense_convolutions_does_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     frame, results = gradient(), []
     for fast in (False, True):
-        monkeypatch.setattr("rawaug.denoising.base.has_fast_bfloat16", lambda device, fast=fast: fast)
+        monkeypatch.setattr("rawaug.denoising.denoiser.has_fast_bfloat16", lambda device, fast=fast: fast)
         results.append(RawDenoiser.of("rawaug-base", "cpu", "auto").frame(frame, (1e-3, 1e-5)))
     assert results[1].dtype == torch.float32 and not torch.equal(*results)
     assert (results[0] - results[1]).std() < 0.03 * (results[0] - frame.mosaic).std()
@@ -271,7 +271,7 @@ def test_a_full_disk_ends_a_folder_in_one_line(
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
         write_dng(path, *rest, **colours)
 
-    monkeypatch.setattr("rawaug.denoising.raw_files.write_dng", write)
+    monkeypatch.setattr("rawaug.denoising.raw.write_dng", write)
     assert main(["denoise", str(source), str(out), "--denoiser", str(identity)]) == 2
     said = capsys.readouterr().err.strip().splitlines()
     assert "b.dng" in said[-1] and "No space left on device" in said[-1] and "c.dng" not in str(said)

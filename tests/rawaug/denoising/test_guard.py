@@ -10,7 +10,7 @@ from torch.nn import functional as F
 import rawaug
 from denoisers.defects import mend_planes
 from rawaug import RawDenoiser, bayer
-from rawaug.denoising.base import Noisy
+from rawaug.denoising.denoiser import Noisy
 from rawaug.denoising.guard import guard_result
 from rawaug.io import RawFrame
 

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 import rawaug
 from rawaug import RawDenoiser, bayer
 from rawaug.commands.judge import run
-from rawaug.denoising.base import Noisy
+from rawaug.denoising.denoiser import Noisy
 from rawaug.denoising.risk import estimate_risk, probe_denoiser
 from rawaug.evaluation.judge import judge_noisy
 from rawaug.io import RawFrame, write_dng

@@ -16,7 +16,7 @@ from rawaug.denoising.levels import UnknownNoise
 from rawaug.errors import count_of
 from rawaug.files import one_at_a_time, require_file, require_folder, require_output, require_same_settings
 from rawaug.io import RawFrame
-from rawaug.io.content import Listing, list_files
+from rawaug.io.content import Listing
 from rawaug.progress import progress
 
 PREVIEWS = (".jpg", ".jpeg", ".png")
@@ -41,31 +41,21 @@ class Files(ABC, Generic[T]):
     format_advice: ClassVar[str]
     """The advice about another extension."""
 
-    others: ClassVar[str]
-    """What a file of a folder is that is of no kind."""
-
     @property
     def settings(self) -> dict[str, Any] | None:
         """Return what the results depend on, as JSON; None if a folder's results may be of several settings."""
         return None
 
     @abstractmethod
-    def extensions(self) -> tuple[str, ...]:
-        """Return the extensions of the files of a folder that are of this kind."""
-
     def listing(self, folder: Path) -> Listing:
         """List the files of a folder that are of this kind; raise ValueError if there is none."""
-        extensions = self.extensions()
-        listing = list_files(folder, extensions, self.others)
-        self._select(folder, listing)
+
+    def require_files(self, folder: Path, listing: Listing, extensions: Sequence[str]) -> Listing:
+        """Return the listing of a folder; raise ValueError if it has no file of these extensions."""
         if not listing.files:
             contents = "; ".join(listing.lines()) or f"supported extensions are {', '.join(extensions)}"
             raise ValueError(f"{folder}: contains no {self.what} file; {contents}")
         return listing
-
-    @abstractmethod
-    def _select(self, folder: Path, listing: Listing) -> None:
-        """Leave out files that are not to be denoised, and say what to do with those that are left out."""
 
     def remarks(self, files: Sequence[Path]) -> list[str]:
         """Write lines on the results of these files of a folder."""
@@ -203,8 +193,18 @@ def denoise_folder(
     """
     source, out = Path(source), Path(out)
     listing = kind.listing(source)
-    targets = _targets(source, out, kind, listing.files)
-    previews_of = _preview_targets(source, out, kind, targets, previews, overwrite)
+    _require_outside(out, source)
+    targets: dict[Path, Path] = {}
+    taken: set[Path] = set()
+    for file in listing.files:
+        target = out / kind.target(file.relative_to(source))
+        if target in taken:
+            raise ValueError(f"{file}: another file of {file.parent} has this stem, and both would become {target}")
+        targets[file] = target
+        taken.add(target)
+    previews_of = {}
+    if previews is not None:
+        previews_of = _name_previews(source, out, Path(previews), kind, targets, overwrite)
 
     require_folder(out)
     if kind.settings is not None:
@@ -253,49 +253,27 @@ def denoise_folder(
     return result
 
 
-def _targets(source: Path, out: Path, kind: Files[T], files: list[Path]) -> dict[Path, Path]:
-    """Name the result of each file."""
-    _require_outside(out, source)
-
-    sources: dict[Path, Path] = {}
-    for file in files:
-        target = out / kind.target(file.relative_to(source))
-        if target in sources:
-            raise ValueError(f"{file}: another file of {file.parent} has this stem, and both would become {target}")
-        sources[target] = file
-    return {file: target for target, file in sources.items()}
-
-
-def _preview_targets(
-    source: Path,
-    out: Path,
-    kind: Files[T],
-    targets: dict[Path, Path],
-    previews: str | Path | None,
-    overwrite: bool,
+def _name_previews(
+    source: Path, out: Path, folder: Path, kind: Files[T], targets: dict[Path, Path], overwrite: bool
 ) -> dict[Path, Path]:
-    """Name the preview of each file, in the subfolders of ``previews``; there are none without such a folder.
+    """Name the preview of each file, in the subfolders of ``folder``.
 
     Previews never lie among the sources, where a JPEG of the same name is the camera's own. A JPEG without a result
     beside it is not a preview of ours, and is not replaced.
     """
-    if previews is None:
-        return {}
-
-    folder = Path(previews)
     kind.require_preview(folder)
     if folder.suffix.lower() in PREVIEWS and not folder.is_dir():
         raise ValueError(f"preview={folder}: the source is a folder, and so are its previews; give a folder")
     _require_outside(folder, source)
     require_folder(folder)
 
-    previews_of = {}
+    previews = {}
     for file, target in targets.items():
         preview = folder / target.relative_to(out).with_suffix(".jpg")
         if not target.exists():
             require_output(preview, overwrite)
-        previews_of[file] = preview
-    return previews_of
+        previews[file] = preview
+    return previews
 
 
 def _require_outside(folder: Path, source: Path) -> None:

@@ -30,17 +30,16 @@ from torch import Tensor
 from denoisers.files import JOINT
 from rawaug import bayer
 from rawaug.bayer import CFA, GreenDifference
-from rawaug.denoising.base import Noisy
 from rawaug.denoising.defects import find_lone_sites, mend_sites, read_defects
-from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.denoising.files import Files
+from rawaug.denoising.denoiser import Noisy, RawDenoiser
+from rawaug.denoising.folder import Files
 from rawaug.denoising.guard import SECOND, guard_result
 from rawaug.denoising.levels import Noise, as_json, find_levels, load_noise
 from rawaug.errors import count_of, escape
 from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
 from rawaug.io.cells import MONOCHROME
-from rawaug.io.content import RAW_EXTENSIONS, Listing
+from rawaug.io.content import RAW_EXTENSIONS, Listing, list_files
 from rawaug.io.dng import LINEAR_WHITE, cell_of_planes
 from rawaug.io.isolated import isolated
 from rawaug.io.raw import develop
@@ -59,39 +58,6 @@ Greens = Literal["auto", "keep"]
 
 
 @dataclass(frozen=True)
-class Corrected:
-    """The corrections of a frame's greens and defects.
-
-    Attributes:
-        greens: by how much the two greens differ; None if that cannot be measured.
-        balanced: whether the difference was taken out.
-        mended: the number of sites of a map of defects that were replaced.
-        kept: the number of sites that look like defects and were left as they are.
-    """
-
-    greens: GreenDifference | None = None
-    balanced: bool = False
-    mended: int = 0
-    kept: int = 0
-
-    def __str__(self) -> str:
-        words = ""
-        if self.greens is not None and self.balanced:
-            words += f", greens differed by {self.greens.share:.2%} +- {self.greens.error:.2%}, balanced"
-        return words + self.defects
-
-    @property
-    def defects(self) -> str:
-        """What was done about single sites, for the line of the file."""
-        words = ""
-        if self.mended:
-            words += f", {count_of(self.mended, 'defect')} of the map mended"
-        if self.kept:
-            words += f", {count_of(self.kept, 'lone site')} kept"
-        return words
-
-
-@dataclass(frozen=True)
 class Denoised:
     """What was done to a RAW file.
 
@@ -102,7 +68,10 @@ class Denoised:
         below_zero: the share of sites whose result was below the digital number 0.
         seconds: the time for reading, denoising and writing.
         camera, iso: the source's camera and ISO.
-        corrected: errors of the sensor that were taken out.
+        greens: by how much the two greens of a Bayer sensor differ; None if that cannot be measured.
+        balanced: whether this difference was taken out.
+        mended: the number of sites of a map of defects that were replaced.
+        kept: the number of sites that look like defects and were left as they are.
         blended: the mean share of the result in its blend with the input; 1 without the guard, or where it found none
             of the frame harmed.
         strength: the share of the noise that was removed.
@@ -117,7 +86,10 @@ class Denoised:
     seconds: float
     camera: str
     iso: float | None
-    corrected: Corrected
+    greens: GreenDifference | None = None
+    balanced: bool = False
+    mended: int = 0
+    kept: int = 0
     blended: float = 1.0
     strength: float = 1.0
 
@@ -136,9 +108,9 @@ class Denoised:
             noise = f"noise {removed}"
 
         line = f"{escape(self.out)}: {noise}"
-        if self.corrected.balanced:
+        if self.balanced:
             line += ", greens balanced"
-        line += self.corrected.defects
+        line += self._defects()
         line += f", {self.seconds:.1f} s"
         if is_uncertain:
             line += "; the estimate is uncertain"
@@ -151,7 +123,18 @@ class Denoised:
     def details(self) -> str:
         """The same in numbers: noise levels, how they were found, and what was corrected."""
         levels = f"shot_var {self.shot_var:.3g}, read_var {self.read_var:.3g} ({self.noise_source})"
-        return f"{escape(self.out)}: {levels}{self.corrected}, {self.seconds:.1f} s{self._losses()}"
+        line = f"{escape(self.out)}: {levels}"
+        if self.greens is not None and self.balanced:
+            line += f", greens differed by {self.greens.share:.2%} +- {self.greens.error:.2%}, balanced"
+        return f"{line}{self._defects()}, {self.seconds:.1f} s{self._losses()}"
+
+    def _defects(self) -> str:
+        words = ""
+        if self.mended:
+            words += f", {count_of(self.mended, 'defect')} of the map mended"
+        if self.kept:
+            words += f", {count_of(self.kept, 'lone site')} kept"
+        return words
 
     def _losses(self) -> str:
         line = ""
@@ -190,7 +173,6 @@ class RawFiles(Files[Denoised]):
     what = "RAW"
     formats = (".dng",)
     format_advice = "the output is a DNG; give a name ending in .dng"
-    others = "neither RAW nor a picture that is known"
 
     def __init__(
         self,
@@ -278,7 +260,7 @@ class RawFiles(Files[Denoised]):
         preview: Path | None = None,
         isolate: bool = False,
     ) -> tuple[RawFrame | Tensor, Denoised]:
-        """Denoise a RAW file or a frame; see :meth:`rawaug.denoising.files.Files.denoise`.
+        """Denoise a RAW file or a frame; see :meth:`rawaug.denoising.folder.Files.denoise`.
 
         Returns:
             The frame with the denoised mosaic ``(1, H, W)`` and the noise that is left, or linear camera RGB
@@ -296,12 +278,12 @@ class RawFiles(Files[Denoised]):
 
         # The denoiser of this pattern; greens that agree; a monochrome frame as the mosaic of a grey scene.
         denoiser = self.denoiser_for(frame.cfa)
-        corrected = Corrected()
+        greens, balanced = None, False
         if denoiser.strength > 0:
-            frame, corrected = balance_greens(frame, self.greens)
+            equal, greens = equalise_greens(frame, self.greens)
+            frame, balanced = equal, equal is not frame
         if self.sites is not None:
             frame = mend_sites(frame, self.sites)
-            corrected = replace(corrected, mended=len(self.sites))
         mosaic = frame
         if frame.cfa == MONOCHROME:
             if denoiser.demosaics:
@@ -316,7 +298,7 @@ class RawFiles(Files[Denoised]):
 
         # The result: full colour, or a mosaic that digital numbers can hold, with the noise that is left.
         image = denoiser.frame(mosaic, levels)
-        blended = 1.0
+        blended, kept = 1.0, 0
         if self.guard and denoiser.strength > 0 and levels is not None and mosaic.cfa in CFA.__members__:
             noisy = Noisy.of(bayer.pack(mosaic.mosaic[None], mosaic.cfa), levels, mosaic.cfa)
             packed = bayer.pack(image[None], mosaic.cfa)
@@ -325,7 +307,7 @@ class RawFiles(Files[Denoised]):
         if self.defects != "mend" and levels is not None:
             lone = find_lone_sites(mosaic, levels)
             image = torch.where(lone, mosaic.mosaic.clamp(max=1.0), image)
-            corrected = replace(corrected, kept=int(lone.sum()))
+            kept = int(lone.sum())
         rgb = None
         if denoiser.demosaics:
             rgb = image
@@ -346,29 +328,32 @@ class RawFiles(Files[Denoised]):
 
         shot_var, read_var = levels or (0.0, 0.0)
         done = Denoised(
-            file,
-            out,
-            shot_var,
-            read_var,
-            noise_source,
-            below_zero,
-            seconds,
-            frame.camera,
-            frame.iso,
-            corrected,
-            blended,
-            denoiser.strength,
+            source=file,
+            out=out,
+            shot_var=shot_var,
+            read_var=read_var,
+            noise_source=noise_source,
+            below_zero=below_zero,
+            seconds=seconds,
+            camera=frame.camera,
+            iso=frame.iso,
+            greens=greens,
+            balanced=balanced,
+            mended=0 if self.sites is None else len(self.sites),
+            kept=kept,
+            blended=blended,
+            strength=denoiser.strength,
         )
         return (frame if rgb is None else rgb), done
 
     # -- files of a folder ---------------------------------------------------------------------------------------------
 
-    def extensions(self) -> tuple[str, ...]:
-        return RAW_EXTENSIONS
-
-    def _select(self, folder: Path, listing: Listing) -> None:
+    def listing(self, folder: Path) -> Listing:
+        """List the RAW files."""
+        listing = list_files(folder, RAW_EXTENSIONS, "neither RAW nor a picture that is known")
         if "RAW file" in listing.left_out:
             listing.left_out["RAW file"].advice = "there is no decoder for these kinds of RAW"
+        return self.require_files(folder, listing, RAW_EXTENSIONS)
 
     def target(self, file: Path) -> Path:
         return file.with_suffix(".dng")
@@ -402,16 +387,18 @@ class RawFiles(Files[Denoised]):
         return informed
 
 
-def balance_greens(frame: RawFrame, greens: Greens = "auto") -> tuple[RawFrame, Corrected]:
-    """Make the two greens of a Bayer frame agree if they clearly differ, and say what was done."""
+def equalise_greens(frame: RawFrame, greens: Greens = "auto") -> tuple[RawFrame, GreenDifference | None]:
+    """Make the two greens of a Bayer frame agree if they clearly differ; return the frame, and by how much they did.
+
+    The difference is None for other patterns, or if it cannot be measured.
+    """
     if frame.cfa not in CFA.__members__:
-        return frame, Corrected()
+        return frame, None
 
     difference = bayer.measure_greens(frame.mosaic, frame.cfa)
     if difference is None or not difference.significant or greens == "keep":
-        return frame, Corrected(difference)
-    mosaic = bayer.balance_greens(frame.mosaic, frame.cfa, difference)
-    return replace(frame, mosaic=mosaic), Corrected(difference, balanced=True)
+        return frame, difference
+    return replace(frame, mosaic=bayer.balance_greens(frame.mosaic, frame.cfa, difference)), difference
 
 
 def clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
