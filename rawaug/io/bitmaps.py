@@ -30,12 +30,12 @@ def unpack_rle4(path: Path) -> bytes:
     (start,) = struct.unpack_from("<I", data, 10)
     width, height = struct.unpack_from("<ii", data, 18)
     pixels = np.zeros((height, width), np.uint8)
-    x, y, place = 0, 0, start
+    x, y, offset = 0, 0, start
     while y < height:
-        if place + 2 > len(data):
+        if offset + 2 > len(data):
             raise ValueError(f"BMP: its run lengths end at row {y} of {height}")
-        count, code = data[place], data[place + 1]
-        place += 2
+        count, code = data[offset], data[offset + 1]
+        offset += 2
 
         if count:
             run = np.resize(np.array([code >> 4, code & 15], np.uint8), count)
@@ -45,14 +45,14 @@ def unpack_rle4(path: Path) -> bytes:
         elif code == 1:
             break
         elif code == 2:
-            x, y = x + data[place], y + data[place + 1]
-            place += 2
+            x, y = x + data[offset], y + data[offset + 1]
+            offset += 2
             continue
         else:
             size = (code + 1) // 2
-            halves = np.frombuffer(data, np.uint8, size, place)
+            halves = np.frombuffer(data, np.uint8, size, offset)
             run = np.stack([halves >> 4, halves & 15], -1).ravel()[:code]
-            place += size + size % 2
+            offset += size + size % 2
 
         run = run[: max(0, width - x)]  # as decoders do, pixels beyond the end of a row are dropped
         pixels[y, x : x + len(run)] = run

@@ -151,8 +151,8 @@ def _find_hdr_transfer(profile: bytes) -> str | None:
     from PIL import ImageCms
 
     count = int.from_bytes(profile[128:132], "big")
-    for place in range(132, min(132 + 12 * count, len(profile) - 11), 12):
-        name, start, size = struct.unpack_from(">4sII", profile, place)
+    for offset in range(132, min(132 + 12 * count, len(profile) - 11), 12):
+        name, start, size = struct.unpack_from(">4sII", profile, offset)
         if name == b"cicp" and size >= 12 and start + 12 <= len(profile):
             return _HDR_TRANSFERS.get(profile[start + 9])
 

@@ -112,8 +112,8 @@ def is_raw(path: str | Path) -> bool:
 
 def _by_bytes(file: BinaryIO) -> Content:
     head = file.read(64)
-    for place, signature, content in _SIGNATURES:
-        if head.startswith(signature, place):
+    for offset, signature, content in _SIGNATURES:
+        if head.startswith(signature, offset):
             return content
 
     if head.startswith(_TIFF):
@@ -137,7 +137,7 @@ def _by_extension(extension: str, content: Content) -> Content:
 def _of_boxes(head: bytes) -> Content:
     """Identify a file of boxes by its brands: its own comes first, then those that it is compatible with."""
     size = int.from_bytes(head[:4], "big")
-    brands = [head[8:12]] + [head[place : place + 4] for place in range(16, min(size, len(head)), 4)]
+    brands = [head[8:12]] + [head[offset : offset + 4] for offset in range(16, min(size, len(head)), 4)]
     if b"crx " in brands:
         return Content("raw", "CR3")
 

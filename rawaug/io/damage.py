@@ -72,7 +72,7 @@ def find_fault(path: Path, stored: StoredMosaic, numbers: np.ndarray | None) -> 
 
 def stated_bytes(path: Path) -> int:
     """Read how many bytes the largest picture of a file based on TIFF has; 0 if it is another kind of file."""
-    most = 0
+    largest = 0
     with path.open("rb") as file:
         try:
             tiff = TiffFile(file)
@@ -80,10 +80,10 @@ def stated_bytes(path: Path) -> int:
                 return 0
             for directory in tiff.directories():
                 for code in (STRIP_BYTES, TILE_BYTES):
-                    most = max(most, sum(tiff.numbers(directory.entries.get(code))))
+                    largest = max(largest, sum(tiff.numbers(directory.entries.get(code))))
         except DamagedTags:  # Fuji, Canon's older files and others have no such tables
             pass
-    return most
+    return largest
 
 
 def is_cut_short(path: Path) -> bool:
@@ -180,8 +180,8 @@ def _ends_with_its_data(stream: bytes, decoded: np.ndarray) -> bool:
         first = _first_change(stream, end, count, decoded)
         if first is not None:
             shortest_code_word = 1  # bit
-            most = 8 * (count + 1) // shortest_code_word
-            return decoded.size - first <= most
+            largest = 8 * (count + 1) // shortest_code_word
+            return decoded.size - first <= largest
     return False
 
 

@@ -507,7 +507,7 @@ def _require_plain_components(path: Path) -> None:
     if size < 0 or size + 42 > len(head):
         return
     count = int.from_bytes(head[size + 40 : size + 42], "big")
-    components = {head[place : place + 3] for place in range(size + 42, size + 42 + 3 * count, 3)}
+    components = {head[offset : offset + 3] for offset in range(size + 42, size + 42 + 3 * count, 3)}
     depths = {component[:1] for component in components}
     is_signed = any(depth >= b"\x80" for depth in depths)
     if is_signed or len(components) > 1 or not components <= {depth + b"\1\1" for depth in depths}:

@@ -36,7 +36,7 @@ class Entry(NamedTuple):
     code: int
     dtype: int
     values: int
-    place: int
+    offset: int
     size: int
 
 
@@ -84,17 +84,17 @@ class TiffFile:
         else:
             (self.first,) = struct.unpack_from(self.order + "I", head, 4)
 
-    def directory(self, place: int) -> Directory:
+    def directory(self, offset: int) -> Directory:
         """Read the directory that begins at ``place``."""
         counter, pointer = ("Q", "Q") if self.big else ("H", "I")
         head = struct.calcsize(self.order + counter)
-        (count,) = struct.unpack(self.order + counter, self.read(place, head))
+        (count,) = struct.unpack(self.order + counter, self.read(offset, head))
         if count > MOST_ENTRIES:
             raise DamagedTags(f"a directory of {count} tags")
 
         inside = struct.calcsize(self.order + pointer)
         step = 4 + 2 * inside
-        table = self.read(place + head, count * step)
+        table = self.read(offset + head, count * step)
 
         entries: dict[int, Entry] = {}
         for start in range(0, count * step, step):
@@ -104,24 +104,24 @@ class TiffFile:
             if not size:
                 continue
 
-            at = place + head + start + 4 + inside
+            at = offset + head + start + 4 + inside
             if size > inside:
                 (at,) = struct.unpack_from(self.order + pointer, table, start + 4 + inside)
             entries[code] = Entry(code, dtype, values, at, size)
 
-        return Directory(entries, self._following(place + head + count * step, pointer))
+        return Directory(entries, self._following(offset + head + count * step, pointer))
 
     def directories(self) -> Iterator[Directory]:
         """Yield the first directories of a file and those that they point at, each once."""
         waiting = [self.first]
         places: set[int] = set()
         while waiting and len(places) < _MOST_DIRECTORIES:
-            place = waiting.pop(0)
-            if not place or place in places:
+            offset = waiting.pop(0)
+            if not offset or offset in places:
                 continue
-            places.add(place)
+            places.add(offset)
 
-            directory = self.directory(place)
+            directory = self.directory(offset)
             yield directory
             waiting.extend(self.numbers(directory.entries.get(SUB_DIRECTORIES)))
             waiting.append(directory.following)
@@ -130,7 +130,7 @@ class TiffFile:
         """Read a tag with its values."""
         if entry.size > MOST_BYTES:
             raise DamagedTags(f"tag {entry.code} of {entry.size} bytes")
-        return Tag(entry.code, entry.dtype, entry.values, self.read(entry.place, entry.size))
+        return Tag(entry.code, entry.dtype, entry.values, self.read(entry.offset, entry.size))
 
     def tags(self, entries: Iterable[Entry]) -> list[Tag]:
         """Read tags with their values. Their total size is limited, since values may overlap in a hostile file."""
@@ -177,25 +177,25 @@ class TiffFile:
             fractions.append(numerator / denominator if denominator else 0.0)
         return fractions
 
-    def _following(self, place: int, pointer: str) -> int:
+    def _following(self, offset: int, pointer: str) -> int:
         """Read where the next directory begins. Some programs leave this out after the last one."""
         size = struct.calcsize(self.order + pointer)
-        if place + size > self.end:
+        if offset + size > self.end:
             return 0
-        return int(struct.unpack(self.order + pointer, self.read(place, size))[0])
+        return int(struct.unpack(self.order + pointer, self.read(offset, size))[0])
 
-    def read(self, place: int, size: int) -> bytes:
+    def read(self, offset: int, size: int) -> bytes:
         """Read bytes of the file; raise DamagedTags if it has fewer."""
-        if place + size > self.end:
-            raise DamagedTags(f"{size} bytes at {place} of {self.end}")
-        self._file.seek(place)
+        if offset + size > self.end:
+            raise DamagedTags(f"{size} bytes at {offset} of {self.end}")
+        self._file.seek(offset)
         return self._file.read(size)
 
 
-def pack_directory(order: str, tags: Iterable[Tag], place: int, following: int = 0) -> bytes:
+def pack_directory(order: str, tags: Iterable[Tag], offset: int, following: int = 0) -> bytes:
     """Pack a directory for ``place``, followed by the values that do not fit into it."""
     ordered = sorted(tags, key=lambda tag: tag.code)
-    beyond = place + 2 + 12 * len(ordered) + 4
+    beyond = offset + 2 + 12 * len(ordered) + 4
 
     table, values = struct.pack(order + "H", len(ordered)), b""
     for tag in ordered:
@@ -208,6 +208,6 @@ def pack_directory(order: str, tags: Iterable[Tag], place: int, following: int =
     return table + struct.pack(order + "I", following) + values
 
 
-def pointer_tag(order: str, code: int, place: int) -> Tag:
+def pointer_tag(order: str, code: int, offset: int) -> Tag:
     """Make the tag that says where a directory is."""
-    return Tag(code, 4, 1, struct.pack(order + "I", place))
+    return Tag(code, 4, 1, struct.pack(order + "I", offset))

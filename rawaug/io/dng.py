@@ -405,26 +405,26 @@ def _append_directories(path: Path, directories: dict[str, list[Tag]], carried: 
         pointers: dict[int, list[int]] = {}
         for name, entries in directories.items():
             if name == "ExifTag" and carried.interoperability:
-                place = _append_directory(file, tiff.order, carried.interoperability)
-                entries = [*entries, pointer_tag(tiff.order, INTEROPERABILITY, place)]
+                offset = _append_directory(file, tiff.order, carried.interoperability)
+                entries = [*entries, pointer_tag(tiff.order, INTEROPERABILITY, offset)]
             pointers[SUB_DIRECTORIES[name]] = [_append_directory(file, tiff.order, entries)]
         if carried.previews:
             pointers[_SUB_IFDS] = [_append_preview(file, tiff.order, preview) for preview in carried.previews]
 
         # The first directory has room for the places.
         for code, places in pointers.items():
-            file.seek(first[code].place)
+            file.seek(first[code].offset)
             file.write(struct.pack(f"{tiff.order}{len(places)}I", *places))
         if tiff.numbers(first[_PHOTOMETRIC]) == (_GREY,):  # tifffile writes linear RAW only of three planes
-            file.seek(first[_PHOTOMETRIC].place)
+            file.seek(first[_PHOTOMETRIC].offset)
             file.write(struct.pack(tiff.order + "H", LINEAR_PHOTOMETRIC))
 
 
 def _append_directory(file: BinaryIO, order: str, entries: Sequence[Tag]) -> int:
     """Write a directory at the end of a file and return its place."""
-    place = _even_end(file)
-    file.write(pack_directory(order, entries, place))
-    return place
+    offset = _even_end(file)
+    file.write(pack_directory(order, entries, offset))
+    return offset
 
 
 def _append_preview(file: BinaryIO, order: str, preview: Preview) -> int:

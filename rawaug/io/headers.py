@@ -171,9 +171,9 @@ def read_exif_colour(file: BinaryIO) -> Colour | None:
         exif = tiff.directory(exif_place)
         space = tiff.number(exif, _COLOR_SPACE)
         index = b""
-        place = tiff.number(exif, INTEROPERABILITY)
-        if place:
-            entry = tiff.directory(place).entries.get(_INTEROPERABILITY_INDEX)
+        offset = tiff.number(exif, INTEROPERABILITY)
+        if offset:
+            entry = tiff.directory(offset).entries.get(_INTEROPERABILITY_INDEX)
             index = tiff.tag(entry).data if entry is not None else b""
     except DamagedTags:
         return None
@@ -190,24 +190,24 @@ class Chunk(NamedTuple):
     """A part of a PNG or WebP: its name, where its data begin, and their length."""
 
     name: bytes
-    place: int
+    offset: int
     length: int
 
 
 def png_chunks(file: BinaryIO) -> Iterator[Chunk]:
     """Yield the chunks of a PNG in their order."""
-    place = len(PNG_SIGNATURE)
+    offset = len(PNG_SIGNATURE)
     end = file.seek(0, 2)
     for _ in range(_MOST_CHUNKS):
-        file.seek(place)
+        file.seek(offset)
         head = file.read(8)
         if len(head) < 8:
             return
         length, name = struct.unpack(">I4s", head)
-        if place + 12 + length > end:
+        if offset + 12 + length > end:
             return
-        yield Chunk(name, place + 8, length)
-        place += 12 + length
+        yield Chunk(name, offset + 8, length)
+        offset += 12 + length
 
 
 def png_fault(path: Path) -> str | None:
@@ -228,7 +228,7 @@ def png_fault(path: Path) -> str | None:
 
 def _checksum(file: BinaryIO, chunk: Chunk) -> bytes:
     """Compute the checksum that a chunk should have; the file is then positioned at the one that it has."""
-    file.seek(chunk.place)
+    file.seek(chunk.offset)
     left, checksum = chunk.length, zlib.crc32(chunk.name)
     while left:
         data = file.read(min(left, _PIECE))
@@ -241,7 +241,7 @@ def chunk_data(file: BinaryIO, chunk: Chunk) -> bytes:
     """Read the data of a chunk."""
     if chunk.length > _MOST_BYTES:
         raise ValueError(f"chunk {chunk.name!r} of {chunk.length} bytes")
-    file.seek(chunk.place)
+    file.seek(chunk.offset)
     return file.read(chunk.length)
 
 
@@ -329,18 +329,18 @@ def _raw_profile(name: bytes, data: bytes) -> bytes | None:
 
 def webp_chunks(file: BinaryIO) -> Iterator[Chunk]:
     """Yield the chunks of a WebP in their order."""
-    place = 12
+    offset = 12
     end = file.seek(0, 2)
     for _ in range(_MOST_CHUNKS):
-        file.seek(place)
+        file.seek(offset)
         head = file.read(8)
         if len(head) < 8:
             return
         name, length = struct.unpack("<4sI", head)
-        if place + 8 + length > end:
+        if offset + 8 + length > end:
             return
-        yield Chunk(name, place + 8, length)
-        place += 8 + length + length % 2
+        yield Chunk(name, offset + 8, length)
+        offset += 8 + length + length % 2
 
 
 def _of_webp(file: BinaryIO) -> Headers:
@@ -381,8 +381,8 @@ def _of_bmp(file: BinaryIO) -> Headers:
     head = file.read(138)
     if len(head) < 138 or head[70:74] != b"DEBM":  # "MBED", embedded
         return Headers()
-    place, size = struct.unpack_from("<II", head, 126)
-    file.seek(14 + place)
+    offset, size = struct.unpack_from("<II", head, 126)
+    file.seek(14 + offset)
     profile = file.read(min(size, _MOST_BYTES))
     return Headers(colour=Colour(profile) if profile else None)
 
@@ -400,22 +400,22 @@ class Box(NamedTuple):
 
 def boxes(file: BinaryIO, start: int, end: int) -> Iterator[Box]:
     """Yield the boxes between two places of a file."""
-    place = start
+    offset = start
     for _ in range(_MOST_CHUNKS):
-        file.seek(place)
+        file.seek(offset)
         head = file.read(16)
-        if place + 8 > end or len(head) < 8:
+        if offset + 8 > end or len(head) < 8:
             return
         size, name = struct.unpack(">I4s", head[:8])
-        inside = place + 8
+        inside = offset + 8
         if size == 1 and len(head) == 16:
             (size,) = struct.unpack(">Q", head[8:])
-            inside = place + 16
-        beyond = place + size if size else end
+            inside = offset + 16
+        beyond = offset + size if size else end
         if beyond < inside or beyond > end:
             return
         yield Box(name, inside, beyond)
-        place = beyond
+        offset = beyond
 
 
 def _of_heif(file: BinaryIO) -> Headers:
@@ -474,18 +474,18 @@ def _properties_of_item(file: BinaryIO, box: Box, item: int) -> list[int]:
     data = file.read(min(box.end - box.start, _MOST_BYTES))
     wide_items, wide_indices = data[0] > 0, data[3] & 1
     (count,) = struct.unpack_from(">I", data, 4)
-    place = 8
+    offset = 8
     indices = []
     for _ in range(count):
-        (number,) = struct.unpack_from(">I" if wide_items else ">H", data, place)
-        place += 4 if wide_items else 2
-        associations = data[place]
-        place += 1
+        (number,) = struct.unpack_from(">I" if wide_items else ">H", data, offset)
+        offset += 4 if wide_items else 2
+        associations = data[offset]
+        offset += 1
         for _ in range(associations):
-            index = data[place] & 0x7F
+            index = data[offset] & 0x7F
             if wide_indices:
-                index = struct.unpack_from(">H", data, place)[0] & 0x7FFF
-            place += 1 + wide_indices
+                index = struct.unpack_from(">H", data, offset)[0] & 0x7FFF
+            offset += 1 + wide_indices
             if number == item and index:
                 indices.append(index - 1)
     return indices

@@ -143,9 +143,9 @@ def _pack_block(tiff: TiffFile, tags: list[Tag], first: Directory) -> bytes:
     behind = b""
     pointers = []
     for code in codes:
-        place = 8 + size + len(behind)
-        pointers.append(pointer_tag(tiff.order, code, place))
-        behind += _pack_pointed(tiff, tiff.number(first, code), place)
+        offset = 8 + size + len(behind)
+        pointers.append(pointer_tag(tiff.order, code, offset))
+        behind += _pack_pointed(tiff, tiff.number(first, code), offset)
 
     return _tiff_head(tiff.order) + pack_directory(tiff.order, tags + pointers, 8) + behind
 
@@ -156,18 +156,18 @@ def _tiff_head(order: str) -> bytes:
     return signature + struct.pack(order + "I", 8)
 
 
-def _pack_pointed(tiff: TiffFile, source: int, place: int) -> bytes:
+def _pack_pointed(tiff: TiffFile, source: int, offset: int) -> bytes:
     """Pack the directory at ``source`` of a file for ``place`` of a block, followed by the interoperability one."""
     directory = tiff.directory(source)
     tags = tiff.tags(_without(POINTERS, directory.entries.values()))
     if INTEROPERABILITY not in directory.entries:
-        return pack_directory(tiff.order, tags, place)
+        return pack_directory(tiff.order, tags, offset)
 
-    size = len(pack_directory(tiff.order, [*tags, pointer_tag(tiff.order, INTEROPERABILITY, 0)], place))
+    size = len(pack_directory(tiff.order, [*tags, pointer_tag(tiff.order, INTEROPERABILITY, 0)], offset))
     inner = tiff.directory(tiff.number(directory, INTEROPERABILITY))
     inner_tags = tiff.tags(inner.entries.values())
-    own = [*tags, pointer_tag(tiff.order, INTEROPERABILITY, place + size)]
-    return pack_directory(tiff.order, own, place) + pack_directory(tiff.order, inner_tags, place + size)
+    own = [*tags, pointer_tag(tiff.order, INTEROPERABILITY, offset + size)]
+    return pack_directory(tiff.order, own, offset) + pack_directory(tiff.order, inner_tags, offset + size)
 
 
 def mend_exif(exif: bytes, thumbnail: Thumbnail | None, upright: bool) -> bytes:
@@ -181,7 +181,7 @@ def mend_exif(exif: bytes, thumbnail: Thumbnail | None, upright: bool) -> bytes:
         first = tiff.directory(tiff.first)
         entry = first.entries.get(ORIENTATION)
         if upright and entry is not None and entry.dtype == 3:
-            struct.pack_into(tiff.order + "H", block, entry.place, 1)
+            struct.pack_into(tiff.order + "H", block, entry.offset, 1)
 
         if thumbnail is not None and first.following:
             _mend_thumbnail(block, tiff, tiff.directory(first.following), thumbnail)
@@ -213,7 +213,7 @@ def _mend_thumbnail(block: bytearray, tiff: TiffFile, second: Directory, render:
     block[start : start + size] = jpeg.ljust(size, b"\0")
     entry = second.entries[THUMBNAIL_BYTES]
     letter = "H" if entry.dtype == 3 else "I"
-    struct.pack_into(tiff.order + letter, block, entry.place, len(jpeg))
+    struct.pack_into(tiff.order + letter, block, entry.offset, len(jpeg))
 
 
 def _small_jpeg(pixels: np.ndarray, size: int) -> bytes | None:
@@ -311,11 +311,11 @@ def _profile_segments(profile: bytes) -> bytes:
 
 def _without_application_segments(plain: bytes) -> bytes:
     """Select the tables and the scans of a JPEG, which follow its start and its application segments."""
-    place = 2
-    while plain[place] == 0xFF and _APP0 <= plain[place + 1] <= _APP15:
-        (length,) = struct.unpack_from(">H", plain, place + 2)
-        place += 2 + length
-    return plain[place:]
+    offset = 2
+    while plain[offset] == 0xFF and _APP0 <= plain[offset + 1] <= _APP15:
+        (length,) = struct.unpack_from(">H", plain, offset + 2)
+        offset += 2 + length
+    return plain[offset:]
 
 
 _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]", re.DOTALL)
@@ -324,15 +324,15 @@ _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]", re.DOTALL)
 
 def _end_of_picture(source: bytes) -> int:
     """Find where the first picture of a JPEG ends, after its end-of-image marker or else at the file's end."""
-    place = 2
-    while (match := _MARKER.search(source, place)) is not None:
+    offset = 2
+    while (match := _MARKER.search(source, offset)) is not None:
         marker = source[match.start() + 1]
         if marker == 0xD9:
             return match.end()
         if match.end() + 2 > len(source):
             break
         (length,) = struct.unpack_from(">H", source, match.end())
-        place = match.end() + length
+        offset = match.end() + length
 
     return len(source)
 
@@ -354,7 +354,7 @@ def _with_places(new: bytes, segments: list[Segment], source: bytes, end: int) -
     if entry is None:
         return new
 
-    for at in range(entry.place, entry.place + entry.size - 15, 16):
+    for at in range(entry.offset, entry.offset + entry.size - 15, 16):
         size, offset = struct.unpack_from(tiff.order + "II", block, at + 4)
         if offset == 0:
             struct.pack_into(tiff.order + "I", block, at + 4, len(new))
@@ -450,14 +450,14 @@ def dress_tiff(plain: bytes, metadata: Metadata, upright: bool) -> bytes:
     block = _block_of(metadata, order, upright)
 
     start = len(block) + len(block) % 2
-    place = start
+    offset = start
     strips: list[bytes] = []
     places: list[int] = []
     for strip in _strips(tiff):
         even = strip + bytes(len(strip) % 2)
-        places.append(place)
+        places.append(offset)
         strips.append(even)
-        place += len(even)
+        offset += len(even)
 
     tags: dict[int, Tag] = {}
     for tag in (*_tags_of_parts(metadata, order), *_tags_of_block(block)):
@@ -467,8 +467,8 @@ def dress_tiff(plain: bytes, metadata: Metadata, upright: bool) -> bytes:
             tags[entry.code] = tiff.tag(entry)
     tags[_STRIP_OFFSETS] = Tag(_STRIP_OFFSETS, 4, len(places), struct.pack(f"{order}{len(places)}I", *places))
 
-    directory = pack_directory(order, tags.values(), place)
-    head = block[:4] + struct.pack(order + "I", place)
+    directory = pack_directory(order, tags.values(), offset)
+    head = block[:4] + struct.pack(order + "I", offset)
     return b"".join((head, block[8:].ljust(start - 8, b"\0"), *strips, directory))
 
 
@@ -519,4 +519,4 @@ def _strips(tiff: TiffFile) -> list[bytes]:
     first = tiff.directory(tiff.first)
     places = tiff.numbers(first.entries.get(_STRIP_OFFSETS))
     sizes = tiff.numbers(first.entries.get(_STRIP_BYTES))
-    return [tiff.read(place, size) for place, size in zip(places, sizes, strict=True)]
+    return [tiff.read(offset, size) for offset, size in zip(places, sizes, strict=True)]

@@ -42,12 +42,12 @@ def unpack_opcodes(opcodes: bytes) -> Iterator[Opcode]:
     """Yield the opcodes of a list; raise ValueError if it is truncated."""
     try:
         (count,) = struct.unpack_from(">I", opcodes)
-        place = 4
+        offset = 4
         for _ in range(count):
-            code, version, flags, size = _HEAD.unpack_from(opcodes, place)
-            place += _HEAD.size
-            yield Opcode(code, version, flags, opcodes[place : place + size])
-            place += size
+            code, version, flags, size = _HEAD.unpack_from(opcodes, offset)
+            offset += _HEAD.size
+            yield Opcode(code, version, flags, opcodes[offset : offset + size])
+            offset += size
     except struct.error as error:
         raise ValueError(f"the opcode list is truncated ({error})") from None
 

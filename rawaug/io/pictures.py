@@ -138,9 +138,9 @@ def _over_black(picture: Decoded) -> np.ndarray:
     if picture.colours.dtype.kind == "f":
         return picture.colours * picture.alpha
 
-    most = np.uint32(np.iinfo(picture.colours.dtype).max)
+    largest = np.uint32(np.iinfo(picture.colours.dtype).max)
     product = picture.colours.astype(np.uint32) * picture.alpha
-    return ((product + most // 2) // most).astype(picture.colours.dtype)
+    return ((product + largest // 2) // largest).astype(picture.colours.dtype)
 
 
 def _as_srgb(colours: np.ndarray, picture: Decoded, path: Path) -> np.ndarray:
@@ -280,11 +280,11 @@ def _exposure_of(path: Path) -> dict[str, float]:
 
     try:
         tiff = TiffFile(BytesIO(exif))
-        place = tiff.number(tiff.directory(tiff.first), EXIF)
-        if not place:
+        offset = tiff.number(tiff.directory(tiff.first), EXIF)
+        if not offset:
             return values
 
-        entries = tiff.directory(place).entries
+        entries = tiff.directory(offset).entries
         values["exposure time"] = tiff.rational(entries.get(_EXPOSURE_TIME))
         values["f-number"] = tiff.rational(entries.get(_F_NUMBER))
         iso, *_ = tiff.numbers(entries.get(_ISO)) or (0,)

@@ -77,17 +77,17 @@ def read_tiff_kind(file: BinaryIO) -> TiffKind | None:
 def _count_pages(tiff: TiffFile) -> int:
     """Count the pictures, without thumbnails, masks, and what is less than half as wide or high as the first."""
     places: list[int] = []
-    place = tiff.first
-    first = tiff.directory(place)
+    offset = tiff.first
+    first = tiff.directory(offset)
     least = tiff.number(first, _HEIGHT) / 2, tiff.number(first, _WIDTH) / 2
 
     pages = 0
-    while place and place not in places and len(places) < _MOST_PAGES:
-        places.append(place)
-        directory = tiff.directory(place)
+    while offset and offset not in places and len(places) < _MOST_PAGES:
+        places.append(offset)
+        directory = tiff.directory(offset)
         is_large = tiff.number(directory, _HEIGHT) >= least[0] and tiff.number(directory, _WIDTH) >= least[1]
         pages += is_large and not _is_reduced(tiff, directory)
-        place = directory.following
+        offset = directory.following
 
     description = first.entries.get(_DESCRIPTION)
     stack = None if description is None else _IMAGEJ_STACK.match(tiff.tag(description).data)

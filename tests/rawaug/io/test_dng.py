@@ -366,7 +366,7 @@ def test_makers_notes_and_interoperability(safe: bool, tmp_path: Path, bayer_dng
         ]
         place = dng._append_directory(file, "<", entries)
         tiff = TiffFile(file)
-        file.seek(tiff.directory(tiff.first).entries[34665].place)
+        file.seek(tiff.directory(tiff.first).entries[34665].offset)
         file.write(struct.pack("<I", place))
     write_dng(tmp_path / "a.dng", read_raw(source), source)
     with tifffile.TiffFile(tmp_path / "a.dng") as written:
