@@ -33,9 +33,10 @@ class Laboratory:
         self.folds: list[tuple[str, str, tuple[float, int, int], int]] = []
         self.wholes: list[tuple[str, int]] = []
         self.denoisers: list[Path] = []
+        self.shown: list[tuple[str, str, str]] = []
         self.stop_after = 10**6
         self.cameras = self.min_side = 0
-        stands_in = ("open_pairs", "open_pictures", "fit_family", "score_rows", "cycle_psnr", "psnr_d")
+        stands_in = ("open_pairs", "open_pictures", "fit_family", "score_rows", "draw_frame", "cycle_psnr", "psnr_d")
         for name in stands_in:
             monkeypatch.setattr(reconstruction, name, getattr(self, name))
 
@@ -70,6 +71,9 @@ class Laboratory:
         rows = {"blind": value, "as-shot": value + 1}
         return {"rows": rows, "mpix_s": 2.0 ** int(pair.name[1:]), "forward": value - 5}
 
+    def draw_frame(self, family: str, model: Any, pair: Pair, folder: Path) -> None:
+        self.shown.append((family, pair.name, folder.name))
+
     def cycle_psnr(self, fitted: Any, pictures: Sequence[torch.Tensor]) -> dict[str, float]:
         return {"cycle": 33.0}
 
@@ -100,6 +104,7 @@ def test_every_figure_is_the_mean_that_its_name_says(laboratory: Laboratory, tmp
     assert row["cycle"] == 33.0 and "cycle" not in rows["dictionary, as-shot gains"]
     assert [frame for _, frame, _, seed in laboratory.folds if seed == 0] == [f"f{k}" for k in range(8)]
     assert laboratory.wholes == [("dictionary", 0)] and laboratory.denoisers == [] and laboratory.min_side == 2
+    assert laboratory.shown == [("dictionary", "f0", "shown")], "the first frame, with the first seed"
 
 
 def test_a_published_split_is_fitted_once_and_scored_on_every_test_frame(
