@@ -20,6 +20,7 @@ defective pixels are mended first, for they are no texture.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -57,6 +58,27 @@ _NOTHING = 1e-3
 _PLACE = 4
 _FLAT = 8
 _LEAST_FLAT = 10
+
+
+@dataclass(frozen=True)
+class Guarded:
+    """A denoiser whose results are guarded, to be scored beside it."""
+
+    denoiser: RawDenoiser
+
+    @property
+    def name(self) -> str:
+        """Its name in tables."""
+        return f"{self.denoiser.name}, guarded"
+
+    @property
+    def takes(self) -> str:
+        """The kind of image that it takes."""
+        return self.denoiser.takes
+
+    def __call__(self, noisy: Noisy) -> Tensor:
+        """Denoise packed RAW ``(1, 4, h, w)`` with known levels, and guard the result."""
+        return guard_result(self.denoiser, noisy, self.denoiser(noisy), self.denoiser.strength)[0]
 
 
 class _Blend(NamedTuple):

@@ -11,6 +11,7 @@ from rawaug.data import open_pairs
 from rawaug.data.frames import as_frames
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoiser import RawDenoiser, shipped_of_mosaics
+from rawaug.denoising.guard import Guarded
 from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.errors import count_of
 from rawaug.evaluation.benchmark import (
@@ -106,7 +107,8 @@ def compare_raw(comparison: BenchmarkSettings) -> None:
     }
     result = {**facts, **benchmark(denoisers, cases)}
     if comparison.harm:
-        result["harm"] = measure_harm(denoisers, frames, crop, comparison.seed)
+        guarded = [Guarded(denoiser) for denoiser in denoisers if denoiser.name in shipped_of_mosaics()]
+        result["harm"] = measure_harm([*denoisers, *guarded], frames, crop, comparison.seed)
 
     for title, head, cells in _all_tables(result):
         print_cells(title, ["denoiser", *head], cells)
@@ -193,8 +195,10 @@ def _make_notes(result: dict[str, Any]) -> list[str]:
             continue
         for strength, scores in row["scores"][TOLD].items():
             summaries[f"{name} ({strength})"] = scores
-        if "harm" in result:
-            for column, scores in result["harm"][name]["frames"].items():
+
+    for name, row in result.get("harm", {}).items():
+        if name != "noisy input":
+            for column, scores in row["frames"].items():
                 summaries[f"{name} ({column})"] = scores
 
     frames = count_of(len(result["frames"]), "frame")

@@ -49,7 +49,7 @@ _LEVELS: Levels = (1e-4, 1e-6)
 _GROUND, _PEAK = 0.01, 0.5
 _SIDE = 64
 _FIELD_SIDE, _FIELD_LIGHTS = 192, 197
-_DRAWS = 4
+_DRAWS = 2
 
 
 def measure_harm(

@@ -5,9 +5,9 @@ r"""Denoisers judged on a file of one's own, which has no clean version: their P
 
 with u of :mod:`rawaug.denoising.risk`. Its deviation is that of the noise's energy on this frame, which nobody knows,
 
-.. math:: \operatorname{var} \sum_i u_i \approx \sum_i (2 \sigma_i^4 + 8 \sigma_i^2 u_i),
+.. math:: \operatorname{var} \sum_i u_i \approx \sum_i (2 \sigma_i^4 + 8 \sigma_i^2 u_i + (k_i - \bar k)^2),
 
-so an error that is a hundredth of the noise needs some 10^6 pixels to be known within a tenth of a decibel. It is the
+where k is the term of the derivatives, whose single values scatter since one probe measures all of them at once. So an error that is a hundredth of the noise needs some 10^6 pixels to be known within a tenth of a decibel. It is the
 same for all denoisers, though, and the difference of two is known far better: its interval comes from blocks. After
 development D, all terms are taken through its derivative J at f(y), which is right to first order:
 :math:`|J (f - y)|^2 - |J n|^2 + 2 (J \sigma^2 b) \cdot J (f(y + e) - f(y)) / e`, where n is drawn noise.
@@ -57,6 +57,10 @@ BANDED = 0.01
 
 MOST_CLIPPED = 0.2
 """A frame is refused if this share of it is clipped at white; what is clipped is left out in any case."""
+
+LEVELS_ERROR = 0.02
+"""Levels that were estimated from the frame are wrong by this part of the variance: of drawn noise on the frames of
+``real:`` and ``demo:`` they were, by 0.01 to 0.03 in the mean of squares, which the interval contains."""
 
 _SURE = 5.0
 """A fault is one if it is beyond its limit, and this many of its deviations from what is right."""
@@ -172,7 +176,8 @@ def judge(
         return render_raw(mosaic, frame.cfa, frame.white_balance, frame.color_matrix, "bilinear", least=None)
 
     noisy = Noisy.of(packed, (shot_var, read_var), frame.cfa)
-    return judge_noisy(noisy, opened, develop, frame.name, noise_source, seed)
+    levels_error = LEVELS_ERROR if noise_source.startswith("estimate") else 0.0
+    return judge_noisy(noisy, opened, develop, frame.name, noise_source, seed, levels_error)
 
 
 def judge_noisy(
@@ -182,8 +187,12 @@ def judge_noisy(
     name: str = "",
     noise_source: str = "given",
     seed: int = 0,
+    levels_error: float = 0.0,
 ) -> Judgement:
-    """Judge denoisers on packed RAW ``(1, 4, h, w)`` with known levels; see :func:`judge`."""
+    """Judge denoisers on packed RAW ``(1, 4, h, w)`` with known levels; see :func:`judge`.
+
+    ``levels_error`` is by what part of the noise's variance the levels may be wrong, a deviation.
+    """
     if noisy.levels is None or noisy.image.shape[1] != 4:
         raise ValueError(f"{name}: judge needs packed RAW (1, 4, h, w) and the levels of its noise")
     image, levels = noisy.image, noisy.levels
@@ -206,7 +215,7 @@ def judge_noisy(
 
     judged = {}
     for key in sorted(risks, key=lambda key: float((risks[key] * is_whole).sum())):
-        one = _judge_one(probes[key], risks[key], probes[best], risks[best], is_whole)
+        one = _judge_one(probes[key], risks[key], risks[best], is_whole, levels_error * noise_energy)
         psnr_srgb = None
         if develop is not None:
             psnr_srgb = _developed(probes[key], image, develop, seed)
@@ -214,12 +223,17 @@ def judge_noisy(
     return Judgement(name, levels, noise_source, (), tuple(remarks), psnr_noisy, judged)
 
 
-def _judge_one(probe: Probe, risk: Tensor, best: Probe, least_risk: Tensor, is_whole: Tensor) -> Judged:
-    """Judge one denoiser beside the best, without the values that are clipped."""
+def _judge_one(probe: Probe, risk: Tensor, least_risk: Tensor, is_whole: Tensor, energy_error: float) -> Judged:
+    """Judge one denoiser beside the best, without the values that are clipped.
+
+    ``energy_error`` is the deviation of the noise's energy if its levels are not known exactly.
+    """
     count = is_whole.sum().clamp_min(1)
     error = float((risk * is_whole).sum() / count)
+    kept = 2.0 * probe.variance * probe.kept
     spread = 2.0 * probe.variance.square() + 8.0 * probe.variance * max(error, 0.0)
-    deviation = float((spread * is_whole).sum().sqrt() / count)
+    spread += (kept - (kept * is_whole).sum() / count).square()
+    deviation = math.hypot(float((spread * is_whole).sum().sqrt() / count), energy_error)
     interval = _decibels(error + _NORMAL * deviation), _decibels(error - _NORMAL * deviation)
 
     size = _pool(is_whole.to(risk))
@@ -367,10 +381,11 @@ def _banding(residual: Tensor, is_flat: Tensor) -> str:
     height, width = mask.shape[-2:]
     mask = mask.expand(1, 4, height, width).to(residual)
     residual = residual[..., :height, :width] * mask
+    energy = (residual.square().sum() / mask.sum()).clamp_min(1.0)
     for axis, lines in ((3, "rows"), (2, "columns")):
         count = mask.sum(axis)
         is_long = count >= 2 * _PLACE
-        scatter = (residual.sum(axis).square() / count.clamp_min(1))[is_long]
+        scatter = (residual.sum(axis).square() / count.clamp_min(1) / energy)[is_long]
         if scatter.numel() < _LEAST_LINES:
             continue
         excess = float(scatter.mean()) - 1.0

@@ -32,7 +32,7 @@ def test_flux_is_what_a_denoiser_keeps_of_a_light() -> None:
     for width in WIDTHS:
         for place in PLACES:
             kept = {name: row["kept"][f"{width:g}"][place] for name, row in rows.items()}
-            assert kept["noisy input"] == pytest.approx(1.0, abs=0.12)
+            assert kept["noisy input"] == pytest.approx(1.0, abs=0.2)
             assert kept["halve"] == pytest.approx(0.5 * kept["noisy input"], abs=1e-4)
             assert kept["ground"] == pytest.approx(0.0, abs=1e-4)
     assert rows["noisy input"]["fields"]["1.2"] > rows["halve"]["fields"]["1.2"] > rows["ground"]["fields"]["1.2"]
