@@ -49,7 +49,8 @@ _LEVELS: Levels = (1e-4, 1e-6)
 _GROUND, _PEAK = 0.01, 0.5
 _SIDE = 64
 _FIELD_SIDE, _FIELD_LIGHTS = 192, 197
-_DRAWS = 2
+_AROUND = slice(12, 20)
+_DRAWS = 4
 
 
 def measure_harm(
@@ -94,13 +95,18 @@ def _measure_kept(denoiser: Denoiser, seed: int) -> dict[str, dict[str, float]]:
     for width in WIDTHS:
         for place, (row, column) in PLACES.items():
             clean = bayer.pack(_GROUND + draw_light(_SIDE, row, column, width)[None, None], CFA.RGGB)
+            flux = _sum_flux(clean)
             shares = []
             for draw in range(_DRAWS):
                 noisy = _add_noise(clean, "light", str(width), place, str(draw), seed=seed)
-                flux = (denoiser(noisy) - _GROUND).sum() / (clean - _GROUND).sum()
-                shares.append(float(flux))
+                shares.append(_sum_flux(denoiser(noisy)) / flux)
             kept.setdefault(f"{width:g}", {})[place] = fmean(shares)
     return kept
+
+
+def _sum_flux(image: Tensor) -> float:
+    """Sum the light above the ground in the 8 x 8 cells around the place."""
+    return float((image[..., _AROUND, _AROUND] - _GROUND).sum())
 
 
 def _measure_fields(denoiser: Denoiser, seed: int) -> dict[str, float]:

@@ -7,8 +7,9 @@ with u of :mod:`rawaug.denoising.risk`. Its deviation is that of the noise's ene
 
 .. math:: \operatorname{var} \sum_i u_i \approx \sum_i (2 \sigma_i^4 + 8 \sigma_i^2 u_i + (k_i - \bar k)^2),
 
-where k is the term of the derivatives, whose single values scatter since one probe measures all of them at once. So an error that is a hundredth of the noise needs some 10^6 pixels to be known within a tenth of a decibel. It is the
-same for all denoisers, though, and the difference of two is known far better: its interval comes from blocks. After
+where k is the term of the derivatives, whose single values scatter since one probe measures all of them at once. So an
+error that is a hundredth of the noise needs some 10^6 pixels to be known within a tenth of a decibel. It is the same
+for all denoisers, though, and the difference of two is known far better: its interval comes from blocks. After
 development D, all terms are taken through its derivative J at f(y), which is right to first order:
 :math:`|J (f - y)|^2 - |J n|^2 + 2 (J \sigma^2 b) \cdot J (f(y + e) - f(y)) / e`, where n is drawn noise.
 
