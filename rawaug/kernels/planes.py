@@ -30,7 +30,7 @@ def demosaic_directional(raw: Tensor, cfa: CFA, method: str) -> Tensor:
     return rgb
 
 
-@compile_loop
+@partial(compile_loop, allocates=True)
 def _rows(mosaic, red_row, red_column, homogeneous, rgb, start, stop):  # type: ignore[no-untyped-def]
     """Demosaic rows ``start`` to ``stop`` of a picture whose mosaic has margins."""
     own = mosaic[start : stop + 2 * _MARGIN]
@@ -134,7 +134,7 @@ def _colour_between_rows(above, below, green_above, green, green_below, sites, o
         out[j] = green[j] + corners * _QUARTER if (j & 1) == sites else green[j] + down * _HALF
 
 
-@compile_part
+@partial(compile_part, allocates=True)
 def _leads(pictures, lead):  # type: ignore[no-untyped-def]
     """Count how many more of a site's four neighbours are like it in the first picture than in the second."""
     rows, width = lead.shape
@@ -184,7 +184,7 @@ def smooth(planes: Tensor, taps: Tensor) -> Tensor:
     return out
 
 
-@compile_loop
+@partial(compile_loop, allocates=True)
 def _smooth_rows(image, weights, out, start, stop):  # type: ignore[no-untyped-def]
     """Filter rows ``start`` to ``stop`` of all planes, two taps at a time.
 

@@ -111,21 +111,25 @@ def has_numba() -> bool:
     return not numba.config.DISABLE_JIT
 
 
-def compile_loop(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile the decorated function to machine code that releases the GIL, cached on disk if a folder is writable."""
+def compile_loop(function: Callable[..., Any], allocates: bool = False) -> Callable[..., Any]:
+    """Compile the decorated function to machine code that releases the GIL, cached on disk if a folder is writable.
+
+    Numba counts references to every slice, which takes a third of the time of a pass over short rows. Without arrays
+    that the loop ``allocates`` itself, nothing has to be counted.
+    """
     from numba import njit
 
     try:
-        return njit(cache=True, **_OPTIONS)(function)
+        return njit(cache=True, _nrt=allocates, **_OPTIONS)(function)
     except RuntimeError:  # no writable folder
-        return njit(**_OPTIONS)(function)
+        return njit(_nrt=allocates, **_OPTIONS)(function)
 
 
-def compile_part(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a decorated function that only those of :func:`compile_loop` in the same module call."""
+def compile_part(function: Callable[..., Any], allocates: bool = False) -> Callable[..., Any]:
+    """Compile a decorated function that only those of :func:`compile_loop` call; for ``allocates`` see there."""
     from numba import njit
 
-    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
+    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=allocates, **_OPTIONS)(function)
 
 
 _pools: dict[int, ThreadPoolExecutor] = {}

@@ -88,6 +88,12 @@ def test_a_curve_has_every_code_of_a_byte() -> None:
     torch.testing.assert_close(between.flatten()[1], curve[0, 100] + 0.25 * (curve[0, 101] - curve[0, 100]))
 
 
+def test_codes_looked_up_sixty_four_at_once_are_those_looked_up_one_by_one() -> None:
+    srgb, setting = pictures(2, 3, 6, 320), camera(2, False, False, entries=256)
+    narrow = cpu.unprocess(srgb[..., :62].contiguous(), setting, 0.9)
+    assert torch.equal(cpu.unprocess(srgb, setting, 0.9)[..., :31], narrow)
+
+
 def one_of(setting: Unprocessing, picture: int) -> Unprocessing:
     own = slice(picture, picture + 1)
     return setting._replace(curves=setting.curves[own], colour=setting.colour[own], frame=setting.frame[own])
