@@ -56,10 +56,10 @@ def psnr_r(
 
         return windows_psnr(reverse, pair, patches)
 
-    blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
-    params = choose(blocks.srgb[None])
-    estimate = isp.reverse_pixels(blocks.srgb[None], params, blocks.coordinates)[0]
-    return block_psnr(estimate, blocks.raw, blocks.clipped)
+    srgb, raw, clipped, coordinates = block_averages(pair.srgb, pair.raw, pair.cfa)
+    params = choose(srgb[None])
+    estimate = isp.reverse_pixels(srgb[None], params, coordinates)[0]
+    return block_psnr(estimate, raw, clipped)
 
 
 def block_psnr(estimate: Tensor, raw: Tensor, clipped: Tensor) -> float:

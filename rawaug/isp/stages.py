@@ -266,23 +266,23 @@ class LensShading(Stage):
 
     def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x5 = x4 G(p) A(x4 G(p), p), both ``(B, 3, H, W)``."""
-        where = coordinates_or_full(x, coordinates)
-        x = x * self.mask(where)
+        coordinates = coordinates_or_full(x, coordinates)
+        x = x * self.mask(coordinates)
 
         if self.reverse_attention is None:
             return x
-        return x * self.reverse_attention(x, where)
+        return x * self.reverse_attention(x, coordinates)
 
     def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x4 from x5, both ``(B, 3, H, W)``: divide by the mask, then apply the forward attention.
 
         The attention's place-dependent gains come first, its colour-dependent ones last.
         """
-        where = coordinates_or_full(x, coordinates)
+        coordinates = coordinates_or_full(x, coordinates)
         if self.forward_attention is None:
-            return x / self.mask(where)
+            return x / self.mask(coordinates)
 
-        x = x * self.forward_attention.of_place(where) / self.mask(where)
+        x = x * self.forward_attention.of_place(coordinates) / self.mask(coordinates)
         return x * self.forward_attention.of_colour(x)
 
     def bake(self, tables: Tables, forward: bool = False) -> Tables:
@@ -368,9 +368,9 @@ class FallOff(Stage):
     def _look_up(self, coordinates: Tensor, edge: Tensor, weights: Tensor) -> Tensor:
         """Mix the tables by weights ``(B, N)``, and look up ``coordinates`` ``(1 or B, 2, H, W)``: ``(B, 3, H, W)``."""
         tables = torch.einsum("bn,nchw->bchw", weights.to(self.tables), self.tables)
-        place = (coordinates / edge[:, :, None, None]).flip(1).permute(0, 2, 3, 1)  # grid_sample takes (x, y)
-        place = place.expand(len(tables), -1, -1, -1)
-        return F.grid_sample(tables, place, padding_mode="border", align_corners=True)
+        grid = (coordinates / edge[:, :, None, None]).flip(1).permute(0, 2, 3, 1)  # grid_sample takes (x, y)
+        grid = grid.expand(len(tables), -1, -1, -1)
+        return F.grid_sample(tables, grid, padding_mode="border", align_corners=True)
 
     def extra_repr(self) -> str:
         """Describe the tables by the light that they leave in the corners."""

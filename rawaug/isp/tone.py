@@ -100,8 +100,8 @@ class ToneDictionary(nn.Module):
             return
 
         is_zero = weights == 0
-        most = weights.shape[1] - int(is_zero.sum(dim=1).min())
-        atoms = is_zero.to(torch.uint8).argsort(dim=1, stable=True)[:, :most]
+        count = weights.shape[1] - int(is_zero.sum(dim=1).min())
+        atoms = is_zero.to(torch.uint8).argsort(dim=1, stable=True)[:, :count]
         for weight, atom in zip(weights.gather(1, atoms).unbind(1), atoms.unbind(1), strict=True):
             yield weight, self.curves[atom]
 

@@ -271,8 +271,8 @@ class EldLevels:
         """Draw ``iso``, ``shot_var`` and ``read_var``, ``(batch,)``."""
         gain = self.sample_gain(batch, generator)
         read_var = self.sample_scale("gaussian", gain, generator).square()
-        return {"iso": self.iso_of(gain), "shot_var": gain / self.white_dn, "read_var": read_var}
+        return {"iso": self.iso_at_gain(gain), "shot_var": gain / self.white_dn, "read_var": read_var}
 
-    def iso_of(self, gain: Tensor) -> Tensor:
+    def iso_at_gain(self, gain: Tensor) -> Tensor:
         """Compute the ISO of gains in DN per electron."""
         return gain * (self.lowest_iso / self.camera["Kmin"])

@@ -79,7 +79,7 @@ def load_profiles() -> Profiles:
             levels = levels_by_iso.setdefault(math.log(float(iso)), [])
             levels.append([math.log(shot_var), math.log(read_var)])
 
-    tables = [_table_of(levels_by_iso) for levels_by_iso in cameras.values()]
+    tables = [_profile_rows(levels_by_iso) for levels_by_iso in cameras.values()]
     rows = torch.tensor([len(table) for table in tables])
     table = pad_sequence(tables, batch_first=True).permute(2, 0, 1).contiguous()
     is_padding = torch.arange(table.shape[2]) >= rows[:, None]
@@ -87,7 +87,7 @@ def load_profiles() -> Profiles:
     return Profiles(tuple(cameras), table, rows)
 
 
-def _table_of(levels_by_iso: dict[float, list[list[float]]]) -> Tensor:
+def _profile_rows(levels_by_iso: dict[float, list[list[float]]]) -> Tensor:
     """Make rows of log ISO, log shot_var and log read_var, ``(R, 3)``, in ascending order of ISO."""
     rows = []
     for log_iso, levels in sorted(levels_by_iso.items()):

@@ -200,7 +200,7 @@ class EldNoise(Compose):
 
         unit_var = gain.new_tensor([tukey_lambda_variance(value) for value in shape.tolist()])
         return super().sample(batch, generator) | {
-            "iso": self.law.iso_of(gain),
+            "iso": self.law.iso_at_gain(gain),
             "shot_var": gain / self.law.white_dn,
             "read_var": self.law.sample_scale("tukey_lambda", gain, generator).square() * unit_var,
             "tukey_lambda": shape,

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -87,12 +87,21 @@ def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
     config = replace(ablation.fit, seed=ablation.seed)
     folder = claim(ablation, overwrite)
 
-    frames = []
+    curves: dict[str, list[list[list[float]]]] = {}
+    scores: dict[str, list[float]] = {}
     for test_pair in progress(pairs, label="ablation", unit="frame"):
-        others = [pair for pair in pairs if pair is not test_pair]
-        frames.append(measure(others, test_pair, config))
+        training_pairs = [pair for pair in pairs if pair is not test_pair]
+        by_setting, without = measure(training_pairs, test_pair, config)
+        for setting, curve in by_setting.items():
+            curves.setdefault(setting, []).append(curve)
+        for stage, score in without.items():
+            scores.setdefault(stage, []).append(score)
 
-    result = {"settings": asdict(ablation), "stages": mean_curves(frames), "without": mean_without(frames)}
+    result = {
+        "settings": asdict(ablation),
+        "stages": {setting: torch.tensor(rows).mean(0).tolist() for setting, rows in curves.items()},
+        "without": {stage: fmean(values) for stage, values in scores.items()},
+    }
     write_json(result, folder / "ablation.json")
     picture = folder / "ablation.png"
     _draw(result, picture, f"{ablation.data}: {len(pairs)} frames, each left out")
@@ -111,21 +120,16 @@ def _first_pairs(ablation: Ablation) -> list[Pair]:
     return pairs
 
 
-class FrameFigures(NamedTuple):
-    """The figures that are measured on a frame.
+def measure(
+    training_pairs: Sequence[Pair], test_pair: Pair, config: FitConfig
+) -> tuple[dict[str, list[list[float]]], dict[str, float]]:
+    """Measure one frame by fits to others.
 
-    Args:
-        curves: by setting, ``blind`` or ``as-shot gains``, the PSNR in dB of 6 stages in 3 spaces.
-        without: PSNR_r in dB of fits without a stage, by the stage; ``none`` lacks nothing.
+    Returns:
+        By setting, ``blind`` or ``as-shot gains``, the PSNR in dB of 6 stages in 3 spaces; and PSNR_r in dB of fits
+        without a stage, by the stage, where ``none`` lacks nothing.
     """
-
-    curves: dict[str, list[list[float]]]
-    without: dict[str, float]
-
-
-def measure(others: Sequence[Pair], test_pair: Pair, config: FitConfig) -> FrameFigures:
-    """Measure one frame by fits to the others."""
-    isp = fit_isp(others, config, progress=False)
+    isp = fit_isp(training_pairs, config, progress=False)
     curves = {
         "blind": stage_psnr(isp, test_pair, white_balance=False),
         "as-shot gains": stage_psnr(isp, test_pair, white_balance=True),
@@ -134,26 +138,9 @@ def measure(others: Sequence[Pair], test_pair: Pair, config: FitConfig) -> Frame
     without = {"none": psnr_r(isp, test_pair, white_balance=True)}
     for stage in LEFT_OUT:
         stages = [name for name in config.isp.get("stages", POINTWISE_STAGES) if name != stage]
-        lacking = fit_isp(others, replace(config, isp={**config.isp, "stages": tuple(stages)}), progress=False)
+        lacking = fit_isp(training_pairs, replace(config, isp={**config.isp, "stages": tuple(stages)}), progress=False)
         without[stage] = psnr_r(lacking, test_pair, white_balance=stage != "gains")
-    return FrameFigures(curves, without)
-
-
-def mean_curves(frames: Sequence[FrameFigures]) -> dict[str, list[list[float]]]:
-    """Compute the mean of the frames' curves, by setting."""
-    means = {}
-    for setting in frames[0].curves:
-        curves = torch.tensor([frame.curves[setting] for frame in frames])
-        means[setting] = curves.mean(0).tolist()
-    return means
-
-
-def mean_without(frames: Sequence[FrameFigures]) -> dict[str, float]:
-    """Compute the mean PSNR_r in dB without a stage, by stage."""
-    means = {}
-    for stage in frames[0].without:
-        means[stage] = fmean(frame.without[stage] for frame in frames)
-    return means
+    return curves, without
 
 
 def _print(result: dict[str, Any]) -> None:
@@ -193,8 +180,8 @@ def stage_psnr(isp: DictionaryISP, pair: Pair, white_balance: bool) -> list[list
 def _comparable_pixels(pair: Pair) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Give sRGB, RAW of three colours, coordinates and the mask of unclipped pixels, all ``(1, C, h, w)``."""
     if not pair.registered:
-        blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
-        return blocks.srgb[None], blocks.raw[None], blocks.coordinates, (~blocks.clipped)[None, None]
+        srgb, raw, clipped, coordinates = block_averages(pair.srgb, pair.raw, pair.cfa)
+        return srgb[None], raw[None], coordinates, (~clipped)[None, None]
 
     every_fourth = (..., slice(None, None, STRIDE), slice(None, None, STRIDE))
     raw = bayer.demosaic(pair.raw[None], pair.cfa)[every_fourth]

@@ -71,8 +71,8 @@ class DownstreamConfig:
 
     def shortest(self) -> DownstreamConfig:
         """Take one step and one small test frame."""
-        one = replace(self.train, steps=1, batch=2, warmup=1, validate_every=1, checkpoint_every=1)
-        return replace(self, test_crop=SHORTEST_CROP, test_count=1, train=one)
+        train = replace(self.train, steps=1, batch=2, warmup=1, validate_every=1, checkpoint_every=1)
+        return replace(self, test_crop=SHORTEST_CROP, test_count=1, train=train)
 
 
 def psnr_d(
@@ -91,7 +91,7 @@ def psnr_d(
         folder: folder of the training's files, with one folder for each seed, from which a stopped training resumes.
         seed: seed of the training.
     """
-    crops = crops_of(model, pictures, noise_model(config.noise), config)
+    crops = synthesise_crops(model, pictures, noise_model(config.noise), config)
     net = train_on(crops, config, folder, seed)
     rows = score_on(net, config, CFA(model.cfa))
     return fmean(row.psnr for row in rows)
@@ -121,7 +121,7 @@ def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> list[Row]:
     return list(score([denoiser], trials, "PSNR_d"))
 
 
-def crops_of(
+def synthesise_crops(
     model: BaselineISP | DictionaryISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig
 ) -> Source:
     """Make the training samples that a method gives for pictures."""

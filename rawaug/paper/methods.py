@@ -161,7 +161,7 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None, balanced: bool =
 
     makers = {}
     for row, setting in settings(model, pair).items():
-        makers[row] = maker_of(model, setting)
+        makers[row] = raw_maker(model, setting)
 
     start = time.perf_counter()
     rows = {row: windows_psnr(make, pair, patches) for row, make in makers.items()}
@@ -171,17 +171,17 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None, balanced: bool =
     area = min(PATCH, height) * min(PATCH, width)
     pixels = len(makers) * len(draw_windows(pair, patches)) * area
 
-    own = own_rendering(model, pair)
-    if own is not None:
-        makers["own"] = maker_of(model, pair.white_balance)
-        rows["own"] = windows_psnr(makers["own"], own, patches)
+    rendered = own_rendering(model, pair)
+    if rendered is not None:
+        makers["own"] = raw_maker(model, pair.white_balance)
+        rows["own"] = windows_psnr(makers["own"], rendered, patches)
 
     figures = {}
     if balanced:
         for row, make in makers.items():
             figures[row] = balanced_psnr(make, pair)
-        if own is not None:
-            figures["own"] = balanced_psnr(makers["own"], own)
+        if rendered is not None:
+            figures["own"] = balanced_psnr(makers["own"], rendered)
 
     return {
         "rows": rows,
@@ -192,7 +192,7 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None, balanced: bool =
     }
 
 
-def maker_of(model: Method, setting: Any) -> Maker:
+def raw_maker(model: Method, setting: Any) -> Maker:
     """Make the function that turns a patch into RAW under a setting."""
     if isinstance(model, DictionaryISP):
         return lambda patch, coordinates: model.reverse(patch, setting, coordinates=coordinates).raw
@@ -206,7 +206,7 @@ def settings(model: Method, pair: Pair) -> dict[str, Any]:
 
     rows: dict[str, Any] = {"blind": None}
     if pair.balance_known:
-        as_shot = model.setting_of(pair.white_balance)
+        as_shot = model.as_shot_setting(pair.white_balance)
         if as_shot is not None:
             rows["as-shot"] = as_shot
     return rows
@@ -220,7 +220,7 @@ def own_rendering(model: Method, pair: Pair) -> Pair | None:
     """
     if not isinstance(model, CompressedISP):
         return None
-    picture = model(pair.raw[None], model.setting_of(pair.white_balance))
+    picture = model(pair.raw[None], model.as_shot_setting(pair.white_balance))
     compressed = (255.0 * jpeg(picture, JPEG_QUALITY)[0]).round().to(torch.uint8)
     return replace(pair, srgb=compressed)
 
@@ -232,10 +232,10 @@ def _block_rows(model: Method, pair: Pair) -> dict[str, float]:
             rows["as-shot"] = psnr_r(model, pair, white_balance=True)
         return rows
 
-    blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
+    srgb, raw, clipped, _ = block_averages(pair.srgb, pair.raw, pair.cfa)
     with torch.no_grad():
-        colour = model.unprocess(blocks.srgb[None])[0]
-    return {"blind": block_psnr(colour, blocks.raw, blocks.clipped)}
+        colour = model.unprocess(srgb[None])[0]
+    return {"blind": block_psnr(colour, raw, clipped)}
 
 
 @torch.no_grad()
@@ -245,19 +245,16 @@ def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
     rows = {"blind": blind}
     if pair.balance_known:
         rows["as-shot"] = isp.with_white_balance(blind, pair.white_balance)
-    rows["samples"] = _from_samples(isp, pair, blind)
-    return rows
 
-
-def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams:
     generator = keyed_generator("raw samples", pair.name)
     height, width = pair.raw.shape[-2:]
-    rows = torch.randint(height, (SAMPLES,), generator=generator)
-    columns = torch.randint(width, (SAMPLES,), generator=generator)
+    row = torch.randint(height, (SAMPLES,), generator=generator)
+    column = torch.randint(width, (SAMPLES,), generator=generator)
 
-    readings = torch.stack([rows.float(), columns.float(), pair.raw[0, rows, columns]], dim=1)[None]
+    readings = torch.stack([row.float(), column.float(), pair.raw[0, row, column]], dim=1)[None]
     x = as_float(pair.srgb[None])
-    return isp.with_raw_samples(blind, x, readings, coordinates_or_full(x, None))
+    rows["samples"] = isp.with_raw_samples(blind, x, readings, coordinates_or_full(x, None))
+    return rows
 
 
 # -- sRGB from RAW, and the cycle -------------------------------------------------------------------------------------
@@ -280,7 +277,7 @@ def forward_psnr(model: Method, pair: Pair) -> float | None:
     if not can_render(model):
         return None
     srgb = as_float(pair.srgb[None])
-    setting = model.setting_of(pair.white_balance)
+    setting = model.as_shot_setting(pair.white_balance)
     if isinstance(model, CycleISP):
         setting = srgb
     return psnr(model(pair.raw[None], setting), srgb).item()
@@ -304,10 +301,10 @@ def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
 
     for picture in pictures:
         x = as_float(picture[None])
-        for way, returned in _cycles(model, x).items():
-            scores.setdefault(way, []).append(psnr(returned, x).item())
+        for cycle, returned in _cycles(model, x).items():
+            scores.setdefault(cycle, []).append(psnr(returned, x).item())
 
-    return {way: fmean(values) for way, values in scores.items()}
+    return {cycle: fmean(values) for cycle, values in scores.items()}
 
 
 def _cycles(model: Method, x: Tensor) -> dict[str, Tensor]:

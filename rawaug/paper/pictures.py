@@ -20,7 +20,7 @@ from rawaug.files import write_bytes
 from rawaug.io.pictures import encode_png, encode_srgb
 from rawaug.isp.functional import frame_coordinates
 from rawaug.isp.model import DictionaryISP
-from rawaug.paper.methods import Method, maker_of, settings
+from rawaug.paper.methods import Method, raw_maker, settings
 from rawaug.seeding import keyed_generator
 
 SIDE = 256
@@ -56,7 +56,7 @@ def draw_frame(family: str, model: Method, pair: Pair, folder: Path) -> None:
     write_bytes(encode_png(show_raw(raw * exposure, pair.cfa)[0]), folder / "RAW.png")
 
     blind = settings(model, pair)["blind"]
-    made = maker_of(model, blind)(patch, place).clamp(0.0, 1.0)
+    made = raw_maker(model, blind)(patch, place).clamp(0.0, 1.0)
     write_bytes(encode_png(show_raw(made * exposure, pair.cfa)[0]), folder / f"{family}.png")
     if not isinstance(model, DictionaryISP):
         return

@@ -75,7 +75,7 @@ def print_methods(title: str, rows: Mapping[str, Mapping[str, Any]], ceiling: fl
         if any(row.get(key) is not None for row in rows.values()):
             columns[key] = heading
 
-    table = [[name, *cells_of(row, list(columns))] for name, row in rows.items()]
+    table = [[name, *format_cells(row, list(columns))] for name, row in rows.items()]
     print_rows(title, ["method", *columns.values(), "M par.", "s to fit", "Mpix/s"], table)
 
     threads = torch.get_num_threads()
@@ -85,7 +85,7 @@ def print_methods(title: str, rows: Mapping[str, Mapping[str, Any]], ceiling: fl
             print(f"note: {name} was fitted before to {row['known']} of the frames that it is scored on")
 
 
-def cells_of(row: Mapping[str, Any], columns: Sequence[str]) -> list[str]:
+def format_cells(row: Mapping[str, Any], columns: Sequence[str]) -> list[str]:
     """Write a row of the table as text: the figures of ``columns``, parameters, seconds and speed."""
     cells = []
     for key in columns:
@@ -259,15 +259,15 @@ class ComparisonRun:
         for seed, frame in progress(fits, label=family, unit="fit"):
             folds.append(self._fold(family, seed, frame))
 
-        whole = self._all_frames(family)
+        on_all_frames = self._all_frames(family)
         forward = [fold.get("forward") for fold in folds]
         if None not in forward:
-            whole["forward"] = means_of(self._by_seed(forward))
+            on_all_frames["forward"] = mean_by_seed(self._by_seed(forward))
 
         rows = {}
         for row in folds[0]["rows"]:
             if row == "blind":
-                rows[family] = {**self._row(folds, row), **whole}
+                rows[family] = {**self._row(folds, row), **on_all_frames}
             else:
                 rows[f"{family}, {ROWS[row]}"] = self._row(folds, row)
         return rows
@@ -287,7 +287,7 @@ class ComparisonRun:
             frames[name] = [of_seed[k] for of_seed in values]
 
         figures: dict[str, Any] = {
-            "psnr_r": means_of(values),
+            "psnr_r": mean_by_seed(values),
             "frames": frames,
             "worst25": worst,
             "best25": best,
@@ -300,7 +300,7 @@ class ComparisonRun:
             figures["mpix_s"] = median(speeds)
         if row in folds[0].get("balanced", {}):
             balanced = [fold["balanced"][row] for fold in folds]
-            figures["balanced"] = means_of(self._by_seed(balanced))
+            figures["balanced"] = mean_by_seed(self._by_seed(balanced))
 
         seen_before = [fold for fold in folds[: len(names)] if fold.get("known")]
         if seen_before:
@@ -339,8 +339,8 @@ class ComparisonRun:
                 if settings.test_crop is not None:
                     pair = pair.middle(settings.test_crop)
             else:
-                others = [other for other in self.pairs if other is not pair]
-                method = self._fit(family, others, seed)
+                training_pairs = [kept for kept in self.pairs if kept is not pair]
+                method = self._fit(family, training_pairs, seed)
 
             if frame == 0 and seed == settings.seed and pair.registered:
                 draw_frame(family.replace("/", "_"), method.model, pair, self.folder / "shown")
@@ -402,7 +402,7 @@ class ComparisonRun:
         return self.folder / f"{stem.replace('/', '_')}.json"
 
 
-def means_of(by_seed: Sequence[Sequence[float]]) -> list[float]:
+def mean_by_seed(by_seed: Sequence[Sequence[float]]) -> list[float]:
     """Average over the frames of each seed."""
     return [fmean(values) for values in by_seed]
 

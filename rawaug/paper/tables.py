@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rawaug.evaluation.page import Figure, Page, command_line
 from rawaug.evaluation.tables import mean_and_spread, print_rows
@@ -23,7 +23,7 @@ from rawaug.files import write_json
 from rawaug.paper import published
 from rawaug.paper.ablation import SPACES, Ablation, ablate
 from rawaug.paper.ablation import TITLES as STAGES
-from rawaug.paper.order import compare_order
+from rawaug.paper.order import compare_order, order_sentence
 from rawaug.paper.reconstruction import Comparison, compare
 
 PARTS = ("table1", "table2_nikon", "table2_canon", "table3", "few", "unsupervised", "ablation")
@@ -111,11 +111,8 @@ class Paper:
         return settings
 
     def _own(self, **data: str | None) -> dict[str, Any]:
-        own = {}
-        for key, value in {**data, "test": self.test, "pictures": self.pictures}.items():
-            if value is not None:
-                own[key] = value
-        return own
+        settings = {**data, "test": self.test, "pictures": self.pictures}
+        return {key: value for key, value in settings.items() if value is not None}
 
 
 @EXPERIMENTS.register("paper")
@@ -167,7 +164,7 @@ def read_tables(folder: Path) -> dict[str, Table]:
         tables["table2"] = dslr_table((nikon or {}).get("rows", {}), (canon or {}).get("rows", {}))
 
     runs = []
-    curves: dict[str, Curve] = {}
+    curves: dict[str, tuple[int, list[float]]] = {}
     for part in ("table3", "few", "unsupervised"):
         results = read_part(folder, part, "results")
         if results is not None:
@@ -190,15 +187,8 @@ def read_part(folder: Path, part: str, stem: str) -> Any:
     return json.loads(path.read_text())
 
 
-class Curve(NamedTuple):
-    """A training as in its log: the last step, and the mean losses between validations."""
-
-    steps: int
-    losses: list[float]
-
-
-def read_curves(folder: Path, arms: Iterable[str]) -> dict[str, Curve]:
-    """Read the trainings of a recipe's arms with their first seed; arms without a log are left out."""
+def read_curves(folder: Path, arms: Iterable[str]) -> dict[str, tuple[int, list[float]]]:
+    """Read the last step and the mean losses of a recipe's arms with their first seed; none of arms without a log."""
     curves = {}
     for arm in arms:
         logs = sorted(folder.glob(f"seed*/{arm}/log.csv"))
@@ -209,7 +199,7 @@ def read_curves(folder: Path, arms: Iterable[str]) -> dict[str, Curve]:
             rows = list(csv.DictReader(file))
         if rows:
             losses = [float(row["loss"]) for row in rows]
-            curves[arm] = Curve(int(rows[-1]["step"]), losses)
+            curves[arm] = int(rows[-1]["step"]), losses
 
     return curves
 
@@ -259,7 +249,7 @@ def dslr_table(nikon: Mapping[str, Mapping[str, Any]], canon: Mapping[str, Mappi
     return table
 
 
-def denoising_table(runs: Sequence[Mapping[str, Any]], curves: Mapping[str, Curve]) -> Table:
+def denoising_table(runs: Sequence[Mapping[str, Any]], curves: Mapping[str, tuple[int, list[float]]]) -> Table:
     """Make table 3 from the results of the recipes that train, with the self-ensemble if there is one.
 
     Args:
@@ -291,7 +281,7 @@ def denoising_table(runs: Sequence[Mapping[str, Any]], curves: Mapping[str, Curv
 
 
 def add_denoiser(
-    table: Table, name: str, psnr: Sequence[float], ssim: Sequence[float], curve: Curve | None = None
+    table: Table, name: str, psnr: Sequence[float], ssim: Sequence[float], curve: tuple[int, list[float]] | None = None
 ) -> None:
     """Add a row of table 3 under the paper's name, if it has one; the first figures of a name stay."""
     names = {**published.DENOISER_NAMES, "noisy": "Noisy"}
@@ -304,8 +294,8 @@ def add_denoiser(
         "SSIM, paper": paper[1],
     }
     if curve is not None:
-        figures["steps"] = curve.steps
-        figures["loss still falling"] = still_falling(curve.losses)
+        figures["steps"], losses = curve
+        figures["loss still falling"] = still_falling(losses)
     table.setdefault(label, figures)
 
 
@@ -353,7 +343,7 @@ def cell(column: str, value: Any) -> str:
     return mean_and_spread(figures, 3 if "SSIM" in column else 2)
 
 
-def columns_of(table: Table) -> list[str]:
+def table_columns(table: Table) -> list[str]:
     """List the columns that have a figure in any row."""
     columns: list[str] = []
     for cells in table.values():
@@ -365,7 +355,7 @@ def columns_of(table: Table) -> list[str]:
 
 def text_rows(table: Table) -> dict[str, list[str]]:
     """Write the cells of a table as text, by row."""
-    columns = columns_of(table)
+    columns = table_columns(table)
     rows = {}
     for name, cells in table.items():
         rows[name] = [cell(column, cells.get(column)) for column in columns]
@@ -377,7 +367,7 @@ def print_paper_table(title: str, table: Table) -> None:
     rows = []
     for name, cells in text_rows(table).items():
         rows.append([name, *cells])
-    print_rows(title, ["", *columns_of(table)], rows)
+    print_rows(title, ["", *table_columns(table)], rows)
 
 
 NOTES = {
@@ -443,11 +433,11 @@ def write_page(folder: Path, tables: Mapping[str, Table], settings: Mapping[str,
     for name, table in tables.items():
         texts = [NOTES[name]]
         for column in ORDERED_BY.get(name, []):
-            sentence = compare_order(table, column).sentence()
+            sentence = order_sentence(*compare_order(table, column))
             if sentence:
                 texts.append(f"{column}: {sentence}")
 
-        page.add(TITLES[name], texts=texts, head=["", *columns_of(table)], rows=text_rows(table))
+        page.add(TITLES[name], texts=texts, head=["", *table_columns(table)], rows=text_rows(table))
         for part in PARTS_OF[name]:
             add_pictures(page, folder, part)
     return page.write(folder / "report.html", settings)

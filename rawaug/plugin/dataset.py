@@ -151,7 +151,7 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
     def _generator(self, *key: int | str) -> torch.Generator:
         return keyed_generator(self.seed, "pairs", *key)
 
-    def _name_of(self, number: int | str) -> str:
+    def _sample_name(self, number: int | str) -> str:
         """The name of a picture: the name of its file if the dataset knows it, else its number."""
         if not isinstance(number, int):
             return str(number)
@@ -365,7 +365,7 @@ class RawPairs(_Pairs[Sample]):
 
             for place, number in enumerate(group):
                 pair = pairs.map(lambda tensor, place=place: tensor[place])
-                form = self.form(pair, self._name_of(indices[number]), batch[place])
+                form = self.form(pair, self._sample_name(indices[number]), batch[place])
                 finished.append(replace_picture(*samples[number], form))
         return finished
 
@@ -525,7 +525,7 @@ class RawPairStream(_Pairs[Any], IterableDataset[Any]):
             raise ValueError(f"picture {name}: {error}") from error
 
         pair = batch.map(lambda tensor: tensor[0])
-        return replace_picture(sample, where, self.form(pair, self._name_of(name), patch))
+        return replace_picture(sample, where, self.form(pair, self._sample_name(name), patch))
 
     def _read_identity(self, sample: Any) -> int | str:
         try:

@@ -22,7 +22,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -127,22 +127,6 @@ def adam(
         yield value.detach()
 
 
-class BestScore(NamedTuple):
-    """The score of a watched stage at its start, the best score with its step, and every score so far."""
-
-    start: float
-    step: int
-    best: float
-    scores: Sequence[float] = ()
-
-    def curve(self) -> list[float]:
-        """At most :data:`CURVE_POINTS` of the scores, including the first and the last, to two decimals."""
-        last = len(self.scores) - 1
-        count = min(CURVE_POINTS, last + 1)
-        places = [round(k * last / max(1, count - 1)) for k in range(count)]
-        return [round(self.scores[place], 2) for place in places]
-
-
 class Descent:
     """Runs the stages of a fit, and saves the end of each, so that a stopped fit goes on with the next one.
 
@@ -157,14 +141,14 @@ class Descent:
 
     def __init__(self, path: Path | None, key: str, seed: int, progress: bool) -> None:
         self.path, self.key, self.seed, self.progress = path, key, seed, progress
-        self.watched: dict[str, BestScore] = {}
+        self.scores: dict[str, list[tuple[int, float]]] = {}
+        """Of every watched stage, its steps and their scores on held-out frames."""
         self._ends: dict[str, Tensor] = {}
         if path is not None and path.is_file():
             header, tensors = read_tensors(path, "delete this state of an interrupted fit")
-            if header.get("key") == key:
+            if header.get("key") == key and "scores" in header:
                 self._ends = tensors
-                for stage, values in json.loads(header["watched"]).items():
-                    self.watched[stage] = BestScore(*values)
+                self.scores = json.loads(header["scores"])
 
     def run(
         self,
@@ -218,11 +202,24 @@ class Descent:
             if watch is None:
                 self._keep(stage, tensors)
             if self.path is not None:
-                write_tensors(self._ends, {"key": self.key, "watched": json.dumps(self.watched)}, self.path)
+                write_tensors(self._ends, {"key": self.key, "scores": json.dumps(self.scores)}, self.path)
 
         for name, tensor in tensors.items():
             tensor.data.copy_(self._ends[f"{stage}/{name}"])
             tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
+
+    def best(self, stage: str) -> tuple[int, float]:
+        """The first step of a watched stage that scored best, and its score."""
+        step, score = max(self.scores[stage], key=lambda entry: entry[1])
+        return step, score
+
+    def curve(self, stage: str) -> list[float]:
+        """At most :data:`CURVE_POINTS` scores of a watched stage, with the first and the last, to two decimals."""
+        scores = self.scores[stage]
+        last = len(scores) - 1
+        count = min(CURVE_POINTS, last + 1)
+        numbers = [round(k * last / max(1, count - 1)) for k in range(count)]
+        return [round(scores[number][1], 2) for number in numbers]
 
     def finish(self) -> None:
         """Remove the state, because the fit is done."""
@@ -238,12 +235,10 @@ class Descent:
 
     def _note(self, stage: str, step: int, score: float, tensors: Mapping[str, Tensor]) -> str:
         """Note a score, and the tensors if it is the best so far."""
-        before = self.watched.get(stage, BestScore(score, step, -math.inf))
-        after = before._replace(scores=[*before.scores, score])
-        if stage not in self.watched or score > before.best:
-            after = after._replace(step=step, best=score)
+        scores = self.scores.setdefault(stage, [])
+        if not scores or score > self.best(stage)[1]:
             self._keep(stage, tensors)
-        self.watched[stage] = after
+        scores.append((step, score))
         return f"held out {score:.2f} dB"
 
 
@@ -276,8 +271,8 @@ def _gain_left_out(frames: FitFrames, folds: int, gain: Callable[[FitFrames, Fit
     count = len(frames.shots)
     total = 0.0
     for fold in range(folds):
-        out, rest = frames.split(range(fold, count, folds))
-        total += len(out.shots) * gain(out, rest, f" without part {fold + 1} of {folds}")
+        out, kept = frames.split(range(fold, count, folds))
+        total += len(out.shots) * gain(out, kept, f" without part {fold + 1} of {folds}")
 
     return total / count
 
@@ -311,11 +306,11 @@ def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, des
 
     def better(out: FitFrames, kept: FitFrames, part: str) -> float:
         """Compute by how many dB encoders beat constants on frames that no stage of the fit has seen."""
-        other = refit(kept, part, config)
-        other.use_encoders(False)
-        constants = mean_psnr(other, out)
-        _train(other, kept, config, descent, f"encoders{part}")
-        return mean_psnr(other, out) - constants
+        refitted = refit(kept, part, config)
+        refitted.use_encoders(False)
+        constants = mean_psnr(refitted, out)
+        _train(refitted, kept, config, descent, f"encoders{part}")
+        return mean_psnr(refitted, out) - constants
 
     mode = config.encoders
     isp.use_encoders(False)
@@ -336,29 +331,20 @@ def _train(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: De
             tensors[name] = parameter
 
     def loss(generator: torch.Generator) -> Tensor:
+        # The frames of a step have the same random pixels.
+        numbers = torch.randint(len(frames.shots), (FRAMES_A_STEP,), generator=generator).tolist()
+        index = torch.randint(frames.pixels.srgb.shape[-1], (ENCODER_PIXELS,), generator=generator)
+
         losses = []
-        for part, shot in _draw_frames(frames, FRAMES_A_STEP, ENCODER_PIXELS, generator):
-            losses.append(_frame_loss(isp, part, shot, config, generator))
+        for number in numbers:
+            part, shot = frames.pixels.pick(index, torch.tensor([number])), frames.shots[number]
+            losses.append(_encoder_loss(isp, part, shot, config, generator))
         return torch.stack(losses).mean()
 
     descent.run(stage, loss, tensors, config.encoder_steps, ENCODER_RATE)
 
 
-def _draw_frames(
-    frames: FitFrames, count: int, pixels: int, generator: torch.Generator
-) -> list[tuple[PixelSamples, FrameSummary]]:
-    """Draw ``count`` of the frames, with replacement, each with the same random pixels."""
-    numbers = torch.randint(len(frames.shots), (count,), generator=generator).tolist()
-    index = torch.randint(frames.pixels.srgb.shape[-1], (pixels,), generator=generator)
-
-    parts = []
-    for number in numbers:
-        pixels_of_frame = frames.pixels.pick(index, torch.tensor([number]))
-        parts.append((pixels_of_frame, frames.shots[number]))
-    return parts
-
-
-def _frame_loss(
+def _encoder_loss(
     isp: DictionaryISP, part: PixelSamples, shot: FrameSummary, config: FitConfig, generator: torch.Generator
 ) -> Tensor:
     srgb, raw = _same_piece(shot.srgb, isp.remove_shading(shot.raw, None), generator)
@@ -438,14 +424,15 @@ def train_jointly(
     tensors = dict(isp.named_parameters())
     descent.run("end to end", loss, tensors, steps, rate, watch=lambda: mean_psnr(isp, watched))
 
-    score = descent.watched["end to end"]
-    if score.step > 0:
+    step, score = descent.best("end to end")
+    if step > 0:
         measure_lights(isp, trained)
+    _, first_score = descent.scores["end to end"][0]
     isp.info["joint"] = {
         "steps": steps,
-        "kept_step": score.step,
-        "gain_db": round(score.best - score.start, 2),
-        "curve": score.curve(),
+        "kept_step": step,
+        "gain_db": round(score - first_score, 2),
+        "curve": descent.curve("end to end"),
     }
     return watched
 

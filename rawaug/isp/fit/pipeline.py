@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -188,9 +189,9 @@ def _new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
         settings["cfa"] = str(patterns.pop())
     settings |= config.isp
 
-    fewest, most = settings["colour_atoms"], settings["colour_atoms"] + more
-    if not fewest <= settings["gain_atoms"] <= most:
-        raise ValueError(f"isp: gain_atoms is {settings['gain_atoms']}, but these frames need {fewest} to {most}")
+    fewest, highest = settings["colour_atoms"], settings["colour_atoms"] + more
+    if not fewest <= settings["gain_atoms"] <= highest:
+        raise ValueError(f"isp: gain_atoms is {settings['gain_atoms']}, but these frames need {fewest} to {highest}")
     return DictionaryISP(ISPConfig(**settings), derive_seed(config.seed, "isp"))
 
 
@@ -351,7 +352,7 @@ class _Fit:
         """Compute the least error under another ISP's tone, or one of its curves, and x2 of ``colours`` by it."""
         curves: list[Callable[[Tensor], Tensor]] = [other.linear]
         if other.tone is not None:
-            curves = [_curve_of(table) for table in other.tone.curves]
+            curves = [partial(_apply_table, table) for table in other.tone.curves]
 
         errors = [self._tone_error(curve)[0] for curve in curves]
         best = errors.index(min(errors))
@@ -410,9 +411,9 @@ class _Fit:
             self.descent.run("RAW to sRGB", loss, tensors, self.config.steps, self.config.learning_rate)
 
 
-def _curve_of(table: Tensor) -> Callable[[Tensor], Tensor]:
-    """Make the function of pictures ``(B, 3, H, W)`` that a table ``(1021,)`` describes."""
-    return lambda x: to_linear(x, table.expand(len(x), -1))
+def _apply_table(table: Tensor, srgb: Tensor) -> Tensor:
+    """Map pictures ``(B, 3, H, W)`` to linear light by a table ``(1021,)``."""
+    return to_linear(srgb, table.expand(len(srgb), -1))
 
 
 def _darkens_corners(mean: Tensor, precision: Tensor) -> bool:

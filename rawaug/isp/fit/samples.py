@@ -142,9 +142,9 @@ class FitFrames(NamedTuple):
         return FitFrames(self.pixels.of_frames(torch.tensor(frames)), shots)
 
     def split(self, frames: Sequence[int]) -> tuple[FitFrames, FitFrames]:
-        """Take some of the frames by their numbers, and the rest."""
-        rest = [number for number in range(len(self.shots)) if number not in frames]
-        return self.some(frames), self.some(rest)
+        """Take some of the frames by their numbers, and all others."""
+        remaining = [number for number in range(len(self.shots)) if number not in frames]
+        return self.some(frames), self.some(remaining)
 
     @property
     def as_shot(self) -> Tensor:
@@ -172,40 +172,35 @@ def sample_pixels(pairs: Iterable[FramePair], pixels: int, seed: int, noisy: boo
     frames = []
     shots = []
     for pair in pairs:
-        samples, shot = _sample_frame(pair, pixels, seed, noisy)
-        frames.append(samples)
+        if not pair.color_known:
+            unknown = "its white balance and colour matrix are unknown"
+            raise ValueError(f"{pair.name}: {unknown}; use an ISP such as universal")
+        raw = pair.noisy if noisy else pair.raw
+        if raw is None:
+            raise ValueError(f"{pair.name}: has no noisy RAW; fit on clean frames or add noise first")
+
+        generator = keyed_generator(seed, "pixels", pair.name)
+        draw = _draw_sites if pair.registered else _draw_blocks
+        try:
+            frames.append(draw(pair.srgb, raw, pair.cfa, pixels, generator))
+        except ValueError as error:
+            raise ValueError(f"{pair.name}: {error}") from None
+
+        shot = FrameSummary(
+            name=pair.name,
+            camera=pair.camera,
+            cfa=CFA(pair.cfa),
+            white_balance=pair.white_balance,
+            srgb=thumbnail(as_float(pair.srgb[None])),
+            raw=thumbnail(_colours(raw, pair.cfa)[None]),
+            registered=pair.registered,
+        )
         shots.append(shot)
     if not frames:
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")
 
     stacked = map(torch.stack, zip(*frames, strict=True))
     return FitFrames(PixelSamples(*stacked), shots)
-
-
-def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple[PixelSamples, FrameSummary]:
-    if not pair.color_known:
-        raise ValueError(f"{pair.name}: its white balance and colour matrix are unknown; use an ISP such as universal")
-    raw = pair.noisy if noisy else pair.raw
-    if raw is None:
-        raise ValueError(f"{pair.name}: has no noisy RAW; fit on clean frames or add noise first")
-
-    generator = keyed_generator(seed, "pixels", pair.name)
-    draw = _draw_sites if pair.registered else _draw_blocks
-    try:
-        samples = draw(pair.srgb, raw, pair.cfa, pixels, generator)
-    except ValueError as error:
-        raise ValueError(f"{pair.name}: {error}") from None
-
-    summary = FrameSummary(
-        name=pair.name,
-        camera=pair.camera,
-        cfa=CFA(pair.cfa),
-        white_balance=pair.white_balance,
-        srgb=thumbnail(as_float(pair.srgb[None])),
-        raw=thumbnail(_colours(raw, pair.cfa)[None]),
-        registered=pair.registered,
-    )
-    return samples, summary
 
 
 def _draw_sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:
@@ -217,7 +212,7 @@ def _draw_sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: tor
     scale = 255.0 if srgb.dtype == torch.uint8 else 1.0
     pixel = srgb[:, row, column].float() / scale
     reading = raw[0, row, column]
-    own = F.one_hot(torch.tensor(cfa.channels)[row % 2, column % 2], 3).T.float()
+    site = F.one_hot(torch.tensor(cfa.channels)[row % 2, column % 2], 3).T.float()
     inside = (pixel.amax(0) < _CLIPPED_SRGB) & (pixel.amin(0) > 0.0) & (reading < CLIPPED_RAW)
 
     top, left = row // 2 * 2, column // 2 * 2
@@ -233,43 +228,37 @@ def _draw_sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: tor
     weight = is_unclipped / (1.0 + (spread * 32.0) ** 2)
 
     coordinates = frame_coordinates(height, width)[0, :, row, column]
-    return _samples(pixel, reading * own, own, own * inside, coordinates, cell_srgb.mean(0), cell_raw, weight)
+    return _samples(pixel, reading * site, site, site * inside, coordinates, cell_srgb.mean(0), cell_raw, weight)
 
 
 def _draw_blocks(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:
     """Draw averages over blocks in linear light, which tolerate a shift of a few pixels."""
-    blocks = block_averages(srgb, raw, cfa)
-    greens = torch.stack([blocks.srgb[1], blocks.raw[1].clamp_min(0.0).sqrt()])[:, ~blocks.clipped]
+    low_srgb, low_raw, clipped, places = block_averages(srgb, raw, cfa)
+    greens = torch.stack([low_srgb[1], low_raw[1].clamp_min(0.0).sqrt()])[:, ~clipped]
     likeness = float(torch.corrcoef(greens)[0, 1])
     if likeness < LEAST_LIKENESS:
         raise ValueError(f"sRGB and RAW hardly correlate ({likeness:.2f}); are they from the same shot?")
 
-    index = torch.randint(blocks.clipped.numel(), (pixels,), generator=generator)
-    pixel, reading = blocks.srgb.flatten(1)[:, index], blocks.raw.flatten(1)[:, index]
-    inside = ~blocks.clipped.flatten()[index] & (pixel.amax(0) < _CLIPPED_SRGB)
-    coordinates = blocks.coordinates[0].flatten(1)[:, index]
+    index = torch.randint(clipped.numel(), (pixels,), generator=generator)
+    pixel, reading = low_srgb.flatten(1)[:, index], low_raw.flatten(1)[:, index]
+    inside = ~clipped.flatten()[index] & (pixel.amax(0) < _CLIPPED_SRGB)
+    coordinates = places[0].flatten(1)[:, index]
     usable = inside.expand(3, -1).float()
     return _samples(pixel, reading, torch.ones_like(usable), usable, coordinates, pixel, reading, inside.float())
 
 
-class Blocks(NamedTuple):
-    """An unregistered pair, averaged over blocks.
+def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Average an unregistered pair over corresponding blocks, with the shift between the two removed.
 
     Args:
-        srgb: ``(3, h, w)``, averaged in linear light.
-        raw: ``(3, h, w)``.
-        clipped: ``(h, w)``, whether any site of the block is clipped.
-        coordinates: ``(1, 2, h, w)``, in the full frame.
+        srgb: ``(3, H, W)``, averaged in linear light.
+        raw: ``(1, H, W)``.
+        cfa: the pattern of ``raw``.
+
+    Returns:
+        sRGB and RAW ``(3, h, w)``; whether any site of a block is clipped, ``(h, w)``; and the blocks' coordinates in
+        the full frame, ``(1, 2, h, w)``.
     """
-
-    srgb: Tensor
-    raw: Tensor
-    clipped: Tensor
-    coordinates: Tensor
-
-
-def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA) -> Blocks:
-    """Average sRGB ``(3, H, W)`` and RAW ``(1, H, W)`` over corresponding blocks, with their shift removed."""
     height, width = raw.shape[-2:]
     dy, dx = find_shift(srgb, raw, cfa)
     top, left = -(min(dy, 0) // 2) * 2, -(min(dx, 0) // 2) * 2
@@ -283,7 +272,7 @@ def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA) -> Blocks:
 
     clipped = F.max_pool2d((window >= CLIPPED_RAW).float()[None], BLOCK)[0, 0] > 0
     coordinates = frame_coordinates(rows, columns, (top, left), (height, width))
-    return Blocks(low_srgb, low_raw, clipped, F.avg_pool2d(coordinates, BLOCK))
+    return low_srgb, low_raw, clipped, F.avg_pool2d(coordinates, BLOCK)
 
 
 def find_shift(srgb: Tensor, raw: Tensor, cfa: CFA) -> tuple[int, int]:

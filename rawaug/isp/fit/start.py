@@ -216,9 +216,9 @@ def plausible_matrices(matrices: Tensor) -> Tensor:
     In a camera's matrix each channel sees its own primary most, and the matrix is far from singular. Frames of few
     colours leave their matrices undetermined, and must not become atoms.
     """
-    own = matrices.diagonal(dim1=1, dim2=2)
-    others = matrices.abs() - torch.diag_embed(matrices.diagonal(dim1=1, dim2=2).abs())
-    return (own > others.amax(dim=2)).all(dim=1) & (torch.linalg.det(matrices) > _LEAST_DETERMINANT)
+    primary = matrices.diagonal(dim1=1, dim2=2)
+    crosstalk = matrices.abs() - torch.diag_embed(primary.abs())
+    return (primary > crosstalk.amax(dim=2)).all(dim=1) & (torch.linalg.det(matrices) > _LEAST_DETERMINANT)
 
 
 def reach_atoms(count: int, reach: float) -> Tensor:

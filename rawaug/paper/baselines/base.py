@@ -98,7 +98,7 @@ class BaselineISP(nn.Module, ABC):
         self.cfa = CFA(cfa)
         self.info: dict[str, Any] = {}
 
-    def setting_of(self, white_balance: tuple[float, float, float]) -> Any:
+    def as_shot_setting(self, white_balance: tuple[float, float, float]) -> Any:
         """Make the setting for as-shot multipliers R, G, B; return None if the method does not use them."""
         return None
 

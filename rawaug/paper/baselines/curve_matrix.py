@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from rawaug.bayer import CFA
 from rawaug.isp.fit.samples import FramePair, sample_pixels
 from rawaug.paper.baselines.base import BASELINES, BaselineISP, Training
-from rawaug.paper.baselines.upi import PIXELS, Moments
+from rawaug.paper.baselines.upi import PIXELS, fit_product
 
 
 def undo_bt709(x: Tensor) -> Tensor:
@@ -51,7 +51,7 @@ class CurveMatrix(BaselineISP):
         self.blind = nn.Parameter(torch.eye(3), requires_grad=False)
         self.register_buffer("balanced", torch.eye(3))
 
-    def setting_of(self, white_balance: tuple[float, float, float]) -> Tensor:
+    def as_shot_setting(self, white_balance: tuple[float, float, float]) -> Tensor:
         """Make the matrix of a frame with these as-shot multipliers."""
         return inverse_balance(white_balance)[:, None] * self.balanced.cpu()
 
@@ -64,9 +64,9 @@ class CurveMatrix(BaselineISP):
         """Fit both matrices to pairs of any CFA, registered or not."""
         pixels = sample_pixels(pairs, PIXELS, training.seed).pixels
         linear = undo_bt709(pixels.srgb)
-        self.blind.copy_(Moments.of(linear, pixels.target, pixels.known).fit())
+        self.blind.copy_(fit_product(linear, pixels.target, pixels.known))
 
         factors = torch.stack([inverse_balance(pair.white_balance) for pair in pairs])
         balanced = pixels.target / factors[:, :, None, None]
-        self.balanced.copy_(Moments.of(linear, balanced, pixels.known).fit())
+        self.balanced.copy_(fit_product(linear, balanced, pixels.known))
         return [math.nan]

@@ -62,7 +62,7 @@ class CompressedISP(CropTrainedISP):
         multipliers = torch.tensor([pair.white_balance for pair in pairs])
         self.balance.copy_(multipliers.log().mean(0, keepdim=True).exp())
 
-    def setting_of(self, white_balance: tuple[float, float, float]) -> Balance:
+    def as_shot_setting(self, white_balance: tuple[float, float, float]) -> Balance:
         """Return the multipliers themselves."""
         return white_balance
 
@@ -128,24 +128,24 @@ class InvertibleBlock(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map ``(B, 3, H, W)`` to ``(B, 3, H, W)``."""
         mixed = F.conv2d(x, self.weight[:, :, None, None])
-        one, two = mixed.split([1, 2], dim=1)
+        first, second = mixed.split([1, 2], dim=1)
 
-        one = one + self.add_one(two)
-        two = two * self.log_scale(one).exp() + self.add_two(one)
-        return torch.cat([one, two], dim=1)
+        first = first + self.add_one(second)
+        second = second * self.log_scale(first).exp() + self.add_two(first)
+        return torch.cat([first, second], dim=1)
 
     def inverse(self, x: Tensor) -> Tensor:
         """Compute the input ``(B, 3, H, W)`` from which :meth:`forward` makes ``x``, which has the same shape."""
-        one, two = x.split([1, 2], dim=1)
-        two = (two - self.add_two(one)) * (-self.log_scale(one)).exp()
-        one = one - self.add_one(two)
+        first, second = x.split([1, 2], dim=1)
+        second = (second - self.add_two(first)) * (-self.log_scale(first)).exp()
+        first = first - self.add_one(second)
 
         unmix = torch.linalg.inv(self.weight)
-        return F.conv2d(torch.cat([one, two], dim=1), unmix[:, :, None, None])
+        return F.conv2d(torch.cat([first, second], dim=1), unmix[:, :, None, None])
 
-    def log_scale(self, one: Tensor) -> Tensor:
-        """Compute the logarithm ``(B, 2, H, W)`` of two channels' factor from the other one, ``(B, 1, H, W)``."""
-        return SCALE_CLAMP * (2.0 * torch.sigmoid(self.scale_two(one)) - 1.0)
+    def log_scale(self, first: Tensor) -> Tensor:
+        """Compute the logarithm ``(B, 2, H, W)`` of two channels' factor from the third, ``(B, 1, H, W)``."""
+        return SCALE_CLAMP * (2.0 * torch.sigmoid(self.scale_two(first)) - 1.0)
 
 
 class Flow(nn.Module):

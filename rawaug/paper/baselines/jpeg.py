@@ -59,9 +59,9 @@ def quantisation_table(base: tuple[tuple[int, ...], ...], quality: int) -> Tenso
 
 def cosines() -> Tensor:
     """Compute the orthonormal matrix ``(8, 8)`` of the discrete cosine transform, with a frequency in each row."""
-    place = torch.arange(BLOCK).double()
-    frequency = place[:, None]
-    matrix = torch.cos(math.pi * (2.0 * place + 1.0) * frequency / (2 * BLOCK)) / 2.0
+    pixel = torch.arange(BLOCK).double()
+    frequency = pixel[:, None]
+    matrix = torch.cos(math.pi * (2.0 * pixel + 1.0) * frequency / (2 * BLOCK)) / 2.0
     matrix[0] /= math.sqrt(2.0)
     return matrix.float()
 

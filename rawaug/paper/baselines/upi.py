@@ -68,7 +68,7 @@ class SmoothstepISP(BaselineISP):
     def default_params(self, batch: int) -> UPIParams:
         """Make the setting of ``batch`` pictures about which nothing is known."""
 
-    def setting_of(self, white_balance: tuple[float, float, float]) -> UPIParams:
+    def as_shot_setting(self, white_balance: tuple[float, float, float]) -> UPIParams:
         """Put as-shot multipliers R, G, B in place of the default ones; the digital gain stays."""
         params = self.default_params(1)
         balance = torch.tensor(white_balance) / white_balance[1]
@@ -138,7 +138,7 @@ class TunedUPI(SmoothstepISP):
         """Fit to pairs of any CFA, registered or not; raise ValueError if the best matrix turns white black."""
         pixels = sample_pixels(pairs, PIXELS, training.seed).pixels
         linear = functional.gamma_expand(inverse_smoothstep(pixels.srgb), GAMMA)
-        product = Moments.of(linear, pixels.target, pixels.known).fit()
+        product = fit_product(linear, pixels.target, pixels.known)
         sums = product.sum(1)
         if (sums <= 0.0).any():
             raise ValueError("tuned UPI: the pairs fit only with negative gains; give frames with more colours")
@@ -147,46 +147,41 @@ class TunedUPI(SmoothstepISP):
         return [math.nan]
 
 
-class Moments(NamedTuple):
-    """Second moments of F frames, in double precision, as means over each frame's known readings."""
+def fit_product(linear: Tensor, target: Tensor, known: Tensor) -> Tensor:
+    """Compute the matrix ``(3, 3)`` of the least sum of the logarithms of the frames' errors.
 
-    a: Tensor  # (F, 3, 3, 3): products of the inputs, by output channel
-    b: Tensor  # (F, 3, 3): of input and output
-    energy: Tensor  # (F,): of the output
+    Only pixels below the highlights count, where the inverse gains are plain divisions.
 
-    @classmethod
-    def of(cls, linear: Tensor, target: Tensor, known: Tensor) -> Moments:
-        """Compute the moments of the pixels below the highlights, where the inverse gains are plain divisions.
+    Args:
+        linear: linear colour, ``(F, 3, 1, P)``.
+        target, known: as in :class:`rawaug.isp.fit.samples.PixelSamples`.
 
-        Args:
-            linear: linear colour, ``(F, 3, 1, P)``.
-            target, known: as in :class:`rawaug.isp.fit.samples.PixelSamples`.
-        """
-        below = known * (linear.mean(1, keepdim=True) < HIGHLIGHT_KNEE)
-        x = linear[:, :, 0].double()
-        y = target[:, :, 0].double()
-        weight = below[:, :, 0].double()
-        if (weight.sum(2) < 32).any():
-            raise ValueError("a frame has too few pixels below the highlights; use better exposed frames")
+    Raises:
+        ValueError: if a frame has fewer than 32 pixels below the highlights.
+    """
+    below = known * (linear.mean(1, keepdim=True) < HIGHLIGHT_KNEE)
+    x = linear[:, :, 0].double()
+    y = target[:, :, 0].double()
+    weight = below[:, :, 0].double()
+    if (weight.sum(2) < 32).any():
+        raise ValueError("a frame has too few pixels below the highlights; use better exposed frames")
 
-        weight = weight / weight.sum((1, 2), keepdim=True)
-        a = torch.einsum("fip,fjp,fcp->fcij", x, x, weight)
-        return cls(a, torch.einsum("fip,fcp,fcp->fci", x, y, weight), (weight * y * y).sum((1, 2)))
+    # Second moments of each frame: of the inputs, by output channel; of input and output; of the output.
+    weight = weight / weight.sum((1, 2), keepdim=True)
+    inputs = torch.einsum("fip,fjp,fcp->fcij", x, x, weight)
+    cross = torch.einsum("fip,fcp,fcp->fci", x, y, weight)
+    energy = (weight * y * y).sum((1, 2))
 
-    def fit(self) -> Tensor:
-        """Compute the matrix ``(3, 3)`` of the least sum of the logarithms of the frames' errors."""
-        product = self.solve(torch.ones(len(self.energy)).double())
-        for _ in range(ROUNDS):
-            product = self.solve(1.0 / (self.error(product) + LOG_MSE_EPS))
-        return product
-
-    def solve(self, weights: Tensor) -> Tensor:
-        """Compute the matrix ``(3, 3)`` of least weighted error; ``weights`` of the frames are ``(F,)``."""
-        a, b = torch.einsum("f,fcij->cij", weights, self.a), torch.einsum("f,fci->ci", weights, self.b)
+    # Least squares, with frames weighted by one over their error, which makes the sum one of logarithms.
+    frames = torch.ones(len(energy)).double()
+    for iteration in range(ROUNDS + 1):
+        a, b = torch.einsum("f,fcij->cij", frames, inputs), torch.einsum("f,fci->ci", frames, cross)
         ridge = 1e-9 * a.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(3).to(a)
-        return torch.linalg.solve(a + ridge, b)
+        product = torch.linalg.solve(a + ridge, b)
+        if iteration == ROUNDS:
+            break
 
-    def error(self, product: Tensor) -> Tensor:
-        """Compute the frames' mean squared errors ``(F,)`` under a matrix ``product`` of shape ``(3, 3)``."""
-        square = torch.einsum("ci,fcij,cj->f", product, self.a, product)
-        return (square - 2.0 * (product * self.b).sum((1, 2)) + self.energy).clamp_min(0.0)
+        square = torch.einsum("ci,fcij,cj->f", product, inputs, product)
+        error = (square - 2.0 * (product * cross).sum((1, 2)) + energy).clamp_min(0.0)
+        frames = 1.0 / (error + LOG_MSE_EPS)
+    return product

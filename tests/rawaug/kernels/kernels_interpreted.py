@@ -26,7 +26,7 @@ FLOATS = ("all stages", "curves")
 def camera_of(srgb: torch.Tensor, blur: torch.Tensor | None, **settings: Any) -> reference.Unprocessing:
     isp = full_isp(**settings)
     place = torch.tensor([[6, 34, 40, 60, 5], [0, 0, *srgb.shape[-2:], 0]])
-    return BakedISP(isp)._camera(srgb, isp.choose(srgb), place, blur)
+    return BakedISP(isp)._unprocessing(srgb, isp.choose(srgb), place, blur)
 
 
 def check_raw(settings: dict[str, Any], dtype: torch.dtype, blur: torch.Tensor | None = None) -> None:

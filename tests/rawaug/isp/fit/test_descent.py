@@ -58,10 +58,11 @@ def test_watched_tensors_come_back_from_their_best_step() -> None:
     x = torch.zeros(3)
     worker = Descent(None, "key", 0, False)
     worker.run("down", lambda g: x.sum(), {"x": x}, 20, 0.1, watch=lambda: -abs(float(x.detach().sum()) + 1.5))
-    start, step, best, scores = worker.watched["down"]
-    assert (start, step) == (-1.5, 5) and best > -0.2  # 5 steps of 0.1 by Adam, three times
-    assert scores[0] == -1.5 and max(scores) == best
-    curve = worker.watched["down"].curve()
+    step, best = worker.best("down")
+    scores = [score for _, score in worker.scores["down"]]
+    assert (scores[0], step) == (-1.5, 5) and best > -0.2  # 5 steps of 0.1 by Adam, three times
+    assert max(scores) == best
+    curve = worker.curve("down")
     assert (curve[0], curve[-1]) == (-1.5, round(scores[-1], 2)) and len(curve) <= CURVE_POINTS
     assert -abs(float(x.sum()) + 1.5) == pytest.approx(best)
 
@@ -170,7 +171,7 @@ def test_a_fit_shows_the_forward_encoders_what_the_forward_pass_does(
     seen: list[Tensor] = []
     isp.forward_encoders.colour.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
     if stage == "encoders":
-        descent._frame_loss(isp, part, shots[0], CLEAN, torch.Generator().manual_seed(0))
+        descent._encoder_loss(isp, part, shots[0], CLEAN, torch.Generator().manual_seed(0))
     else:
         descent._joint_loss(isp, part, shots[0].srgb, isp.remove_shading(shots[0].raw, None), CLEAN)
     shaded = shots[0].raw.std((2, 3)) / shots[0].raw.mean((2, 3))

@@ -38,7 +38,7 @@ def test_the_matrix_is_found_and_the_gains_change_it_from_shot_to_shot() -> None
     torch.testing.assert_close(model.balanced, MATRIX, atol=1e-3, rtol=0)
 
     pair = shot(2, (1.2, 1.0, 2.6))
-    as_shot = model.reverse(pair.srgb[None], model.setting_of(pair.white_balance))
+    as_shot = model.reverse(pair.srgb[None], model.as_shot_setting(pair.white_balance))
     torch.testing.assert_close(as_shot[0], pair.raw, atol=1e-3, rtol=0)
     blind = model.reverse(pair.srgb[None])[0]
     assert (blind - pair.raw).abs().mean() > 0.01
