@@ -23,9 +23,9 @@ BENCHMARKS := augment denoise faults folder forty_lines fuzz loader networks noi
 help:  ## what there is to make
 	@sed -n 's/^\([a-z]*\):.*##  *\(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r target text; do printf '%-8s %s\n' "$$target" "$$text"; done
 
-demo: $(VENV)/.demo  ## train a RAW denoiser on a simulated camera, with and without augmentation, and test it on real frames
+demo: $(VENV)/.demo  ## train a RAW denoiser on a simulated camera, with and without augmentation, and test it on photographs with drawn noise
 	$(BIN)/rawaug run recipes/fewshot.yaml
-	$(BIN)/rawaug benchmark runs/fewshot/seed0/*/denoiser.safetensors --noise cycleisp_sidd  # on real frames
+	$(BIN)/rawaug benchmark runs/fewshot/seed0/*/denoiser.safetensors --noise cycleisp_sidd  # on photographs
 
 test: $(VENV)/.test  ## style, types and all tests, at once
 	$(MAKE) --jobs 2 lint pytest

@@ -36,6 +36,7 @@ def main(command: Sequence[str] | None = None) -> None:
     options.add_argument("table", type=Path, help="JSON file of all scores")
     options.add_argument("denoisers", nargs="*")
     options.add_argument("--sets", nargs="+", default=["real:test", "real:validation"])
+    options.add_argument("--noise", help="noise in place of the four strengths, as for rawaug benchmark")
     options.add_argument("--crop", type=int, default=256, help="side of the middles, in pixels of the mosaic")
     options.add_argument("--sensors", action="store_true", help="score sensors as they are, too")
     options.add_argument("--threads", type=int, default=torch.get_num_threads())
@@ -46,18 +47,18 @@ def main(command: Sequence[str] | None = None) -> None:
     conditions = [TOLD, REAL] if args.sensors else [TOLD]
 
     for name in args.sets:
-        everything = [trial for trial in frozen_trials(name, args.crop) if trial.condition in conditions]
+        everything = [trial for trial in frozen_trials(name, args.crop, args.noise) if trial.condition in conditions]
         for spec in ["noisy", *args.denoisers]:
             add_scores(table, name, spec, everything, args.table)
     print_table(table)
 
 
-def frozen_trials(spec: str, crop: int) -> list[Trial]:
+def frozen_trials(spec: str, crop: int, noise: str | None = None) -> list[Trial]:
     """The middles of all frames of a set, such as ``FOLDER@4``, under every condition and strength."""
     data, _, factor = spec.partition("@")
     pairs = open_pairs(data, split="test")
     frames = measure_own_noise(pairs, len(pairs)).binned(int(factor or 1))
-    return trials(frames, crop, strengths=choose_strengths())
+    return trials(frames, crop, strengths=choose_strengths(noise))
 
 
 def add_scores(table: Scores, name: str, spec: str, everything: Sequence[Trial], path: Path) -> None:

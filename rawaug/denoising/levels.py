@@ -81,7 +81,7 @@ def _automatic(frame: RawFrame) -> tuple[float, float, str]:
         shot_var, read_var, source = _estimate(frame)
     except UnknownNoise:
         with suppress(ValueError):
-            return *_published_levels(frame, frame.camera), f"published for {frame.camera}"
+            return *_published_levels(frame, frame.camera), f"the law published for {frame.camera}"
         raise
 
     for remark in frame.remarks:
@@ -120,7 +120,11 @@ def _estimate(frame: RawFrame) -> tuple[float, float, str]:
 
 def _published_levels(frame: RawFrame, name: str) -> tuple[float, float]:
     if not isinstance(noise_levels(name), (EldLevels, ProfileLevels)) and name not in camera_names():
-        raise ValueError(f"noise {name!r} is no camera; use auto, profile, estimate, the name of one, or {_BY_HAND}")
+        raise ValueError(
+            f"noise {name!r} is no camera's: a preset draws its levels, and a file has levels of its own; use auto, "
+            "profile, estimate, the name of a camera, 'camera' for the law that the denoiser was trained with, the "
+            f".safetensors file of rawaug fit, a camera's .yaml sheet, or {_BY_HAND}"
+        )
     if frame.iso is None:
         raise UnknownNoise(f"{frame.name}: has no ISO tag, needed for {name}'s noise levels; pass {_BY_HAND}")
 

@@ -48,7 +48,7 @@ MID_GREY = 0.18
 """The signal whose noise is stated for photographers, on the scale black 0, white 1."""
 
 _SOURCES = {"profile": "by its tag", "estimate": "estimated", "given": "as given", "camera": "by its camera's law"}
-"""Where noise levels come from, in the words of a line for photographers; others stand as they are."""
+"""Where noise levels come from, in the words of a line for photographers; a camera or other files are named."""
 
 OTHER_PATTERNS = "rawaug-xtrans"
 """The denoiser of X-Trans and Quad-Bayer frames if none is named."""
@@ -103,7 +103,7 @@ class Denoised:
         source, *remarks = self.noise_source.split("; ")
         is_uncertain = "uncertain" in source
         source = source.partition(",")[0]
-        noise = f"noise of {deviation:.1f} % of mid grey, {_SOURCES.get(source, source)}, {removed}"
+        noise = f"noise of {deviation:.1f} % of mid grey, {_SOURCES.get(source, f'by {source}')}, {removed}"
         if not deviation:
             noise = f"noise {removed}"
 

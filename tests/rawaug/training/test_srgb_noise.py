@@ -177,3 +177,13 @@ def test_a_share_of_the_samples_has_noise_drawn_on_srgb_and_each_depends_on_its_
     for k in (0, 7, 8, 9):
         again = mixed.draw(torch.Generator().manual_seed(k))
         assert all(map(torch.equal, again, samples[k]))
+
+
+def test_each_compressed_picture_keeps_its_own_chroma() -> None:
+    """Of red and green columns 4:2:0 makes one colour; a picture before them that is no JPEG shifts nobody's."""
+    stripes = torch.zeros(3, 3, 32, 32)
+    stripes[:, 0, :, ::2], stripes[:, 1, :, 1::2] = 0.8, 0.4
+    kept = {"sigma": [0.0] * 3, "quality": [0, 98, 98], "chroma_420": [True, False, True]}
+    coded = stripes + noise_of(ColouredNoise(), stripes, **kept)
+    chroma = (coded[:, 0] - coded[:, 1]).diff(dim=-1).abs().mean((1, 2))
+    assert chroma[0] > 1.0 and chroma[1] > 1.0 and chroma[2] < 0.5
