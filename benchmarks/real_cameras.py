@@ -1,6 +1,6 @@
 """The recipe ``augmentation`` on two real cameras: few-shot on a Canon S40, tested on a G2, and real noise of a D5000.
 
-    python -m benchmarks.real_cameras canon CANON_RAW PHOTOS --out RUNS
+    python -m benchmarks.real_cameras canon CANON_RAW PHOTOS --out RUNS --beside PMRID.safetensors BF_DNCNN.safetensors
     python -m benchmarks.real_cameras d5000 BRACKET PHOTOS --out RUNS --beside PMRID.safetensors BF_DNCNN.safetensors
 
 Canon: the middles of 96 of the five S40 frames, with drawn noise; validation are other windows of 256 of these frames,
@@ -79,7 +79,7 @@ def make_recipe(name: str, photographs: Path, out: str, blur: float, **settings:
     )
 
 
-def run_canon(folder: Path, photographs: Path, out: str) -> None:
+def run_canon(folder: Path, photographs: Path, out: str, beside: Sequence[str]) -> None:
     """Few-shot on the S40, tested on the G2."""
     pairs = list(open_pairs(folder))
     train = [pair for pair in pairs if "S40" in pair.camera]
@@ -95,6 +95,7 @@ def run_canon(folder: Path, photographs: Path, out: str) -> None:
             test += [window(pair, top, left, WINDOW) for top, left in places]
 
     recipe = make_recipe("canon", photographs, out, blur or 0.0, noise="cycleisp_sidd", classical=["NonLocalMeans"])
+    recipe.baselines = list(beside)
     run(recipe, overwrite=True, pairs=train, validation=validation, test=test)
 
 
@@ -178,11 +179,11 @@ def main() -> None:
     cli.add_argument("frames", type=Path)
     cli.add_argument("photographs", type=Path)
     cli.add_argument("--out", default="runs")
-    cli.add_argument("--beside", nargs="*", default=[], help="denoisers to score beside, for the D5000")
+    cli.add_argument("--beside", nargs="*", default=[], help="denoisers to score beside")
     options = cli.parse_args()
     torch.set_num_threads(1)
     if options.camera == "canon":
-        run_canon(options.frames, options.photographs, options.out)
+        run_canon(options.frames, options.photographs, options.out, options.beside)
     else:
         run_d5000(options.frames, options.photographs, options.out, options.beside)
 
