@@ -134,11 +134,9 @@ def run_d5000(folder: Path, photographs: Path, out: str, beside: Sequence[str]) 
     fit_isp(squares, FIT).save(file)
 
     recipe = make_recipe("d5000", photographs, out, blur or 0.0, isp=str(file), noise=short.levels)
-    for arm in ("soft", "sharp"):
-        settings = recipe.arms[arm]
-        assert settings.draw is not None
-        settings.draw = replace(settings.draw, exposure=2.0)
-    del recipe.arms["own"]  # the shot's own picture is as noisy as the shot
+    for arm in ("own", "sharp"):  # the shot's own picture is as noisy as the shot
+        del recipe.arms[arm]
+    recipe.arms["soft"].draw = Draw("perturb", blur=blur or 0.0, exposure=2.0)
     run(recipe, overwrite=True, pairs=train, validation=watched, test=[block_pair(block, short) for block in right])
 
     # The errors of the bracket, which know the noise of the reference.
