@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import Any
+
+from rawaug.evaluation.verdict import paired_interval
 
 TENTH = 0.1
 """Least difference in dB that a table of one seed is believed."""
@@ -15,34 +16,47 @@ TENTH = 0.1
 def compare_order(table: Mapping[str, Mapping[str, Any]], column: str) -> tuple[int, list[str], list[str]]:
     """Compare the order of the rows by a column with that of the paper's figures.
 
-    A pair of rows is open if these differ by no more than two standard errors over the seeds, or by less than
-    :data:`TENTH` where there is one seed, of which no spread is known.
+    A pair of rows is open if the interval of their differences, seed by seed, holds 0
+    (:func:`rawaug.evaluation.verdict.paired_interval`), or if they differ by less than :data:`TENTH` where there is one
+    seed, of which no spread is known.
 
     Returns:
         The number of pairs that are ordered alike, the pairs that are refuted, and those that are open.
     """
     figures = {}
     for name, cells in table.items():
-        ours, paper = as_mean(cells.get(column)), cells.get(f"{column}, paper")
-        if ours is not None and paper is not None:
-            figures[name] = (ours, _standard_error(cells[column]), paper)
+        ours, paper = cells.get(column), cells.get(f"{column}, paper")
+        if as_mean(ours) is not None and paper is not None:
+            figures[name] = ours, paper
 
     alike = 0
     refuted: list[str] = []
     undecided: list[str] = []
-    for (first, (a, error_a, b)), (second, (c, error_c, d)) in combinations(figures.items(), 2):
-        pair = f"{first} above {second}" if b > d else f"{second} above {first}"
-        margin = TENTH
-        if error_a is not None and error_c is not None:
-            margin = 2.0 * math.hypot(error_a, error_c)
-
-        if abs(a - c) <= margin:
+    for (first, (ours, paper)), (second, (other, other_paper)) in combinations(figures.items(), 2):
+        pair = f"{first} above {second}" if paper > other_paper else f"{second} above {first}"
+        side = _compare(ours, other)
+        if side == 0:
             undecided.append(pair)
-        elif (a - c) * (b - d) > 0:
+        elif side * (paper - other_paper) > 0:
             alike += 1
         else:
             refuted.append(pair)
     return alike, refuted, undecided
+
+
+def _compare(ours: Any, other: Any) -> int:
+    """Say which of two figures is higher, 1 or -1, or 0 if that is not decided."""
+    difference = (as_mean(ours) or 0.0) - (as_mean(other) or 0.0)
+    low, high = difference - TENTH, difference + TENTH
+
+    if isinstance(ours, list) and isinstance(other, list):
+        by_seed = [a - b for a, b in zip(ours, other, strict=False) if a is not None and b is not None]
+        if len(by_seed) > 1:
+            low, high = paired_interval(by_seed)
+
+    if low <= 0.0 <= high:
+        return 0
+    return 1 if difference > 0 else -1
 
 
 def order_sentence(alike: int, refuted: Sequence[str], undecided: Sequence[str]) -> str:
@@ -58,17 +72,6 @@ def order_sentence(alike: int, refuted: Sequence[str], undecided: Sequence[str])
         if pairs:
             sentence += f"; {answer}: {', '.join(pairs)}"
     return f"{sentence}."
-
-
-def _standard_error(value: Any) -> float | None:
-    """Compute the standard error of a figure that is given for several seeds; None of one."""
-    if not isinstance(value, list):
-        return None
-
-    numbers = [number for number in value if number is not None]
-    if len(numbers) < 2:
-        return None
-    return stdev(numbers) / math.sqrt(len(numbers))
 
 
 def as_mean(value: Any) -> float | None:
