@@ -132,8 +132,8 @@ def move_off_locus(xy: Array, kelvin: Array, duv: Array) -> Array:
     normal = rate[..., ::-1] * (1.0, -1.0)  # to higher v: the locus runs to lower u as it gets hotter
     length = np.hypot(rate[..., 0], rate[..., 1])
 
-    uv = _uv_from_xy(xy) + (duv / length)[..., None] * normal
-    return _xy_from_uv(uv)
+    uv = xy * (4.0, 6.0) / (12.0 * xy[..., 1:] - 2.0 * xy[..., :1] + 3.0)
+    return _xy_from_uv(uv + (duv / length)[..., None] * normal)
 
 
 def white_point(xy: Array | tuple[float, float]) -> Tensor:
@@ -188,10 +188,6 @@ def _planckian_uv(kelvin: Array) -> tuple[Array, Array]:
 def _white_point(xy: Array) -> Array:
     x, y = xy[..., 0], xy[..., 1]
     return np.stack([x / y, np.ones_like(x), (1.0 - x - y) / y], axis=-1)
-
-
-def _uv_from_xy(xy: Array) -> Array:
-    return xy * (4.0, 6.0) / (12.0 * xy[..., 1:] - 2.0 * xy[..., :1] + 3.0)
 
 
 def _xy_from_uv(uv: Array) -> Array:

@@ -104,8 +104,7 @@ class CameraSampler:
         for _ in range(_ROUNDS):
             generators = take_generators(generator, missing)
             cameras, shares = sparse_shares(len(missing), len(self.mixtures), CAMERAS_MIXED, generators)
-            light = self.sample_lights(len(missing), generators)
-            weights[missing] = self.weigh(cameras.numpy(), shares.numpy(), light)
+            weights[missing], light = self.draw_in_light(cameras.numpy(), shares.numpy(), generators)
             balance[missing] = self.balance(weights[missing], light)
 
             missing = missing[~self.is_plausible(balance[missing])]
@@ -120,13 +119,14 @@ class CameraSampler:
         low, high = self.plausible
         return np.asarray(((balance >= low) & (balance <= high)).all(axis=1))
 
-    def sample_lights(self, batch: int, generator: Generators) -> Array:
-        """Draw white points ``(batch, 3)``, XYZ with Y = 1."""
-        return sample_lights(batch, generator, self.lights)
+    def draw_in_light(self, cameras: Array, shares: Array, generator: Generators) -> tuple[Array, Array]:
+        """Draw lights for mixtures of cameras, by their numbers and shares ``(B, 2)``.
 
-    def weigh(self, cameras: Array, shares: Array, light: Array) -> Array:
-        """Compute weights ``(B, N)`` of the atoms for cameras and shares ``(B, 2)`` in light ``(B, 3)``."""
-        return np.asarray((shares[..., None] * self.mixtures[cameras]).sum(axis=1))
+        Returns:
+            Weights of the atoms ``(B, N)``, and white points ``(B, 3)``, XYZ with Y = 1.
+        """
+        weights = (shares[..., None] * self.mixtures[cameras]).sum(axis=1)
+        return weights, sample_lights(len(cameras), generator, self.lights)
 
     def balance(self, weights: Array, light: Array) -> Array:
         """Compute the white balance ``(B, 3)``, green 1, of mixtures ``(B, N)`` in light of white points ``(B, 3)``."""
@@ -176,20 +176,19 @@ class DataSheetSampler(CameraSampler):
             lights = light_range(light)
         super().__init__(mixtures, matrices, responses, lights, consistent)
 
-    def sample_lights(self, batch: int, generator: Generators) -> Array:
-        """Draw white points ``(batch, 3)``, or take the light that is named."""
-        if self._exact is not None:
-            return np.broadcast_to(self._exact, (batch, 3))
-        return super().sample_lights(batch, generator)
+    def draw_in_light(self, cameras: Array, shares: Array, generator: Generators) -> tuple[Array, Array]:
+        """Draw lights, or take the one that is named, and weigh each camera's atoms by how near their light is."""
+        if self._exact is None:
+            light = sample_lights(len(cameras), generator, self.lights)
+        else:
+            light = np.broadcast_to(self._exact, (len(cameras), 3))
 
-    def weigh(self, cameras: Array, shares: Array, light: Array) -> Array:
-        """Compute weights ``(B, N)`` of the atoms for cameras and shares ``(B, 2)``: those of the nearest lights."""
         mired = compute_mired(light)
         blocks = []
         for number, mireds in enumerate(self._mireds):
             share = (shares * (cameras == number)).sum(axis=1)
             blocks.append(share[:, None] * weights_in_light(mireds, mired))
-        return np.concatenate(blocks, axis=1)
+        return np.concatenate(blocks, axis=1), light
 
     def balance(self, weights: Array, light: Array) -> Array:
         """Compute the white balance ``(B, 3)``, green 1, of mixtures ``(B, N)`` in light of white points ``(B, 3)``."""

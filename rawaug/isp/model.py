@@ -138,7 +138,7 @@ class DictionaryISP(nn.Module):
                 encoders.gain = AtomEncoder(len(gain.log_gains))
 
         if tone is not None:
-            cast(ToneCurve, isp.stages["curve"]).dictionary = tone
+            cast(ToneCurve, isp.stages[ToneCurve.name]).dictionary = tone
             isp.configure(tone_atoms=len(tone.curves))
 
         stages = [name for name in isp.stages if name != FallOff.name]
@@ -178,10 +178,9 @@ class DictionaryISP(nn.Module):
     @property
     def tone(self) -> ToneDictionary | None:
         """The dictionary of tone curves; None if the curve is learned."""
-        stage = self.find(ToneCurve)
-        if stage is None:
+        if ToneCurve.name not in self.stages:
             return None
-        return stage.dictionary
+        return cast(ToneCurve, self.stages[ToneCurve.name]).dictionary
 
     def typical_tones(self) -> Tensor:
         """Weights ``(K,)`` of the tone curves for a picture of which nothing is known; none if the curve is learned."""

@@ -17,8 +17,6 @@ a standard's curve :math:`T_0` by scaling its slope on each of 51 pieces of five
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import torch
 from torch import Tensor, nn
 
@@ -87,23 +85,20 @@ class ToneDictionary(nn.Module):
     def combine(self, weights: Tensor) -> Tensor:
         """Mix the curves by weights ``(B, K)`` into tables ``(B, 1021)``, with the same bits in a batch of any size."""
         table = weights.new_zeros(len(weights), self.curves.shape[1])
-        for weight, curve in self._pair_weights(weights):
-            table += weight[:, None] * curve
-        return table
 
-    def _pair_weights(self, weights: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Pair weights ``(B,)`` with one curve ``(1021,)`` or one for each picture ``(B, 1021)``, in order of atoms."""
         # Weights of 0 are skipped on a CPU, unless they are being fitted. On a GPU looking for them would stall it, and
         # an exported pass has no values to look at.
         if weights.is_cuda or weights.requires_grad or torch.compiler.is_compiling():
-            yield from zip(weights.unbind(1), self.curves, strict=True)
-            return
+            for weight, curve in zip(weights.unbind(1), self.curves, strict=True):
+                table += weight[:, None] * curve
+            return table
 
         is_zero = weights == 0
         count = weights.shape[1] - int(is_zero.sum(dim=1).min())
         atoms = is_zero.to(torch.uint8).argsort(dim=1, stable=True)[:, :count]
         for weight, atom in zip(weights.gather(1, atoms).unbind(1), atoms.unbind(1), strict=True):
-            yield weight, self.curves[atom]
+            table += weight[:, None] * self.curves[atom]
+        return table
 
 
 @STAGES.register("curve")

@@ -67,10 +67,11 @@ def draw_crop(
         return torch.cat([smaller, torch.tensor([rows])])
 
     corner = bayer.RandomCrop(region).sample(height, width, generator)
-    view = torch.tensor(0)
+    view = torch.zeros(1, dtype=torch.int64)
     if views:
-        view = bayer.RandomView(bayer.CFA.RGGB, quarter=region[0] == region[1]).sample(generator)
-    return torch.cat([corner, torch.tensor([height, width]), view[None]])
+        count = bayer.N_VIEWS if region[0] == region[1] else bayer.N_VIEWS // 2  # quarter turns exchange the sides
+        view = torch.randint(count, (1,), generator=generator)
+    return torch.cat([corner, torch.tensor([height, width]), view])
 
 
 def draw_patch(
@@ -92,9 +93,9 @@ def draw_patch(
     Returns:
         The patch ``(3, *size)``, uint8 or float32, and its crop ``(5,)`` or ``(6,)``.
     """
-    whole = trim_to_even(to_rgb_tensor(picture, bgr))
-    place = draw_crop((whole.shape[-2], whole.shape[-1]), size, views, generator, zoom)
-    return cut_patch(whole, place, size), place
+    image = trim_to_even(to_rgb_tensor(picture, bgr))
+    crop = draw_crop((image.shape[-2], image.shape[-1]), size, views, generator, zoom)
+    return cut_patch(image, crop, size), crop
 
 
 def read_patch(
@@ -114,24 +115,24 @@ def read_patch(
         size, views, generator, zoom, bgr: as for :func:`draw_patch`, which draws the same crop.
     """
     start = generator.get_state()
-    place = torch.zeros(0, dtype=torch.int64)
+    crop = torch.zeros(0, dtype=torch.int64)
     fault: ValueError | None = None
 
     def choose(height: int, width: int) -> tuple[int, int, int, int]:
-        nonlocal place, fault
+        nonlocal crop, fault
         generator.set_state(start)  # another file may stand in for one that turns out to be damaged
         try:
-            place = draw_crop((height // 2 * 2, width // 2 * 2), size, views, generator, zoom)
+            crop = draw_crop((height // 2 * 2, width // 2 * 2), size, views, generator, zoom)
         except ValueError as error:  # the crop is at fault, not the file
             fault = error
             return 0, 0, 2, 2
-        top, left, _, _, _, rows = (*place.tolist(), 0)[:6]
+        top, left, _, _, _, rows = (*crop.tolist(), 0)[:6]
         return top, left, *_region(size, rows)
 
     region = pictures.read_part(index, choose)
     if fault is not None:
         raise fault
-    return _turn(region.flip(-3) if bgr else region, place, size), place
+    return _turn(region.flip(-3) if bgr else region, crop, size), crop
 
 
 def cut_patch(picture: Tensor, crop: Tensor, size: tuple[int, int] | None) -> Tensor:

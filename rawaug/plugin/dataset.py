@@ -148,9 +148,6 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
             crop = f"crops of {self.crop[0]} x {self.crop[1]}"
         return f"{type(self).__name__} of {pictures}, {crop}, seed {self.seed}\n{self.augment!r}"
 
-    def _generator(self, *key: int | str) -> torch.Generator:
-        return keyed_generator(self.seed, "pairs", *key)
-
     def _sample_name(self, number: int | str) -> str:
         """The name of a picture: the name of its file if the dataset knows it, else its number."""
         if not isinstance(number, int):
@@ -321,7 +318,7 @@ class RawPairs(_Pairs[Sample]):
             numbers.append(number % length)
 
         self._epochs.fetch(len(numbers))
-        generators = [self._generator(*self._epochs.key(number)) for number in numbers]
+        generators = [keyed_generator(self.seed, "pairs", *self._epochs.key(number)) for number in numbers]
         return self._draw_samples(numbers, generators)
 
     def draw(self, index: int, generator: torch.Generator) -> Sample:
@@ -507,7 +504,7 @@ class RawPairStream(_Pairs[Any], IterableDataset[Any]):
             name: tuple[int | str, ...] = (number, *self._epochs.rank())
             if self.identity is not None:
                 name = (self._read_identity(sample),)
-            pair = self._make_pair(sample, name[0], self._generator(epoch, *name))
+            pair = self._make_pair(sample, name[0], keyed_generator(self.seed, "pairs", epoch, *name))
             self._epochs.at(number + 1)
             yield pair
 

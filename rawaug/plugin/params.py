@@ -94,12 +94,11 @@ class AugmentParams(NamedTuple):
     @classmethod
     def concatenate(cls, parts: Sequence[AugmentParams]) -> AugmentParams:
         """Join the parameters of several batches ``(B, ...)`` to those of one."""
-        batches = [params.tensors() for params in parts]
-
-        joined = {}
-        for name in batches[0]:
-            joined[name] = torch.cat([tensors[name] for tensors in batches])
-        return cls.from_tensors(joined)
+        first = parts[0]
+        isp = ISPParams(*map(torch.cat, zip(*[params.isp for params in parts], strict=True)))
+        noise = {name: torch.cat([params.noise[name] for params in parts]) for name in first.noise}
+        extras = {name: torch.cat([params.extras[name] for params in parts]) for name in first.extras}
+        return cls(isp, noise, torch.cat([params.crop for params in parts]), extras)
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> AugmentParams:
@@ -191,7 +190,13 @@ class PairForm:
             ValueError: if the name is asked for and there is none.
         """
         if self.planes is not None:
-            pair = self._in_order(pair)
+            images = []
+            for image in pair[:3]:
+                if image.ndim >= 3 and image.shape[-3] == len(RAW_PLANES):  # packed; anything else stays as it is
+                    image = image[..., list(self.planes), :, :]
+                images.append(image)
+            noisy, clean, variance = images
+            pair = RawPair(noisy, clean, variance, pair.params)
         if self.fields is None:
             return pair
 
@@ -209,17 +214,6 @@ class PairForm:
         if self.keys is None:
             return tuple(values)
         return dict(zip(self.keys, values, strict=True))
-
-    def _in_order(self, pair: RawPair) -> RawPair:
-        noisy, clean, variance, params = pair
-        return RawPair(self._reorder(noisy), self._reorder(clean), self._reorder(variance), params)
-
-    def _reorder(self, part: Tensor) -> Tensor:
-        """Reorder packed RAW ``(..., 4, h, w)`` to the order of the planes; leave everything else as it is."""
-        is_packed = part.ndim >= 3 and part.shape[-3] == len(RAW_PLANES)
-        if not is_packed or self.planes is None:
-            return part
-        return part[..., list(self.planes), :, :]
 
 
 Keys = Sequence[str] | Mapping[str, str]
@@ -241,7 +235,7 @@ def pair_form(
     Raises:
         ValueError: if a name, a field or a plane is unknown or appears twice.
     """
-    planes = None if order is None else _planes_of(order)
+    planes = None if order is None else parse_order(order)
     if keys is not None and fields is not None:
         raise ValueError("give keys for a dict, or fields for a tuple; keys={'lq': 'noisy'} names fields")
 
@@ -266,7 +260,8 @@ def pair_form(
     return PairForm(RawPair._fields[: len(names)], names, planes)
 
 
-def _planes_of(order: str | Sequence[str]) -> tuple[int, ...]:
+def parse_order(order: str | Sequence[str]) -> tuple[int, ...]:
+    """Read an order of planes: indices of :data:`RAW_PLANES`; ValueError if it does not name each of them once."""
     if isinstance(order, str) and order in _ORDERS:
         return _ORDERS[order]
 
@@ -298,9 +293,9 @@ def load_params(path: str | Path) -> AugmentParams:
         raise FileNotFoundError(f"{path}: no such file of parameters")
 
     header, tensors = read_tensors(path, "save the parameters again")
-    kind = header.get("kind", "no rawaug parameters")
-    if kind != _KIND:
-        raise ValueError(f"{path}: holds {kind}, not the parameters of an augmentation")
+    contents = header.get("kind", "no rawaug parameters")
+    if contents != _KIND:
+        raise ValueError(f"{path}: holds {contents}, not the parameters of an augmentation")
 
     try:
         return AugmentParams.from_tensors(tensors)

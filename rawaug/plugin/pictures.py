@@ -165,7 +165,13 @@ def replace_picture(sample: Any, where: Where, value: Any) -> Any:
     if where is None:
         return value
     if isinstance(sample, Mapping):
-        return _replace_in_mapping(sample, where, value)
+        if not isinstance(value, dict):
+            return {**sample, where: value}
+        fields_left = {name: field for name, field in sample.items() if name != where}
+        duplicates = sorted(map(str, fields_left.keys() & value.keys()))
+        if duplicates:
+            raise ValueError(f"the samples have {', '.join(duplicates)} already; give other keys=")
+        return fields_left | value
 
     fields = list(sample)
     fields[int(where)] = value
@@ -174,17 +180,6 @@ def replace_picture(sample: Any, where: Where, value: Any) -> Any:
     if hasattr(sample, "_fields"):  # a named tuple
         return type(sample)(*fields)
     return tuple(fields)
-
-
-def _replace_in_mapping(sample: Mapping[Any, Any], where: str | int, value: Any) -> dict[Any, Any]:
-    if not isinstance(value, dict):
-        return {**sample, where: value}
-
-    others = {name: field for name, field in sample.items() if name != where}
-    duplicates = sorted(map(str, others.keys() & value.keys()))
-    if duplicates:
-        raise ValueError(f"the samples have {', '.join(duplicates)} already; give other keys=")
-    return others | value
 
 
 def _as_tensor(picture: Any) -> Tensor:
