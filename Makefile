@@ -52,9 +52,9 @@ dist: | $(BIN)/python  ## the wheel and the source archive of a release
 	$(BIN)/python -m build
 
 archive: $(VENV)/.test  ## the source archive, unpacked in build/archive, and its fast tests
-	rm -rf build/archive && mkdir -p build/archive
-	$(BIN)/python -c "from setuptools.build_meta import build_sdist; build_sdist('build/archive')"
-	tar --extract --gzip --strip-components 1 --directory build/archive --file build/archive/rawaug-*.tar.gz
+	rm -rf build/archive build/rawaug-*.tar.gz && mkdir -p build/archive
+	$(BIN)/python -c "from setuptools.build_meta import build_sdist; build_sdist('build')"
+	tar --extract --gzip --strip-components 1 --directory build/archive --file build/rawaug-*.tar.gz
 	cd build/archive && PYTHONPATH=. $(abspath $(BIN))/python -m pytest --numprocesses 2 --dist worksteal -m "not long"
 
 lock: $(WHEEL)  ## constraints.txt anew, for every Python version and platform at once; pins that still hold stay
