@@ -33,7 +33,7 @@ from rawaug.isp.stages import BatchParams, Stage, Tables, node_colours
 from rawaug.isp.tone import STEPS, to_code
 from rawaug.kernels import fastest
 from rawaug.kernels.reference import Display, Unprocessing, blur_taps, fall_off, look_up, mask_frame, render, unprocess
-from rawaug.kernels.runtime import one_thread
+from rawaug.kernels.runtime import move_together, one_thread
 
 NODES = 65
 """Number of nodes of the table along each axis of the sRGB cube."""
@@ -51,19 +51,17 @@ class BakedISP(nn.Module):
 
     def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
         super().__init__()
-        self.isp, self.config = deepcopy(isp), isp.config
+        self.config = isp.config
+        self._host = _copy_to_host(isp)
 
         table, attention = _tables(isp, nodes)
         self.register_buffer("table", table)
         self.register_buffer("attention", attention)
 
-    @torch.no_grad()
-    def choose(self, srgb: Tensor) -> ISPParams:
-        """The setting that the encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``, as in the ISP."""
-        if not self.config.encoders:
-            return self.isp.choose(srgb)
-        with one_thread():  # the same choice in every process
-            return self.isp.choose(srgb)
+    @property
+    def host(self) -> DictionaryISP:
+        """The ISP on the host, wherever the tables are."""
+        return self._host[0]
 
     @torch.no_grad()
     def forward(
@@ -91,8 +89,7 @@ class BakedISP(nn.Module):
         _require_batch(srgb, params, place, blur)
 
         camera = self._unprocessing(srgb, params, place, blur)
-        size = srgb.shape[-2], srgb.shape[-1]
-        gain = _place_gain(self.isp.ordered_stages, params, place, size, self.table, forward=False)
+        gain = self._gain(srgb, params, place)
         if gain is None:
             return _pass(srgb, camera, white)
 
@@ -129,29 +126,62 @@ class BakedISP(nn.Module):
         camera = self._unprocessing(srgb, params, place, blur)
         gain = None
         if shaded:
-            size = srgb.shape[-2], srgb.shape[-1]
-            gain = _place_gain(self.isp.ordered_stages, params, place, size, self.table, forward=False)
+            gain = self._gain(srgb, params, place)
         else:
             camera = camera._replace(attention=camera.attention[:0], shading=camera.shading[:0])
 
-        ceiling = math.inf
-        if gain is None:
-            ceiling = white
-        planes = []
-        for colour in range(3):
-            sites = torch.tensor([(i, j, colour) for i, j in CFA.RGGB.sites])
-            packed = _pass(srgb, camera._replace(sites=sites), ceiling)
-            planes.append(unpack(packed, CFA.RGGB))
-        rgb = torch.cat(planes, dim=1)
+        ceiling = white if gain is None else math.inf
 
+        def in_three_passes() -> Tensor:
+            planes = []
+            for colour in range(3):
+                sites = tuple((i, j, colour) for i, j in CFA.RGGB.sites)
+                packed = _pass(srgb, camera._replace(sites=sites), ceiling)
+                planes.append(unpack(packed, CFA.RGGB))
+            return torch.cat(planes, dim=1)
+
+        rgb = fastest("colours", _as_pixels(srgb), camera, ceiling, otherwise=in_three_passes)
         if gain is None:
             return rgb
         return (rgb * gain).clamp_max(white)
 
     @torch.no_grad()
+    def with_noise(
+        self,
+        srgb: Tensor,
+        params: ISPParams,
+        levels: Tensor,
+        keys: Sequence[int],
+        place: Tensor | None = None,
+        blur: Tensor | None = None,
+        colours: bool = False,
+        mapped: bool = True,
+    ) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Convert sRGB to noisy and clean RAW and the variance map in a single pass, clipped at 1.
+
+        Args:
+            srgb, params, place, blur: as in :meth:`forward`.
+            levels, keys: shot and read variance ``(B, 2)`` and the number of the noise of each picture, as for
+                ``shot_read`` of :mod:`rawaug.kernels.cpu`.
+            colours: whether clean RAW has all three colours at every pixel, ``(B, 3, H, W)``.
+            mapped: whether to compute the variance map; it is empty otherwise.
+
+        Returns:
+            Noisy, clean, variance; None where there is no such pass, and :meth:`forward` or :meth:`colours` and the
+            noise have to make them one after the other.
+        """
+        _require_batch(srgb, params, place, blur)
+        if self._gain(srgb, params, place) is not None:
+            return None
+        camera = self._unprocessing(srgb, params, place, blur)
+        return fastest(
+            "raw_pairs", _as_pixels(srgb), camera, levels, keys, 1.0, colours, mapped, otherwise=lambda: None
+        )
+
+    @torch.no_grad()
     def shade(self, x4: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor:
         """Apply the shading and attention of the lens to x4 ``(B, 3, H, W)``; the result is x5."""
-        camera = self._unprocessing(x4, params, place)
+        camera = Unprocessing(*move_together(self._unprocessing(x4, params, place), x4.device))
         x5 = x4
 
         mask = fall_off(camera, 0, *x4.shape[-2:])
@@ -160,17 +190,20 @@ class BakedISP(nn.Module):
         if camera.attention.numel():
             x5 = x5 * look_up(camera.attention, x5)[:, :1]
 
-        size = x4.shape[-2], x4.shape[-1]
-        gain = _place_gain(self.isp.ordered_stages, params, place, size, self.table, forward=False)
+        gain = self._gain(x4, params, place)
         if gain is not None:
             x5 = x5 * gain
         return x5
+
+    def _gain(self, image: Tensor, params: ISPParams, place: Tensor | None) -> Tensor | None:
+        size = image.shape[-2], image.shape[-1]
+        return _place_gain(self.host.ordered_stages, params, place, size, image.device, forward=False)
 
     def _unprocessing(
         self, srgb: Tensor, params: ISPParams, place: Tensor | None, blur: Tensor | None = None
     ) -> Unprocessing:
         table = self.table
-        matrix, floor, frame, curves, shading = _batch_params(self.isp.ordered_stages, srgb, params, place, table)
+        matrix, floor, frame, curves, shading = _batch_params(self.host.ordered_stages, srgb, params, place)
         if curves.numel():
             table = table[:0]
             if srgb.dtype == torch.uint8:
@@ -184,12 +217,10 @@ class BakedISP(nn.Module):
         for channel, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True):
             sites.append((i, j, channel))
 
-        taps = table.new_empty(len(srgb), 0)
+        taps = colour.new_empty(len(srgb), 0)
         if blur is not None:
-            taps = blur_taps(blur.to(table))
-        return Unprocessing(
-            table, curves, self.attention, colour, knee or 0.0, frame, shading, torch.tensor(sites), taps
-        )
+            taps = blur_taps(blur.to(colour))
+        return Unprocessing(table, curves, self.attention, colour, knee or 0.0, frame, shading, tuple(sites), taps)
 
 
 class FastForward(nn.Module):
@@ -201,7 +232,7 @@ class FastForward(nn.Module):
     def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
         super().__init__()
         self.cfa = CFA(isp.cfa)
-        self.isp = deepcopy(isp).requires_grad_(False)
+        self._host = _copy_to_host(isp)
 
         table, attention = _tables(isp, nodes, forward=True)
         self.register_buffer("table", table)
@@ -224,8 +255,8 @@ class FastForward(nn.Module):
 
         needs_gradient = linear.requires_grad or display.matrix.requires_grad or display.gains.requires_grad
         if needs_gradient and torch.is_grad_enabled():
-            return render(linear, display)
-        return fastest("render", linear, display, otherwise=lambda: render(linear, display))
+            return render(linear, Display(*[part.to(linear.device) for part in display]))
+        return _render(linear, display)
 
     @torch.no_grad()
     def develop(
@@ -248,61 +279,42 @@ class FastForward(nn.Module):
             sites = bayer.mosaic(gain.expand(-1, 3, -1, -1), self.cfa)
             raws = [raw * sites for raw in raws]
 
-        groups: dict[str, list[int]] = {}
-        for number, method in enumerate(methods):
-            kind = method if method in bayer.DIRECTIONAL else ""
-            groups.setdefault(kind, []).append(number)
-        if len(groups) == 1:
-            return [self._develop_alike(raw, methods, display) for raw in raws]
+        numbers = torch.tensor([bayer.METHODS.index(method) for method in methods])
+        *parts, numbers = move_together([*display, numbers], raws[0].device)
+        display = Display(*parts)
 
-        developed = [raw.new_empty(len(raw), 3, *raw.shape[-2:], dtype=torch.float32) for raw in raws]
-        for numbers in groups.values():
-            members = torch.tensor(numbers)
-            own_methods = [methods[number] for number in numbers]
-            own_display = display.of(members.to(raws[0].device))
-            for raw, srgb in zip(raws, developed, strict=True):
-                index = members.to(raw.device)
-                srgb[index] = self._develop_alike(raw[index], own_methods, own_display)
-        return developed
+        def in_steps(raw: Tensor) -> Tensor:
+            return render(self._demosaic(raw, methods, numbers, display.gains), display)
 
-    def _develop_alike(self, raw: Tensor, methods: Sequence[str], display: Display) -> Tensor:
-        """Develop mosaics ``(B, 1, H, W)``, all by stencils or all by one method that chooses directions."""
-
-        def in_steps() -> Tensor:
-            linear = self._demosaic(raw, methods, display.gains)
-            return fastest("render", linear, display, otherwise=lambda: render(linear, display))
-
-        if methods[0] in bayer.DIRECTIONAL:
-            return in_steps()
-        return fastest("develop", raw, display, self.cfa, methods, otherwise=in_steps)
+        return [fastest("develop", raw, display, self.cfa, numbers, otherwise=partial(in_steps, raw)) for raw in raws]
 
     def _gain(self, image: Tensor, params: ISPParams, place: Tensor | None) -> Tensor | None:
         size = image.shape[-2], image.shape[-1]
-        return _place_gain(self.isp.ordered_stages, params, place, size, self.table, forward=True)
+        stages = self._host[0].ordered_stages
+        return _place_gain(stages, params, place, size, image.device, forward=True)
 
-    def _demosaic(self, raw: Tensor, methods: Sequence[str], gains: Tensor) -> Tensor:
-        """Demosaic ``(B, 1, H, W)``; choosing a direction needs balanced RAW clipped at black, as developers do it."""
-        method = methods[0]
-        if method not in bayer.DIRECTIONAL:
-            pictures = [bayer.demosaic(raw, self.cfa, name) for name in dict.fromkeys(methods)]
-            rgb = pictures[0]
-            for name, picture in zip(list(dict.fromkeys(methods))[1:], pictures[1:], strict=True):
-                is_own = torch.tensor([own == name for own in methods], device=raw.device)
-                rgb = torch.where(is_own[:, None, None, None], picture, rgb)
-            return rgb
+    def _demosaic(self, raw: Tensor, methods: Sequence[str], numbers: Tensor, gains: Tensor) -> Tensor:
+        """Demosaic each picture of ``(B, 1, H, W)`` by its own method; all are made by each method, and one is kept.
 
+        Choosing a direction needs balanced RAW clipped at black, as developers do it.
+        """
         balance = gains[:, :3, None, None]
         cell = bayer.mosaic(balance.expand(-1, 3, 2, 2), self.cfa)
         sites = cell.repeat(1, 1, raw.shape[-2] // 2, raw.shape[-1] // 2)
-        balanced = (raw * sites).clamp_min(0.0)
 
-        plain = partial(bayer.demosaic, balanced, self.cfa, method)
-        rgb = fastest("demosaic_directional", balanced, self.cfa, method, otherwise=plain)
-        return rgb.div_(balance)
+        rgb = raw.new_zeros(len(raw), 3, *raw.shape[-2:])
+        for name in dict.fromkeys(methods):
+            if name in bayer.DIRECTIONAL:
+                picture = bayer.demosaic((raw * sites).clamp_min(0.0), self.cfa, name) / balance
+            else:
+                picture = bayer.demosaic(raw, self.cfa, name)
+            is_drawn = numbers == bayer.METHODS.index(name)
+            rgb = torch.where(is_drawn[:, None, None, None], picture, rgb)
+        return rgb
 
     def _display(self, linear: Tensor, params: ISPParams, place: Tensor | None) -> Display:
         table = self.table
-        matrix, floor, frame, curves, shading = _batch_params(self.isp.ordered_stages, linear, params, place, table)
+        matrix, floor, frame, curves, shading = _batch_params(self._host[0].ordered_stages, linear, params, place)
         if curves.numel():
             table = table[:0]
             light = torch.linspace(0.0, 1.0, _CURVE_NODES).square().to(curves).expand(len(curves), 1, 1, -1)
@@ -334,17 +346,24 @@ def _tables(isp: DictionaryISP, nodes: int, forward: bool = False) -> tuple[Tens
     return _as_table(tables.x2, nodes), attention
 
 
-def _batch_params(
-    stages: Sequence[Stage], image: Tensor, params: ISPParams, place: Tensor | None, table: Tensor
-) -> BatchParams:
+def _copy_to_host(isp: DictionaryISP) -> list[DictionaryISP]:
+    """Copy an ISP to the host, where its stages compute the few numbers that a pass takes for each picture.
+
+    It is in a list, which is no submodule, so that it stays there when the module around it moves.
+    """
+    return [deepcopy(isp).cpu().requires_grad_(False)]
+
+
+def _batch_params(stages: Sequence[Stage], image: Tensor, params: ISPParams, place: Tensor | None) -> BatchParams:
     batch, _, height, width = image.shape
     batch_params = BatchParams(
-        matrix=torch.eye(3).to(table).expand(batch, 3, 3),
-        floor=torch.ones(batch, 1, 3).to(table),
-        frame=table.new_zeros(batch, 6),
-        curves=table.new_empty(batch, 0),
-        shading=table.new_empty(0),
+        matrix=torch.eye(3).expand(batch, 3, 3),
+        floor=torch.ones(batch, 1, 3),
+        frame=torch.zeros(batch, 6),
+        curves=torch.empty(batch, 0),
+        shading=torch.empty(0),
     )
+    params = params.map(Tensor.cpu)
     for stage in stages:
         batch_params = stage.adjust(batch_params, params, place, (height, width))
     return batch_params
@@ -357,7 +376,7 @@ def _place_gain(
     params: ISPParams,
     place: Tensor | None,
     size: tuple[int, int],
-    like: Tensor,
+    device: torch.device,
     forward: bool,
 ) -> Tensor | None:
     """Compute place-dependent gains of pictures of a size, from :data:`_PLACE_NODES` nodes a side.
@@ -374,18 +393,19 @@ def _place_gain(
     places = [[0, 0, height, width]] * len(params.gains)
     if place is not None:
         places = place.tolist()
-    frame = like.new_tensor([mask_frame(row, height, width, (0.0, 0.0)) for row in places])
-    sides = like.new_tensor(places)[:, 2:4]
+    frame = torch.tensor([mask_frame(row, height, width, (0.0, 0.0)) for row in places])
+    sides = torch.tensor(places, dtype=torch.float32)[:, 2:4]
     edges = sides / sides.square().sum(dim=1, keepdim=True).sqrt()
 
-    down = torch.linspace(0.0, height - 1.0, min(_PLACE_NODES, height)).to(like)[:, None]
-    right = torch.linspace(0.0, width - 1.0, min(_PLACE_NODES, width)).to(like)
+    down = torch.linspace(0.0, height - 1.0, min(_PLACE_NODES, height))[:, None]
+    right = torch.linspace(0.0, width - 1.0, min(_PLACE_NODES, width))
     start_y, start_x, down_y, down_x, right_y, right_x = frame[:, :, None, None].unbind(1)
     y = start_y + down * down_y + right * right_y
     x = start_x + down * down_x + right * right_x
     coordinates = torch.stack([y, x], dim=1)
 
-    # One picture at a time: on a GPU the bits of a convolution depend on the number of pictures.
+    # One picture at a time: the bits of a convolution may depend on the number of pictures.
+    params = params.map(Tensor.cpu)
     gains = []
     for number, picture in enumerate(coordinates.split(1)):
         edge = edges[number : number + 1]
@@ -394,14 +414,26 @@ def _place_gain(
         for place_gain in place_gains:
             gain = gain * place_gain(picture, edge, setting)
         gains.append(gain)
-    gain = torch.cat(gains)
-    return F.interpolate(gain, size, mode="bilinear", align_corners=True)
+
+    (nodes,) = move_together([torch.cat(gains)], device)
+    return F.interpolate(nodes, size, mode="bilinear", align_corners=True)
+
+
+def _as_pixels(srgb: Tensor) -> Tensor:
+    """Pictures as the passes read them, uint8 or float32."""
+    return srgb if srgb.dtype == torch.uint8 else srgb.float()
 
 
 def _pass(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
-    if srgb.dtype != torch.uint8:
-        srgb = srgb.float()
+    srgb = _as_pixels(srgb)
     return fastest("unprocess", srgb, camera, white, otherwise=lambda: unprocess(srgb, camera, white))
+
+
+def _render(linear: Tensor, display: Display) -> Tensor:
+    def in_pytorch() -> Tensor:
+        return render(linear, Display(*move_together(display, linear.device)))
+
+    return fastest("render", linear, display, otherwise=in_pytorch)
 
 
 def _require_batch(srgb: Tensor, params: ISPParams, place: Tensor | None, blur: Tensor | None = None) -> None:

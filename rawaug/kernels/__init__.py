@@ -21,8 +21,15 @@ from rawaug.kernels import runtime
 
 R = TypeVar("R")
 
-_ON_GPU = ("unprocess", "shot_read")
-"""These passes have a Triton kernel."""
+_CPU, _GPU, _GPU_SRGB = "rawaug.kernels.cpu", "rawaug.kernels.gpu", "rawaug.kernels.gpu_srgb"
+_PASSES = {
+    "cpu": dict.fromkeys(("unprocess", "shot_read", "develop", "render", "smooth"), _CPU),
+    "cuda": {
+        **dict.fromkeys(("unprocess", "raw_pairs", "colours", "shot_read"), _GPU),
+        **dict.fromkeys(("develop", "smooth", "mean_square"), _GPU_SRGB),
+    },
+}
+"""The module that has a pass of a name as loops, for the CPU, or as a Triton kernel."""
 
 _failed: list[str] = []
 """Triton's kernels have raised errors of these names; after one error they are not tried again."""
@@ -37,16 +44,17 @@ def fastest(name: str, image: Tensor, *args: Any, otherwise: Callable[[], R]) ->
     """Run a pass by the kernel for the device of an image.
 
     Args:
-        name: name of the pass, a function of :mod:`rawaug.kernels.cpu` or :mod:`rawaug.kernels.gpu`.
+        name: name of the pass, a function of the modules of kernels.
         image: the image, of any shape.
         args: further arguments of the pass.
         otherwise: the same pass in PyTorch, for devices without a kernel.
     """
-    if name in _ON_GPU and can_use_triton(image):
-        return try_kernel(lambda: getattr(import_module("rawaug.kernels.gpu"), name)(image, *args), otherwise)
+    if name in _PASSES["cuda"] and can_use_triton(image):
+        kernel = getattr(import_module(_PASSES["cuda"][name]), name)
+        return try_kernel(lambda: kernel(image, *args), otherwise)
 
-    if image.device.type == "cpu" and runtime.has_numba():
-        result: R = getattr(import_module("rawaug.kernels.cpu"), name)(image, *args)
+    if name in _PASSES["cpu"] and image.device.type == "cpu" and runtime.has_numba():
+        result: R = getattr(import_module(_PASSES["cpu"][name]), name)(image, *args)
         return result
     return otherwise()
 

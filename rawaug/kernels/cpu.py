@@ -6,7 +6,6 @@ vector instructions, except for those of :mod:`rawaug.kernels.vectors`. The expo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -14,10 +13,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.bayer import CFA, demosaicing_stencils
+from rawaug.bayer import CFA, METHODS, STENCILS
+from rawaug.kernels.planes import demosaic_balanced
 from rawaug.kernels.planes import demosaic_directional as demosaic_directional
 from rawaug.kernels.planes import smooth as smooth
-from rawaug.kernels.reference import Display, Unprocessing
+from rawaug.kernels.reference import Display, Unprocessing, site_weights
 from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
 from rawaug.kernels.shot_read import shot_read as shot_read
 from rawaug.kernels.vectors import at_least, at_most, blur_plane, clip, interpolate, take_codes
@@ -67,7 +67,7 @@ def unprocess(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
         np.float32(camera.knee) if camera.colour[:, 5].any() else None,  # else no gain spares highlights
         _present(camera.frame),
         _present(camera.shading),
-        _present(camera.sites),
+        np.array(camera.sites),
         _present(camera.taps),
         np.float32(white),
         raw.numpy(),
@@ -103,38 +103,53 @@ def _present(part: Tensor) -> np.ndarray | None:
 
 def render(linear: Tensor, display: Display) -> Tensor:
     """Develop camera colour x5 ``(B, 3, H, W)``, float32 on the CPU, to sRGB in [0, 1]."""
-    return _render_rows(linear.detach().contiguous(), None, np.empty(0, np.int64), linear.shape, display)
+    mosaics = linear.new_empty(0, 1, 1, 1)
+    return _render_rows(linear, mosaics, np.full(len(linear), -1), np.arange(len(linear)), CFA.RGGB, display)
 
 
-def develop(raw: Tensor, display: Display, cfa: CFA | str, methods: Sequence[str]) -> Tensor:
+def develop(raw: Tensor, display: Display, cfa: CFA | str, methods: Tensor) -> Tensor:
     """Develop mosaics to sRGB.
 
     Args:
         raw: ``(B, 1, H, W)``, float32 on the CPU.
         display: the way from camera colour to sRGB.
         cfa: pattern of the mosaics.
-        methods: the demosaicing of each, one of :data:`rawaug.bayer.STENCILS`.
+        methods: ``(B,)``, the numbers of their demosaicings in :data:`rawaug.bayer.METHODS`.
 
     Returns:
         sRGB ``(B, 3, H, W)`` in [0, 1].
     """
-    padded = F.pad(raw.detach(), (2, 2, 2, 2), mode="reflect")  # about the border sites, so the pattern stays
-    names = sorted(set(methods))
-    weights = np.stack([_site_weights(CFA(cfa), name) for name in names])
-    numbers = np.array([names.index(method) for method in methods])
-    return _render_rows(padded, weights, numbers, (len(raw), 3, *raw.shape[2:]), display)
+    raw, numbers = raw.detach(), methods.numpy()
+    by_stencil = numbers < len(STENCILS)
+    demosaiced = raw if by_stencil.all() else raw[by_stencil]
+    mosaics = F.pad(demosaiced, (2, 2, 2, 2), mode="reflect")  # about the border sites, so the pattern stays
+
+    directional = np.flatnonzero(~by_stencil)
+    linear = torch.empty(len(directional), 3, *raw.shape[2:])
+    for picture, rgb in zip(directional, linear.numpy(), strict=True):
+        homogeneous, gains = METHODS[numbers[picture]] == "ahd", display.gains[picture, :3].numpy()
+        demosaic_balanced(raw[picture, 0].numpy(), gains, True, CFA(cfa), homogeneous, rgb)
+
+    places = np.where(by_stencil, np.cumsum(by_stencil), np.cumsum(~by_stencil)) - 1
+    return _render_rows(linear, mosaics, np.where(by_stencil, numbers, -1), places, CFA(cfa), display)
 
 
 def _render_rows(
-    source: Tensor, weights: np.ndarray | None, methods: np.ndarray, shape: Sequence[int], display: Display
+    linear: Tensor, mosaics: Tensor, stencils: np.ndarray, places: np.ndarray, cfa: CFA, display: Display
 ) -> Tensor:
-    srgb = torch.empty(tuple(shape), dtype=torch.float32)
+    """Develop pictures of camera colour and padded mosaics.
+
+    ``stencils`` ``(B,)`` are the numbers of the mosaics' stencils, -1 for camera colour, and ``places`` ``(B,)`` where
+    each picture is among its like.
+    """
+    height, width = linear.shape[-2:]
+    srgb = torch.empty(len(places), 3, height, width)
     if not srgb.numel():
         return srgb
 
-    batch, _, height, width = shape
     display = display._replace(frame=display.frame * _EVERY_SECOND.to(display.frame))
-    settings = source.numpy(), weights, methods, *map(_present, display), srgb.numpy()
+    sources = linear.detach().contiguous().numpy(), mosaics.numpy(), _site_weights(cfa), stencils, places
+    settings = *sources, *map(_present, display), srgb.numpy()
 
     def convert(start: int, stop: int) -> None:
         scratch = (
@@ -148,21 +163,17 @@ def _render_rows(
         )
         _srgb_rows(*settings, *scratch, start, stop)
 
-    run_over_rows(batch * height, 3 * width, convert)
+    run_over_rows(len(places) * height, 3 * width, convert)
     return srgb
 
 
 @lru_cache
-def _site_weights(cfa: CFA, method: str) -> np.ndarray:
-    """Lay out the weights of :func:`_demosaic`'s six sums by row of the cell, colour and site, (2, 3, 6, _TILE)."""
-    stencils, kinds = demosaicing_stencils(cfa, method)
-    edge = 2 - stencils.shape[-1] // 2
-    around = F.pad(stencils, (edge, edge, edge, edge))
+def _site_weights(cfa: CFA) -> np.ndarray:
+    """Lay out the weights of :func:`_demosaic`'s six sums by stencil, row of the cell, colour and site.
 
-    measured = torch.eye(6)[:1]  # a site that has the colour keeps its own value
-    sums = torch.stack([around[:, i, j] for i, j in ((2, 2), (2, 1), (1, 2), (1, 1), (2, 0), (0, 2))], dim=1)
-    weights = torch.cat([measured, sums])[torch.tensor(kinds)]  # (colour, row, column, sum)
-    return weights.permute(1, 0, 3, 2).repeat(1, 1, 1, _TILE // 2).contiguous().numpy()
+    Shape ``(2, 2, 3, 6, _TILE)``.
+    """
+    return site_weights(cfa).permute(0, 1, 3, 4, 2).repeat(1, 1, 1, 1, _TILE // 2).contiguous().numpy()
 
 
 @compile_part
@@ -415,24 +426,25 @@ def _at_curve(root, curve, nodes, shares, out):  # type: ignore[no-untyped-def]
 
 @compile_loop
 def _srgb_rows(  # type: ignore[no-untyped-def]
-    source, weights, methods, table, curves, attention, matrix, gains, frame, shading, srgb,
+    linear, mosaics, weights, stencils, places, table, curves, attention, matrix, gains, frame, shading, srgb,
     nodes, shares, x, root, mask, sums, looked_up, start, stop,
 ):  # fmt: skip
-    """Develop rows ``start`` to ``stop`` of all pictures' rows, of camera colour or, with weights, of mosaics."""
+    """Develop rows ``start`` to ``stop`` of all pictures' rows, of camera colour or of mosaics."""
     height, width = srgb.shape[2], srgb.shape[3]
 
     for row in range(start, stop):
         b, i = divmod(row, height)
+        place = places[b]
         for first in range(0, width, _TILE):
             last = min(first + _TILE, width)
             n = last - first
 
-            if weights is None:
+            if stencils[b] < 0:
                 for c in range(3):
                     for j in range(n):  # faster than slices
-                        x[c, j] = source[b, c, i, first + j]
+                        x[c, j] = linear[place, c, i, first + j]
             else:
-                _demosaic(source[b, 0], i, first, weights[methods[b], i % 2], sums, x[:, :n])
+                _demosaic(mosaics[place, 0], i, first, weights[stencils[b], i % 2], sums, x[:, :n])
 
             if shading is not None:
                 _fall_off(frame[b], i, 2 * first, shading, mask[:n])

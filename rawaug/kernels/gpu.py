@@ -1,11 +1,14 @@
 """The passes of :mod:`rawaug.kernels.reference` as Triton kernels: a program works on a block of Bayer cells.
 
-The pass to RAW reads every pixel once and writes every site once, with 3 bytes in and 4 out for each pixel. The table,
-4.4 MB at 65 nodes, stays in the GPU's cache. Triton's generator is Philox4x32-10 with the cell as its counter, so the
-noise is that of a CPU, except for the rounding of logarithms.
+The pass to RAW reads every pixel once and writes clean, noisy and variance, with 3 bytes in and 12 out for each pixel.
+The table, 4.4 MB at 65 nodes, stays in the GPU's cache. Triton's generator is Philox4x32-10 with the cell as its
+counter, so the noise is that of a CPU, except for the rounding of logarithms. What is on the host of a pass's settings
+crosses in one copy. The way back to sRGB is in :mod:`rawaug.kernels.gpu_srgb`.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 import triton
@@ -13,6 +16,7 @@ import triton.language as tl
 from torch import Tensor
 
 from rawaug.kernels.reference import Unprocessing
+from rawaug.kernels.runtime import move_together
 
 _RAW_BLOCK = 256
 _NOISE_BLOCK = 512
@@ -20,19 +24,68 @@ _NOISE_BLOCK = 512
 
 def unprocess(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
     """Convert sRGB ``(B, 3, H, W)``, uint8 or float32 in [0, 1], to packed RAW ``(B, 4, H/2, W/2)`` up to ``white``."""
+    _, raw, _ = _convert(srgb, camera, white)
+    return raw
+
+
+def colours(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
+    """Convert sRGB ``(B, 3, H, W)`` to RAW of all three colours at every pixel, ``(B, 3, H, W)``, up to ``white``."""
+    _, rgb, _ = _convert(srgb, camera, white, in_colour=True)
+    return rgb
+
+
+def raw_pairs(
+    srgb: Tensor, camera: Unprocessing, levels: Tensor, keys: Sequence[int], white: float, in_colour: bool, mapped: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Convert sRGB ``(B, 3, H, W)`` to noisy and clean RAW and the variance map, in one pass.
+
+    Args:
+        srgb: uint8 or float32 in [0, 1].
+        camera: the settings of the pass.
+        levels, keys: as of :func:`shot_read`.
+        white: the value to clip at.
+        in_colour: whether clean RAW has all three colours at every pixel, ``(B, 3, H, W)``; packed otherwise.
+        mapped: whether to compute the variance map; it is empty otherwise.
+
+    Returns:
+        Noisy, clean and variance, packed ``(B, 4, H/2, W/2)``.
+    """
+    return _convert(srgb, camera, white, in_colour, levels, keys, mapped)
+
+
+def _convert(
+    srgb: Tensor,
+    camera: Unprocessing,
+    white: float,
+    in_colour: bool = False,
+    levels: Tensor | None = None,
+    keys: Sequence[int] = (),
+    mapped: bool = False,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Convert sRGB to noisy RAW, clean RAW and the variance map; without levels there is no noise."""
     batch, _, height, width = srgb.shape
     h, w = height // 2, width // 2
-    raw = torch.empty(batch, 4, h, w, device=srgb.device, dtype=torch.float32)
+    has_noise = levels is not None
+    if levels is None:
+        levels = camera.colour.new_empty(0)
+
+    sites = [i + 2 * j + 4 * channel for i, j, channel in camera.sites]
+    *parts, levels, seeds = move_together([*camera, levels, _signed(keys)], srgb.device)
+    camera = Unprocessing(*parts)
 
     nodes = max(camera.table.shape[0], camera.attention.shape[0])
     entries = camera.curves.shape[1] if camera.curves.numel() else 0
     largest_code = 255.0 if srgb.dtype == torch.uint8 else 1.0
     scale = ((entries or nodes) - 1) / largest_code
-    sites = [i + 2 * j + 4 * channel for i, j, channel in camera.sites.tolist()]
-    parts = (camera.table, camera.curves, camera.attention, camera.colour, camera.frame, camera.shading, camera.taps)
-    tensors = [part.contiguous() for part in parts]
+    tables = (camera.table, camera.curves, camera.attention, camera.colour, camera.frame, camera.shading, camera.taps)
+    tensors = [part.contiguous() for part in tables]
     source, is_linear = srgb.contiguous(), False
     blurs = camera.taps.numel() > 0
+
+    shape = (batch, 3, height, width) if in_colour else (batch, 4, h, w)
+    raw = torch.empty(shape, device=srgb.device, dtype=torch.float32)
+    noisy = raw.new_empty(batch, 4, h, w) if has_noise else raw.new_empty(0)
+    variance = torch.empty_like(noisy if mapped else noisy[:, :, :0]) if has_noise else noisy
 
     with torch.cuda.device_of(srgb):  # which need not be the current one
         if blurs and not entries:  # a table is read once for each pixel, not for each neighbour
@@ -43,11 +96,17 @@ def unprocess(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
             source, is_linear = light, True
 
         _raw_cells[(triton.cdiv(h * w, _RAW_BLOCK), batch)](
-            source, *tensors, raw, h, w, scale, camera.knee, white, *sites,
+            source, *tensors, levels, seeds, raw, noisy, variance, h, w, scale, camera.knee, white, *sites,
             NODES=nodes, ENTRIES=entries, ATTENDS=camera.attention.numel() > 0, SHADES=camera.shading.numel() > 0,
-            BLURS=blurs, LINEAR=is_linear, BLOCK=_RAW_BLOCK, enable_fp_fusion=True,
+            BLURS=blurs, LINEAR=is_linear, COLOURS=in_colour, NOISE=has_noise, MAP=mapped, BLOCK=_RAW_BLOCK,
+            enable_fp_fusion=True,
         )  # fmt: skip
-    return raw
+    return noisy, raw, variance
+
+
+def _signed(keys: Sequence[int]) -> Tensor:
+    """Keys below 2^64 as int64, bit by bit."""
+    return torch.tensor([key - 2**64 if key >= 2**63 else key for key in keys], dtype=torch.int64)
 
 
 @triton.jit
@@ -137,15 +196,38 @@ def _channel(colour, k, r, g, b, m, shade):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
+def _shade(frame, shading, row, column):  # type: ignore[no-untyped-def]
+    """Compute the mask at a pixel."""
+    i, j = row.to(tl.float32), column.to(tl.float32)
+    y = tl.load(frame) + i * tl.load(frame + 2) + j * tl.load(frame + 4)
+    x = tl.load(frame + 1) + i * tl.load(frame + 3) + j * tl.load(frame + 5)
+    vertical = tl.load(shading) * y * y
+    return tl.exp2(-(vertical + (tl.load(shading + 1) * y + tl.load(shading + 2) * x) * x))
+
+
+@triton.jit
+def _attention(attention, r, g, b, NODES: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Look up the gain of a colour."""
+    red, u = _axis(r * (NODES - 1.0), NODES)
+    green, v = _axis(g * (NODES - 1.0), NODES)
+    blue, t = _axis(b * (NODES - 1.0), NODES)
+    return _read(attention, ((blue * NODES + green) * NODES + red) * 4, u, v, t, NODES)
+
+
+@triton.jit
 def _site(  # type: ignore[no-untyped-def]
     srgb, table, curve, attention, colour, frame, shading, taps, raw, cell, h, w, scale, knee, white,
-    SITE: tl.constexpr, NODES: tl.constexpr, ENTRIES: tl.constexpr, ATTENDS: tl.constexpr, SHADES: tl.constexpr,
-    BLURS: tl.constexpr, LINEAR: tl.constexpr,
+    SITE: tl.constexpr, PLANE: tl.constexpr, NODES: tl.constexpr, ENTRIES: tl.constexpr, ATTENDS: tl.constexpr,
+    SHADES: tl.constexpr, BLURS: tl.constexpr, LINEAR: tl.constexpr, COLOURS: tl.constexpr,
 ):  # fmt: skip
-    """Convert one plane of the cells; SITE is row + 2 column + 4 colour of its sites."""
+    """Convert a site of the cells and return its signal; SITE is row + 2 column + 4 colour.
+
+    The signal is written to plane PLANE of packed RAW, or, with COLOURS, all three colours are to RAW of full size.
+    """
     size = h.to(tl.int64) * w
     inside = cell < h * w
     row, column = cell // w * 2 + SITE % 2, cell % w * 2 + SITE // 2 % 2
+    here = row.to(tl.int64) * (2 * w) + column
 
     if BLURS:
         zero = (cell * 0).to(tl.float32)
@@ -161,51 +243,58 @@ def _site(  # type: ignore[no-untyped-def]
             weight = _tap(taps, i)
             r, g, b = r + weight * r_line, g + weight * g_line, b + weight * b_line
     else:
-        pixel = row.to(tl.int64) * (2 * w) + column
-        r, g, b = _linear(srgb, table, curve, pixel, 4 * size, inside, scale, NODES, ENTRIES, LINEAR)
+        r, g, b = _linear(srgb, table, curve, here, 4 * size, inside, scale, NODES, ENTRIES, LINEAR)
 
     m = tl.minimum(tl.maximum((_row(colour, 3, r, g, b) - knee) / (1.0 - knee), 0.0), 1.0)
     shade = 1.0
     if SHADES:
-        i, j = row.to(tl.float32), column.to(tl.float32)
-        y = tl.load(frame) + i * tl.load(frame + 2) + j * tl.load(frame + 4)
-        x = tl.load(frame + 1) + i * tl.load(frame + 3) + j * tl.load(frame + 5)
-        vertical = tl.load(shading) * y * y
-        shade = tl.exp2(-(vertical + (tl.load(shading + 1) * y + tl.load(shading + 2) * x) * x))
+        shade = _shade(frame, shading, row, column)
 
-    x4 = _channel(colour, SITE // 4, r, g, b, m * m, shade)
+    gain = 1.0
     if ATTENDS:
-        last = NODES - 1.0
-        red, u = _axis(_channel(colour, 0, r, g, b, m * m, shade) * last, NODES)
-        green, v = _axis(_channel(colour, 1, r, g, b, m * m, shade) * last, NODES)
-        blue, t = _axis(_channel(colour, 2, r, g, b, m * m, shade) * last, NODES)
-        x4 = x4 * _read(attention, ((blue * NODES + green) * NODES + red) * 4, u, v, t, NODES)
-    tl.store(raw + cell, tl.minimum(x4, white), mask=inside)
+        red = _channel(colour, 0, r, g, b, m * m, shade)
+        green = _channel(colour, 1, r, g, b, m * m, shade)
+        blue = _channel(colour, 2, r, g, b, m * m, shade)
+        gain = _attention(attention, red, green, blue, NODES)
+
+    x4 = tl.minimum(_channel(colour, SITE // 4, r, g, b, m * m, shade) * gain, white)
+    if COLOURS:
+        for k in tl.static_range(3):
+            value = tl.minimum(_channel(colour, k, r, g, b, m * m, shade) * gain, white)
+            tl.store(raw + 4 * k * size + here, value, mask=inside)
+    else:
+        tl.store(raw + PLANE * size + cell, x4, mask=inside)
+    return x4
 
 
 @triton.jit
 def _raw_cells(  # type: ignore[no-untyped-def]
-    srgb, table, curves, attention, colour, frame, shading, taps, raw, h, w, scale, knee, white,
-    S0: tl.constexpr, S1: tl.constexpr, S2: tl.constexpr, S3: tl.constexpr,
-    NODES: tl.constexpr, ENTRIES: tl.constexpr, ATTENDS: tl.constexpr, SHADES: tl.constexpr,
-    BLURS: tl.constexpr, LINEAR: tl.constexpr, BLOCK: tl.constexpr,
+    srgb, table, curves, attention, colour, frame, shading, taps, levels, keys, raw, noisy, variance,
+    h, w, scale, knee, white, S0: tl.constexpr, S1: tl.constexpr, S2: tl.constexpr, S3: tl.constexpr,
+    NODES: tl.constexpr, ENTRIES: tl.constexpr, ATTENDS: tl.constexpr, SHADES: tl.constexpr, BLURS: tl.constexpr,
+    LINEAR: tl.constexpr, COLOURS: tl.constexpr, NOISE: tl.constexpr, MAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     picture = tl.program_id(1).to(tl.int64)
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     size = h.to(tl.int64) * w
-    x, y = srgb + picture * 12 * size, raw + picture * 4 * size
+    planes = 12 if COLOURS else 4
+    x, y = srgb + picture * 12 * size, raw + picture * planes * size
     c, f, curve, t = colour + picture * 18, frame + picture * 6, curves + picture * ENTRIES, taps + picture * 3
-    _site(x, table, curve, attention, c, f, shading, t, y, cell, h, w, scale, knee, white,
-          S0, NODES, ENTRIES, ATTENDS, SHADES, BLURS, LINEAR)  # fmt: skip
-    _site(x, table, curve, attention, c, f, shading, t, y + size, cell, h, w, scale, knee, white,
-          S1, NODES, ENTRIES, ATTENDS, SHADES, BLURS, LINEAR)  # fmt: skip
-    _site(x, table, curve, attention, c, f, shading, t, y + 2 * size, cell, h, w, scale, knee, white,
-          S2, NODES, ENTRIES, ATTENDS, SHADES, BLURS, LINEAR)  # fmt: skip
-    _site(x, table, curve, attention, c, f, shading, t, y + 3 * size, cell, h, w, scale, knee, white,
-          S3, NODES, ENTRIES, ATTENDS, SHADES, BLURS, LINEAR)  # fmt: skip
+    red = _site(x, table, curve, attention, c, f, shading, t, y, cell, h, w, scale, knee, white,
+                S0, 0, NODES, ENTRIES, ATTENDS, SHADES, BLURS, LINEAR, COLOURS)  # fmt: skip
+    green_r = _site(x, table, curve, attention, c, f, shading, t, y, cell, h, w, scale, knee, white,
+                    S1, 1, NODES, ENTRIES, ATTENDS, SHADES, BLURS, LINEAR, COLOURS)  # fmt: skip
+    green_b = _site(x, table, curve, attention, c, f, shading, t, y, cell, h, w, scale, knee, white,
+                    S2, 2, NODES, ENTRIES, ATTENDS, SHADES, BLURS, LINEAR, COLOURS)  # fmt: skip
+    blue = _site(x, table, curve, attention, c, f, shading, t, y, cell, h, w, scale, knee, white,
+                 S3, 3, NODES, ENTRIES, ATTENDS, SHADES, BLURS, LINEAR, COLOURS)  # fmt: skip
+    if NOISE:
+        at = picture * 4 * size + cell
+        _add_noise(red, green_r, green_b, blue, levels + 2 * picture, tl.load(keys + picture), noisy, variance,
+                   cell, at, size, cell < h * w, white, MAP)  # fmt: skip
 
 
-def shot_read(clean: Tensor, levels: Tensor, keys: list[int], white: float, mapped: bool) -> tuple[Tensor, Tensor]:
+def shot_read(clean: Tensor, levels: Tensor, keys: Sequence[int], white: float, mapped: bool) -> tuple[Tensor, Tensor]:
     """Add shot and read noise to clean RAW, as :func:`rawaug.kernels.cpu.shot_read` does, on a GPU.
 
     Args:
@@ -219,14 +308,12 @@ def shot_read(clean: Tensor, levels: Tensor, keys: list[int], white: float, mapp
     batch, _, height, width = clean.shape
     noisy = torch.empty_like(clean)
     variance = torch.empty_like(noisy if mapped else noisy[:, :, :0])
-    signed = [key - 2**64 if key >= 2**63 else key for key in keys]
-    seeds = torch.tensor(signed, device=clean.device)
-    variances = levels.to(clean.device, torch.float32).contiguous()
+    levels, seeds = move_together([levels.float().contiguous(), _signed(keys)], clean.device)
 
     grid = (triton.cdiv(height * width, _NOISE_BLOCK), batch)
     with torch.cuda.device_of(clean):  # which need not be the current one
         _noise_cells[grid](
-            clean, variances, seeds, noisy, variance, height * width, white, mapped,
+            clean, levels, seeds, noisy, variance, height * width, white, mapped,
             BLOCK=_NOISE_BLOCK, enable_fp_fusion=True,
         )  # fmt: skip
     return noisy, variance
@@ -251,8 +338,7 @@ def _pair(u, turn):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _disturb(clean, normal, noisy, variance, at, inside, shot, read, white, MAP: tl.constexpr):  # type: ignore[no-untyped-def]
-    y = tl.load(clean + at, mask=inside, other=0.0)
+def _disturb(y, normal, noisy, variance, at, inside, shot, read, white, MAP: tl.constexpr):  # type: ignore[no-untyped-def]
     value = tl.minimum(y + tl.sqrt(shot * tl.maximum(y, 0.0) + read) * normal, white)
     tl.store(noisy + at, value, mask=inside)
     if MAP:
@@ -260,19 +346,31 @@ def _disturb(clean, normal, noisy, variance, at, inside, shot, read, white, MAP:
 
 
 @triton.jit
+def _add_noise(  # type: ignore[no-untyped-def]
+    red, green_r, green_b, blue, levels, key, noisy, variance, cell, at, size, inside, white, MAP: tl.constexpr
+):
+    """Add noise to the four signals of cells, and write them from ``at`` on."""
+    shot, read = tl.load(levels), tl.load(levels + 1)
+    a, b, c, d = tl.randint4x(key, cell)
+    n0, n1 = _pair(a, b)
+    n2, n3 = _pair(c, d)
+    _disturb(red, n0, noisy, variance, at, inside, shot, read, white, MAP)
+    _disturb(green_r, n1, noisy, variance, at + size, inside, shot, read, white, MAP)
+    _disturb(green_b, n2, noisy, variance, at + 2 * size, inside, shot, read, white, MAP)
+    _disturb(blue, n3, noisy, variance, at + 3 * size, inside, shot, read, white, MAP)
+
+
+@triton.jit
 def _noise_cells(clean, levels, keys, noisy, variance, cells, white, MAP: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
-    picture = tl.program_id(1)
+    picture = tl.program_id(1).to(tl.int64)
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = cell < cells
-    shot, read = tl.load(levels + 2 * picture), tl.load(levels + 2 * picture + 1)
-
-    a, b, c, d = tl.randint4x(tl.load(keys + picture), cell)
-    red, green_r = _pair(a, b)
-    green_b, blue = _pair(c, d)
-
     size = cells.to(tl.int64)
     at = picture * 4 * size + cell
-    _disturb(clean, red, noisy, variance, at, inside, shot, read, white, MAP)
-    _disturb(clean, green_r, noisy, variance, at + size, inside, shot, read, white, MAP)
-    _disturb(clean, green_b, noisy, variance, at + 2 * size, inside, shot, read, white, MAP)
-    _disturb(clean, blue, noisy, variance, at + 3 * size, inside, shot, read, white, MAP)
+
+    red = tl.load(clean + at, mask=inside, other=0.0)
+    green_r = tl.load(clean + at + size, mask=inside, other=0.0)
+    green_b = tl.load(clean + at + 2 * size, mask=inside, other=0.0)
+    blue = tl.load(clean + at + 3 * size, mask=inside, other=0.0)
+    _add_noise(red, green_r, green_b, blue, levels + 2 * picture, tl.load(keys + picture), noisy, variance,
+               cell, at, size, inside, white, MAP)  # fmt: skip

@@ -22,17 +22,52 @@ def demosaic_directional(raw: Tensor, cfa: CFA, method: str) -> Tensor:
     if method not in ("adams", "ahd"):
         return demosaic(raw, cfa, method)
 
-    batch, _, height, width = raw.shape
-    rgb = torch.empty(batch, 3, height, width)
+    rgb = torch.empty(len(raw), 3, *raw.shape[2:])
     for mosaic, out in zip(raw.detach().numpy()[:, 0], rgb.numpy(), strict=True):
-        padded = np.pad(mosaic, _MARGIN, mode="reflect")
-        run_over_rows(height, width, partial(_rows, padded, *cfa.sites[0], method == "ahd", out))
+        demosaic_balanced(mosaic, np.ones(3, np.float32), False, cfa, method == "ahd", out)
     return rgb
 
 
+def demosaic_balanced(
+    mosaic: np.ndarray, gains: np.ndarray, clipped: bool, cfa: CFA, homogeneous: bool, rgb: np.ndarray
+) -> None:
+    """Demosaic ``(H, W)`` to ``(3, H, W)`` by ``ahd``, or ``adams``, under the gains of three colours, then undone.
+
+    Balanced RAW is clipped at black if ``clipped``.
+    """
+    height, width = mosaic.shape
+    site_gains = gains[np.array(cfa.channels)]
+    padded = np.empty((height + 2 * _MARGIN, width + 2 * _MARGIN), np.float32)
+    _balance(mosaic, site_gains, np.float32(0 if clipped else -np.inf), padded)
+    run_over_rows(height, width, partial(_rows, padded, *cfa.sites[0], homogeneous, gains, rgb))
+
+
+@compile_loop
+def _balance(mosaic, gains, black, padded):  # type: ignore[no-untyped-def]
+    """Multiply a mosaic by the gains of its sites, clip it at black, and reflect it about its border sites."""
+    height, width = mosaic.shape
+    for i in range(height + 2 * _MARGIN):
+        y = _reflect(i - _MARGIN, height)
+        row = padded[i]
+        for j in range(width):
+            row[_MARGIN + j] = max(mosaic[y, j] * gains[y & 1, j & 1], black)
+        for j in range(-_MARGIN, 0):
+            row[_MARGIN + j] = row[_MARGIN + _reflect(j, width)]
+        for j in range(width, width + _MARGIN):
+            row[_MARGIN + j] = row[_MARGIN + _reflect(j, width)]
+
+
+@compile_part
+def _reflect(k, size):  # type: ignore[no-untyped-def]
+    """Reflect a row or column about the first and the last, as often as it takes."""
+    period = 2 * size - 2
+    k = abs(k) % period
+    return period - k if k >= size else k
+
+
 @partial(compile_loop, allocates=True)
-def _rows(mosaic, red_row, red_column, homogeneous, rgb, start, stop):  # type: ignore[no-untyped-def]
-    """Demosaic rows ``start`` to ``stop`` of a picture whose mosaic has margins."""
+def _rows(mosaic, red_row, red_column, homogeneous, gains, rgb, start, stop):  # type: ignore[no-untyped-def]
+    """Demosaic rows ``start`` to ``stop`` of a picture whose mosaic has margins, and divide them by the gains."""
     own = mosaic[start : stop + 2 * _MARGIN]
     rows, width = own.shape
     first = (start + red_row) % 2  # of the rows with red
@@ -63,20 +98,26 @@ def _rows(mosaic, red_row, red_column, homogeneous, rgb, start, stop):  # type: 
     if homogeneous:
         _leads(pictures, lead)
 
+    sums, total = np.zeros(width, np.int32), np.ones(width, np.int32)
     for i in range(_MARGIN, rows - _MARGIN):
-        for j in range(_MARGIN, width - _MARGIN):
-            total = np.int32(1)
-            if homogeneous:
-                total = np.int32(0)
-                for k in range(-1, 2):
-                    total += lead[i + k, j - 1] + lead[i + k, j] + lead[i + k, j + 1]
-            for c in range(3):
-                value = pictures[0, c, i, j]
-                if total < 0:
-                    value = pictures[1, c, i, j]
-                elif total == 0:
-                    value = _HALF * (pictures[0, c, i, j] + pictures[1, c, i, j])
-                rgb[c, start + i - _MARGIN, j - _MARGIN] = value
+        if homogeneous:
+            for j in range(width):
+                sums[j] = np.int32(lead[i - 1, j]) + np.int32(lead[i, j]) + np.int32(lead[i + 1, j])
+            for j in range(1, width - 1):
+                total[j] = sums[j - 1] + sums[j] + sums[j + 1]
+        for c in range(3):
+            along_row, along_column = pictures[0, c, i], pictures[directions - 1, c, i]
+            _pick(along_row, along_column, total, gains[c], rgb[c, start + i - _MARGIN])
+
+
+@compile_part
+def _pick(along_row, along_column, total, gain, out):  # type: ignore[no-untyped-def]
+    """Take the first row of colours where ``total`` is above 0, the second below, else their mean, over the gain."""
+    for j in range(len(out)):
+        a, b, lead = along_row[_MARGIN + j], along_column[_MARGIN + j], total[_MARGIN + j]
+        value = b if lead < 0 else a
+        value = _HALF * (a + b) if lead == 0 else value
+        out[j] = value / gain
 
 
 @compile_part

@@ -34,6 +34,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from rawaug.bayer import CFA, STENCILS, demosaicing_stencils
+from rawaug.kernels.runtime import move_together
+
 MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
 INCREMENTS = (0x9E3779B9, 0xBB67AE85)
 ROUNDS = 10
@@ -44,7 +47,9 @@ BAND = 2**19
 
 
 class Unprocessing(NamedTuple):
-    """The numbers of the reverse pass, float32 on the device of the pictures; an absent part is an empty tensor.
+    """The numbers of the reverse pass, float32; an absent part is an empty tensor.
+
+    The tables are on the device of the pictures. The numbers of each picture are on the host, and cross with the pass.
 
     Args:
         table: ``(N, N, N, 4)`` x2 over the sRGB cube, axes B, G, R; the last of the four is not used. Empty if the
@@ -56,7 +61,7 @@ class Unprocessing(NamedTuple):
         knee: mean of x3 where the gains start to spare highlights.
         frame: ``(B, 6)`` y and x about the mask's centre of the first pixel, of a step down, and of one to the right.
         shading: ``(3,)`` a, b, c of the mask ``G = 2^-(a y^2 + b x y + c x^2)``; or empty, for none.
-        sites: ``(4, 3)`` row and column within the cell, and colour, of R, Gr, Gb, B; integers on the CPU.
+        sites: row and column within the cell, and colour, of R, Gr, Gb, B.
         taps: ``(B, 3)`` a, b, c of the blur; or empty, for none.
     """
 
@@ -67,7 +72,7 @@ class Unprocessing(NamedTuple):
     knee: float
     frame: Tensor
     shading: Tensor
-    sites: Tensor
+    sites: tuple[tuple[int, int, int], ...]
     taps: Tensor
 
 
@@ -137,6 +142,7 @@ def unprocess(srgb: Tensor, camera: Unprocessing, white: float, band: int = BAND
         float32 ``(B, 4, H/2, W/2)``.
     """
     batch, _, height, width = srgb.shape
+    camera = Unprocessing(*move_together(camera, srgb.device))
     raw = torch.empty(batch, 4, height // 2, width // 2, device=srgb.device, dtype=torch.float32)
     pictures, rows = batch, height
     if srgb.device.type == "cpu":
@@ -185,14 +191,11 @@ def apply_curves(curves: Tensor, x: Tensor) -> Tensor:
 
 def _take(curves: Tensor, index: Tensor) -> Tensor:
     """Take the entries ``index`` ``(B, C, H, W)`` of each picture's curve."""
-    values = curves.new_empty(index.shape)
-    for b in range(len(index)):
-        values[b] = curves[b].index_select(0, index[b].flatten()).reshape(index.shape[1:])
-    return values
+    return curves.gather(1, index.flatten(1).long()).reshape(index.shape)
 
 
 class Display(NamedTuple):
-    """The settings of the way from camera colour to sRGB, float32 on the device of the pictures.
+    """The settings of the way from camera colour to sRGB, float32; where they are is as for :class:`Unprocessing`.
 
     Args:
         table: ``(N, N, N, 4)`` sRGB over the cube of roots of x2, axes B, G, R; empty if the pictures have curves.
@@ -211,14 +214,26 @@ class Display(NamedTuple):
     frame: Tensor
     shading: Tensor
 
-    def of(self, pictures: Tensor) -> Display:
-        """The settings of some pictures, by their numbers."""
-        return self._replace(
-            curves=self.curves[pictures],
-            matrix=self.matrix[pictures],
-            gains=self.gains[pictures],
-            frame=self.frame[pictures],
-        )
+
+def site_weights(cfa: CFA) -> Tensor:
+    """Lay out the stencils of :data:`rawaug.bayer.STENCILS` as weights of six sums around a site.
+
+    They are the site's own value and the sums of its neighbours along the row, along the column, along the diagonals,
+    and of those two sites away along row and column: stencils are symmetric.
+
+    Returns:
+        Weights ``(2, 2, 2, 3, 6)`` by stencil, row and column of the cell, colour and sum.
+    """
+    weights = []
+    for method in STENCILS:
+        stencils, kinds = demosaicing_stencils(cfa, method)
+        edge = 2 - stencils.shape[-1] // 2
+        around = F.pad(stencils, (edge, edge, edge, edge))
+
+        measured = torch.eye(6)[:1]  # a site that has the colour keeps its own value
+        sums = torch.stack([around[:, i, j] for i, j in ((2, 2), (2, 1), (1, 2), (1, 1), (2, 0), (0, 2))], dim=1)
+        weights.append(torch.cat([measured, sums])[torch.tensor(kinds)].permute(1, 2, 0, 3))
+    return torch.stack(weights)
 
 
 def render(linear: Tensor, display: Display) -> Tensor:
@@ -262,7 +277,7 @@ def _develop(x2: Tensor, camera: Unprocessing, top: int, raw: Tensor) -> None:
     """Convert rows of linear light from ``top`` on, and write them to ``raw``."""
     mask = fall_off(camera, top, *x2.shape[-2:])
 
-    for plane, (i, j, channel) in enumerate(camera.sites.tolist()):
+    for plane, (i, j, channel) in enumerate(camera.sites):
         here = x2[..., i::2, j::2]
         shade = mask
         if mask is not None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache, wraps
@@ -17,6 +17,7 @@ from itertools import pairwise
 from typing import Any, ParamSpec, TypeVar
 
 import torch
+from torch import Tensor
 
 from rawaug.registry import suggest
 
@@ -63,6 +64,55 @@ def has_fast_bfloat16(device: torch.device) -> bool:
     get_capabilities = getattr(torch.cpu, "get_capabilities", dict)  # PyTorch has it from 2.7 on
     capabilities: dict[str, Any] = get_capabilities()
     return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
+
+
+_ALIGNMENT = 16
+"""A tensor among others begins at a multiple of this many bytes, as any type may."""
+
+
+def move_together(settings: Iterable[Any], device: torch.device) -> list[Any]:
+    """Move the tensors among ``settings`` that are on the host to a device, in one copy that nothing waits for.
+
+    Everything else stays as it is. Each small copy would cost a GPU more time than a pass over a crop.
+    """
+    moved = list(settings)
+    places = [k for k, part in enumerate(moved) if isinstance(part, Tensor) and part.device != device]
+    if not places:
+        return moved
+
+    pieces, starts, end = [], [], 0
+    for k in places:
+        piece = moved[k].detach().clone(memory_format=torch.contiguous_format).view(-1).view(torch.uint8)
+        gap = -end % _ALIGNMENT
+        pieces += [piece.new_zeros(gap), piece]
+        starts.append(end + gap)
+        end += gap + len(piece)
+
+    packed = torch.cat(pieces)
+    if device.type == "cuda":
+        packed = packed.pin_memory()
+    there = packed.to(device, non_blocking=True)
+
+    for k, start in zip(places, starts, strict=True):
+        part = moved[k]
+        moved[k] = there[start : start + part.numel() * part.element_size()].view(part.dtype).view(part.shape)
+    return moved
+
+
+def take_pictures(images: Tensor, are_taken: Tensor) -> Tensor:
+    """Take some pictures of a batch ``(B, ...)``, chosen on the host by booleans ``(B,)``, without waiting for it."""
+    if are_taken.all():
+        return images
+    (rows,) = move_together([are_taken.nonzero()[:, 0]], images.device)
+    return images[rows]
+
+
+def replace_pictures(images: Tensor, are_replaced: Tensor, by: Tensor) -> Tensor:
+    """Put pictures ``(b, ...)`` in the places of some of a batch, written to ``images``; see :func:`take_pictures`."""
+    if are_replaced.all():
+        return by
+    (rows,) = move_together([are_replaced.nonzero()[:, 0]], images.device)
+    return images.index_copy_(0, rows, by)
 
 
 @contextmanager

@@ -27,7 +27,7 @@ from rawaug.noise.levels import (
     load_presets,
     log_uniform,
 )
-from rawaug.noise.models import NOISE, NoiseModel, Params, ShotReadNoise, draw_seeds, per_picture
+from rawaug.noise.models import NOISE, NoiseModel, Params, ShotReadNoise, draw_seeds, move_params, per_picture
 
 _LEAST = 1e-12
 """Replaces a variance of 0 in logarithms."""
@@ -238,6 +238,17 @@ class RoundedNoise(ShotReadNoise):
         ):
             if name in stated:
                 self.effects.append(effect)
+
+    def move(self, params: Params, device: torch.device) -> Params:
+        """Move all but the seeds, unless an effect reads them on the host."""
+        if self.tails is not None or self.effects:
+            return params
+        return move_params(params, device)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether nothing is rounded, and no effect but shot and read noise is stated."""
+        return self.quantum is None and self.lowest is None and self.tails is None and not self.effects
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         """Draw ``shot_var``, ``read_var`` (without the rounding), ``seed``, and ``quantum``, ``lowest`` of whole DN.

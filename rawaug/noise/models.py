@@ -28,7 +28,7 @@ from rawaug.bayer import noise_variance
 from rawaug.errors import count_of
 from rawaug.kernels import fastest
 from rawaug.kernels.reference import normals
-from rawaug.kernels.runtime import eager
+from rawaug.kernels.runtime import eager, move_together
 from rawaug.noise.levels import NoiseLevels, draw_levels
 from rawaug.registry import Registry
 from rawaug.seeding import derive_seed, keyed_generator
@@ -94,6 +94,10 @@ class NoiseModel(ABC):
         noisy = self.apply(clean, params)
         return noisy, self.variance(noisy, params)
 
+    def move(self, params: Params, device: torch.device) -> Params:
+        """Move the parameters that :meth:`apply` takes from the device of the pictures; by default it takes none."""
+        return params
+
     def generators(self, params: Params, device: torch.device) -> Iterator[torch.Generator]:
         """Yield one generator for each picture on ``device``, keyed by the picture's seed and the model's stream."""
         for seed in params["seed"].tolist():
@@ -108,6 +112,13 @@ def _require_batch(clean: Tensor, params: Params) -> None:
         if value.shape[:1] != clean.shape[:1]:
             pictures = count_of(len(clean), "picture")
             raise ValueError(f"noise parameter {name!r}: {tuple(value.shape)}, but the batch has {pictures}")
+
+
+def move_params(params: Params, device: torch.device) -> Params:
+    """Move parameters to a device in one copy; seeds stay on the host, where generators are made."""
+    names = [name for name in params if not name.endswith("seed")]
+    moved = move_together([params[name] for name in names], device)
+    return {**params, **dict(zip(names, moved, strict=True))}
 
 
 def draw_seeds(batch: int, generator: torch.Generator) -> Tensor:
@@ -160,6 +171,11 @@ class ShotReadNoise(ShotReadModel):
         torch.Size([2, 4, 8, 8])
     """
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether shot and read noise are all there is, so that the pass that makes clean RAW may add them."""
+        return type(self).apply_with_variance is ShotReadNoise.apply_with_variance
+
     @eager
     @torch.no_grad()
     def apply(self, clean: Tensor, params: Params) -> Tensor:
@@ -187,10 +203,14 @@ class ShotReadNoise(ShotReadModel):
         if clean.dtype != torch.float32:
             return in_pytorch()
 
-        levels = torch.stack([params["shot_var"], params["read_var"]], dim=1)
-        return fastest("shot_read", clean, levels, self._keys(params), white, mapped, otherwise=in_pytorch)
+        return fastest("shot_read", clean, *self.levels_and_keys(params), white, mapped, otherwise=in_pytorch)
+
+    def levels_and_keys(self, params: Params) -> tuple[Tensor, list[int]]:
+        """Shot and read variance ``(B, 2)`` and a number for each picture, as the passes over pixels take them."""
+        return torch.stack([params["shot_var"], params["read_var"]], dim=1), self._keys(params)
 
     def _in_pytorch(self, clean: Tensor, params: Params, white: float, with_variance: bool) -> tuple[Tensor, Tensor]:
+        params = move_params(params, clean.device)
         deviation = self.variance(clean, params).sqrt_()
         noisy = torch.addcmul(clean, self._normals(clean, params), deviation).clamp_(max=white)
         if with_variance:

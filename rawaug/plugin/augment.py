@@ -28,8 +28,9 @@ from rawaug.errors import count_of
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP, restrict_to_cameras
-from rawaug.kernels.runtime import eager
+from rawaug.kernels.runtime import eager, take_pictures
 from rawaug.noise import Iso, NoiseSpec, noise_model
+from rawaug.noise.models import ShotReadNoise
 from rawaug.plugin.camera_noise import noise_label, usual_noise, with_iso
 from rawaug.plugin.crops import cut_patch, draw_patch
 from rawaug.plugin.draw import Draw, SettingSampler
@@ -270,14 +271,39 @@ class RawAugment(PairMaker):
         """Make the pairs of pictures ``(B, 3, H, W)`` that the parameters describe."""
         self._require_here(batch)
         self._require_as_many(batch, params)
+        host = params.map(Tensor.cpu)  # where they are drawn, unless they have been moved since
         with _float32(batch):
             if self.burst is not None:
-                return self._burst(batch, params, self.burst)
-
-            noisy, clean, variance = self._noisy(self._clean(batch, params), params)
-            if self.target == "rgb":
-                clean = self.baked.colours(batch, params.isp, params.crop, 1.0, params.extras.get("blur"))
+                noisy, clean, variance = self._burst(batch, host, self.burst)
+            else:
+                noisy, clean, variance = self._shot(batch, host)
             return RawPair(noisy, clean, variance, params)
+
+    def _shot(self, srgb: Tensor, params: AugmentParams) -> tuple[Tensor, Tensor, Tensor]:
+        """Make noisy, clean and variance of single shots, in one pass where there is one."""
+        in_colour = self.target == "rgb"
+        if self.pattern is None and isinstance(self.noise, ShotReadNoise) and self.noise.is_plain:
+            made = self.baked.with_noise(
+                srgb,
+                params.isp,
+                *self.noise.levels_and_keys(params.noise),
+                params.crop,
+                params.extras.get("blur"),
+                colours=in_colour,
+                mapped=self.srgb is None,
+            )
+            if made is not None:
+                noisy, clean, variance = made
+                if self.srgb is not None:
+                    return self._developed(self.srgb, noisy, clean, params)
+                return noisy, clean, variance
+
+        if not in_colour:
+            return self._noisy(self._clean(srgb, params), params)
+
+        clean = self.baked.colours(srgb, params.isp, params.crop, 1.0, params.extras.get("blur"))
+        noisy, _, variance = self._noisy(self._planes(clean), params)
+        return noisy, clean, variance
 
     def _clean(self, srgb: Tensor, params: AugmentParams) -> Tensor:
         if self.pattern is None:
@@ -292,19 +318,26 @@ class RawAugment(PairMaker):
 
     def _noisy(self, planes: Tensor, params: AugmentParams) -> tuple[Tensor, Tensor, Tensor]:
         """Add noise to clean planes ``(B, 4, H/2, W/2)``; return noisy, clean and variance, as RAW or developed."""
+        noise = self.noise.move(params.noise, planes.device)
         if self.srgb is not None:
-            raw = self.noise.apply(planes, params.noise)
+            raw = self.noise.apply(planes, noise)
             _require_finite(raw)
-            noisy, clean = bayer.unpack(raw, self.isp.cfa), bayer.unpack(planes, self.isp.cfa)
-            shots = self._further_shots(self.srgb, planes, params)
-            noisy, clean = self.srgb.develop(self._forward_pass(), noisy, clean, params, shots)
-            return noisy, clean, noisy.new_empty(len(noisy), 0)
+            return self._developed(self.srgb, raw, planes, params)
 
-        noisy, variance = self.noise.apply_with_variance(planes, params.noise)
+        noisy, variance = self.noise.apply_with_variance(planes, noise)
         _require_finite(noisy)
         if self.pattern is None:
             return noisy, planes, variance
         return bayer.unpack(noisy, CFA.RGGB), bayer.unpack(planes, CFA.RGGB), bayer.unpack(variance, CFA.RGGB)
+
+    def _developed(
+        self, target: Srgb, raw: Tensor, planes: Tensor, params: AugmentParams
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Develop noisy and clean planes ``(B, 4, H/2, W/2)``; there is no variance."""
+        noisy, clean = bayer.unpack(raw, self.isp.cfa), bayer.unpack(planes, self.isp.cfa)
+        shots = self._further_shots(target, planes, params)
+        noisy, clean = target.develop(self._forward_pass(), noisy, clean, params, shots)
+        return noisy, clean, noisy.new_empty(len(noisy), 0)
 
     def _further_shots(self, target: Srgb, planes: Tensor, params: AugmentParams) -> list[Tensor]:
         """Make mosaics ``(b, 1, H, W)`` in pairs of opposite noise, of the b pictures whose target is their mean."""
@@ -312,17 +345,18 @@ class RawAugment(PairMaker):
         if not is_averaged.any():
             return []
 
-        planes = planes[is_averaged.to(planes.device)]
-        params = params.map(lambda tensor: tensor[is_averaged.to(tensor.device)])
+        planes = take_pictures(planes, is_averaged)
+        params = params.map(lambda tensor: tensor[is_averaged])
 
         shots = []
         for seed in params.extras["shot_seed"].unbind(1):
-            noise = self.noise.disturb(planes, _with_seed(params.noise, seed)) - planes
+            shot_noise = self.noise.move(_with_seed(params.noise, seed), planes.device)
+            noise = self.noise.disturb(planes, shot_noise) - planes
             for shot in (planes + noise, planes - noise):
                 shots.append(bayer.unpack(shot.clamp_(max=1.0), self.isp.cfa))
         return shots
 
-    def _burst(self, srgb: Tensor, params: AugmentParams, burst: Burst) -> RawPair:
+    def _burst(self, srgb: Tensor, params: AugmentParams, burst: Burst) -> tuple[Tensor, Tensor, Tensor]:
         """Make pairs of N noisy frames; each frame has its own noise, and all share the sensor's defects."""
         frame_params = params.map(lambda tensor: tensor.repeat_interleave(burst.frames, 0))
         noise = _with_seed(frame_params.noise, params.extras["frame_seed"].flatten())
@@ -337,8 +371,7 @@ class RawAugment(PairMaker):
 
         bursts = (len(srgb), burst.frames)
         noisy, variance = noisy.unflatten(0, bursts), variance.unflatten(0, bursts)
-        clean = clean.unflatten(0, bursts)[:, 0]
-        return RawPair(noisy, clean, variance, params)
+        return noisy, clean.unflatten(0, bursts)[:, 0], variance
 
     # -- back to sRGB -------------------------------------------------------------------------------------------------
 
@@ -379,7 +412,8 @@ class RawAugment(PairMaker):
         mosaic = bayer.unpack(raw.float(), self.isp.cfa)
         methods = [demosaicing] * len(raw)
         with _float32(raw):
-            (srgb,) = self._forward_pass().develop([mosaic], methods, keep_white(params.isp), params.crop)
+            setting = keep_white(params.isp.map(Tensor.cpu))
+            (srgb,) = self._forward_pass().develop([mosaic], methods, setting, params.crop)
         return srgb
 
     def _forward_pass(self) -> FastForward:

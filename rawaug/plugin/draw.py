@@ -24,6 +24,7 @@ from rawaug.isp.config import ISPParams
 from rawaug.isp.dictionary import EXPOSURE, perturb
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
+from rawaug.kernels.runtime import one_thread
 from rawaug.registry import suggest
 from rawaug.seeding import Generators, draw_rows
 
@@ -115,8 +116,8 @@ class SettingSampler:
 
     Args:
         draw: how to draw.
-        isp: the camera.
-        baked: its tables, which choose settings for pictures.
+        isp: the camera, which chooses settings for pictures, where they are.
+        baked: the same camera, from whose copy on the host settings are drawn.
 
     Raises:
         ValueError: if light or tone is given for an ISP that was fitted to frames, or is unknown.
@@ -130,7 +131,7 @@ class SettingSampler:
                 raise ValueError(f"{rule}, not of a fitted ISP; omit them")
             if draw.sampling not in ("convex", "independent"):
                 raise ValueError(f"{rule}, not with sampling {draw.sampling!r}; omit them")
-        self.draw, self.isp, self.baked = draw, isp, baked
+        self.draw, self.isp, self.host = draw, isp, baked.host
 
         usual = EXPOSURE if has_cameras else (0.0, 0.0)
         self.exposure: tuple[float, float] = draw.exposure_range or usual
@@ -146,11 +147,14 @@ class SettingSampler:
     @property
     def constants(self) -> ISPParams:
         """The setting ``(1, ...)`` of an unknown picture."""
-        return self.isp.typical_setting()
+        return self.host.typical_setting()
 
     def choose(self, srgb: Tensor) -> ISPParams:
-        """Choose the settings of whole pictures ``(B, 3, H, W)``, before any draw."""
-        return self.baked.choose(srgb)
+        """Choose the settings of whole pictures ``(B, 3, H, W)``, before any draw, and wait for them."""
+        if not self.isp.config.encoders:
+            return self.host.choose(srgb)
+        with torch.no_grad(), one_thread():  # the same choice in every process
+            return self.isp.choose(srgb).map(Tensor.cpu)
 
     def sample(self, srgb: Tensor, generator: Generators, chosen: ISPParams | None = None) -> ISPParams:
         """Draw the settings of pictures, exposure included.
@@ -191,7 +195,7 @@ class SettingSampler:
                 setting = self._perturb(setting, generator)
             return setting
 
-        setting = self.isp.draw_setting(len(srgb), generator, self._cameras)
+        setting = self.host.draw_setting(len(srgb), generator, self._cameras)
         if self._tone is None:
             return setting
         return setting._replace(tone_weights=self._tone.to(setting.tone_weights).expand_as(setting.tone_weights))
@@ -201,7 +205,7 @@ class SettingSampler:
         for atoms in (setting.colour_weights, setting.gain_weights, setting.tone_weights):
             if atoms.shape[1]:
                 weights.append(perturb(atoms, self.draw.strength, generator))
-        return self.isp.params_from_weights(*weights)
+        return self.host.params_from_weights(*weights)
 
     def __repr__(self) -> str:
         """Describe the camera, the sampling, the light, the exposure and the blur in a line."""

@@ -32,7 +32,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug.kernels import fastest
-from rawaug.kernels.runtime import one_thread
+from rawaug.kernels.runtime import move_together, one_thread, replace_pictures, take_pictures
 from rawaug.noise.models import per_picture
 
 _REACH = 2.5
@@ -96,11 +96,11 @@ class Finish:
     @one_thread()  # the same bits everywhere
     def apply(self, noisy: Tensor, clean: Tensor, finish: Tensor) -> tuple[Tensor, Tensor]:
         """Finish noisy and clean sRGB ``(B, 3, H, W)`` in [0, 1] alike, by the ``finish`` of :meth:`sample`."""
-        pictures = torch.cat([noisy, clean], dim=1)
+        pictures, finish = torch.cat([noisy, clean], dim=1), finish.cpu()
         is_finished = finish.any(dim=1)
         if is_finished.any():
-            index = is_finished.to(pictures.device)
-            pictures[index] = _finish(pictures[index], finish[is_finished])
+            finished = _finish(take_pictures(pictures, is_finished), finish[is_finished])
+            pictures = replace_pictures(pictures, is_finished, finished)
 
         noisy, clean = pictures.split(3, dim=1)
         return noisy.contiguous(), clean.contiguous()
@@ -120,15 +120,19 @@ def _between(limits: tuple[float, float], share: Tensor, by_logarithm: bool) -> 
 
 def _finish(pictures: Tensor, finish: Tensor) -> Tensor:
     """Finish noisy and clean pictures ``(B, 6, H, W)``, colour by colour, as ``finish`` ``(B, 8)`` says."""
-    softness, window, share, edge, chroma_blur, mix, amount, radius = finish.cpu().unbind(1)
-    pictures = gaussian_blur(pictures, softness)
+    softness, window, share, edge, chroma_blur, mix, amount, radius = finish.unbind(1)
+    taps = gaussian(softness), gaussian(chroma_blur), box(window), gaussian(radius)
+    shares = [per_picture(values, finish) for values in (share, edge, mix, amount)]
+    soft, blurred, flat, unsharp, share, edge, mix, amount = move_together([*taps, *shares], pictures.device)
+
+    pictures = smooth(pictures, soft)
     red, green, blue = pictures[:, 0::3], pictures[:, 1::3], pictures[:, 2::3]
 
     luma = (0.299 * red).add_(green, alpha=0.587).add_(blue, alpha=0.114)
     chroma = torch.cat([red - luma, blue - luma], dim=1)
-    chroma.lerp_(gaussian_blur(chroma, chroma_blur), per_picture(mix, chroma))
-    luma = _reduce_noise(luma, window, per_picture(share, luma), per_picture(edge, luma))
-    luma.addcmul_(per_picture(amount, luma), luma - gaussian_blur(luma, radius))
+    chroma.add_(smooth(chroma, blurred).sub_(chroma).mul_(mix))  # a lerp's bits depend on what else is in the batch
+    luma = _reduce_noise(luma, flat, share, edge)
+    luma.add_((luma - smooth(luma, unsharp)).mul_(amount))
 
     torch.add(chroma[:, :2], luma, out=red)
     torch.add(chroma[:, 2:], luma, out=blue)
@@ -138,39 +142,54 @@ def _finish(pictures: Tensor, finish: Tensor) -> Tensor:
 
 def _reduce_noise(luma: Tensor, window: Tensor, share: Tensor, edge: Tensor) -> Tensor:
     """Pass noisy and clean luma ``(B, 2, H, W)`` through the module's guided filter."""
-    noise = torch.stack([(noisy - clean).square().mean() for noisy, clean in luma])[:, None, None, None]
-    mean = box_mean(torch.cat([luma, luma[:, :1].square()], dim=1), window)
+    noise = fastest("mean_square", luma, otherwise=lambda: _mean_square(luma))[:, None, None, None]
+    mean = smooth(torch.cat([luma, luma[:, :1].square()], dim=1), window)
     variance = (mean[:, 2:] - mean[:, :1].square()).clamp_min(1e-9)
 
     weights = (1.0 - edge * noise / variance).clamp_min(0.0)
-    smoothed = box_mean(torch.cat([weights, (1.0 - weights) * mean[:, :2]], dim=1), window)
+    smoothed = smooth(torch.cat([weights, (1.0 - weights) * mean[:, :2]], dim=1), window)
     mean_weights, flat = smoothed[:, :1], smoothed[:, 1:]
     return luma + share * (flat - (1.0 - mean_weights) * luma)
 
 
+def _mean_square(luma: Tensor) -> Tensor:
+    """The mean squared difference ``(B,)`` of noisy and clean luma ``(B, 2, H, W)``, picture by picture."""
+    return torch.stack([(noisy - clean).square().mean() for noisy, clean in luma])
+
+
 def gaussian_blur(image: Tensor, deviation: Tensor) -> Tensor:
     """Blur ``(B, N, H, W)`` with Gaussians of deviations ``(B,)`` in pixels; the edge is repeated outwards."""
-    reach = _REACH * deviation[:, None].cpu()
+    return smooth(image, gaussian(deviation.cpu()))
+
+
+def gaussian(deviation: Tensor) -> Tensor:
+    """The taps ``(B, K)`` of Gaussians of deviations ``(B,)`` in pixels, for :func:`smooth`."""
+    reach = _REACH * deviation[:, None].double()
     distance = torch.arange(math.ceil(float(reach.max())) + 1)
     taps = torch.exp(-0.5 * (distance * _REACH / reach.clamp_min(0.1)).square())
-    return _filter(image, torch.where(distance < reach.ceil() + 1, taps, 0.0))
+    return _normalise(torch.where(distance < reach.ceil() + 1, taps, 0.0))
 
 
-def box_mean(image: Tensor, reach: Tensor) -> Tensor:
-    """The means of ``(B, N, H, W)`` in squares of sides ``2 reach + 1``, ``(B,)``, whose border counts in part."""
+def box(reach: Tensor) -> Tensor:
+    """The taps ``(B, K)`` of means in squares of sides ``2 reach + 1``, ``(B,)``, whose border counts in part."""
     distance = torch.arange(math.ceil(float(reach.max())) + 1)
-    return _filter(image, (reach[:, None].cpu() + 1.0 - distance).clamp(0.0, 1.0))
+    return _normalise((reach[:, None].double() + 1.0 - distance).clamp(0.0, 1.0))
 
 
-def _filter(image: Tensor, taps: Tensor) -> Tensor:
-    """Filter along both axes with ``(B, K)`` taps, the middle one first, normalised to a sum of 1."""
-    taps = taps / (2.0 * taps.sum(1, keepdim=True) - taps[:, :1])
+def _normalise(taps: Tensor) -> Tensor:
+    """Divide float64 taps by their sum; rounded to float32, they do not depend on how many pictures there are."""
+    return (taps / (2.0 * taps.sum(1, keepdim=True) - taps[:, :1])).float()
+
+
+def smooth(image: Tensor, taps: Tensor) -> Tensor:
+    """Filter ``(B, N, H, W)`` along both axes with taps ``(B, K)``, the middle one first, which are on both sides."""
     return fastest("smooth", image, taps, otherwise=lambda: _convolve(image, taps))
 
 
 def _convolve(image: Tensor, taps: Tensor) -> Tensor:
     batch, count, height, width = image.shape
     reach = taps.shape[1] - 1
+    (taps,) = move_together([taps], image.device)
     kernel = torch.cat([taps[:, 1:].flip(1), taps], dim=1).to(image).repeat_interleave(count, 0)[:, None, None]
 
     planes = F.pad(image.reshape(1, -1, height, width), (reach,) * 4, mode="replicate")

@@ -40,9 +40,10 @@ from rawaug import bayer
 from rawaug.errors import count_of
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fast import FastForward
-from rawaug.kernels.runtime import one_thread
+from rawaug.kernels.runtime import move_together, one_thread, replace_pictures
 from rawaug.noise.models import draw_seeds
 from rawaug.plugin.finishing import Finish
+from rawaug.plugin.jpeg import compress_jpeg
 from rawaug.plugin.params import AugmentParams
 
 Target = Literal["raw", "rgb", "srgb"]
@@ -134,7 +135,7 @@ class Srgb:
             forward: the ISP's forward pass.
             noisy: mosaics ``(B, 1, H, W)`` of at least 4 x 4; a saturated sensor becomes white.
             clean: mosaics of the same shape.
-            params: the parameters that were drawn for them.
+            params: the parameters that were drawn for them, on the host.
             shots: further noisy mosaics ``(b, 1, H, W)`` of the b pictures whose target is the mean of such shots.
 
         Returns:
@@ -147,11 +148,11 @@ class Srgb:
         noisy, clean = forward.develop((noisy, clean), methods, keep_white(params.isp), params.crop)
         if shots:
             is_averaged = self.needs_shots(params)
-            own = params.map(lambda tensor: tensor[is_averaged.to(tensor.device)])
+            own = params.map(lambda tensor: tensor[is_averaged])
             own_methods = [self.methods[number] for number in own.extras["demosaicing"].tolist()]
 
             pictures = forward.develop(shots, own_methods, keep_white(own.isp), own.crop)
-            clean[is_averaged.to(clean.device)] = torch.stack(pictures).mean(0)
+            clean = replace_pictures(clean, is_averaged, torch.stack(pictures).mean(0))
 
         if self.finishing is not None:
             noisy, clean = self.finishing.apply(noisy, clean, params.extras["finish"])
@@ -166,22 +167,6 @@ def keep_white(setting: ISPParams) -> ISPParams:
     With gains below 1, for RAW drawn brighter than its picture, the sensor's white would become grey.
     """
     return setting._replace(gains=setting.gains / setting.gains.amin(dim=-1, keepdim=True).clamp_max(1.0))
-
-
-def compress_jpeg(srgb: Tensor, quality: Tensor, chroma_420: Tensor | None = None) -> Tensor:
-    """Compress sRGB ``(B, 3, H, W)`` in [0, 1] as JPEGs of the qualities ``(B,)``, and decode them again.
-
-    Chroma is 4:2:2. If ``chroma_420`` ``(B,)`` is given, it is 4:2:0 where that is true and 4:4:4 elsewhere.
-    """
-    from rawaug.io.pictures import recode_jpeg  # OpenImageIO
-
-    subsampling = ["4:2:2"] * len(srgb)
-    if chroma_420 is not None:
-        subsampling = ["4:2:0" if is_halved else "4:4:4" for is_halved in chroma_420.tolist()]
-
-    pictures = (srgb * 255.0).round().to("cpu", torch.uint8)
-    decoded = list(map(recode_jpeg, pictures, quality.tolist(), subsampling))
-    return torch.stack(decoded).to(srgb) / 255.0
 
 
 @dataclass(frozen=True)
@@ -227,18 +212,21 @@ class Burst:
 
     def move(self, scene: Tensor, motion: Tensor) -> Tensor:
         """Make the frames ``(B * N, 3, H, W)`` that show light ``(B, 3, H, W)`` after their motions ``(B, N, 3)``."""
-        moving = move(scene.repeat_interleave(self.frames, 0), motion.flatten(0, 1))
+        frames = scene[:, None].expand(-1, self.frames, -1, -1, -1).flatten(0, 1)
+        moving = move(frames, motion.flatten(0, 1))
         moving.clamp_(min=0.0)  # a bicubic curve undershoots beside edges
 
-        first = (motion == 0.0).all(-1).flatten().nonzero()[:, 0].to(scene.device)
-        moving[first] = scene[first // self.frames]  # the first frame is not interpolated
-        return moving
+        still = (motion == 0.0).all(-1).flatten().nonzero()[:, 0]  # the first frame is not interpolated
+        (still,) = move_together([still], scene.device)
+        return moving.index_copy_(0, still, frames[still])
 
     def expose(self, frames: Tensor) -> Tensor:
         """Expose frames ``(B * N, 3, H, W)`` as their stops say, clipped at 1, the sensor's white."""
-        stops = torch.tensor(self.stops or (0.0,) * self.frames, device=frames.device)
-        stops = stops.repeat(len(frames) // self.frames)
-        return (frames * torch.exp2(stops)[:, None, None, None]).clamp_max(1.0)
+        if self.stops is None:
+            return frames.clamp_max(1.0)
+        factors = torch.exp2(torch.tensor(self.stops)).repeat(len(frames) // self.frames)
+        (factors,) = move_together([factors], frames.device)
+        return (frames * factors[:, None, None, None]).clamp_max_(1.0)
 
 
 def _is_finite(value: object) -> bool:
@@ -254,11 +242,12 @@ def move(image: Tensor, motion: Tensor) -> Tensor:
         True
     """
     height, width = image.shape[-2:]
-    dy, dx, angle = motion.to(image).unbind(1)
+    dy, dx, angle = motion.to(image.dtype).unbind(1)
     cosine, sine = angle.cos(), angle.sin()
     across = torch.stack([cosine, -sine * height / width, 2.0 * dx / width], dim=1)
     down = torch.stack([sine * width / height, cosine, 2.0 * dy / height], dim=1)
+    (affine,) = move_together([torch.stack([across, down], dim=1)], image.device)
 
     with one_thread():  # the same bits everywhere
-        grid = F.affine_grid(torch.stack([across, down], dim=1), list(image.shape), align_corners=False)
+        grid = F.affine_grid(affine, list(image.shape), align_corners=False)
         return F.grid_sample(image, grid, mode="bicubic", padding_mode="reflection", align_corners=False)

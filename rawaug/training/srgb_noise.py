@@ -20,7 +20,7 @@ from torch import Tensor
 from rawaug.noise.levels import uniform
 from rawaug.noise.models import Params, draw_normals, draw_seeds, per_picture, poisson
 from rawaug.plugin.finishing import gaussian_blur
-from rawaug.plugin.targets import compress_jpeg
+from rawaug.plugin.jpeg import compress_jpeg
 from rawaug.registry import Spec, check_settings, require_between, split_spec, suggest
 from rawaug.seeding import keyed_generator
 

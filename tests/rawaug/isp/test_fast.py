@@ -13,6 +13,8 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading, ToneMap
 from rawaug.kernels import runtime
 from rawaug.metrics import psnr
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.draw import Draw
 from tests.rawaug.kernels.full_isp import full_isp
 
 
@@ -77,7 +79,8 @@ def test_choice_is_that_of_the_isp(looks: bool) -> None:
         for encoder in (isp.reverse_encoders.colour, isp.reverse_encoders.gain) if looks else ():
             list(encoder.parameters())[-2].normal_(std=5.0, generator=generator)
     srgb = torch.randint(256, (3, 3, 150, 200), generator=generator, dtype=torch.uint8)
-    chosen, expected = BakedISP(isp).choose(srgb), isp.choose(srgb)
+    augment = RawAugment(isp, noise=(0.0, 0.0), draw=Draw(sampling="chosen"))
+    chosen, expected = augment.settings.choose(srgb), isp.choose(srgb)
     assert (expected.colour_weights.std(0) > 1e-3).any() == looks
     for a, b in zip(chosen, expected, strict=True):
         torch.testing.assert_close(a, b, atol=1e-3, rtol=0)

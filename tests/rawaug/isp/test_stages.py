@@ -151,7 +151,7 @@ def test_a_new_stage_is_reversed_baked_chosen_by_and_saved(tmp_path: Path, srgb:
     x5 = isp.reverse_pixels(srgb, result.params)
     torch.testing.assert_close(isp.forward_pixels(x5, result.params), srgb, atol=1e-4, rtol=0)
     baked = BakedISP(isp)
-    for chosen, expected in zip(baked.choose(srgb), result.params, strict=True):
+    for chosen, expected in zip(baked.host.choose(srgb), result.params, strict=True):
         torch.testing.assert_close(chosen, expected, atol=1e-3, rtol=0)
     assert psnr(baked(srgb, result.params), bayer.pack(result.raw, isp.cfa)).min().item() > 75.0
     with torch.no_grad():

@@ -8,11 +8,12 @@ from typing import Any
 from unittest import mock
 
 import torch
+import torch.nn.functional as F
 
-from rawaug import kernels
-from rawaug.isp.fast import BakedISP
+from rawaug import bayer, kernels
+from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels import cpu, gpu, reference
+from rawaug.kernels import cpu, gpu, gpu_srgb, reference
 from rawaug.noise.levels import FixedLevels
 from rawaug.noise.models import ShotReadNoise
 from tests.rawaug.kernels.full_isp import CONFIGURATIONS, full_isp
@@ -33,9 +34,39 @@ def check_raw(settings: dict[str, Any], dtype: torch.dtype, blur: torch.Tensor |
     srgb = torch.randint(256, (2, 3, 18, 34), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
     srgb = srgb if dtype == torch.uint8 else srgb / 255.0
     camera = camera_of(srgb, blur, **settings)
-    raw = gpu.unprocess(srgb, camera, 0.3)
-    torch.testing.assert_close(raw, reference.unprocess(srgb, camera, 0.3), atol=2e-6, rtol=1e-5)
+    raw, expected = gpu.unprocess(srgb, camera, 0.3), reference.unprocess(srgb, camera, 0.3)
+    torch.testing.assert_close(raw, expected, atol=2e-6, rtol=1e-5)
     assert raw.max() == torch.tensor(0.3)
+
+    rgb = gpu.colours(srgb, camera, 0.3)
+    torch.testing.assert_close(bayer.pack_rgb(rgb, "GBRG"), expected, atol=2e-6, rtol=1e-5)
+
+    levels, keys = torch.tensor([[1e-2, 1e-3], [1e-3, 0.0]]), [2**64 - 5, 123456789012345]
+    noisy, clean, variance = gpu.raw_pairs(srgb, camera, levels, keys, 0.3, False, True)
+    assert torch.equal(clean, raw)
+    for a, b in zip((noisy, variance), gpu.shot_read(raw, levels, keys, 0.3, True), strict=True):
+        torch.testing.assert_close(a, b, atol=1e-6, rtol=1e-5)
+    again, in_colour, _ = gpu.raw_pairs(srgb, camera, levels, keys, 0.3, True, False)
+    assert torch.equal(again, noisy) and torch.equal(in_colour, rgb)
+
+
+def check_developed(settings: dict[str, Any]) -> None:
+    isp = full_isp(**settings)
+    forward, params = FastForward(isp), isp.draw_setting(4, torch.Generator().manual_seed(1))
+    generator = torch.Generator().manual_seed(0)
+    raw = F.interpolate(torch.rand(4, 1, 6, 9, generator=generator), (18, 30), mode="bicubic").mul_(0.5)
+    raw += 0.02 * torch.randn(raw.shape, generator=generator)
+    display, methods = forward._display(raw, params, None), torch.tensor([3, 1, 2, 0])
+    ours, expected = (way.develop(raw, display, forward.cfa, methods) for way in (gpu_srgb, cpu))
+    torch.testing.assert_close(ours, expected, atol=5e-6, rtol=1e-5)
+
+
+def check_finishing() -> None:
+    planes = torch.rand(3, 2, 13, 21, generator=torch.Generator().manual_seed(0))
+    taps = torch.rand(3, 5, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(gpu_srgb.smooth(planes, taps), cpu.smooth(planes, taps), atol=1e-6, rtol=1e-5)
+    mean = (planes[:, 0] - planes[:, 1]).square().mean((1, 2))
+    torch.testing.assert_close(gpu_srgb.mean_square(planes), mean, atol=0, rtol=1e-5)
 
 
 def check_noise(white: float) -> None:
@@ -50,7 +81,7 @@ def check_noise(white: float) -> None:
 def check_kernels_are_used() -> None:
     model, clean = ShotReadNoise(FixedLevels(1e-3, 1e-5)), torch.rand(1, 4, 8, 8)
     isp, srgb = BakedISP(DictionaryISP()), torch.rand(1, 3, 16, 16)
-    params, chosen = model.sample(1, torch.Generator().manual_seed(0)), isp.choose(srgb)
+    params, chosen = model.sample(1, torch.Generator().manual_seed(0)), isp.host.choose(srgb)
     expected = model.apply(clean, params), isp(srgb, chosen)
     asked: list[torch.Size] = []
 
@@ -61,7 +92,7 @@ def check_kernels_are_used() -> None:
     with mock.patch.object(kernels, "can_use_triton", usable):
         torch.testing.assert_close(model.apply(clean, params), expected[0], atol=1e-6, rtol=1e-5)
         torch.testing.assert_close(isp(srgb, chosen), expected[1], atol=2e-6, rtol=1e-5)
-    assert asked == [clean.shape, srgb.shape] and not kernels._failed
+    assert set(asked) == {clean.shape, srgb.shape} and not kernels._failed
 
 
 if __name__ == "__main__":
@@ -75,5 +106,10 @@ if __name__ == "__main__":
     for white in (1.0, float("inf")):
         check_noise(white)
         print("noise")
+    for settings in CONFIGURATIONS.values():
+        check_developed(settings)
+        print("developed")
+    check_finishing()
+    print("finishing")
     check_kernels_are_used()
     print("used")

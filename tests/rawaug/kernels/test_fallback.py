@@ -23,7 +23,9 @@ def test_step_by_step_they_do_what_the_cpu_does() -> None:
     environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": paths}
     done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
-    assert done.stdout.split() == 6 * ["raw"] + 2 * ["blurred"] + 2 * ["noise"] + ["used"]
+    assert done.stdout.split() == [
+        *6 * ["raw"], *2 * ["blurred"], *2 * ["noise"], *4 * ["developed"], "finishing", "used",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("with_map", [True, False])
@@ -44,12 +46,42 @@ def test_the_raw_compiles_for_a_gpu(pixels: str, all_stages: bool, blurs: bool) 
 
     types = {
         "srgb": pixels,
-        **dict.fromkeys(("table", "curves", "attention", "colour", "frame", "shading", "taps", "raw"), "*fp32"),
+        **dict.fromkeys(("table", "curves", "attention", "colour", "frame", "shading", "taps", "levels"), "*fp32"),
+        "keys": "*i64",
+        **dict.fromkeys(("raw", "noisy", "variance"), "*fp32"),
     }
     types |= {"h": "i32", "w": "i32", **dict.fromkeys(("scale", "knee", "white"), "fp32")}
     constants = {"S0": 0, "S1": 6, "S2": 5, "S3": 11, "NODES": 65, "ENTRIES": 0 if all_stages else 256, "BLOCK": 256}
     constants |= {"ATTENDS": all_stages, "SHADES": all_stages, "BLURS": blurs, "LINEAR": blurs and all_stages}
+    constants |= {"COLOURS": all_stages, "NOISE": True, "MAP": blurs}
     assert "st.global" in compiled_for_a_gpu(gpu._raw_cells, types, constants)
+
+
+def test_developing_compiles_for_a_gpu() -> None:
+    from rawaug.kernels import gpu_srgb
+
+    sides = {"h": "i32", "w": "i32"}
+    mosaic = {"raw": "*fp32", "methods": "*i64", "gains": "*fp32", "pictures": "*fp32", **sides}
+    mosaic |= {"red_row": "i32", "red_column": "i32"}
+    leads = {"methods": "*i64", "pictures": "*fp32", "leads": "*i8", **sides}
+    for kernel, types in ((gpu_srgb._greens, mosaic), (gpu_srgb._colours, mosaic), (gpu_srgb._leads, leads)):
+        assert "st.global" in compiled_for_a_gpu(kernel, types, {"BLOCK": 256})
+
+    settings = ("weights", "table", "curves", "attention", "matrix", "gains", "frame", "shading", "srgb")
+    types = {"raw": "*fp32", **leads, **dict.fromkeys(settings, "*fp32")}
+    types = {name: types[name] for name in ("raw", "methods", "pictures", "leads", *settings, "h", "w")}
+    for entries in (0, 1025):
+        constants = {"NODES": 65, "ENTRIES": entries, "ATTENDS": not entries, "SHADES": not entries, "BLOCK": 256}
+        assert "st.global" in compiled_for_a_gpu(gpu_srgb._srgb_pixels, types, constants)
+
+
+def test_finishing_compiles_for_a_gpu() -> None:
+    from rawaug.kernels import gpu_srgb
+
+    types = {**dict.fromkeys(("source", "taps", "out"), "*fp32"), **dict.fromkeys(("count", "h", "w", "reach"), "i32")}
+    assert "st.global" in compiled_for_a_gpu(gpu_srgb._smooth_lines, types, {"DOWN": True, "BLOCK": 256})
+    types = {"pairs": "*fp32", "means": "*fp32", "size": "i32"}
+    assert "st.global" in compiled_for_a_gpu(gpu_srgb._mean_squares, types, {"BLOCK": 2048})
 
 
 def compiled_for_a_gpu(kernel: Any, types: dict[str, str], constants: dict[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import itemgetter
 from typing import Any
 
 import pytest
@@ -14,8 +15,11 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, ShotReadNoise
 from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.finishing import Finish
+from rawaug.plugin.jpeg import compress_jpeg
 from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
+from rawaug.plugin.targets import Burst, Srgb
 from tests.rawaug.kernels.full_isp import CONFIGURATIONS, full_isp
 
 pytestmark = pytest.mark.gpu
@@ -88,6 +92,43 @@ def test_a_replay_is_exact_alone_in_another_batch_and_from_parameters_on_the_cpu
     assert_same_bits(augment.apply(srgb, pair.params), pair)
     assert_same_bits(augment.apply(srgb, pair.params.map(Tensor.cpu)), pair)
     assert_same_bits(augment.apply(srgb[1], pair.params.map(lambda t: t[1])), pair.map(lambda t: t[1]))
+
+
+TARGETS: dict[str, dict[str, Any]] = {
+    "raw": {},
+    "rgb": {"target": "rgb"},
+    "burst": {"burst": Burst(3)},
+    "srgb": {"target": "srgb"},
+    "finished": {"target": Srgb(finish=Finish(unfinished=0.3), shots=1)},
+}
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_targets_never_wait_for_the_device_and_are_those_of_the_cpu(name: str) -> None:
+    augment = RawAugment.from_pretrained("universal", **TARGETS[name])
+    srgb = torch.randint(256, (6, 3, 48, 66), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
+    expected = augment(srgb, torch.Generator().manual_seed(2))
+    augment, there = augment.to(DEVICE), srgb.to(DEVICE)
+    augment(there)  # compiles the kernels, and moves what is constant
+
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        pair = augment(there, torch.Generator().manual_seed(2))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    least = 40 if name == "finished" else SAME  # a code that is rounded otherwise changes a block
+    assert psnr(pair.noisy.cpu(), expected.noisy).min() >= least
+    assert psnr(pair.clean.cpu(), expected.clean).min() >= SAME
+    for k in range(len(srgb)):
+        one = pair.map(itemgetter(k))
+        assert_same_bits(augment.apply(there[k], one.params), one)
+
+
+def test_jpeg_on_the_device_has_the_codes_of_the_cpu() -> None:
+    srgb, quality = pictures().float() / 255.0, torch.tensor([30, 80, 99])
+    for halved in (None, torch.tensor([True, False, True])):
+        there = compress_jpeg(srgb.to(DEVICE), quality, halved)
+        assert torch.equal(there.cpu(), compress_jpeg(srgb, quality, halved))
 
 
 def test_raw_stays_float32_under_autocast() -> None:

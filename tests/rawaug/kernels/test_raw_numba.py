@@ -30,7 +30,7 @@ def camera(
         knee=0.9,
         frame=torch.tensor(frames).reshape(batch, 6),
         shading=torch.tensor([0.9, 0.4, 0.7]) if shading else torch.empty(0),
-        sites=torch.tensor([(1, 0, 0), (1, 1, 1), (0, 0, 1), (0, 1, 2)]),
+        sites=((1, 0, 0), (1, 1, 1), (0, 0, 1), (0, 1, 2)),
         taps=blur_taps(torch.linspace(0.0, 1.0, batch)) if blurs else torch.empty(batch, 0),
     )
 

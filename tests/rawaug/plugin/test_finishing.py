@@ -11,8 +11,9 @@ from torch import Tensor
 
 from rawaug.plugin import finishing
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.finishing import Finish, box_mean, gaussian_blur
-from rawaug.plugin.targets import Srgb, compress_jpeg
+from rawaug.plugin.finishing import Finish, box, gaussian_blur, smooth
+from rawaug.plugin.jpeg import compress_jpeg
+from rawaug.plugin.targets import Srgb
 
 SIDE = 96
 
@@ -42,10 +43,10 @@ def test_blur_divides_the_variance_of_white_noise_by_4_pi_s_squared(deviation: f
 def test_a_window_of_whole_pixels_is_a_mean_and_a_part_of_one_counts_in_part() -> None:
     image = torch.rand(2, 1, 12, 15, generator=torch.Generator().manual_seed(0))
     whole = F.avg_pool2d(F.pad(image, (2,) * 4, mode="replicate"), 5, 1)
-    assert torch.allclose(box_mean(image, torch.tensor([2.0, 2.0])), whole, atol=1e-6)
+    assert torch.allclose(smooth(image, box(torch.tensor([2.0, 2.0]))), whole, atol=1e-6)
     row = torch.zeros(1, 1, 1, 9)
     row[..., 4] = 1.0
-    assert torch.allclose(box_mean(row, torch.tensor([1.5]))[0, 0, 0, 2:7], torch.tensor([0.5, 1, 1, 1, 0.5]) / 4)
+    assert torch.allclose(smooth(row, box(torch.tensor([1.5])))[0, 0, 0, 2:7], torch.tensor([0.5, 1, 1, 1, 0.5]) / 4)
 
 
 def test_each_picture_has_its_own_filter_in_pytorch_and_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
