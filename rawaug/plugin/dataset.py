@@ -360,9 +360,9 @@ class RawPairs(_Pairs[Sample]):
                 names = ", ".join(str(indices[number]) for number in group)
                 raise ValueError(f"picture {names}: {error}") from error
 
-            for place, number in enumerate(group):
-                pair = pairs.map(lambda tensor, place=place: tensor[place])
-                form = self.form(pair, self._sample_name(indices[number]), batch[place])
+            for row, number in enumerate(group):
+                pair = pairs.map(lambda tensor, row=row: tensor[row])
+                form = self.form(pair, self._sample_name(indices[number]), batch[row])
                 finished.append(replace_picture(*samples[number], form))
         return finished
 
@@ -379,21 +379,21 @@ class RawPairs(_Pairs[Sample]):
         patches, places, settings = [], [], []
         for index, generator in zip(indices, generators, strict=True):
             sample: Any = None
-            where: Where = None
+            picture_key: Where = None
             chosen: ISPParams | None = None
             try:
                 if self._reads_parts and self.crop is not None:
                     cut = read_patch(self.dataset, index, self.crop, self.views, generator, self.zoom, self.bgr)
                 else:
                     sample = self.dataset[index]
-                    where = find_picture(sample, self.key)
-                    picture = get_picture(sample, where)
+                    picture_key = find_picture(sample, self.key)
+                    picture = get_picture(sample, picture_key)
                     cut = self.augment.draw_patch(picture, self.crop, self.views, generator, self.zoom, self.bgr)
                     chosen = self.augment.look(picture, self.bgr)
             except ValueError as error:
                 raise ValueError(f"picture {index}: {error}") from error
 
-            samples.append((sample, where))
+            samples.append((sample, picture_key))
             patches.append(cut[0])
             places.append(cut[1])
             settings.append(chosen)
@@ -511,18 +511,18 @@ class RawPairStream(_Pairs[Any], IterableDataset[Any]):
         self._epochs.end()
 
     def _make_pair(self, sample: Any, name: int | str, generator: torch.Generator) -> Any:
-        where = find_picture(sample, self.key)
-        picture = get_picture(sample, where)
+        picture_key = find_picture(sample, self.key)
+        picture = get_picture(sample, picture_key)
 
         try:
-            patch, place = self.augment.draw_patch(picture, self.crop, self.views, generator, self.zoom, self.bgr)
+            patch, crop = self.augment.draw_patch(picture, self.crop, self.views, generator, self.zoom, self.bgr)
             chosen = self.augment.look(picture, self.bgr)
-            batch = self.augment.make_pair(patch[None], generator, place[None], chosen)
+            batch = self.augment.make_pair(patch[None], generator, crop[None], chosen)
         except ValueError as error:
             raise ValueError(f"picture {name}: {error}") from error
 
         pair = batch.map(lambda tensor: tensor[0])
-        return replace_picture(sample, where, self.form(pair, self._sample_name(name), patch))
+        return replace_picture(sample, picture_key, self.form(pair, self._sample_name(name), patch))
 
     def _read_identity(self, sample: Any) -> int | str:
         try:

@@ -422,12 +422,12 @@ class WrappedLoader(ResumableLoader[Batch]):
         """Do nothing: the pairs are drawn here, so the dataset keeps its own epochs."""
 
     def _convert(self, batch: Any, epoch: int, number: int) -> Batch:
-        where = find_picture(batch, self.key, batched=True)
-        pictures = self._with_channel(get_picture(batch, where))
+        picture_key = find_picture(batch, self.key, batched=True)
+        pictures = self._with_channel(get_picture(batch, picture_key))
         generator = keyed_generator(self.augment.seed, "wrap", epoch, number, *rank_key())
 
         pair, patches = self._make_pair(pictures, generator)
-        converted: Batch = replace_picture(batch, where, self.form(pair, picture=patches))
+        converted: Batch = replace_picture(batch, picture_key, self.form(pair, picture=patches))
         return converted
 
     def _with_channel(self, batch: Any) -> Any:
@@ -456,9 +456,9 @@ class WrappedLoader(ResumableLoader[Batch]):
 
         patches, places, settings = [], [], []
         for picture in pictures:
-            patch, place = self.augment.draw_patch(picture, self.crop, False, generator, bgr=self.bgr)
+            patch, crop = self.augment.draw_patch(picture, self.crop, False, generator, bgr=self.bgr)
             patches.append(patch)
-            places.append(place)
+            places.append(crop)
 
             setting = self.augment.look(picture, self.bgr)
             if setting is not None:

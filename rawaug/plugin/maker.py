@@ -215,13 +215,13 @@ class PairMaker(nn.Module, ABC):
         Raises:
             ValueError: if there are no inputs.
         """
-        where = self.find(batch, key)
-        inputs = get_picture(batch, where)
+        picture_key = self.find(batch, key)
+        inputs = get_picture(batch, picture_key)
 
         pair = self.make_pair(self._batch(inputs), generator or self._own_generator())
         if self.is_single(inputs):
             pair = pair.map(_first)
-        return replace_picture(batch, where, pair)
+        return replace_picture(batch, picture_key, pair)
 
     if TYPE_CHECKING:  # nn.Module's own call has no types
 

@@ -125,10 +125,10 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
             return None
         if key is None and len(sample) > 1 and _likely_pair(*sample[:2]):
             warn_of_pairs()
-        where = key or 0
-        if not isinstance(where, int) or not -len(sample) <= where < len(sample):
+        picture_key = key or 0
+        if not isinstance(picture_key, int) or not -len(sample) <= picture_key < len(sample):
             raise ValueError(f"key={key!r}: samples are tuples of {len(sample)}; give the index of the picture")
-        return where % len(sample)
+        return picture_key % len(sample)
     if key is not None:
         raise ValueError(f"key={key!r}: samples are neither mappings nor tuples but {describe(sample)}; omit key")
     return None
@@ -152,29 +152,29 @@ def _likely_pair(first: Any, second: Any) -> bool:
     return first.mode == second.mode == "RGB" and bool(first.size == second.size)
 
 
-def get_picture(sample: Any, where: Where) -> Any:
+def get_picture(sample: Any, picture_key: Where) -> Any:
     """Get the picture of a sample, at the place that :func:`find_picture` has found."""
-    return sample if where is None else sample[where]
+    return sample if picture_key is None else sample[picture_key]
 
 
-def replace_picture(sample: Any, where: Where, value: Any) -> Any:
+def replace_picture(sample: Any, picture_key: Where, value: Any) -> Any:
     """Put ``value`` into a sample in place of its picture; the other fields stay, and a mapping becomes a dict.
 
     A dict that replaces the picture of a mapping is merged with it; ValueError if that would overwrite another field.
     """
-    if where is None:
+    if picture_key is None:
         return value
     if isinstance(sample, Mapping):
         if not isinstance(value, dict):
-            return {**sample, where: value}
-        fields_left = {name: field for name, field in sample.items() if name != where}
+            return {**sample, picture_key: value}
+        fields_left = {name: field for name, field in sample.items() if name != picture_key}
         duplicates = sorted(map(str, fields_left.keys() & value.keys()))
         if duplicates:
             raise ValueError(f"the samples have {', '.join(duplicates)} already; give other keys=")
         return fields_left | value
 
     fields = list(sample)
-    fields[int(where)] = value
+    fields[int(picture_key)] = value
     if isinstance(sample, list):
         return fields
     if hasattr(sample, "_fields"):  # a named tuple

@@ -148,9 +148,9 @@ class KeptOrder:
         if type(self.sampler) is not DistributedSampler:
             return list(self.sampler)
 
-        whole = copy.copy(self.sampler)
-        whole.rank, whole.num_replicas, whole.num_samples = 0, 1, self.sampler.total_size
-        return list(whole)
+        sampler = copy.copy(self.sampler)
+        sampler.rank, sampler.num_replicas, sampler.num_samples = 0, 1, self.sampler.total_size
+        return list(sampler)
 
     def _requests(self) -> Iterator[Any]:
         """Go through the order, and number this process's part of it."""
@@ -159,14 +159,14 @@ class KeptOrder:
         epoch = self.epoch
 
         seen: Counter[Any] = Counter()
-        for place, entry in enumerate(self.order):
+        for position, entry in enumerate(self.order):
             requests = []
             for index in entry if self.has_batches else [entry]:
                 index = _as_number(index)
                 requests.append((index, epoch, seen[index], own_rank))
                 seen[index] += 1
 
-            if place >= self._first and (place - self._first) % processes == rank:
+            if position >= self._first and (position - self._first) % processes == rank:
                 yield requests if self.has_batches else requests[0]
 
     def visited(self, batches: int) -> int:
@@ -185,11 +185,11 @@ class KeptOrder:
         ``drop_last``, else some are visited twice, as DistributedSampler does.
         """
         order, processes = list(order), self._share[1]
-        left = len(order) - first
+        remaining = len(order) - first
         if self.drop_last:
-            order = order[: first + left // processes * processes]
+            order = order[: first + remaining // processes * processes]
         else:
-            extra = -left % processes
+            extra = -remaining % processes
             order += (order[first:] * extra)[:extra]
         self.start_anew()
         self._next = order, first
@@ -256,9 +256,9 @@ class _Answer:
 
     def key(self, number: int) -> tuple[int | str, ...]:
         """The key of the next draw, of picture ``number``."""
-        place = min(self.draws, len(self.requests) - 1)
-        index, epoch, occurrence, rank = self.requests[place]
-        further = self.draws - place  # a dataset may ask for more pairs than one
+        request = min(self.draws, len(self.requests) - 1)
+        index, epoch, occurrence, rank = self.requests[request]
+        further = self.draws - request  # a dataset may ask for more pairs than one
         self.draws += 1
 
         if (index, occurrence, further) == (number, 0, 0):
@@ -347,10 +347,10 @@ def _has_own_order(loader: DataLoader[Any]) -> bool:
 
 def _copy_loader(loader: DataLoader[Any], **parts: Any) -> DataLoader[Any]:
     """Copy a DataLoader with other parts, and with its own workers."""
-    other = copy.copy(loader)
+    copied = copy.copy(loader)
     for name, part in {**parts, "_iterator": None}.items():
-        object.__setattr__(other, name, part)  # a DataLoader forbids this after its construction
-    return other
+        object.__setattr__(copied, name, part)  # a DataLoader forbids this after its construction
+    return copied
 
 
 def pack_order(order: Sequence[Any]) -> dict[str, Any]:
