@@ -19,7 +19,7 @@ from rawaug.data import open_pairs
 from rawaug.data.frames import as_frames
 from rawaug.data.pairs import centre
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
-from rawaug.evaluation.scores import Denoiser, NoisyInput
+from rawaug.evaluation.scores import NoisyInput, ScoredDenoiser
 from rawaug.evaluation.tables import print_rows
 from rawaug.metrics import psnr
 from rawaug.noise import noise_model
@@ -45,7 +45,7 @@ def main(command: Sequence[str] | None = None) -> None:
     noise, pairs = noise_model(args.noise), as_frames(open_pairs(args.data))
     if args.quick:
         pairs = pairs.some(range(1))
-    everyone: list[Denoiser] = [NoisyInput("noisy"), *map(RawDenoiser.of, args.denoisers)]
+    everyone: list[ScoredDenoiser] = [NoisyInput("noisy"), *map(RawDenoiser.of, args.denoisers)]
     side = (96 if args.quick else args.crop) // 2
     for way, together in WAYS.items():
         found: dict[str, list[float]] = {one.name: [] for one in everyone}

@@ -40,12 +40,12 @@ from torch import Tensor
 
 from benchmarks.measure import arguments, finish, start
 from rawaug import bayer
-from rawaug.data.development import develop_packed, exposure_of
+from rawaug.data.development import develop_packed, exposure_gain
 from rawaug.data.folders import RAW_EXTENSIONS, files_in  # type: ignore[attr-defined]
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.levels import UnknownNoise, find_levels
-from rawaug.evaluation.scores import Denoiser, NoisyInput
+from rawaug.evaluation.scores import NoisyInput, ScoredDenoiser
 from rawaug.evaluation.tables import print_rows
 from rawaug.io import RawFrame, read_raw
 from rawaug.progress import progress
@@ -208,7 +208,7 @@ def used(noisy: Shot, reference: Shot) -> tuple[list[Block], Counter[str]]:
     return kept, left_out
 
 
-def denoised(one: Denoiser, noisy: Shot, blocks: Sequence[Block]) -> Iterator[Tensor]:
+def denoised(one: ScoredDenoiser, noisy: Shot, blocks: Sequence[Block]) -> Iterator[Tensor]:
     """What a denoiser makes of each block, packed ``(1, 4, h, w)``."""
     frame, around = noisy.frame, MARGIN // 2
     for block in progress(blocks, label=one.name, unit="block"):
@@ -222,7 +222,7 @@ def errors_of(results: Iterator[Tensor], noisy: Shot, blocks: Sequence[Block]) -
     """Squared errors of each block in RAW and in developed sRGB, less those of the reference's own noise."""
     frame = noisy.frame
     pair = Pair.of_frame(frame.name, frame, torch.zeros(3, *frame.mosaic.shape[-2:], dtype=torch.uint8))
-    exposure = exposure_of(bayer.pack(frame.mosaic[None], frame.cfa), pair)
+    exposure = exposure_gain(bayer.pack(frame.mosaic[None], frame.cfa), pair)
     errors = []
     for result, block in zip(results, blocks, strict=True):
         raw = (result - block.target).square().mean() - block.own.square().mean()
@@ -238,7 +238,7 @@ def decibels(errors: Sequence[float]) -> float:
     return round(-10.0 * math.log10(fmean(errors)), 2)
 
 
-def scored(noisy: Shot, reference: Shot, everyone: Sequence[Denoiser], args: Any) -> dict[str, Any]:
+def scored(noisy: Shot, reference: Shot, everyone: Sequence[ScoredDenoiser], args: Any) -> dict[str, Any]:
     """Every denoiser on the blocks of a shot, and what is known of these blocks."""
     blocks, left_out = used(noisy, reference)
     if not blocks:
@@ -302,7 +302,7 @@ def main(command: Sequence[str] | None = None) -> None:
     args = parser.parse_args(command)
     figures = start(args)
     specs = ("NonLocalMeans", *args.denoisers, *shipped_of_mosaics())
-    everyone: list[Denoiser] = [NoisyInput("noisy"), *(RawDenoiser.of(spec).require_mosaic() for spec in specs)]
+    everyone: list[ScoredDenoiser] = [NoisyInput("noisy"), *(RawDenoiser.of(spec).require_mosaic() for spec in specs)]
     figures["command"] = shlex.join(["python", "-m", "benchmarks.bracket", *sys.argv[1:]])
     for noisy, reference in pairwise(bracket(args.folder)):
         title = f"{noisy.named} against {reference.named}"

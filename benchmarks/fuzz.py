@@ -37,12 +37,12 @@ import denoisers
 from benchmarks.damage import IMPORTED, IRREGULAR, MUTATIONS, make_originals, mutated
 from benchmarks.measure import parser
 from rawaug import DictionaryISP
-from rawaug.commands.info import describe
+from rawaug.commands.info import describe_file
 from rawaug.commands.run import with_values
 from rawaug.data.formats import read_mosaic
 from rawaug.data.mat import read_value
 from rawaug.data.published import read_packed
-from rawaug.data.sidd_scenes import colour_of, mosaic_of
+from rawaug.data.sidd_scenes import read_sidd_colour, read_sidd_mosaic
 from rawaug.evaluation.tables import print_rows
 from rawaug.experiment.recipe import find_kind, find_settings, read_recipe
 from rawaug.experiment.settings import Recipe
@@ -102,10 +102,10 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
         return [lambda: read_packed(path, path.with_suffix(".png"), None)]
     if kind != "safetensors":
         values = [lambda name=name: read_value(path, name) for name in ("cells", "text")]
-        return [lambda: mosaic_of(path), lambda: colour_of(path), *values]
+        return [lambda: read_sidd_mosaic(path), lambda: read_sidd_colour(path), *values]
     load = {"isp": isp_of, "denoiser": denoisers.load, "params": load_params}
     kept = path.stem.split("-")[0]
-    return [lambda: load[kept](path), *([lambda: describe(path)] if kept != "params" else [])]
+    return [lambda: load[kept](path), *([lambda: describe_file(path)] if kept != "params" else [])]
 
 
 def _set_up(path: Path) -> None:

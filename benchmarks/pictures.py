@@ -26,7 +26,7 @@ from PIL import Image, ImageCms, ImageOps
 from benchmarks.measure import parser
 from rawaug.bayer import plane_indices
 from rawaug.io import RawFrame, read_picture, read_raw
-from rawaug.io.content import Content, content_of
+from rawaug.io.content import Content, identify_content
 from rawaug.io.isolated import isolated
 from rawaug.io.tiff import ACTIVE_AREA, all_pages, main_mosaic, opened_tiff
 
@@ -45,7 +45,7 @@ class Comparison(NamedTuple):
 def compare(path: Path, tolerance: float = TOLERANCE) -> Comparison:
     """Read a file here and by the other library."""
     try:
-        content = content_of(path)
+        content = identify_content(path)
     except OSError as error:
         return Comparison(path, "not opened", "unknown", str(error))
     if content.kind == "other":
@@ -183,7 +183,7 @@ def digital_numbers(frame: RawFrame) -> np.ndarray:
 # -- folders -----------------------------------------------------------------------------------------------------------
 
 
-def files_of(folders: Sequence[str]) -> Iterator[Path]:
+def frame_files(folders: Sequence[str]) -> Iterator[Path]:
     """Every file below the folders, sorted."""
     for folder in folders:
         for path in sorted(Path(folder).rglob("*")):
@@ -198,7 +198,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.add_argument("--json", type=Path, help="write all outcomes to this file")
     args = options.parse_args(arguments)
 
-    comparisons = [compare(path, args.tolerance) for path in files_of(args.folders)]
+    comparisons = [compare(path, args.tolerance) for path in frame_files(args.folders)]
     counts = Counter(one.outcome for one in comparisons)
     print(f"{len(comparisons)} files")
     for outcome, count in counts.most_common():

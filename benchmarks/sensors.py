@@ -24,7 +24,7 @@ from rawaug.data import open_pairs
 from rawaug.data.pairs import centre
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.denoising.raw import equalise_greens
-from rawaug.evaluation.scores import Denoiser, NoisyInput
+from rawaug.evaluation.scores import NoisyInput, ScoredDenoiser
 from rawaug.evaluation.tables import print_rows
 from rawaug.io import RawFrame
 from rawaug.noise import SensorNoise
@@ -82,14 +82,14 @@ def decibels(error: Tensor) -> float:
     return round(-10.0 * error.mean().log10().item(), 2)
 
 
-def mean_psnr(one: Denoiser, shots: Shots, levels: tuple[float, float], **sensor: Any) -> float:
+def mean_psnr(one: ScoredDenoiser, shots: Shots, levels: tuple[float, float], **sensor: Any) -> float:
     """PSNR, the mean over frames."""
     made = noisy_shots(shots, levels, **sensor)
     scores = [decibels((one(y).clamp(max=1.0) - x).square()) for x, y in made]
     return round(sum(scores) / len(scores), 2)
 
 
-def left_in_flat(one: Denoiser, levels: tuple[float, float]) -> float:
+def left_in_flat(one: ScoredDenoiser, levels: tuple[float, float]) -> float:
     """Share of the noise's variance that is left in four ramps of 96 x 96 cells."""
     light = torch.tensor([0.05, 0.1, 0.2, 0.4])[:, None, None, None] * torch.linspace(0.9, 1.1, 96)
     ramps = [(str(k), light[k : k + 1].expand(1, 4, 96, 96).contiguous()) for k in range(len(light))]
@@ -98,7 +98,7 @@ def left_in_flat(one: Denoiser, levels: tuple[float, float]) -> float:
     return round((left / added).item(), 3)
 
 
-def beside_lights(one: Denoiser, shots: Shots, levels: tuple[float, float]) -> tuple[float, float]:
+def beside_lights(one: ScoredDenoiser, shots: Shots, levels: tuple[float, float]) -> tuple[float, float]:
     """dB in clipped cells, and beside them, of all frames together."""
     inside, beside = [], []
     for clean, noisy in noisy_shots(shots, levels):
@@ -126,7 +126,7 @@ def main() -> None:
     middles = [(name, centre(raw, side, side, step=1)) for name, raw in packed]
     wholes = middles if args.quick else [(name, balanced(raw)) for name, raw in packed]
     lights = [(name, raw) for name, raw in packed if (raw[:, 1:3] >= CLIPPED).all(1).any()]
-    everyone: list[Denoiser] = [NoisyInput("noisy"), *map(RawDenoiser.of, args.denoisers)]
+    everyone: list[ScoredDenoiser] = [NoisyInput("noisy"), *map(RawDenoiser.of, args.denoisers)]
     for one in progress(everyone, label="sensors", unit="denoiser"):
         row: dict[str, float] = {}
         for name, sensor in SENSORS.items():

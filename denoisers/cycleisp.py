@@ -2,7 +2,7 @@ r"""CycleISP's denoiser of RAW and the layers that all three of its networks sha
 
 A block is ``v + merge([f s, f c])`` with ``f = conv(prelu(conv(v)))``, ``s = sigmoid(conv([max_c f, mean_c f]))`` over
 space, and ``c``, one weight for each channel, the sigmoid of two layers on the mean of f. Layers have nearly the names
-that they have in the authors' published files of weights, which :func:`load_published` reads.
+that they have in the authors' published files of weights, which :func:`load_part` reads.
 
 Source: Zamir et al., "CycleISP: Real Image Restoration via Improved Data Synthesis", CVPR 2020.
 """
@@ -142,14 +142,14 @@ class CycleISPDenoiser(Denoiser):
     def from_published(cls, path: str | os.PathLike[str]) -> CycleISPDenoiser:
         """Make the network with the weights of a published checkpoint (``sidd_denoising_raw.pth``), in eval mode.
 
-        The weights are for RAW in RGGB, clipped to [0, 1]; errors are those of :func:`load_published`.
+        The weights are for RAW in RGGB, clipped to [0, 1]; errors are those of :func:`load_part`.
         """
         model = cls()
-        load_published(model.trunk, path, "the denoiser")
+        load_part(model.trunk, path, "the denoiser")
         return model.eval()
 
 
-def load_published(network: nn.Module, path: str | os.PathLike[str], part: str) -> None:
+def load_part(network: nn.Module, path: str | os.PathLike[str], part: str) -> None:
     """Load the weights of a published checkpoint into a network; nothing in the file is run as code.
 
     ``part`` is what messages call the network.

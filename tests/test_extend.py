@@ -123,7 +123,7 @@ def test_a_package_is_imported_before_its_network_is_outlined(site: Path, tmp_pa
     """Its module makes tensors and imports rawaug.noise, neither of which works on the meta device."""
     file = str(tmp_path / "x.safetensors")
     denoisers.save(denoisers.build("Shallow", width=4), file, {})
-    in_a_fresh_process(site, f"from rawaug.commands.info import describe; describe({file!r})")
+    in_a_fresh_process(site, f"from rawaug.commands.info import describe_file; describe_file({file!r})")
 
 
 def test_what_is_imported_on_another_device_is_whole(site: Path) -> None:

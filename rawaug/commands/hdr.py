@@ -17,7 +17,7 @@ from torch import Tensor
 from rawaug.commands import YAML
 from rawaug.errors import count_of
 from rawaug.files import require_output
-from rawaug.io.content import content_of
+from rawaug.io.content import identify_content
 from rawaug.io.isolated import isolated
 from rawaug.io.metadata import Metadata, mend_exif, read_exif
 from rawaug.io.pictures import decode_srgb, write_linear
@@ -135,7 +135,7 @@ def _find_motions(
 
 def _write(target: Path, srgb: Tensor, source: Path) -> None:
     """Write sRGB ``(3, H, W)``, in 16 bits as TIFF, with the EXIF of ``source``."""
-    content = content_of(source)
+    content = identify_content(source)
     exif = read_exif(source, "TIFF" if content.kind == "raw" else content.format)
     if exif is not None:
         exif = mend_exif(exif, None, upright=True)
@@ -174,9 +174,9 @@ def _read(paths: Sequence[str | Path]) -> list[Tensor]:
 
 def _require_one_kind(paths: Sequence[str | Path]) -> None:
     """Raise ValueError for RAW beside developed pictures, whose tone curves and white balance differ."""
-    first = content_of(paths[0])
+    first = identify_content(paths[0])
     for path in paths:
-        content = content_of(path)
+        content = identify_content(path)
         if (content.kind == "raw") != (first.kind == "raw"):
             kinds = f"{content.format}, but {paths[0]} is {first.format}"
             raise ValueError(f"{path}: is {kinds}; give RAW files or developed pictures, not both")

@@ -40,7 +40,7 @@ def run(weights: str, /, *part: str, json: bool = False) -> None:
     elif part:
         raise ValueError(f"{' '.join(part)}: too many arguments; use rawaug info cameras to look for a camera")
     else:
-        text = dumps(as_json(weights)) if json else describe(weights)
+        text = dumps(read_facts(weights)) if json else describe_file(weights)
     print(text)
 
 
@@ -100,7 +100,7 @@ def _level_row(iso: float, shot_var: tuple[float, float], read_var: tuple[float,
     return f"  ISO {iso:<7g} shot_var {shot_range}   read_var {read_range}"
 
 
-def as_json(weights: str | Path) -> dict[str, Any]:
+def read_facts(weights: str | Path) -> dict[str, Any]:
     """Collect what ``rawaug info --json`` prints.
 
     The keys of an ISP are those of :meth:`rawaug.isp.model.DictionaryISP.description`.
@@ -123,7 +123,7 @@ def as_json(weights: str | Path) -> dict[str, Any]:
     }
 
 
-def describe(weights: str | Path) -> str:
+def describe_file(weights: str | Path) -> str:
     """Describe a file in lines: kind, size, settings and atoms of weights, or the figures of a camera's YAML file."""
     if is_camera_file(weights):
         return describe_camera(Camera.load(weights))
@@ -131,7 +131,7 @@ def describe(weights: str | Path) -> str:
     if read_header(path)["kind"] == "isp":
         return _describe_isp(path)
 
-    content = as_json(path)
+    content = read_facts(path)
     lines = [f"{path}: denoiser {content['name']}, {content['parameters'] / 1e6:.3f} M parameters"]
     for key, value in {**content["config"], **content["info"]}.items():
         lines.append(f"  {key}: {dumps(value)}")

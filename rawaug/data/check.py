@@ -34,7 +34,7 @@ from rawaug.data.sidd_scenes import is_scene
 from rawaug.errors import escape
 from rawaug.files import files_below, files_in
 from rawaug.io import RawFrame, read_raw
-from rawaug.io.content import RAW_EXTENSIONS, content_of, list_files, picture_extensions
+from rawaug.io.content import RAW_EXTENSIONS, identify_content, list_files, picture_extensions
 from rawaug.io.isolated import isolated
 
 _MAX_VALUES = 6
@@ -200,7 +200,7 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
 def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Yield RAW files and pictures of no known dataset; FiveK cannot be told from other DNGs."""
     if path.is_file():
-        kind = content_of(path).kind
+        kind = identify_content(path).kind
         if kind in _READERS:
             what, reader = _READERS[kind]
             yield what, partial(reader, path)
@@ -276,21 +276,21 @@ def _facts(opening: bytes, index: int) -> dict[str, str]:
     """Describe size, pattern, levels, camera and ISO of an item: a picture, pair, RAW frame or noisy block."""
     items = _opened(opening)
     item = getattr(items, "read", items.__getitem__)(index)
-    return _facts_of(item)
+    return _describe_item(item)
 
 
 @singledispatch
-def _facts_of(picture: Any) -> dict[str, str]:
+def _describe_item(picture: Any) -> dict[str, str]:
     """Describe an item by kinds of fact; for a picture this is its size."""
     return {"sizes": _size(picture)}
 
 
-@_facts_of.register
+@_describe_item.register
 def _(pair: PicturePair) -> dict[str, str]:
     return {"sizes": _size(pair.noisy)}
 
 
-@_facts_of.register
+@_describe_item.register
 def _(pair: Pair) -> dict[str, str]:
     facts = {"sizes": _size(pair.raw), "cfas": str(pair.cfa)}
     if pair.shot_var is not None and pair.read_var is not None:
@@ -298,7 +298,7 @@ def _(pair: Pair) -> dict[str, str]:
     return facts | _origin(pair)
 
 
-@_facts_of.register
+@_describe_item.register
 def _(frame: RawFrame) -> dict[str, str]:
     facts = {"sizes": _size(frame.mosaic), "cfas": str(frame.cfa)}
     if frame.white > 1:

@@ -55,7 +55,7 @@ _SHADING_FOCAL_LENGTH = 1.85
 _SHOULDER, _CONTRAST = 1.2, 0.4
 
 
-class Shot(NamedTuple):
+class DemoShot(NamedTuple):
     """The settings of one shot: gains of R, G, B; exposure; ISO, a key of NOISE_LEVELS; the noise's seed."""
 
     white_balance: tuple[float, float, float]
@@ -77,7 +77,7 @@ class DemoCamera:
 
     cfa: CFA = CFA.GRBG
 
-    def sample(self, generator: torch.Generator, iso: int | None = None) -> Shot:
+    def sample(self, generator: torch.Generator, iso: int | None = None) -> DemoShot:
         """Draw the parameters of a shot, including the ISO unless it is given."""
         place, red, blue, exposure, level = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
 
@@ -91,14 +91,14 @@ class DemoCamera:
 
         if iso is None:
             iso = list(NOISE_LEVELS)[int(level * len(NOISE_LEVELS))]
-        return Shot(
+        return DemoShot(
             white_balance=(red_gain, 1.0, blue_gain),
             exposure=_EXPOSURE[0] + exposure * (_EXPOSURE[1] - _EXPOSURE[0]),
             iso=iso,
             noise_seed=int(torch.randint(2**62, (), generator=generator)),
         )
 
-    def apply(self, picture: Tensor, shot: Shot, name: str = "demo") -> Pair:
+    def apply(self, picture: Tensor, shot: DemoShot, name: str = "demo") -> Pair:
         """Take the shot with ``picture`` as the scene, uint8 ``(3, H, W)`` with even sides of at least 4."""
         if picture.ndim != 3 or picture.shape[0] != 3 or picture.dtype != torch.uint8 or min(picture.shape[1:]) < 4:
             raise ValueError(f"{name}: a scene must be uint8 (3, H, W), at least 4 x 4, got {tuple(picture.shape)}")
@@ -126,7 +126,7 @@ class DemoCamera:
         """Call :meth:`sample` and :meth:`apply` in one step."""
         return self.apply(picture, self.sample(generator, iso), name)
 
-    def _expose(self, picture: Tensor, shot: Shot) -> Tensor:
+    def _expose(self, picture: Tensor, shot: DemoShot) -> Tensor:
         """Compute the light on the sensor before noise, ``(1, H, W)``, white = 1."""
         from kornia.filters import gaussian_blur2d
 
@@ -139,7 +139,7 @@ class DemoCamera:
         light = shot.exposure * _shading(*picture.shape[-2:]) * camera
         return mosaic(light, self.cfa).clamp(min=0)
 
-    def _render(self, raw: Tensor, shot: Shot) -> Tensor:
+    def _render(self, raw: Tensor, shot: DemoShot) -> Tensor:
         """Develop a mosaic ``(1, H, W)`` to uint8 ``(3, H, W)``."""
         unshaded = raw / _shading(*raw.shape[-2:])
         camera = demosaic(unshaded[None], self.cfa, "malvar")[0] * _column(shot.white_balance)

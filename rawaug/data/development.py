@@ -100,7 +100,7 @@ def develop_packed(packed: Tensor, cfa: CFA, pair: Pair, exposure: float = 1.0) 
     return render_raw(raw, cfa, pair.white_balance, pair.color_matrix, "bilinear", exposure, least=None)
 
 
-def exposure_of(packed: Tensor, pair: Pair) -> float:
+def exposure_gain(packed: Tensor, pair: Pair) -> float:
     """Compute the factor that brings the brightest percent of a clean frame to white."""
     green = packed[:, 1:3].flatten()
     stride = max(1, green.numel() // 1_000_000)

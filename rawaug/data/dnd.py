@@ -39,14 +39,6 @@ class Box(NamedTuple):
     right: int
 
 
-class FrameInfo(NamedTuple):
-    """A frame as ``info`` describes it; ``stated`` holds the arguments of a :class:`RawFrame` that it states."""
-
-    boxes: list[Box]
-    cfa: CFA
-    stated: dict[str, Any]
-
-
 class Dnd(Lazy[RawFrame]):
     """The boxes, frame by frame: 1,000 boxes of 512 x 512. One frame at a time is in memory.
 
@@ -73,8 +65,8 @@ class Dnd(Lazy[RawFrame]):
 
         self.places: list[tuple[int, int]] = []
         names = []
-        for number, frame in enumerate(self.frames):
-            for box in range(len(frame.boxes)):
+        for number, (boxes, _, _) in enumerate(self.frames):
+            for box in range(len(boxes)):
                 self.places.append((number, box))
                 names.append(f"{number + 1:04d}_{box + 1:02d}")
         self._open_frame: tuple[int, Tensor] | None = None
@@ -91,8 +83,8 @@ class Dnd(Lazy[RawFrame]):
             self._open_frame = (number, mosaic)
 
         noisy = self._open_frame[1]
-        frame = self.frames[number]
-        box = frame.boxes[box_number]
+        boxes, cfa, stated = self.frames[number]
+        box = boxes[box_number]
         height, width = noisy.shape[-2:]
         inside = 0 <= box.top < box.bottom <= height and 0 <= box.left < box.right <= width
         if not inside:
@@ -101,12 +93,14 @@ class Dnd(Lazy[RawFrame]):
             )
 
         cut = noisy[:, box.top : box.bottom, box.left : box.right].contiguous()
-        cfa = frame.cfa.shift(box.top, box.left)
-        return RawFrame(cut, cfa, name=self.names[index], **frame.stated)
+        return RawFrame(cut, cfa.shift(box.top, box.left), name=self.names[index], **stated)
 
 
-def parse_frame(entry: Any, file: Path, number: int) -> FrameInfo:
-    """Parse a frame of the struct array ``info``; ValueError, naming the file, if it is not as published."""
+def parse_frame(entry: Any, file: Path, number: int) -> tuple[list[Box], CFA, dict[str, Any]]:
+    """Parse a frame of the struct array ``info``: its boxes, its pattern, and what it states for a RawFrame.
+
+    ValueError, naming the file, is raised if it is not as published.
+    """
     try:
         boxes = []
         for top, left, bottom, right in np.asarray(entry["boundingboxes"]).reshape(-1, 4).astype(int).tolist():
@@ -119,7 +113,7 @@ def parse_frame(entry: Any, file: Path, number: int) -> FrameInfo:
             "white_balance": gains_from_neutral(camera["AsShotNeutral"]),
             "color_matrix": srgb_from_camera(camera["ColorMatrix2"]),
         }
-        return FrameInfo(boxes, CFA("".join(colours)), stated)
+        return boxes, CFA("".join(colours)), stated
     except (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError) as error:
         raise ValueError(f"{file}: frame {number + 1} of info is not as published ({error})") from error
 

@@ -128,7 +128,7 @@ class DslrFrames(Frames):
         dslr = CAMERAS[self.camera]
         generator = keyed_generator(self.seed, "dslrs", self.names[index])
         scene = draw_window(self._file(index), _FRAME, generator, self.max_pixels)
-        shot = take(dslr, scene, generator, self.names[index])
+        shot = take_frame(dslr, scene, generator, self.names[index])
 
         with TemporaryDirectory() as folder:
             file = Path(folder) / f"{self.names[index]}.dng"
@@ -145,7 +145,7 @@ class DslrFrames(Frames):
         return self.files[int(order[place])]
 
 
-def take(dslr: Dslr, scene: Tensor, generator: torch.Generator, name: str) -> RawFrame:
+def take_frame(dslr: Dslr, scene: Tensor, generator: torch.Generator, name: str) -> RawFrame:
     """Take a RAW frame of a scene, linear sRGB ``(3, H, W)`` in [0, 1] with even sides, in daylight."""
     exposure = float(torch.rand((), generator=generator, dtype=torch.float64))
     light, red, blue = torch.randn(3, generator=generator, dtype=torch.float64).tolist()

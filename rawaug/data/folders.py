@@ -263,7 +263,7 @@ class RawFolder(Frames):
     def frame(self, index: int) -> RawFrame:
         return read_raw(self.files[index])
 
-    def files_of(self, index: int) -> Sequence[Path]:
+    def frame_files(self, index: int) -> Sequence[Path]:
         return (self.files[index],)
 
     def read(self, index: int) -> Pair:

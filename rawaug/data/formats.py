@@ -37,7 +37,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.mat import MAX_BYTES, read_array, read_value, require_size, variables
+from rawaug.data.mat import MAX_BYTES, read_array, read_value, require_bytes, variables
 from rawaug.data.mosaic_metadata import KINDS, Metadata, complete_metadata, format_value, levels, parse_metadata
 from rawaug.errors import extra
 from rawaug.files import replacing, require_file, write_bytes
@@ -57,7 +57,7 @@ class _Unclear(ValueError):
 
 def _read_npz(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
     def select(names: list[str]) -> list[str]:
-        return [_name_of(file, names, which, alone), *KINDS.keys() & set(names)]
+        return [_choose_name(file, names, which, alone), *KINDS.keys() & set(names)]
 
     with damage_as_os_error(file, "cannot be read as NPZ", _Unclear):
         arrays = read_npz(file, select)
@@ -98,7 +98,7 @@ def _read_npy(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
             shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
         else:
             raise ValueError(f"version {version[0]}.{version[1]} of the format")
-        require_size(math.prod(shape) * dtype.itemsize, "its array")
+        require_bytes(math.prod(shape) * dtype.itemsize, "its array")
 
         stream.seek(0)
         return np.load(stream, allow_pickle=False), {}
@@ -121,7 +121,7 @@ def _read_mat(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
     for name in names:
         if name in KINDS:
             stated[name] = read_value(file, name)
-    return read_array(file, _name_of(file, names, which, alone)), stated
+    return read_array(file, _choose_name(file, names, which, alone)), stated
 
 
 def _read_tiff(file: Path, which: str, alone: bool, max_pixels: int) -> Contents:
@@ -219,7 +219,7 @@ def read_mosaic(
     return RawFrame(_scale_to_raw(file, numbers, metadata), metadata["cfa"], **attributes)
 
 
-def _name_of(file: Path, names: Iterable[str], which: str, alone: bool) -> str:
+def _choose_name(file: Path, names: Iterable[str], which: str, alone: bool) -> str:
     """Find the name of the array that is the mosaic: ``which``, or that of the only array."""
     arrays = [name for name in names if name not in KINDS]
     if which in arrays:

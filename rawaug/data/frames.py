@@ -88,14 +88,14 @@ class Frames(Lazy[Pair]):
 
         return RawFrame(mosaic, pair.cfa, camera=pair.camera, iso=pair.iso)
 
-    def files_of(self, index: int) -> Sequence[Path]:
+    def frame_files(self, index: int) -> Sequence[Path]:
         """The files that identify a pair; empty if its name identifies it."""
         return ()
 
     def stamp(self, index: int) -> str:
         """Identify the content of a pair by the path, size and modification time of its files, or by its name."""
         parts = []
-        for file in self.files_of(index):
+        for file in self.frame_files(index):
             status = file.stat()
             parts.append(f"{os.path.realpath(file)} {status.st_size} {status.st_mtime_ns}")
         if not parts:
@@ -167,8 +167,8 @@ class _View(Frames):
             return pair
         return self.change(pair)
 
-    def files_of(self, index: int) -> Sequence[Path]:
-        return self.frames.files_of(self.indices[index])
+    def frame_files(self, index: int) -> Sequence[Path]:
+        return self.frames.frame_files(self.indices[index])
 
     def stamp(self, index: int) -> str:
         stamp = self.frames.stamp(self.indices[index])
@@ -212,7 +212,7 @@ def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
 def _identities(pairs: Frames) -> set[str]:
     identities: set[str] = set()
     for index, name in enumerate(pairs.names):
-        files = pairs.files_of(index)
+        files = pairs.frame_files(index)
         identities.update(map(os.path.realpath, files))
         if not files:
             identities.add(name)

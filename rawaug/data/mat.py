@@ -108,7 +108,7 @@ def _read(path: Path, name: str, plain: bool) -> Any:
         if version == "5":
             from scipy.io import loadmat
 
-            require_size(8 * math.prod(shapes[name]), name)
+            require_bytes(8 * math.prod(shapes[name]), name)
             return loadmat(path, variable_names=[name], simplify_cells=plain)[name]
 
         with _hdf5(path) as file:
@@ -118,7 +118,7 @@ def _read(path: Path, name: str, plain: bool) -> Any:
             return np.ascontiguousarray(_values(node).T)
 
 
-def require_size(size: int, name: str) -> None:
+def require_bytes(size: int, name: str) -> None:
     """Raise ValueError if a variable declares more than :data:`MAX_BYTES`."""
     if not 0 <= size <= MAX_BYTES:
         raise ValueError(f"{name} declares {size} bytes, above the limit of {MAX_BYTES}")
@@ -137,7 +137,7 @@ def _values(node: Any) -> Any:
     """Read the values of an HDF5 dataset. External storage and datasets above the size limit are refused."""
     if node.external or node.is_virtual:
         raise ValueError(f"{node.name} is stored in another file")
-    require_size(node.size * node.dtype.itemsize, node.name)
+    require_bytes(node.size * node.dtype.itemsize, node.name)
     return node[()]
 
 

@@ -92,7 +92,7 @@ class PairFolder(Frames):
         self.pairs = _pairs_below(Path(path), noisy, clean)
         super().__init__([pair.name for pair in self.pairs])
 
-    def files_of(self, index: int) -> Sequence[Path]:
+    def frame_files(self, index: int) -> Sequence[Path]:
         _, noisy, clean = self.pairs[index]
         if noisy == clean:
             return (noisy,)

@@ -35,7 +35,7 @@ from rawaug.bayer import CFA, demosaic, mosaic
 from rawaug.data.frames import Frames
 from rawaug.data.pairs import DATASETS, Pair
 from rawaug.data.scenes import camera_in_light, draw_window, scene_files
-from rawaug.data.sidd_scenes import HELD_BACK, PHONES, label_of
+from rawaug.data.sidd_scenes import HELD_BACK, PHONES, parse_label
 from rawaug.io import encode_srgb
 from rawaug.seeding import keyed_generator
 
@@ -78,7 +78,7 @@ class Rendering(NamedTuple):
         lift_error: standard deviation of the digital gain, in stops.
         shading_removed: q, the exponent of the shading that is divided out.
         saturation: factor on the distance from grey.
-        brightness, contrast: parameters of the tone curve, see :func:`tone_curve`.
+        brightness, contrast: parameters of the tone curve, see :func:`phone_curve`.
     """
 
     adaptation: float
@@ -213,7 +213,7 @@ invented.
 """
 
 
-def noise_levels(phone: Phone, iso: int) -> tuple[float, float]:
+def phone_noise(phone: Phone, iso: int) -> tuple[float, float]:
     """Look up (shot_var, read_var) at an ISO: interpolated in logarithms, and constant beyond the published ISOs."""
     isos = sorted(phone.noise)
     if iso <= isos[0]:
@@ -230,7 +230,7 @@ def noise_levels(phone: Phone, iso: int) -> tuple[float, float]:
     return levels[0], levels[1]
 
 
-def tone_curve(linear: Tensor, brightness: float, contrast: float) -> Tensor:
+def phone_curve(linear: Tensor, brightness: float, contrast: float) -> Tensor:
     """Render linear light in [0, 1] as display values: ``d + b d (1 - d) - c d (1 - d)(1 - 2 d)``, d its sRGB code.
 
     ``brightness`` b lifts the middle, ``contrast`` c bends an S; the curve rises as long as ``b + c < 1``.
@@ -288,7 +288,7 @@ class PhoneFrames(Frames):
         for instance in self.instances:
             for number in numbers:
                 self.shots.append((instance, number))
-                labels.append(label_of(instance.name))
+                labels.append(parse_label(instance.name))
                 names.append(f"{instance.name}_{number}")
         self.labels = labels
         super().__init__(names)
@@ -317,13 +317,13 @@ class PhoneFrames(Frames):
 
     def read(self, index: int) -> Pair:
         instance, _ = self.shots[index]
-        code = label_of(instance.name).phone
+        code = parse_label(instance.name).phone
         phone = CAMERAS[code]
 
         generator = keyed_generator(self.seed, "phones window", self.split, instance.name)
         scene = draw_window(instance.file, self.size, generator, self.max_pixels)
         noise = keyed_generator(self.seed, "phones noise", self.split, self.names[index])
-        return take(phone, scene, instance.shot, noise, self.names[index])
+        return take_shot(phone, scene, instance.shot, noise, self.names[index])
 
 
 def _training_labels(seed: int) -> list[tuple[int, int, str]]:
@@ -336,7 +336,7 @@ def _training_labels(seed: int) -> list[tuple[int, int, str]]:
     for place, number in enumerate(numbers):
         block, position = divmod(place, len(codes))
         order = torch.randperm(len(codes), generator=keyed_generator(seed, "phones order", block)).tolist()
-        labels.append((number, _scene_of(number), codes[order[position]]))
+        labels.append((number, _scene_number(number), codes[order[position]]))
     return labels
 
 
@@ -344,13 +344,13 @@ def _held_back_labels() -> list[tuple[int, int, str]]:
     """List the number, scene and phone of SIDD's held-back instances."""
     labels = []
     for name in HELD_BACK:
-        label = label_of(name)
+        label = parse_label(name)
         labels.append((int(name[:4]), int(label.scene), label.phone))
     return labels
 
 
 @cache
-def _scene_of(number: int) -> int:
+def _scene_number(number: int) -> int:
     return 1 + next(place for place, end in enumerate(_SCENE_ENDS) if number <= end)
 
 
@@ -373,7 +373,7 @@ def _draw_shot(phone: Phone, generator: torch.Generator) -> tuple[Shot, str]:
     return shot, brightness
 
 
-def take(phone: Phone, scene: Tensor, shot: Shot, generator: torch.Generator, name: str = "phone") -> Pair:
+def take_shot(phone: Phone, scene: Tensor, shot: Shot, generator: torch.Generator, name: str = "phone") -> Pair:
     """Take a shot of a scene.
 
     Args:
@@ -389,13 +389,13 @@ def take(phone: Phone, scene: Tensor, shot: Shot, generator: torch.Generator, na
 
     Example:
         >>> shot = Shot(kelvin=3200, stops=1.0, iso=400, balance_error=0.0, tint_error=(0.0, 0.0), lift_error=0.0)
-        >>> pair = take(CAMERAS["IP"], torch.full((3, 64, 96), 0.5), shot, torch.Generator().manual_seed(0))
+        >>> pair = take_shot(CAMERAS["IP"], torch.full((3, 64, 96), 0.5), shot, torch.Generator().manual_seed(0))
         >>> pair.raw.shape, pair.srgb.shape, pair.cfa
         (torch.Size([1, 64, 96]), torch.Size([3, 64, 96]), <CFA.RGGB: 'RGGB'>)
     """
     clean = _expose(phone, scene, shot)
 
-    shot_var, read_var = noise_levels(phone, shot.iso)
+    shot_var, read_var = phone_noise(phone, shot.iso)
     electrons = torch.poisson(clean / shot_var, generator=generator)
     read_noise = torch.randn(clean.shape, generator=generator) * read_var**0.5
     noisy = _digitise(shot_var * electrons + read_noise, phone.black)
@@ -404,7 +404,7 @@ def take(phone: Phone, scene: Tensor, shot: Shot, generator: torch.Generator, na
     lift = digital_gain(phone, clean, gains, shot)
     return Pair(
         name=name,
-        srgb=render(phone, clean, gains, lift, shot),
+        srgb=render_shot(phone, clean, gains, lift, shot),
         raw=clean,
         cfa=phone.cfa,
         white_balance=(float(gains[0] / gains[1]), 1.0, float(gains[2] / gains[1])),
@@ -413,7 +413,7 @@ def take(phone: Phone, scene: Tensor, shot: Shot, generator: torch.Generator, na
         shot_var=shot_var,
         read_var=read_var,
         camera=phone.name,
-        noisy_srgb=render(phone, noisy, gains, lift, shot),
+        noisy_srgb=render_shot(phone, noisy, gains, lift, shot),
         iso=float(shot.iso),
     )
 
@@ -459,7 +459,7 @@ def digital_gain(phone: Phone, clean: Tensor, gains: Tensor, shot: Shot) -> floa
     return min(max(2.0**stops, 1.0), _MOST_LIFT)
 
 
-def render(phone: Phone, raw: Tensor, gains: Tensor, lift: float, shot: Shot) -> Tensor:
+def render_shot(phone: Phone, raw: Tensor, gains: Tensor, lift: float, shot: Shot) -> Tensor:
     """Develop a mosaic ``(1, H, W)`` as the phone does: sRGB, uint8 ``(3, H, W)``."""
     law = phone.rendering
     flat = raw / shading(phone.shading, *raw.shape[-2:]) ** law.shading_removed
@@ -471,7 +471,7 @@ def render(phone: Phone, raw: Tensor, gains: Tensor, lift: float, shot: Shot) ->
     saturated = law.saturation * matrix + (1.0 - law.saturation) * (luma @ matrix)
     linear = torch.einsum("ij,jhw->ihw", saturated.float(), balanced).clamp(0.0, 1.0)
 
-    display = tone_curve(linear, law.brightness, law.contrast)
+    display = phone_curve(linear, law.brightness, law.contrast)
     return (display * 255.0).round().clamp(0, 255).to(torch.uint8)
 
 

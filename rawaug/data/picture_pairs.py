@@ -78,7 +78,7 @@ class PicturePairs(Frames):
     def __iter__(self) -> Iterator[PicturePair]:  # type: ignore[override]
         return map(self.read, range(len(self)))
 
-    def files_of(self, index: int) -> Sequence[Path]:
+    def frame_files(self, index: int) -> Sequence[Path]:
         return self._files[index]
 
     def read(self, index: int) -> PicturePair:  # type: ignore[override]

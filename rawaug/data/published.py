@@ -123,7 +123,7 @@ class Rawir(Frames):
         """Choose the files of a split; here all of them, since every split has a folder."""
         return files
 
-    def camera_of(self, file: Path) -> str:
+    def camera_name(self, file: Path) -> str:
         return "unknown"
 
     def read(self, index: int) -> Pair:
@@ -135,7 +135,7 @@ class Rawir(Frames):
             srgb=read_picture(picture, self.max_pixels),
             raw=unpack(read_packed(file, picture, self.white), CFA.RGGB),
             cfa=CFA.RGGB,
-            camera=self.camera_of(file),
+            camera=self.camera_name(file),
             registered=not is_phone,
         )
 
@@ -191,7 +191,7 @@ class Rgb2Raw(Rawir):
                 files_of_split.append(file)
         return files_of_split
 
-    def camera_of(self, file: Path) -> str:
+    def camera_name(self, file: Path) -> str:
         return file.parent.name
 
 
@@ -277,12 +277,12 @@ class RawBench(Frames):
                 raise FileNotFoundError(f"{folder}: has no RAW file at ISO 100; download it too")
         super().__init__([file.stem for file in self.files])
 
-    def files_of(self, index: int) -> Sequence[Path]:
+    def frame_files(self, index: int) -> Sequence[Path]:
         file = self.files[index]
         return (file, *self.clean[file.parent])
 
     def read(self, index: int) -> Pair:
-        noisy_file, *clean_files = self.files_of(index)
+        noisy_file, *clean_files = self.frame_files(index)
         noisy = read_raw(noisy_file)
         mosaics = []
         for file in clean_files:

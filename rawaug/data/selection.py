@@ -36,13 +36,13 @@ def select_pairs(
 def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
     """Get the indices of the frames of the first scenes in order of their names, ``count`` frames in all."""
 
-    def scene_of(index: int) -> str:
+    def frame_scene(index: int) -> str:
         return labels[index].scene
 
-    order = sorted(range(len(labels)), key=scene_of)
+    order = sorted(range(len(labels)), key=frame_scene)
     totals = []
     for place, index in enumerate(order, start=1):
-        is_last_of_scene = place == len(order) or scene_of(order[place]) != scene_of(index)
+        is_last_of_scene = place == len(order) or frame_scene(order[place]) != frame_scene(index)
         if is_last_of_scene:
             totals.append(place)
 
@@ -56,7 +56,7 @@ def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
 def one_a_phone(labels: Sequence[FrameLabel], count: int) -> list[int]:
     """Get indices of ``count`` frames, by phones in turn; the frames of each phone are evenly spread in ISO."""
 
-    def iso_of(index: int) -> int:
+    def frame_iso(index: int) -> int:
         return labels[index].iso
 
     frames_of: dict[str, list[int]] = {}
@@ -69,7 +69,7 @@ def one_a_phone(labels: Sequence[FrameLabel], count: int) -> list[int]:
         share = count // len(phones)
         if place < count % len(phones):
             share += 1
-        frames = sorted(frames_of[phone], key=iso_of)
+        frames = sorted(frames_of[phone], key=frame_iso)
         if share > len(frames):
             pairs = count_of(len(frames), "pair")
             raise ValueError(f"data.count: {count} takes {share} of {phone}, which has {pairs}")

@@ -21,13 +21,13 @@ from rawaug.data.pairs import DATASETS, Pair
 from rawaug.data.sidd_blocks import SiddBlocks
 from rawaug.data.sidd_scenes import (
     HELD_BACK,
-    colour_of,
     even,
+    find_phone,
     index_files,
-    label_of,
-    mosaic_of,
     noise_level_functions,
-    phone_of,
+    parse_label,
+    read_sidd_colour,
+    read_sidd_mosaic,
 )
 from rawaug.io import read_picture
 
@@ -47,18 +47,18 @@ class SiddFrames(Frames):
             raise ValueError(f"{path}: contains no NOISY_RAW training frames of SIDD")
 
         self.levels = noise_level_functions(self.path)
-        self.labels = [label_of(scene) for scene, _, _ in self.shots]
+        self.labels = [parse_label(scene) for scene, _, _ in self.shots]
         super().__init__([f"{scene}_{number}" for scene, number, _ in self.shots])
 
     def read(self, index: int) -> Pair:
         scene, _, files = self.shots[index]
-        clean = mosaic_of(files["GT_RAW"])
-        noisy = mosaic_of(files["NOISY_RAW"])
+        clean = read_sidd_mosaic(files["GT_RAW"])
+        noisy = read_sidd_mosaic(files["NOISY_RAW"])
         if clean.shape != noisy.shape:
             sizes = f"{tuple(clean.shape[1:])} and {tuple(noisy.shape[1:])}"
             raise ValueError(f"{files['NOISY_RAW']}: the clean and the noisy frame differ in size, {sizes}")
 
-        gains, matrix, view = colour_of(files["METADATA_RAW"])
+        gains, matrix, view = read_sidd_colour(files["METADATA_RAW"])
         pictures = {}
         for key, kind in (("srgb", "GT_SRGB"), ("noisy_srgb", "NOISY_SRGB")):
             if kind in files:
@@ -66,7 +66,7 @@ class SiddFrames(Frames):
 
         published = self.levels.get(scene)
         shot_var, read_var = published or measure_levels(clean, noisy)
-        camera, cfa = phone_of(scene)
+        camera, cfa = find_phone(scene)
         return develop_pair(
             self.names[index],
             clean,

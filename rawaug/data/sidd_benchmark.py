@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rawaug.data.frames import Lazy
 from rawaug.data.sidd_blocks import BLOCKS, Once, block_names, blocks_of_scenes
-from rawaug.data.sidd_scenes import HELD_BACK, find_file, noise_level_functions, phone_of
+from rawaug.data.sidd_scenes import HELD_BACK, find_file, find_phone, noise_level_functions
 from rawaug.files import replacing
 from rawaug.io import RawFrame
 
@@ -36,7 +36,7 @@ class SiddBenchmark(Lazy[RawFrame]):
     def read(self, index: int) -> RawFrame:
         number, block = divmod(index, BLOCKS)
         scene = HELD_BACK[number]
-        _, cfa = phone_of(scene)
+        _, cfa = find_phone(scene)
         return RawFrame(
             self._all()[number, block],
             cfa,

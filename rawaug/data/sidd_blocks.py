@@ -27,13 +27,12 @@ from rawaug.data.noise_levels import measure_noise
 from rawaug.data.pairs import DATASETS, Pair
 from rawaug.data.sidd_scenes import (
     HELD_BACK,
-    Colour,
-    colour_of,
     find_file,
+    find_phone,
     index_files,
     matching_files,
     noise_level_functions,
-    phone_of,
+    read_sidd_colour,
 )
 from rawaug.files import require_file
 
@@ -70,8 +69,6 @@ def _correlation(a: Tensor, b: Tensor) -> Tensor:
 BLOCKS = 32
 """Number of blocks of a frame."""
 
-_NO_COLOUR = Colour(*UNKNOWN_COLOUR, 0)
-
 
 class Once(Generic[T]):
     """A function that calls ``read`` once, and returns its value or raises its error on every call."""
@@ -99,7 +96,7 @@ class _Frame(NamedTuple):
     camera: str
     cfa: CFA
     levels: tuple[float, float] | None = None
-    colour: Colour | None = None
+    colour: tuple[tuple[float, float, float], Tensor, int] | None = None
 
 
 class _Blocks(Frames):
@@ -144,12 +141,12 @@ class _Blocks(Frames):
                 images[key] = turn_like(images[key], images["raw"], frame.cfa, f"{self.path}: {frame.name}")
 
         shot_var, read_var = frame.levels or measure_noise(images["raw"].numpy(), images["noisy"].numpy())
-        colour = frame.colour or _NO_COLOUR
+        gains, matrix, _ = frame.colour or (*UNKNOWN_COLOUR, 0)
         attributes = {
             "cfa": frame.cfa,
             "camera": frame.camera,
-            "white_balance": colour.white_balance,
-            "color_matrix": colour.matrix,
+            "white_balance": gains,
+            "color_matrix": matrix,
             "shot_var": shot_var,
             "read_var": read_var,
             "levels_from_clean": frame.levels is None,
@@ -181,7 +178,7 @@ class SiddBlocks(_Blocks):
 
     def _describe(self, number: int) -> _Frame:
         name = HELD_BACK[number]
-        camera, cfa = phone_of(name)
+        camera, cfa = find_phone(name)
         return _Frame(name, camera, cfa, self._levels.get(name), self._colours.get(name))
 
     def _read_all(self) -> dict[str, Tensor]:
@@ -261,7 +258,7 @@ def blocks_of_scenes(file: Path) -> Tensor:
     return blocks
 
 
-def _colours(path: Path) -> dict[str, Colour]:
+def _colours(path: Path) -> dict[str, tuple[tuple[float, float, float], Tensor, int]]:
     """Read the colour of each scene instance of the blocks that has a METADATA file below ``path``."""
     files = {}
     for (scene, _), files_of_frame in index_files(path).items():
@@ -270,7 +267,7 @@ def _colours(path: Path) -> dict[str, Colour]:
 
     colours = {}
     for scene, file in files.items():
-        colours[scene] = colour_of(file)
+        colours[scene] = read_sidd_colour(file)
     return colours
 
 

@@ -12,7 +12,7 @@ import csv
 import re
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from torch import Tensor
 
@@ -35,7 +35,7 @@ PHONES = {
 _NAME = re.compile(r"\d{4}_(\d{3})_([A-Z0-9]{2})_(\d{5})_\d{5}_\d{4}_[LNH]")
 
 
-def label_of(name: str) -> FrameLabel:
+def parse_label(name: str) -> FrameLabel:
     """Parse scene, phone and ISO from the name of a scene instance, which is the name of its folder."""
     match = _NAME.fullmatch(name)
     if match is None or match[2] not in PHONES:
@@ -45,9 +45,9 @@ def label_of(name: str) -> FrameLabel:
     return FrameLabel(scene, phone, int(iso))
 
 
-def phone_of(name: str) -> tuple[str, CFA]:
+def find_phone(name: str) -> tuple[str, CFA]:
     """The phone of a scene instance, and the pattern of its frames."""
-    return PHONES[label_of(name).phone]
+    return PHONES[parse_label(name).phone]
 
 
 def is_scene(name: str) -> bool:
@@ -61,7 +61,7 @@ HELD_BACK = tuple(Path(__file__).with_name("sidd.txt").read_text(encoding="ascii
 _FILE = re.compile(r"(?:\d{4}_)?(GT_RAW|NOISY_RAW|METADATA_RAW|GT_SRGB|NOISY_SRGB)_(\d{3})\.(?:mat|png)", re.IGNORECASE)
 
 
-def mosaic_of(file: Path) -> Tensor:
+def read_sidd_mosaic(file: Path) -> Tensor:
     """Read the mosaic ``x`` of a frame, float32 ``(1, H, W)``; an odd side loses its last line."""
     return even(to_raw(read_array(file, "x"), 2, file))
 
@@ -111,22 +111,14 @@ def index_files(path: Path) -> dict[tuple[str, str], dict[str, Path]]:
     return index
 
 
-class Colour(NamedTuple):
-    """Gains, colour matrix and upright view from a METADATA file."""
-
-    white_balance: tuple[float, float, float]
-    matrix: Tensor
-    upright_view: int
-
-
-def colour_of(file: Path) -> Colour:
-    """Read the colour that a METADATA file states."""
+def read_sidd_colour(file: Path) -> tuple[tuple[float, float, float], Tensor, int]:
+    """Read white balance, colour matrix ``(3, 3)`` and upright view of a METADATA file."""
     tags: dict[str, Any] = read_value(file, "metadata")
     try:
         gains = gains_from_neutral(tags["AsShotNeutral"])
         matrix = srgb_from_camera(tags["ColorMatrix2"])
         view = view_of_orientation(int(tags.get("Orientation", 1)))
-        return Colour(gains, matrix, view)
+        return gains, matrix, view
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise ValueError(f"{file}: has no valid AsShotNeutral and ColorMatrix2 ({error}); download it again") from error
 

@@ -11,7 +11,7 @@ from rawaug.denoising.pictures import LINEAR, PictureFiles
 from rawaug.denoising.raw import Greens, RawFiles
 from rawaug.files import files_below, require_output
 from rawaug.io import RawFrame
-from rawaug.io.content import ALL_PICTURE_EXTENSIONS, RAW_EXTENSIONS, content_of, picture_extensions
+from rawaug.io.content import ALL_PICTURE_EXTENSIONS, RAW_EXTENSIONS, identify_content, picture_extensions
 
 
 def denoise(
@@ -132,7 +132,7 @@ def _is_raw(source: str | Path | RawFrame) -> bool:
         has_pictures = not extensions.isdisjoint(ALL_PICTURE_EXTENSIONS)
         return not has_pictures or not extensions.isdisjoint(RAW_EXTENSIONS)
 
-    kind = content_of(path).kind
+    kind = identify_content(path).kind
     if kind not in ("raw", "picture"):
         raise ValueError(f"{path}: is neither camera RAW nor a picture of a known format; check that it is complete")
     return kind == "raw"

@@ -196,7 +196,7 @@ def load_noise(noise: Noise, denoiser: ImageDenoiser) -> Noise:
     return camera_law(laws[0])
 
 
-def as_json(noise: Noise) -> Any:
+def noise_as_json(noise: Noise) -> Any:
     """Convert the setting to what JSON can hold."""
     if isinstance(noise, MeasuredLevels):
         return noise.spec()

@@ -34,7 +34,7 @@ from rawaug.denoising.defects import find_lone_sites, mend_sites, read_defects
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.denoising.folder import Files
 from rawaug.denoising.guard import SECOND, guard_result
-from rawaug.denoising.levels import Noise, as_json, find_levels, load_noise
+from rawaug.denoising.levels import Noise, find_levels, load_noise, noise_as_json
 from rawaug.errors import count_of, escape
 from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
@@ -229,7 +229,7 @@ class RawFiles(Files[Denoised]):
         settings = dict(self.denoiser.settings)
         if settings:
             settings["self_ensemble"] = self.denoiser.views > 1
-        settings["noise"] = as_json(self.noise)
+        settings["noise"] = noise_as_json(self.noise)
 
         if self.greens != "auto":
             settings["greens"] = self.greens

@@ -20,7 +20,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.data.pairs import centre
 from rawaug.errors import escape, extra
-from rawaug.evaluation.scores import NOISY, Denoiser, to_domain
+from rawaug.evaluation.scores import NOISY, ScoredDenoiser, to_domain
 from rawaug.evaluation.trials import Trial
 from rawaug.files import write_bytes
 from rawaug.metrics import psnr
@@ -72,7 +72,7 @@ class Panels:
         return self.trial.develop(image)
 
 
-def make_panels(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = NOISY) -> Panels:
+def make_panels(denoisers: Sequence[ScoredDenoiser], trial: Trial, noisy: ScoredDenoiser = NOISY) -> Panels:
     """Make the pictures of a trial: noisy, denoised by each denoiser, and clean.
 
     Captions state the PSNR. That of the clean image states its own noise, as the PSNR of a perfect denoiser. ``noisy``
@@ -81,7 +81,7 @@ def make_panels(denoisers: Sequence[Denoiser], trial: Trial, noisy: Denoiser = N
     panels = Panels(trial)
     clean = trial.compared(trial.clean)
 
-    titles: dict[str, Denoiser] = {"noisy": noisy}
+    titles: dict[str, ScoredDenoiser] = {"noisy": noisy}
     for denoiser in denoisers:
         titles[denoiser.name] = denoiser
 

@@ -23,7 +23,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA, noise_variance
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import Levels, Noisy
-from rawaug.evaluation.scores import NOISY, Denoiser, group_rows, score, summary
+from rawaug.evaluation.scores import NOISY, ScoredDenoiser, group_rows, score, summary
 from rawaug.evaluation.trials import Trial, freeze_noise, raw_trial
 from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, SensorNoise
@@ -54,7 +54,7 @@ _DRAWS = 4
 
 
 def measure_harm(
-    denoisers: Sequence[Denoiser], frames: Sequence[Pair], crop: int, seed: int = 0
+    denoisers: Sequence[ScoredDenoiser], frames: Sequence[Pair], crop: int, seed: int = 0
 ) -> dict[str, dict[str, Any]]:
     """Measure denoisers in all conditions, levels told.
 
@@ -89,7 +89,7 @@ def _frame_trial(frame: Pair, column: str, seed: int) -> Trial:
     return raw_trial(frame, noisy, packed, variance, levels, CFA(frame.cfa), strength=column)
 
 
-def _measure_kept(denoiser: Denoiser, seed: int) -> dict[str, dict[str, float]]:
+def _measure_kept(denoiser: ScoredDenoiser, seed: int) -> dict[str, dict[str, float]]:
     """Measure the share of its flux that a light keeps, by width and place."""
     kept: dict[str, dict[str, float]] = {}
     for width in WIDTHS:
@@ -109,7 +109,7 @@ def _sum_flux(image: Tensor) -> float:
     return float((image[..., _AROUND, _AROUND] - _GROUND).sum())
 
 
-def _measure_fields(denoiser: Denoiser, seed: int) -> dict[str, float]:
+def _measure_fields(denoiser: ScoredDenoiser, seed: int) -> dict[str, float]:
     """Measure the PSNR of fields of lights, by width."""
     fields = {}
     for width in WIDTHS:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from rawaug.data.picture_pairs import PicturePair
 from rawaug.errors import count_of, extra
-from rawaug.evaluation.scores import NOISY, Denoiser, group_rows, score, summary
+from rawaug.evaluation.scores import NOISY, ScoredDenoiser, group_rows, score, summary
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial, make_trials
 
@@ -63,7 +63,7 @@ def register(noisy: Tensor, clean: Tensor) -> Tensor:
     return torch.from_numpy(np.stack(planes)).float().clamp(0.0, 1.0)
 
 
-def picture_scores(denoisers: Sequence[Denoiser], pairs: Sequence[Any]) -> dict[str, Any]:
+def picture_scores(denoisers: Sequence[ScoredDenoiser], pairs: Sequence[Any]) -> dict[str, Any]:
     """Score every denoiser on pairs of pictures: ``rows`` by name and condition, as in ``rawaug evaluate --json``."""
     rows: dict[str, dict[str, Any]] = {}
     for condition in (PUBLISHED, REGISTERED):

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
@@ -30,7 +29,7 @@ _SHOWN_FAULTS = 5
 """Maximum number of infinite or NaN scores that an error names."""
 
 
-class Denoiser(Protocol):
+class ScoredDenoiser(Protocol):
     """A denoiser that can be scored: :class:`rawaug.RawDenoiser`, and anything that gives developed pictures in [0, 1].
 
     Attributes:
@@ -49,12 +48,13 @@ class Denoiser(Protocol):
     def __call__(self, noisy: Noisy) -> Tensor: ...
 
 
-@dataclass(frozen=True)
 class NoisyInput:
-    """The input itself, as a denoiser that changes nothing."""
+    """The input itself, as a denoiser that changes nothing, by the ``name`` that it has in tables."""
 
-    name: str = "noisy input"
-    takes: str = ""
+    takes = ""
+
+    def __init__(self, name: str = "noisy input") -> None:
+        self.name = name
 
     def __call__(self, noisy: Noisy) -> Tensor:
         return noisy.image
@@ -100,7 +100,7 @@ class Row(NamedTuple):
         return ", ".join(filter(None, [self.condition, self.strength]))
 
 
-def score(denoisers: Sequence[Denoiser], trials: Iterable[Trial], label: str = "") -> Iterator[Row]:
+def score(denoisers: Sequence[ScoredDenoiser], trials: Iterable[Trial], label: str = "") -> Iterator[Row]:
     """Score every denoiser on every trial, with one trial in memory at a time.
 
     Args:
@@ -126,7 +126,7 @@ def score(denoisers: Sequence[Denoiser], trials: Iterable[Trial], label: str = "
             yield from _score_one(denoiser, trial)
 
 
-def _score_one(denoiser: Denoiser, trial: Trial) -> Iterator[Row]:
+def _score_one(denoiser: ScoredDenoiser, trial: Trial) -> Iterator[Row]:
     """Make the rows of one denoiser on one trial: several if several ways lead to the trial's domain."""
     noisy = trial.input_for(denoiser)
 

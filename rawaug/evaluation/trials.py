@@ -21,7 +21,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA, crop_to_cfa, noise_variance
-from rawaug.data.development import develop_packed, exposure_of
+from rawaug.data.development import develop_packed, exposure_gain
 from rawaug.data.frames import Cached, Frames, as_frames
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import Levels, Noisy
@@ -165,7 +165,7 @@ def raw_trial(
         cfa: the pattern by which all three are packed.
         about: other attributes of the trial.
     """
-    develop = partial(develop_packed, cfa=cfa, pair=pair, exposure=exposure_of(clean, pair))
+    develop = partial(develop_packed, cfa=cfa, pair=pair, exposure=exposure_gain(clean, pair))
     own = None
     if pair.own_noise is not None:
         own = noise_variance(clean, *pair.own_noise).mean().item()

@@ -32,7 +32,7 @@ from denoisers.mosaic import lines_before, with_planes
 from denoisers.network import PACKED
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.development import exposure_of, render_rgb
+from rawaug.data.development import exposure_gain, render_rgb
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import Noisy
 from rawaug.errors import extra
@@ -97,7 +97,7 @@ def rgb_trial(
         "rgb",
         levels=levels,
         cfa=bayer.canonical_cfa(cfa),
-        develop=partial(develop_rgb, pair=pair, exposure=exposure_of(bayer.pack_rgb(rgb, CFA.RGGB), pair)),
+        develop=partial(develop_rgb, pair=pair, exposure=exposure_gain(bayer.pack_rgb(rgb, CFA.RGGB), pair)),
         ways=follow,
         **about,
     )

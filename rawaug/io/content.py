@@ -1,8 +1,8 @@
 """The content of a file by its first bytes: camera RAW, a picture, or neither.
 
 Names can be misleading: iPhones write HEIC that is renamed to .jpg; DNG, NEF and CR2 are TIFF files whose first picture
-is a thumbnail; and downloads may have no extension at all. Every command asks :func:`content_of`. If the bytes say
-nothing (RAW without a header, an empty file), the extension decides, so that the reader can say what is wrong.
+is a thumbnail; and downloads may have no extension at all. Every command asks :func:`identify_content`. If the bytes
+say nothing (RAW without a header, an empty file), the extension decides, so that the reader can say what is wrong.
 
 A TIFF is RAW if it has a DNG's version, or a directory whose pixels are a mosaic (photometric interpretation 32803) or
 linear RAW (34892). Source: TIFF 6.0; DNG 1.7.1; ISO/IEC 14496-12 (brands of HEIF); the signatures of each format.
@@ -80,7 +80,7 @@ _DNG_VERSION, _LEAF = 50706, 34310
 _RAW_PHOTOMETRICS = (32803, 34892)
 
 
-def content_of(path: str | Path) -> Content:
+def identify_content(path: str | Path) -> Content:
     """Identify a file by its first bytes, or by its extension if they say nothing.
 
     Raises:
@@ -88,17 +88,17 @@ def content_of(path: str | Path) -> Content:
         OSError: if it is not a regular file, or cannot be read.
 
     Example:
-        >>> content_of("IMG_0001.jpg").format  # doctest: +SKIP
+        >>> identify_content("IMG_0001.jpg").format  # doctest: +SKIP
         'HEIC'
     """
     path = Path(path)
     require_file(path)
     with path.open("rb") as file:
-        return content_of_opened(file, path)
+        return identify_opened(file, path)
 
 
-def content_of_opened(file: BinaryIO, path: Path) -> Content:
-    """Identify a file that is open at its beginning, as :func:`content_of` does."""
+def identify_opened(file: BinaryIO, path: Path) -> Content:
+    """Identify a file that is open at its beginning, as :func:`identify_content` does."""
     content = _by_bytes(file)
     if content.kind == "other" or content.format == "TIFF":
         return _by_extension(path.suffix.lower(), content)
@@ -106,8 +106,8 @@ def content_of_opened(file: BinaryIO, path: Path) -> Content:
 
 
 def is_raw(path: str | Path) -> bool:
-    """Tell whether a file is camera RAW; see :func:`content_of`."""
-    return content_of(path).kind == "raw"
+    """Tell whether a file is camera RAW; see :func:`identify_content`."""
+    return identify_content(path).kind == "raw"
 
 
 def _by_bytes(file: BinaryIO) -> Content:

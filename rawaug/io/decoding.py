@@ -25,7 +25,7 @@ from rawaug.errors import extra, how_to_install
 from rawaug.files import require_file
 from rawaug.io.bitmaps import is_rle4, unpack_rle4
 from rawaug.io.colour import Colour, colour_from_chromaticities, require_sdr
-from rawaug.io.content import content_of_opened, reads_avif, reads_heic
+from rawaug.io.content import identify_opened, reads_avif, reads_heic
 from rawaug.io.headers import ICC_TAG, Headers, headers_of_opened, mend_jpeg_header, png_fault
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.tiff_pictures import TiffKind, choose_tiff_reader, decode_tiff_codes, read_tiff_kind
@@ -87,7 +87,7 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, coarse: bool = False) -> De
     require_file(path, "picture file")
     require_utf8(path)
     with path.open("rb") as file:
-        content = content_of_opened(file, path)
+        content = identify_opened(file, path)
         headers = headers_of_opened(file, content.format)
     if content.kind == "raw":
         raise ValueError(f"{path}: is camera RAW ({content.format}), not a developed picture; develop it first")
@@ -287,7 +287,7 @@ def decode_part(
     """
     require_utf8(path)
     with path.open("rb") as file:
-        if content_of_opened(file, path).format != "JPEG":
+        if identify_opened(file, path).format != "JPEG":
             return None
         headers = headers_of_opened(file, "JPEG")
         file.seek(-len(_END_OF_JPEG), os.SEEK_END)

@@ -390,7 +390,7 @@ def _of_bmp(file: BinaryIO) -> Headers:
 # -- boxes of HEIF and JPEG XL -----------------------------------------------------------------------------------------
 
 
-class Box(NamedTuple):
+class MediaBox(NamedTuple):
     """A box, with its name and the places where its contents begin and end."""
 
     name: bytes
@@ -398,7 +398,7 @@ class Box(NamedTuple):
     end: int
 
 
-def boxes(file: BinaryIO, start: int, end: int) -> Iterator[Box]:
+def boxes(file: BinaryIO, start: int, end: int) -> Iterator[MediaBox]:
     """Yield the boxes between two places of a file."""
     offset = start
     for _ in range(_MOST_CHUNKS):
@@ -414,13 +414,13 @@ def boxes(file: BinaryIO, start: int, end: int) -> Iterator[Box]:
         beyond = offset + size if size else end
         if beyond < inside or beyond > end:
             return
-        yield Box(name, inside, beyond)
+        yield MediaBox(name, inside, beyond)
         offset = beyond
 
 
 def _of_heif(file: BinaryIO) -> Headers:
     """Read the colour of the primary item, whose profile counts before its code points; the decoder gives EXIF."""
-    meta = _inner_boxes(file, Box(b"", 0, file.seek(0, 2))).get(b"meta")
+    meta = _inner_boxes(file, MediaBox(b"", 0, file.seek(0, 2))).get(b"meta")
     if meta is None:
         return Headers()
     in_meta = _inner_boxes(file, meta._replace(start=meta.start + 4))
@@ -453,22 +453,22 @@ def _of_heif(file: BinaryIO) -> Headers:
         return Headers(unread=str(error))
 
 
-def _inner_boxes(file: BinaryIO, outer: Box) -> dict[bytes, Box]:
+def _inner_boxes(file: BinaryIO, outer: MediaBox) -> dict[bytes, MediaBox]:
     """Find the first box of each name within a box."""
-    inner: dict[bytes, Box] = {}
+    inner: dict[bytes, MediaBox] = {}
     for box in boxes(file, outer.start, outer.end):
         inner.setdefault(box.name, box)
     return inner
 
 
-def _primary_item(file: BinaryIO, box: Box) -> int:
+def _primary_item(file: BinaryIO, box: MediaBox) -> int:
     """Read the number of the item that is the picture."""
     file.seek(box.start)
     data = file.read(min(8, box.end - box.start))
     return int.from_bytes(data[4:8] if data[0] else data[4:6], "big")
 
 
-def _properties_of_item(file: BinaryIO, box: Box, item: int) -> list[int]:
+def _properties_of_item(file: BinaryIO, box: MediaBox, item: int) -> list[int]:
     """Read the places of an item's properties in their list, the first being 0."""
     file.seek(box.start)
     data = file.read(min(box.end - box.start, _MOST_BYTES))

@@ -339,7 +339,7 @@ def _end_of_picture(source: bytes) -> int:
 
 def _with_places(new: bytes, segments: list[Segment], source: bytes, end: int) -> bytes:
     """Update the list of pictures (MPF) of the new first picture, if it has one, with the others' new places."""
-    listing = _listing_of(segments)
+    listing = _pack_listing(segments)
     if listing is None:
         return new
 
@@ -365,7 +365,7 @@ def _with_places(new: bytes, segments: list[Segment], source: bytes, end: int) -
     return new[:new_place] + bytes(block) + new[new_place + len(block) :]
 
 
-def _listing_of(segments: Iterable[Segment]) -> bytes | None:
+def _pack_listing(segments: Iterable[Segment]) -> bytes | None:
     """Find the list of pictures in a JPEG of several."""
     for segment in segments:
         if segment.marker == _APP2 and segment.data.startswith(_MPF_PREFIX):
@@ -447,7 +447,7 @@ def dress_tiff(plain: bytes, metadata: Metadata, upright: bool) -> bytes:
     """
     tiff = TiffFile(BytesIO(plain))
     order = tiff.order
-    block = _block_of(metadata, order, upright)
+    block = _pack_exif(metadata, order, upright)
 
     start = len(block) + len(block) % 2
     offset = start
@@ -487,7 +487,7 @@ def _tags_of_block(block: bytes) -> list[Tag]:
     return tiff.tags(_without_layout(entries.values()) + pointers)
 
 
-def _block_of(metadata: Metadata, order: str, upright: bool) -> bytes:
+def _pack_exif(metadata: Metadata, order: str, upright: bool) -> bytes:
     """Return the EXIF block, or an empty one if there is none or it is damaged."""
     if metadata.exif is not None:
         try:

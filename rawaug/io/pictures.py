@@ -26,7 +26,7 @@ from rawaug.bayer import turn
 from rawaug.errors import extra
 from rawaug.files import replacing, require_file, write_bytes
 from rawaug.io.colour import SRGB, to_srgb
-from rawaug.io.content import content_of
+from rawaug.io.content import identify_content
 from rawaug.io.decoding import MAX_PIXELS as MAX_PIXELS
 from rawaug.io.decoding import Decoded, decode, decode_part, load_oiio, reason
 from rawaug.io.decoding import require_utf8 as require_utf8
@@ -262,7 +262,7 @@ def read_exposure(path: str | Path) -> float:
         ValueError: if the EXIF lacks one of the three.
     """
     require_file(path, "picture file")
-    exposure = _exposure_of(Path(path))
+    exposure = _exposure_tags(Path(path))
     missing = [name for name, value in exposure.items() if not 0 < value < math.inf]
     if missing:
         raise ValueError(f"{path}: its EXIF has no {' or '.join(missing)}; give the exposures as ev=")
@@ -271,10 +271,10 @@ def read_exposure(path: str | Path) -> float:
     return math.log2(seconds * speed / (100.0 * f_number**2))
 
 
-def _exposure_of(path: Path) -> dict[str, float]:
+def _exposure_tags(path: Path) -> dict[str, float]:
     """Read seconds, f-number and ISO as EXIF states them, with 0 for none."""
     values = {"exposure time": 0.0, "f-number": 0.0, "ISO": 0.0}
-    exif = read_exif(path, content_of(path).format)
+    exif = read_exif(path, identify_content(path).format)
     if exif is None:
         return values
 

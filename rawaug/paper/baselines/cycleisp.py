@@ -18,7 +18,7 @@ import os
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from denoisers.cycleisp import Trunk, load_published
+from denoisers.cycleisp import Trunk, load_part
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.functional import as_float
@@ -176,7 +176,7 @@ class CycleISP(CropTrainedISP):
     def load_published(self, path: str | os.PathLike[str], part: str = "rgb2raw") -> None:
         """Take the RGGB weights of a published checkpoint.
 
-        Nothing in the file is run as code; errors are those of :func:`denoisers.cycleisp.load_published`.
+        Nothing in the file is run as code; errors are those of :func:`denoisers.cycleisp.load_part`.
 
         Args:
             path: path of the checkpoint.
@@ -185,4 +185,4 @@ class CycleISP(CropTrainedISP):
         networks = {"rgb2raw": self.reverse_network, "raw2rgb": self.raw2rgb, "ccm": self.colour_branch}
         if part not in networks:
             raise ValueError(f"part must be one of {', '.join(networks)}, got {part!r}")
-        load_published(networks[part], path, part)
+        load_part(networks[part], path, part)

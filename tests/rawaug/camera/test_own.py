@@ -99,10 +99,10 @@ def test_pairs_replay_bit_for_bit(sheet: Path, tmp_path: Path) -> None:
 
 
 def test_info_prints_the_sheet_back(sheet: Path) -> None:
-    text = info.describe(sheet)
+    text = info.describe_file(sheet)
     for part in ("Maker M1", "GRBG", "black 64, white 1000 DN", "gains 1.3100 1.0000 2.6400", "ISO 3200", "linear"):
         assert part in text
-    content = info.as_json(sheet)
+    content = info.read_facts(sheet)
     assert Camera.from_json(content["figures"]) == Camera.load(sheet)
     assert content["lights"]["D65"]["gains"] == pytest.approx(GAINS["D65"])
     assert content["noise"][1]["shot_var"] == pytest.approx(0.96 / FULL_SCALE)

@@ -12,7 +12,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from rawaug.cli import main
 from rawaug.commands.export import export_cube
-from rawaug.commands.info import as_json
+from rawaug.commands.info import read_facts
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading
 
@@ -53,7 +53,7 @@ def test_the_commands_write_and_print_and_refuse(
 ) -> None:
     assert main(["info", "canon-powershot", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert printed == json.loads(json.dumps(as_json("canon-powershot")))
+    assert printed == json.loads(json.dumps(read_facts("canon-powershot")))
     assert len(printed["tone_curve"]) == 256 and printed["kind"] == "isp"
     assert main(["info", "rawaug-small", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["name"] == "DRUNet"

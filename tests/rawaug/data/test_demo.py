@@ -18,7 +18,7 @@ from rawaug.data.demo import (
     PHOTOGRAPHS,
     PICTURES_ONLY,
     WHITE,
-    Shot,
+    DemoShot,
     _leaves,
     _pair,
     _shading,
@@ -34,7 +34,7 @@ def flat(level: int, size: int = 192) -> torch.Tensor:
     return torch.full((3, size, size), level, dtype=torch.uint8)
 
 
-DAYLIGHT = Shot(white_balance=(2.0, 1.0, 1.5), exposure=0.9, iso=100, noise_seed=7)
+DAYLIGHT = DemoShot(white_balance=(2.0, 1.0, 1.5), exposure=0.9, iso=100, noise_seed=7)
 
 
 def test_capture_is_sample_and_apply_and_replays_bit_for_bit() -> None:

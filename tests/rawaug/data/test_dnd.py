@@ -57,7 +57,7 @@ def test_boxes_are_cut_where_the_kit_cuts_them(folder: Path) -> None:
 def test_patterns_are_matlabs_and_move_with_the_box(folder: Path) -> None:
     dnd = Dnd(folder)
     for k, name in enumerate(CFAS):
-        assert dnd.frames[k].cfa == CFA(name)
+        assert dnd.frames[k][1] == CFA(name)
         top, left = (info(k)["boundingboxes"][0][:2] - 1).astype(int)
         assert dnd[20 * k].cfa == CFA(name).shift(top, left)
 

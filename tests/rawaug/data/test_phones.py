@@ -19,14 +19,14 @@ from rawaug.data.phones import (
     Shot,
     balance,
     colour_matrix,
-    noise_levels,
+    phone_curve,
+    phone_noise,
     shading,
-    take,
-    tone_curve,
+    take_shot,
 )
 from rawaug.data.scenes import camera_in_light, scene_files, white_point
 from rawaug.data.selection import select_pairs
-from rawaug.data.sidd_scenes import HELD_BACK, label_of
+from rawaug.data.sidd_scenes import HELD_BACK, parse_label
 from rawaug.io.pictures import write_picture
 
 PLAIN = Shot(kelvin=5500, stops=0.5, iso=100, balance_error=0.0, tint_error=(0.0, 0.0), lift_error=0.0)
@@ -56,7 +56,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("iso", [50, 1600])
 def test_noise_has_the_published_levels_and_no_bias(code: str, iso: int) -> None:
     phone = CAMERAS[code]
-    pair = take(phone, grey(), PLAIN._replace(iso=iso), generator())
+    pair = take_shot(phone, grey(), PLAIN._replace(iso=iso), generator())
     assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
     noise = (pair.noisy - pair.raw).double()
     step = 1 / (WHITE - phone.black)
@@ -66,24 +66,24 @@ def test_noise_has_the_published_levels_and_no_bias(code: str, iso: int) -> None
 
 
 def test_noise_of_black_is_not_clipped() -> None:
-    pair = take(CAMERAS["N6"], grey(0.0), PLAIN._replace(iso=3200), generator())
+    pair = take_shot(CAMERAS["N6"], grey(0.0), PLAIN._replace(iso=3200), generator())
     assert pair.noisy is not None
     assert (pair.noisy < 0).float().mean() > 0.3
 
 
 def test_levels_between_published_isos_lie_between_them_and_are_held_beyond() -> None:
     pixel = CAMERAS["GP"]
-    assert noise_levels(pixel, 400) == pytest.approx((0.000886, 5e-6))
-    shot, read = noise_levels(pixel, 200)
+    assert phone_noise(pixel, 400) == pytest.approx((0.000886, 5e-6))
+    shot, read = phone_noise(pixel, 200)
     assert 0.000228 < shot < 0.000886 and 2e-6 < read < 5e-6
-    assert noise_levels(pixel, 50) == (0.000228, 2e-6)
-    assert noise_levels(CAMERAS["G4"], 1600) == (0.003356, 6.3e-5)
+    assert phone_noise(pixel, 50) == (0.000228, 2e-6)
+    assert phone_noise(CAMERAS["G4"], 1600) == (0.003356, 6.3e-5)
 
 
 @pytest.mark.parametrize("code", CODES)
 def test_noisy_raw_has_ten_bits_and_the_pattern_of_the_phone(code: str) -> None:
     phone = CAMERAS[code]
-    pair = take(phone, torch.rand(3, 32, 48, generator=generator()), PLAIN, generator())
+    pair = take_shot(phone, torch.rand(3, 32, 48, generator=generator()), PLAIN, generator())
     assert pair.noisy is not None and pair.cfa == phone.cfa and pair.camera == phone.name
     numbers = pair.noisy.double() * (WHITE - phone.black) + phone.black
     assert (numbers - numbers.round()).abs().max() < 1e-3
@@ -95,7 +95,7 @@ def test_noisy_raw_has_ten_bits_and_the_pattern_of_the_phone(code: str) -> None:
 @pytest.mark.parametrize("kelvin", LIGHTS)
 def test_raw_of_grey_has_the_colour_of_the_light_to_the_camera(code: str, kelvin: int) -> None:
     phone = CAMERAS[code]
-    pair = take(phone, grey(), PLAIN._replace(kelvin=kelvin), generator())
+    pair = take_shot(phone, grey(), PLAIN._replace(kelvin=kelvin), generator())
     middle = pack(pair.raw, phone.cfa)[:, 31:33, 31:33].mean((1, 2))
     response = camera_in_light(phone.xyz_to_camera, kelvin).sum(1)
     assert float(middle[0] / middle[1]) == pytest.approx(float(response[0] / response[1]), rel=0.01)
@@ -105,10 +105,10 @@ def test_raw_of_grey_has_the_colour_of_the_light_to_the_camera(code: str, kelvin
 @pytest.mark.parametrize("code", CODES)
 def test_lamps_stay_warm_by_the_phones_own_share(code: str) -> None:
     phone = CAMERAS[code]
-    lamp = take(phone, grey(0.1), PLAIN._replace(kelvin=3200), generator()).srgb.float().mean((1, 2))
+    lamp = take_shot(phone, grey(0.1), PLAIN._replace(kelvin=3200), generator()).srgb.float().mean((1, 2))
     assert lamp[0] > lamp[1] > lamp[2]
     knowing = phone._replace(rendering=phone.rendering._replace(adaptation=1.0))
-    neutral = take(knowing, grey(0.1), PLAIN._replace(kelvin=3200), generator()).srgb.float().mean((1, 2))
+    neutral = take_shot(knowing, grey(0.1), PLAIN._replace(kelvin=3200), generator()).srgb.float().mean((1, 2))
     assert float(neutral.max() - neutral.min()) < 2.0
     assert float(lamp.max() - lamp.min()) > 8.0
 
@@ -123,18 +123,18 @@ def test_a_warmer_picture_is_of_smaller_red_gains() -> None:
 
 def test_a_dark_frame_is_lifted_by_parts() -> None:
     phone = CAMERAS["GP"]
-    bright, dark = (take(phone, grey(0.5), PLAIN._replace(stops=stops), generator()) for stops in (0.0, 2.0))
+    bright, dark = (take_shot(phone, grey(0.5), PLAIN._replace(stops=stops), generator()) for stops in (0.0, 2.0))
     ratio = float(dark.raw.mean() / bright.raw.mean())
     assert ratio == pytest.approx(0.25, rel=0.01)
     careless = phone._replace(rendering=phone.rendering._replace(lift=0.0))
-    unlifted = take(careless, grey(0.5), PLAIN._replace(stops=2.0), generator())
+    unlifted = take_shot(careless, grey(0.5), PLAIN._replace(stops=2.0), generator())
     levels = [float(pair.srgb.float().mean()) for pair in (unlifted, dark, bright)]
     assert levels[0] + 5.0 < levels[1] < levels[2] - 5.0
 
 
 def test_the_white_balance_of_a_pair_is_the_renderers() -> None:
     shot = PLAIN._replace(tint_error=(0.2, -0.1))
-    pair = take(CAMERAS["G4"], grey(), shot, generator())
+    pair = take_shot(CAMERAS["G4"], grey(), shot, generator())
     gains = balance(CAMERAS["G4"], shot)
     assert pair.white_balance == pytest.approx((float(gains[0] / gains[1]), 1.0, float(gains[2] / gains[1])))
     assert torch.allclose(pair.color_matrix.sum(1), torch.ones(3), atol=1e-5)
@@ -144,7 +144,7 @@ def test_the_white_balance_of_a_pair_is_the_renderers() -> None:
 @pytest.mark.parametrize("code", CODES)
 def test_tone_curves_rise_from_black_to_white(code: str) -> None:
     law = CAMERAS[code].rendering
-    curve = tone_curve(torch.linspace(0, 1, 4096), law.brightness, law.contrast)
+    curve = phone_curve(torch.linspace(0, 1, 4096), law.brightness, law.contrast)
     assert (curve.diff() > 0).all()
     assert curve[0] == pytest.approx(0, abs=1e-6) and curve[-1] == pytest.approx(1, abs=1e-6)
 
@@ -179,7 +179,7 @@ def test_frames_have_the_names_and_counts_of_sidd() -> None:
     assert set(phones.values()) == {64} and set(phones) == set(CAMERAS)
     for name, label in zip(frames.names, frames.labels, strict=True):
         instance, _, number = name.rpartition("_")
-        assert label_of(instance) == label and number in ("010", "011")
+        assert parse_label(instance) == label and number in ("010", "011")
         assert 50 <= label.iso <= 3200
 
 

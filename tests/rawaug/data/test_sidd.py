@@ -23,7 +23,7 @@ from rawaug.data import SiddBenchmark, check, open_pairs, sidd_blocks, write_sub
 from rawaug.data.mat import read_array
 from rawaug.data.sidd import SiddFrames
 from rawaug.data.sidd_blocks import SiddBlocks, SiddPlusBlocks
-from rawaug.data.sidd_scenes import HELD_BACK, PHONES, phone_of
+from rawaug.data.sidd_scenes import HELD_BACK, PHONES, find_phone
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.io import RawFrame, write_picture
@@ -64,7 +64,7 @@ def write_scene(
 ) -> None:
     """One scene instance of SIDD Medium."""
     for number in numbers:
-        clean = clean_frame(phone_of(name)[1])
+        clean = clean_frame(find_phone(name)[1])
         at = folder / name / f"{name[:4]}_"
         for kind, frame in (("GT", clean), ("NOISY", noisy_frame(clean, int(number)))):
             mat73(Path(f"{at}{kind}_RAW_{number}.MAT"), {"x": frame[0].numpy()})
@@ -188,7 +188,7 @@ def flat_frame(cfa: CFA) -> torch.Tensor:
 def blocks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Validation and benchmark as published, with blocks of 16 x 16: each in the pattern of its scene instance."""
     folder = tmp_path_factory.mktemp("sidd_blocks")
-    clean = torch.stack([flat_frame(phone_of(name)[1]).expand(32, SIDE, SIDE) for name in HELD_BACK])
+    clean = torch.stack([flat_frame(find_phone(name)[1]).expand(32, SIDE, SIDE) for name in HELD_BACK])
     clean = clean * torch.linspace(0.2, 1, 32)[:, None, None]
     noisy = noisy_frame(clean)
     for name, values in (("ValidationGt", clean), ("ValidationNoisy", noisy), ("BenchmarkNoisy", noisy.flip(1))):
@@ -332,7 +332,7 @@ def raw_of(camera: DictionaryISP, pictures: Tensor) -> Tensor:
     """Mosaics ``(2, 32, SIDE, SIDE)`` in the pattern of each scene's phone, of 12 bits."""
     mosaics = []
     for name, srgb in zip(SCENES, pictures, strict=True):
-        camera.configure(cfa=str(phone_of(name)[1]))
+        camera.configure(cfa=str(find_phone(name)[1]))
         mosaics.append(camera.reverse(srgb).raw[:, 0])
     camera.configure(cfa="GRBG")
     return (4095 * torch.stack(mosaics)).round() / 4095

@@ -11,7 +11,7 @@ import torch
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.development import develop_packed, exposure_of
+from rawaug.data.development import develop_packed, exposure_gain
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.figures import Panels, save_picture
 from rawaug.evaluation.tables import mean_and_spread, print_table
@@ -34,8 +34,8 @@ def test_grey_is_developed_to_grey_and_the_brightest_near_white(grey_pair: Pair)
     panel = develop_packed(packed, CFA.GBRG, grey_pair)
     torch.testing.assert_close(panel, panel[:1].expand(3, 32, 32), atol=1e-5, rtol=0)
     assert panel.mean().item() == pytest.approx(0.665, abs=0.002)  # the sRGB value of linear 0.4
-    assert exposure_of(packed, grey_pair) * 0.4 == pytest.approx(0.9, abs=1e-4)
-    assert exposure_of(packed * 0, replace(grey_pair, raw=grey_pair.raw * 0)) < 1e4
+    assert exposure_gain(packed, grey_pair) * 0.4 == pytest.approx(0.9, abs=1e-4)
+    assert exposure_gain(packed * 0, replace(grey_pair, raw=grey_pair.raw * 0)) < 1e4
 
 
 def test_the_figure_is_written(grey_pair: Pair, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from rawaug.cli import main
 from rawaug.data import PictureFolder, check
 from rawaug.data.folders import reports
 from rawaug.io import content, read_picture
-from rawaug.io.content import content_of, list_pictures
+from rawaug.io.content import identify_content, list_pictures
 from rawaug.io.directories import Tag, pack_directory
 
 Dng = Callable[..., Path]
@@ -48,7 +48,7 @@ HEADS: dict[str, tuple[bytes, str, str]] = {
 def test_a_file_is_what_its_bytes_say(tmp_path: Path, name: str, extension: str) -> None:
     data, kind, format_name = HEADS[name]
     (tmp_path / f"a{extension}").write_bytes(data)
-    assert content_of(tmp_path / f"a{extension}") == (kind, format_name)
+    assert identify_content(tmp_path / f"a{extension}") == (kind, format_name)
 
 
 def test_a_wrong_extension_does_not_deceive_and_decides_where_bytes_tell_nothing(
@@ -56,15 +56,15 @@ def test_a_wrong_extension_does_not_deceive_and_decides_where_bytes_tell_nothing
 ) -> None:
     bayer_dng(tmp_path / "a.dng", np.full((32, 48), 1000, np.uint16))
     (tmp_path / "a.jpg").write_bytes((tmp_path / "a.dng").read_bytes())
-    assert content_of(tmp_path / "a.jpg") == ("raw", "DNG")
+    assert identify_content(tmp_path / "a.jpg") == ("raw", "DNG")
     Image.fromarray(PIXELS).save(tmp_path / "b.png")
     (tmp_path / "b.dng").write_bytes((tmp_path / "b.png").read_bytes())
-    assert content_of(tmp_path / "b.dng") == ("picture", "PNG")
+    assert identify_content(tmp_path / "b.dng") == ("picture", "PNG")
     for extension, kind in ((".raw", "raw"), (".jpg", "picture"), (".txt", "other")):
         (tmp_path / f"c{extension}").write_bytes(bytes(100))
-        assert content_of(tmp_path / f"c{extension}").kind == kind
+        assert identify_content(tmp_path / f"c{extension}").kind == kind
     with pytest.raises(FileNotFoundError, match="none"):
-        content_of(tmp_path / "none")
+        identify_content(tmp_path / "none")
 
 
 def test_raw_is_never_read_as_the_picture_that_lies_in_it(tmp_path: Path, bayer_dng: Dng) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rawaug.data.phones import CAMERAS, Shot, take
+from rawaug.data.phones import CAMERAS, Shot, take_shot
 from rawaug.isp.fit.start import plausible_matrices
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading
@@ -50,7 +50,7 @@ def test_it_tells_a_dark_room_from_daylight(isp: DictionaryISP) -> None:
 
     def green_gain(stops: float) -> float:
         shot = Shot(5500, stops, 100, balance_error=0.0, tint_error=(0.0, 0.0), lift_error=0.0)
-        pair = take(CAMERAS["IP"], scene, shot, torch.Generator().manual_seed(0))
+        pair = take_shot(CAMERAS["IP"], scene, shot, torch.Generator().manual_seed(0))
         with torch.no_grad():
             return float(isp.choose(pair.srgb[None]).gains[0, 1])
 
