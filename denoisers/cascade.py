@@ -84,9 +84,9 @@ class CascadeDRUNet(Denoiser):
         self.views = views
         self.frozen = frozen
 
-        own: Shared = {"variance_map": False, "domain": self.domain, "seed": self.seed}
-        self.first = DRUNet(width, SCALES, 1, limits=True, mend=True, pyramid=2, **own)
-        self.second = _CorrectingUNet(width, blocks, **own)
+        settings: Shared = {"variance_map": False, "domain": self.domain, "seed": self.seed}
+        self.first = DRUNet(width, SCALES, 1, limits=True, mend=True, pyramid=2, **settings)
+        self.second = _CorrectingUNet(width, blocks, **settings)
         self.stride = self.first.stride
         if frozen:
             self.first.requires_grad_(False)

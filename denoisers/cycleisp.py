@@ -197,8 +197,8 @@ def _own_names(state: dict[str, Tensor]) -> dict[str, Tensor]:
     renamed = {}
     for name, value in state.items():
         key = name.removeprefix("module.")
-        for published, own in RENAMED:
-            key = key.replace(published, own)
+        for published, name in RENAMED:
+            key = key.replace(published, name)
         if not key.startswith(UNUSED):
             renamed[key] = value
     return renamed

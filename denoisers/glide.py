@@ -89,8 +89,8 @@ def filter_plane(plane: Tensor, vectors: Tensor, values: Tensor, noise: float) -
     """Filter a plane of pixels ``(n,)``; the power and the number of eigenvectors minimise the estimated error."""
     coefficients = vectors.T @ plane.double()
     energy = (coefficients.square() - noise**2).clamp_min(0.0)
-    whole = (plane.double().square().sum() - len(plane) * noise**2).clamp_min(0.0)
-    missing = (whole - energy.cumsum(0)).clamp_min(0.0)
+    total = (plane.double().square().sum() - len(plane) * noise**2).clamp_min(0.0)
+    missing = (total - energy.cumsum(0)).clamp_min(0.0)
 
     best_error = len(plane) * noise**2
     best = plane

@@ -38,8 +38,8 @@ Array = np.ndarray[Any, np.dtype[np.float64]]
 
 def overcomplete_cosines() -> Array:
     """Compute the initial dictionary ``(64, 256)`` of products of sampled cosines; its columns have length 1."""
-    place = np.arange(SIDE)
-    waves: Array = np.cos(np.outer(place, np.arange(ATOMS_A_SIDE)) * math.pi / ATOMS_A_SIDE)
+    position = np.arange(SIDE)
+    waves: Array = np.cos(np.outer(position, np.arange(ATOMS_A_SIDE)) * math.pi / ATOMS_A_SIDE)
     waves[:, 1:] -= waves[:, 1:].mean(0)
     waves /= np.linalg.norm(waves, axis=0)
     return np.asarray(np.kron(waves, waves), np.float64)
@@ -60,12 +60,12 @@ def update_atoms(dictionary: Array, codes: Array, patches: Array) -> None:
 
         coefficients = codes[atom, users]
         codes[atom, users] = 0.0
-        rest = patches[:, users] - dictionary @ codes[:, users]
-        direction = rest @ coefficients
+        residual = patches[:, users] - dictionary @ codes[:, users]
+        direction = residual @ coefficients
         length = np.linalg.norm(direction)
         if length > 0.0:
             dictionary[:, atom] = direction / length
-        codes[atom, users] = dictionary[:, atom] @ rest
+        codes[atom, users] = dictionary[:, atom] @ residual
 
 
 @FILTERS.register("KSVD")

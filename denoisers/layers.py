@@ -110,8 +110,8 @@ def pad_to_multiple(image: Tensor, stride: int) -> Tensor:
     # torch's own padding reflects at most once, which is not enough for a picture smaller than the stride.
     for axis, size in ((-2, height), (-1, width)):
         period = 2 * (size - 1)
-        place = torch.remainder(torch.arange(size + -size % stride, device=image.device), period)
-        image = image.index_select(axis, torch.minimum(place, period - place))
+        position = torch.remainder(torch.arange(size + -size % stride, device=image.device), period)
+        image = image.index_select(axis, torch.minimum(position, period - position))
     return image
 
 

@@ -166,12 +166,12 @@ class MosaicDRUNet(ResidualUNet):
         variance = self._require_variance(raw, variance)
 
         levels = fit_levels(raw.float(), variance.float())
-        whole = raw
+        mended = raw
         if self.mend:
-            whole = self._mend(raw, levels, partial(mend_mosaic, planes=planes))
+            mended = self._mend(raw, levels, partial(mend_mosaic, planes=planes))
 
-        clipped = (whole >= 1.0).to(raw)
-        denoised = self._at_halves(whole, planes, levels, clipped, self.pyramid)
+        clipped = (mended >= 1.0).to(raw)
+        denoised = self._at_halves(mended, planes, levels, clipped, self.pyramid)
         return torch.where(variance > 0, denoised, raw)
 
     def _at_halves(self, raw: Tensor, planes: Tensor, levels: Levels, clipped: Tensor, halvings: int) -> Tensor:

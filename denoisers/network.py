@@ -95,13 +95,13 @@ class Denoiser(nn.Module, ABC):
 
     def __init_subclass__(cls) -> None:
         """Show ``help`` and recipes the shared settings by name, instead of ``**shared``."""
-        own = inspect.signature(cls.__init__).parameters
+        declared = inspect.signature(cls.__init__).parameters
         parameters = []
-        for name, parameter in own.items():
+        for name, parameter in declared.items():
             if name not in ("self", "shared"):
                 parameters.append(parameter)
 
-        if "shared" in own:
+        if "shared" in declared:
             keyword = inspect.Parameter.KEYWORD_ONLY
             for name, default in cls.defaults.items():
                 annotation = type(default).__name__
@@ -192,13 +192,13 @@ class Denoiser(nn.Module, ABC):
         """
         variance = self._require_input(noisy, variance)
 
-        whole = noisy
+        mended = noisy
         if variance is not None and self.mend:
             levels = fit_levels(noisy.float(), variance.float())
-            whole = self._mend(noisy, levels, mend_planes)
+            mended = self._mend(noisy, levels, mend_planes)
 
-        clipped = (whole >= 1.0).to(noisy.dtype)
-        denoised = self._at_scales(whole, variance, clipped, self.pyramid)
+        clipped = (mended >= 1.0).to(noisy.dtype)
+        denoised = self._at_scales(mended, variance, clipped, self.pyramid)
 
         if variance is None or self.domain == "linear" or self.upscale > 1:
             return denoised
@@ -329,10 +329,10 @@ class Denoiser(nn.Module, ABC):
             return False
 
         for key in (self.config.keys() & model.config.keys()) - self.layerless:
-            own = self.config[key]
+            mine = self.config[key]
             other = model.config[key]
-            grows = key in self.growing and _is_as_large(own, other)
-            if own != other and not grows:
+            grows = key in self.growing and _is_as_large(mine, other)
+            if mine != other and not grows:
                 return False
         return True
 
@@ -376,6 +376,6 @@ class Denoiser(nn.Module, ABC):
 def _is_as_large(value: int | Sequence[int], other: int | Sequence[int]) -> bool:
     """Tell whether a setting, one number or one for each scale, is nowhere smaller than another."""
     values = np.atleast_1d(value)
-    others = np.atleast_1d(other)
-    can_compare = 1 in (len(values), len(others)) or len(values) == len(others)
-    return can_compare and bool((values >= others).all())
+    second_values = np.atleast_1d(other)
+    can_compare = 1 in (len(values), len(second_values)) or len(values) == len(second_values)
+    return can_compare and bool((values >= second_values).all())

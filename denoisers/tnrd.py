@@ -38,8 +38,8 @@ PUBLISHED_REACH = 310.0 / 255.0
 
 def cosine_filters(side: int) -> Tensor:
     """Compute the orthonormal cosines of a square without the constant one, ``(side^2 - 1, 1, side, side)``."""
-    place = torch.arange(side).double()
-    waves = torch.cos(math.pi * (2.0 * place + 1.0) * place[:, None] / (2 * side))
+    position = torch.arange(side).double()
+    waves = torch.cos(math.pi * (2.0 * position + 1.0) * position[:, None] / (2 * side))
     waves = waves / waves.norm(dim=1, keepdim=True)
     squares = torch.einsum("ay,bx->abyx", waves, waves).flatten(0, 1)
     return squares[1:, None].float()
@@ -77,10 +77,10 @@ class Diffusion(nn.Module):
         table = (self.heights @ gaussians).flatten()
 
         spacing = 2.0 * self.reach / (GAUSSIANS - 1)
-        place = ((response + self.reach) / spacing + MARGIN) * KNOTS_A_GAUSSIAN
-        place = place.clamp(0.0, KNOTS - 1.001)
-        knot = place.detach().floor()
-        share = place - knot
+        position = ((response + self.reach) / spacing + MARGIN) * KNOTS_A_GAUSSIAN
+        position = position.clamp(0.0, KNOTS - 1.001)
+        knot = position.detach().floor()
+        share = position - knot
 
         row = torch.arange(response.shape[1], device=response.device)[:, None, None] * KNOTS
         index = knot.long() + row

@@ -96,8 +96,8 @@ def run(
             result = denoise_folder(
                 source, out, kind, previews=preview, overwrite=overwrite, elsewhere=("rendering", *PICTURE_KINDS)
             )
-            others = ("RAW file", "other file")
-            result += denoise_folder(source, out, pictures, overwrite=overwrite, elsewhere=others)
+            not_pictures = ("RAW file", "other file")
+            result += denoise_folder(source, out, pictures, overwrite=overwrite, elsewhere=not_pictures)
         else:
             result = denoise_folder(source, out, kind, previews=preview, overwrite=overwrite)
     else:

@@ -64,6 +64,6 @@ def run(
 def _as_json(judgement: Judgement) -> dict[str, Any]:
     """Make JSON of what was found on a frame, without the maps of blocks."""
     result = asdict(judgement)
-    for one in result["denoisers"].values():
-        del one["gain"]
+    for scores in result["denoisers"].values():
+        del scores["gain"]
     return result

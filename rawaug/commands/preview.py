@@ -62,8 +62,8 @@ def run(
     require_output(path, overwrite, FIGURES, [picture])
 
     augment = RawAugment.from_pretrained(isp, cfa=cfa)
-    whole = trim_to_even(read_shot(picture, max_pixels))
-    save_figure(_draw_stages(augment, whole, count, seed), path)
+    srgb = trim_to_even(read_shot(picture, max_pixels))
+    save_figure(_draw_stages(augment, srgb, count, seed), path)
     print(path)
 
 
@@ -74,9 +74,9 @@ def _draw_stages(augment: RawAugment, whole: Tensor, count: int, seed: int) -> A
     height, width = min(frame[0], _MAXIMUM), min(frame[1], _MAXIMUM)
     top, left = (frame[0] - height) // 4 * 2, (frame[1] - width) // 4 * 2
     srgb = bayer.crop(whole, top, left, height, width)
-    place = frame_coordinates(height, width, (top, left), frame)
-    setting = isp.reverse(srgb[None], coordinates=place).params
-    panels = stage_pictures(augment, srgb, setting, place)
+    coordinates = frame_coordinates(height, width, (top, left), frame)
+    setting = isp.reverse(srgb[None], coordinates=coordinates).params
+    panels = stage_pictures(augment, srgb, setting, coordinates)
 
     generator = keyed_generator(seed, "preview")
     for k in range(count):

@@ -88,13 +88,13 @@ def parse_options(words: Sequence[str], settings: type[Any]) -> list[tuple[str, 
         field_names.update(key.name.split("."))
 
     options = []
-    rest = iter(words)
-    for word in rest:
+    remaining = iter(words)
+    for word in remaining:
         name, equals, text = word.partition("=")
         if not name.startswith("--"):
             raise ValueError(f"{word}: too many arguments; keys of the recipe are set by --key value")
         if not equals:
-            following = next(rest, None)
+            following = next(remaining, None)
             if following is None:
                 raise ValueError(f"{name} needs a value")
             text = following
@@ -163,25 +163,25 @@ def drop_old_settings(content: dict[str, Any], key: str, name: Any) -> None:
         key: the dotted key that names the network.
         name: the other network.
     """
-    place: Any = content
+    section: Any = content
     above = key.removesuffix(".name")
     for part in above.split("."):
-        place = place.get(part) if isinstance(place, Mapping) else None
+        section = section.get(part) if isinstance(section, Mapping) else None
 
-    if not isinstance(place, dict) or not place.get("settings") or place.get("name", "UNet") == name:
+    if not isinstance(section, dict) or not section.get("settings") or section.get("name", "UNet") == name:
         return
 
     shared = {}
     dropped = {}
-    for setting, value in place["settings"].items():
+    for setting, value in section["settings"].items():
         if setting in SHARED:
             shared[setting] = value
         else:
             dropped[setting] = value
 
-    place["settings"] = shared
+    section["settings"] = shared
     if dropped:
-        of = place.get("name", "UNet")
+        of = section.get("name", "UNet")
         print(
             f"{above}: the settings of {of} are dropped for {name}'s own: {json.dumps(dropped)}; "
             f"others: --{above}.settings.KEY VALUE"
@@ -318,8 +318,8 @@ def _require_keys(settings: Any, content: Any, names: Iterable[str], above: str 
         if not by_name:
             _require_keys(part, value, names, f"{above}{key}.")
         elif isinstance(value, Mapping):
-            for name, one in value.items():
-                _require_keys(part, one, names, f"{above}{key}.{name}.")
+            for name, entry in value.items():
+                _require_keys(part, entry, names, f"{above}{key}.{name}.")
 
 
 def _reason(error: Any, content: Any) -> str:

@@ -79,10 +79,10 @@ class DemoCamera:
 
     def sample(self, generator: torch.Generator, iso: int | None = None) -> DemoShot:
         """Draw the parameters of a shot, including the ISO unless it is given."""
-        place, red, blue, exposure, level = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
+        red_to_blue, red, blue, exposure, level = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
 
         # interpolate between two illuminants; real light deviates from their line by a few percent
-        position = place * (len(_ILLUMINANTS) - 1)
+        position = red_to_blue * (len(_ILLUMINANTS) - 1)
         k = int(position)
         t = position - k
         (red0, blue0), (red1, blue1) = _ILLUMINANTS[k : k + 2]
@@ -288,8 +288,8 @@ def _pair(split: str, k: int) -> Pair:
     scenes = list(photographs)
     if split != "train":
         scenes.append("leaves")
-    turn, place = divmod(k, len(scenes))
-    scene = scenes[place]
+    turn, position = divmod(k, len(scenes))
+    scene = scenes[position]
 
     generator = keyed_generator(0, "demo pair", split, k)
     if scene == "leaves":
@@ -298,7 +298,7 @@ def _pair(split: str, k: int) -> Pair:
         picture = _random_crop(photographs[scene], generator)
     # each scene gets every ISO in turn, and the first few pairs span the range
     isos = list(NOISE_LEVELS)
-    iso = isos[(1 + turn + len(isos) // len(scenes) * place) % len(isos)]
+    iso = isos[(1 + turn + len(isos) // len(scenes) * position) % len(isos)]
     return DemoCamera().capture(picture, generator, name=f"{split}_{k:02d}_{scene}", iso=iso)
 
 

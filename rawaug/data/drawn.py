@@ -220,9 +220,9 @@ def draw_shapes(side: int, rng: Rng) -> Tensor:
 
 def _shaded(picture: np.ndarray, rng: Rng) -> Tensor:
     """Light a picture ``(side, side, 3)`` from one side; returns uint8 ``(3, side, side)``."""
-    place = np.linspace(-0.5, 0.5, len(picture), dtype=np.float32)
+    distance = np.linspace(-0.5, 0.5, len(picture), dtype=np.float32)
     down, right = rng.normal(0.0, 0.35, 2).astype(np.float32)
-    lit = picture * np.exp(down * place[:, None] + right * place)[..., None]
+    lit = picture * np.exp(down * distance[:, None] + right * distance)[..., None]
     return torch.from_numpy(lit.clip(0, 255).round().astype(np.uint8)).permute(2, 0, 1).contiguous()
 
 
@@ -254,9 +254,9 @@ def _boxes(picture: Any, centre: np.ndarray, radius: float, rng: Rng, angle: flo
 
     lay(-half_width, half_width, _colour(rng))
     if stripes:
-        other, width = _colour(rng), max(2.0 * _OVERSAMPLING, half_width / stripes)
+        background, width = _colour(rng), max(2.0 * _OVERSAMPLING, half_width / stripes)
         for left in np.arange(-half_width, half_width, 2 * width):
-            lay(left, min(half_width, left + width), other)
+            lay(left, min(half_width, left + width), background)
 
 
 def _polygon(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:

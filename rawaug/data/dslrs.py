@@ -140,9 +140,9 @@ class DslrFrames(Frames):
         return Pair.of_frame(self.names[index], frame, srgb)
 
     def _file(self, index: int) -> Path:
-        turn, place = divmod(index, len(self.files))
+        turn, position = divmod(index, len(self.files))
         order = torch.randperm(len(self.files), generator=keyed_generator(self.seed, "dslrs order", self.split, turn))
-        return self.files[int(order[place])]
+        return self.files[int(order[position])]
 
 
 def take_frame(dslr: Dslr, scene: Tensor, generator: torch.Generator, name: str) -> RawFrame:

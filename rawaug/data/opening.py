@@ -125,7 +125,7 @@ def open_pictures(spec: str | Path | Sequence[str | Path], min_side: int = 2, ma
         42
     """
     if not isinstance(spec, (str, Path)):
-        return ConcatDataset([open_pictures(one, min_side, max_pixels) for one in spec])
+        return ConcatDataset([open_pictures(name, min_side, max_pixels) for name in spec])
 
     spec = str(spec)
     kind, path = _kind_and_path(spec)
@@ -140,7 +140,7 @@ def picture_stamp(spec: str | Path | Sequence[str | Path]) -> str:
     No file is read. Pictures that are no files have their spec as fingerprint.
     """
     if not isinstance(spec, (str, Path)):
-        return fingerprint([picture_stamp(one) for one in spec])
+        return fingerprint([picture_stamp(name) for name in spec])
 
     kind, path = _kind_and_path(str(spec))
     if kind is not None or spec == OWN_PICTURES:

@@ -179,10 +179,10 @@ def _pairs_below(path: Path, noisy: str | None, clean: str | None) -> list[PairF
 
     pairs = pairs_by_pattern(top, files, noisy or NOISY, clean or clean_pattern(noisy or NOISY))
     if noisy is None:
-        others = set(files)
+        unpaired = set(files)
         for pair in pairs:
-            others -= {pair.noisy, pair.clean}
-        pairs = pairs + _two_in_one(top, sorted(others), is_strict=path.is_dir())
+            unpaired -= {pair.noisy, pair.clean}
+        pairs = pairs + _two_in_one(top, sorted(unpaired), is_strict=path.is_dir())
     if path.is_file():
         pairs = [pair for pair in pairs if path in (pair.noisy, pair.clean)]
     if not pairs:

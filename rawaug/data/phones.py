@@ -333,8 +333,8 @@ def _training_labels(seed: int) -> list[tuple[int, int, str]]:
     codes = list(CAMERAS)
 
     labels = []
-    for place, number in enumerate(numbers):
-        block, position = divmod(place, len(codes))
+    for index, number in enumerate(numbers):
+        block, position = divmod(index, len(codes))
         order = torch.randperm(len(codes), generator=keyed_generator(seed, "phones order", block)).tolist()
         labels.append((number, _scene_number(number), codes[order[position]]))
     return labels
@@ -351,7 +351,7 @@ def _held_back_labels() -> list[tuple[int, int, str]]:
 
 @cache
 def _scene_number(number: int) -> int:
-    return 1 + next(place for place, end in enumerate(_SCENE_ENDS) if number <= end)
+    return 1 + next(position for position, end in enumerate(_SCENE_ENDS) if number <= end)
 
 
 def _draw_shot(phone: Phone, generator: torch.Generator) -> tuple[Shot, str]:
@@ -445,8 +445,8 @@ def colour_matrix(phone: Phone, shot: Shot) -> Tensor:
 def _taken_for(phone: Phone, shot: Shot) -> float:
     """Compute the colour temperature that the renderer assumes for the light, in kelvin."""
     neutral = 1e6 / _TAKEN_FOR_NEUTRAL
-    way = phone.rendering.adaptation * (1e6 / shot.kelvin - neutral)
-    mired = neutral + way + shot.balance_error
+    shift = phone.rendering.adaptation * (1e6 / shot.kelvin - neutral)
+    mired = neutral + shift + shot.balance_error
     return min(max(1e6 / mired, 2000.0), 20000.0)
 
 

@@ -186,8 +186,8 @@ class Rgb2Raw(Rawir):
         places_in: dict[Path, dict[str, int]] = {}
         for file in files:
             places = places_in.setdefault(file.parent, {})
-            place = places.setdefault(_raw_id(file), len(places))
-            if place % _TENTH in _TURN[split]:
+            scene = places.setdefault(_raw_id(file), len(places))
+            if scene % _TENTH in _TURN[split]:
                 files_of_split.append(file)
         return files_of_split
 

@@ -65,8 +65,8 @@ def scene_files(path: str | Path, split: str) -> list[Path]:
     if (folder / "train").is_dir() and (folder / "test").is_dir():
         files = _subfolder_files(folder, split)
     else:
-        for place, file in enumerate(files_in(folder, "picture", PICTURE_EXTENSIONS)):
-            if _SHARES[place % len(_SHARES)] == split:
+        for number, file in enumerate(files_in(folder, "picture", PICTURE_EXTENSIONS)):
+            if _SHARES[number % len(_SHARES)] == split:
                 files.append(file)
 
     if not files:
@@ -84,9 +84,9 @@ def _package_files(split: str) -> list[Path]:
 def _subfolder_files(folder: Path, split: str) -> list[Path]:
     if split == "train":
         return files_in(folder / "train", "picture", PICTURE_EXTENSIONS)
-    others = files_in(folder / "test", "picture", PICTURE_EXTENSIONS)
+    held_out = files_in(folder / "test", "picture", PICTURE_EXTENSIONS)
     first = 0 if split == "validation" else 1
-    return others[first::2]
+    return held_out[first::2]
 
 
 def draw_window(file: Path, size: tuple[int, int], generator: torch.Generator, max_pixels: int = MAX_PIXELS) -> Tensor:

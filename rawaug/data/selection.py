@@ -41,10 +41,10 @@ def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
 
     order = sorted(range(len(labels)), key=frame_scene)
     totals = []
-    for place, index in enumerate(order, start=1):
-        is_last_of_scene = place == len(order) or frame_scene(order[place]) != frame_scene(index)
+    for position, index in enumerate(order, start=1):
+        is_last_of_scene = position == len(order) or frame_scene(order[position]) != frame_scene(index)
         if is_last_of_scene:
-            totals.append(place)
+            totals.append(position)
 
     if count not in totals:
         nearest = sorted(totals, key=lambda total: abs(total - count))[:2]
@@ -65,9 +65,9 @@ def one_a_phone(labels: Sequence[FrameLabel], count: int) -> list[int]:
 
     selection: list[list[int]] = []
     phones = sorted(frames_of)
-    for place, phone in enumerate(phones):
+    for position, phone in enumerate(phones):
         share = count // len(phones)
-        if place < count % len(phones):
+        if position < count % len(phones):
             share += 1
         frames = sorted(frames_of[phone], key=frame_iso)
         if share > len(frames):

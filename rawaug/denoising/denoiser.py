@@ -136,10 +136,10 @@ class ImageDenoiser(ABC):
         denoiser = spec if isinstance(spec, cls) else cls._resolve(spec, changes.get("name"))
         network = denoiser.network
         if network is not None:
-            where = find_device(str(device))
-            network.to(where, memory_format=torch.channels_last)  # type: ignore[call-overload]
-            mixed = precision == "auto" and getattr(network, "mixed", False) and has_fast_bfloat16(where)
-            changes = {"device": where, "mixed": mixed, **changes}
+            target = find_device(str(device))
+            network.to(target, memory_format=torch.channels_last)  # type: ignore[call-overload]
+            mixed = precision == "auto" and getattr(network, "mixed", False) and has_fast_bfloat16(target)
+            changes = {"device": target, "mixed": mixed, **changes}
 
         return replace(denoiser, **changes)
 

@@ -188,10 +188,10 @@ def benchmark(denoisers: Sequence[RawDenoiser], cases: Sequence[Trial]) -> dict[
     for name, of_one in rows_by_name.items():
         rows[name] = {"gmac": None, "seconds": None, "scores": _by_condition(of_one, strengths)}
 
-    for one in denoisers:
-        seconds = fmean(row.seconds for row in rows_by_name[one.name])
-        rows[one.name]["seconds"] = round(seconds, 3)
-        rows[one.name]["gmac"] = _gmac(one, cases[0])
+    for denoiser in denoisers:
+        seconds = fmean(row.seconds for row in rows_by_name[denoiser.name])
+        rows[denoiser.name]["seconds"] = round(seconds, 3)
+        rows[denoiser.name]["gmac"] = _gmac(denoiser, cases[0])
 
     frames = list(dict.fromkeys(trial.frame for trial in cases))
     return {"frames": frames, "hash": hash_trials(cases), "rows": rows}

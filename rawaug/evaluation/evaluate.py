@@ -167,8 +167,8 @@ def evaluate_pictures(evaluation: Evaluation) -> dict[str, Any]:
     }
     if evaluation.views > 1:
         result |= {"self_ensemble": True, "views": evaluation.views, "plain": rows[plain.name][PUBLISHED]}
-    for one in filters:
-        result.setdefault("classical", {})[one.name] = rows[one.name]
+    for denoiser in filters:
+        result.setdefault("classical", {})[denoiser.name] = rows[denoiser.name]
 
     evaluation.write(result)
     return result

@@ -166,14 +166,14 @@ class Page:
             caption = ", ".join(filter(None, [name, row.captions.get(name)]))
             figures.append(Figure(png, name, "window", caption))
 
-        whole = row.show(clean)
-        height, width = whole.shape[-2:]
+        picture = row.show(clean)
+        height, width = picture.shape[-2:]
         part = name_part(height, width, crop)
         if width > _WHOLE:
-            whole = F.interpolate(whole[None], scale_factor=_WHOLE / width, mode="area")[0]
+            picture = F.interpolate(picture[None], scale_factor=_WHOLE / width, mode="area")[0]
 
         caption = f"{part}, clean; window at row {pixels * lines.start}, column {pixels * columns.start}"
-        figures.append(Figure(encode_png(whole), part, caption=caption))
+        figures.append(Figure(encode_png(picture), part, caption=caption))
 
         heading = "Pictures"
         if any(part["heading"] == heading for part in self.parts):

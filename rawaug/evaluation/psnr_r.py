@@ -89,7 +89,7 @@ def windows_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair, count: in
     for corner in draw_windows(pair, count):
         y, x = corner
         window = (None, slice(None), slice(y, y + PATCH), slice(x, x + PATCH))
-        place = frame_coordinates(min(PATCH, height), min(PATCH, width), corner, (height, width))
-        values.append(patch_psnr(make(pair.srgb[window], place).clamp(0.0, 1.0), pair.raw[window]))
+        coordinates = frame_coordinates(min(PATCH, height), min(PATCH, width), corner, (height, width))
+        values.append(patch_psnr(make(pair.srgb[window], coordinates).clamp(0.0, 1.0), pair.raw[window]))
 
     return torch.cat(values).mean().item()

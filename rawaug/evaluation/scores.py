@@ -164,8 +164,8 @@ def to_domain(name: str, denoised: Tensor, trial: Trial) -> Iterator[tuple[str, 
         yield name, denoised
         return
 
-    for way, follow in trial.ways.items():
-        yield ", ".join(filter(None, [name, way])), follow(denoised)
+    for development, follow in trial.ways.items():
+        yield ", ".join(filter(None, [name, development])), follow(denoised)
 
 
 def compare_images(image: Tensor, trial: Trial) -> tuple[float, float, float | None, float | None]:
@@ -264,26 +264,26 @@ def _image(row: Row) -> dict[str, Any]:
 def _own_noise(rows: Sequence[Row], images: Sequence[dict[str, Any]]) -> dict[str, float]:
     """Compute the references' own noise as a share of the squared error: of each image, in place, and overall."""
     errors = []
-    own = []
+    energies = []
     for row, image in zip(rows, images, strict=True):
         if row.own_noise is None or "psnr" not in image:
             continue
         error = 10.0 ** (-row.psnr / 10.0)
         errors.append(error)
-        own.append(row.own_noise * error)
+        energies.append(row.own_noise * error)
         image["own_noise"] = row.own_noise
 
-    if not own:
+    if not energies:
         return {}
 
-    return {"own_noise": sum(own) / sum(errors)}
+    return {"own_noise": sum(energies) / sum(errors)}
 
 
 def require_numbers(summaries: Iterable[Mapping[str, Any]]) -> None:
     """Raise ValueError if summaries left out scores; this is called after everything else is printed and written."""
     faults: list[str] = []
-    for one in summaries:
-        faults += [*one.get("broken", ()), *one.get("no_numbers", ())]
+    for scores in summaries:
+        faults += [*scores.get("broken", ()), *scores.get("no_numbers", ())]
 
     if not faults:
         return

@@ -219,8 +219,8 @@ def _format_figure(key: str, value: float | None) -> str:
 def join_figures(scores: Mapping[str, Any], first: str, second: str) -> str:
     """Format two figures for a cell; a dash stands for a missing number."""
     figure = _format_figure(first, scores.get(first)) or "-"
-    other = _format_figure(second, scores.get(second)) or "-"
-    return f"{figure} / {other}"
+    second_figure = _format_figure(second, scores.get(second)) or "-"
+    return f"{figure} / {second_figure}"
 
 
 # -- printing ----------------------------------------------------------------------------------------------------------

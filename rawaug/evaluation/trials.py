@@ -166,11 +166,11 @@ def raw_trial(
         about: other attributes of the trial.
     """
     develop = partial(develop_packed, cfa=cfa, pair=pair, exposure=exposure_gain(clean, pair))
-    own = None
+    own_variance = None
     if pair.own_noise is not None:
-        own = noise_variance(clean, *pair.own_noise).mean().item()
+        own_variance = noise_variance(clean, *pair.own_noise).mean().item()
 
-    return Trial(noisy, clean, variance, pair.name, levels=levels, cfa=cfa, develop=develop, own=own, **about)
+    return Trial(noisy, clean, variance, pair.name, levels=levels, cfa=cfa, develop=develop, own=own_variance, **about)
 
 
 def make_trials(cases: Sequence[_Case], make: Callable[[_Case], Trial]) -> Sequence[Trial]:
@@ -244,14 +244,14 @@ def added_noise_note(trials: Iterable[Trial]) -> str:
     if not own_variances:
         return ""
 
-    own = fmean(own_variances)
-    share = own / fmean(test_variances)
+    own_variance = fmean(own_variances)
+    share = own_variance / fmean(test_variances)
     if share <= _MUCH:
         return ""
 
     return (
         f"the test frames' own noise has {share:.0%} of the variance of the noise added to them: "
-        f"a perfect denoiser would score {-10.0 * math.log10(own):.1f} dB; {CLEANER_TEST}"
+        f"a perfect denoiser would score {-10.0 * math.log10(own_variance):.1f} dB; {CLEANER_TEST}"
     )
 
 

@@ -200,9 +200,9 @@ def _common_frames(methods: Sequence[Sequence[Summary]]) -> tuple[list[int], int
     for runs in methods:
         for run in runs:
             scored = set()
-            for place, image in enumerate(run["images"]):
+            for index, image in enumerate(run["images"]):
                 if math.isfinite(image.get("psnr", math.nan)):
-                    scored.add(place)
+                    scored.add(index)
             scored_by_all = scored if scored_by_all is None else scored_by_all & scored
             count = max(count, len(run["images"]))
 
@@ -266,22 +266,22 @@ def _kept_noise(arm: str, runs: Sequence[Summary], rival: str, other: Summary) -
     if other["psnr"] > best["psnr"]:
         name, scores = rival, other
 
-    own, test_noise = _noise_of_references(scores)
-    if own is None:
+    own_noise, test_noise = _noise_of_references(scores)
+    if own_noise is None:
         return ""
 
     decides = f"to decide, {CLEANER_TEST}, or test on noisy and clean captures (pairs:PATH)"
     if scores["own_noise"] > 1.0:
         return (
-            f"{name} scores {scores['psnr']:.2f} dB and a perfect denoiser would score {-10 * math.log10(own):.1f} dB "
-            f"on these references, whose noise it has kept; {decides}"
+            f"{name} scores {scores['psnr']:.2f} dB and a perfect denoiser would score "
+            f"{-10 * math.log10(own_noise):.1f} dB on these references, whose noise it has kept; {decides}"
         )
 
     if test_noise is None:
         return ""
 
     gap = abs(_squared_error(best["psnr"]) - _squared_error(other["psnr"]))
-    by_keeping = own**2 / (own + test_noise)
+    by_keeping = own_noise**2 / (own_noise + test_noise)
     if abs(best["psnr"] - other["psnr"]) >= MATTERS and gap <= by_keeping:
         return f"{arm} and {rival} differ by no more than a method gains by keeping the references' noise; {decides}"
 

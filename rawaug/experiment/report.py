@@ -114,7 +114,7 @@ def write_report(
         for name, scores in first_runs(arms, others[table]).items():
             first[with_name(name, table)] = scores
 
-    uses = {table: one.use for table, one in verdicts.items()}
+    uses = {table: decision.use for table, decision in verdicts.items()}
     commands = usage(recipe, folder, tables, uses)
     own_noise = own_noise_note(first)
 

@@ -300,9 +300,9 @@ def change_cfa(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
     if isp.cfa == cfa:
         return isp
 
-    other = copy.deepcopy(isp)
-    other.configure(cfa=str(cfa))
-    return other
+    copied = copy.deepcopy(isp)
+    copied.configure(cfa=str(cfa))
+    return copied
 
 
 def train_arm(

@@ -420,16 +420,16 @@ class Recipe:
 
     def loop(self, arm: str) -> TrainConfig:
         """Return the training loop of an arm: the recipe's, with the arm's own rate, weighting, batch and steps."""
-        own = self.arms[arm]
+        settings = self.arms[arm]
         loop = self.train
-        if own.learning_rate is not None:
-            loop = replace(loop, learning_rate=own.learning_rate)
-        if own.weigh is not None:
-            loop = replace(loop, weigh=own.weigh)
-        if own.batch is not None:
-            loop = replace(loop, batch=own.batch)
-        if own.steps is not None:
-            loop = replace(loop, steps=min(own.steps, loop.steps))
+        if settings.learning_rate is not None:
+            loop = replace(loop, learning_rate=settings.learning_rate)
+        if settings.weigh is not None:
+            loop = replace(loop, weigh=settings.weigh)
+        if settings.batch is not None:
+            loop = replace(loop, batch=settings.batch)
+        if settings.steps is not None:
+            loop = replace(loop, steps=min(settings.steps, loop.steps))
 
         return loop
 

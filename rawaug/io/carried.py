@@ -147,8 +147,8 @@ def _read_tiff(
     exif = []
     for entry in directories.get("ExifTag", []):
         if entry.code == INTEROPERABILITY:
-            (place,) = struct.unpack_from(tiff.order + "I", entry.data.ljust(4, b"\0"))
-            interoperability = tiff.tags(tiff.directory(place).entries.values())
+            (start,) = struct.unpack_from(tiff.order + "I", entry.data.ljust(4, b"\0"))
+            interoperability = tiff.tags(tiff.directory(start).entries.values())
         elif entry.code != MAKER_NOTE or is_note_safe:
             exif.append(entry)
     if "ExifTag" in directories:
@@ -214,13 +214,13 @@ def _read_previews(pages: list[Any], tiff: TiffFile) -> list[Preview]:
 
 def _read_segments(page: Any, tiff: TiffFile, codes: tuple[int, int]) -> list[bytes] | None:
     """Read the strips or tiles of a page; return None if the file does not hold them all."""
-    places = np.ravel(page.tags.valueof(codes[0]))
+    starts = np.ravel(page.tags.valueof(codes[0]))
     lengths = np.ravel(page.tags.valueof(codes[1]))
     segments = []
-    for place, length in zip(places.tolist(), lengths.tolist(), strict=True):
-        if length > _MOST_PREVIEW_BYTES or place + length > tiff.end:
+    for start, length in zip(starts.tolist(), lengths.tolist(), strict=True):
+        if length > _MOST_PREVIEW_BYTES or start + length > tiff.end:
             return None
-        segments.append(tiff.read(place, length))
+        segments.append(tiff.read(start, length))
     return segments
 
 

@@ -51,8 +51,8 @@ def read_crw_exposure(path: Path) -> tuple[float | None, float | None]:
 def _find_shot_info(file: BinaryIO, order: str, start: int, end: int, depth: int) -> tuple[int, ...] | None:
     """Find the numbers of ShotInfo in the heap from ``start`` to ``end``; return None if it is not there."""
     file.seek(max(0, end - 4))
-    (place,) = struct.unpack(order + "I", file.read(4))
-    file.seek(start + place)
+    (directory,) = struct.unpack(order + "I", file.read(4))
+    file.seek(start + directory)
     (count,) = struct.unpack(order + "H", file.read(2))
     entries = file.read(10 * min(count, _MOST_ENTRIES))
 
@@ -70,6 +70,6 @@ def _find_shot_info(file: BinaryIO, order: str, start: int, end: int, depth: int
 
 def _stops(value: int) -> float:
     """Convert Canon's steps of 1/32 to stops; 12 and 20 stand for thirds."""
-    whole, part = divmod(abs(value), 32)
+    stops, part = divmod(abs(value), 32)
     part_of_stop = {12: 32 / 3, 20: 64 / 3}.get(part, float(part)) / 32
-    return math.copysign(whole + part_of_stop, value)
+    return math.copysign(stops + part_of_stop, value)

@@ -194,12 +194,12 @@ def _first_change(stream: bytes, end: int, count: int, decoded: np.ndarray) -> i
     if stream[start - 1] == 0xFF:  # what follows must not become a marker
         start -= 1
 
-    others = bytearray()
+    changed = bytearray()
     for byte in stream[start:end]:
-        others.append(0x33 if byte == 0x5A else 0x5A)
+        changed.append(0x33 if byte == 0x5A else 0x5A)
 
     try:
-        again = imagecodecs.jpeg8_decode(stream[:start] + bytes(others) + _MORE + _END)
+        again = imagecodecs.jpeg8_decode(stream[:start] + bytes(changed) + _MORE + _END)
     except Exception:  # a kind of stream that only the other decoder takes
         return decoded.size
 

@@ -66,8 +66,8 @@ def parse_gain_maps(opcodes: bytes, on_mosaic: bool) -> tuple[GainMap, ...]:
 def _parse(body: bytes, on_mosaic: bool) -> GainMap:
     if len(body) < _GRID.size:
         raise ValueError("the opcode list is truncated (a gain map)")
-    top, left, bottom, right, plane, planes, *rest = _GRID.unpack_from(body)
-    rows, columns, points_v, points_h, spacing_v, spacing_h, origin_v, origin_h, map_planes = rest
+    top, left, bottom, right, plane, planes, *grid = _GRID.unpack_from(body)
+    rows, columns, points_v, points_h, spacing_v, spacing_h, origin_v, origin_h, map_planes = grid
     size = points_v * points_h * map_planes
     if size == 0 or min(rows, columns) == 0 or len(body) < _GRID.size + 4 * size:
         raise ValueError(f"a gain map of {points_v} x {points_h} points and pitch {rows} x {columns} is incomplete")

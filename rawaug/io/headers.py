@@ -296,11 +296,11 @@ def _find_png_colour(chunks: dict[bytes, bytes]) -> Colour | None:
 
 def xmp_of_text(data: bytes) -> bytes | None:
     """Find the packet in an iTXt chunk; return None if it holds another text."""
-    keyword, _, rest = data.partition(b"\0")
-    if keyword != XMP_KEYWORD or len(rest) < 2:
+    keyword, _, text = data.partition(b"\0")
+    if keyword != XMP_KEYWORD or len(text) < 2:
         return None
-    packet = rest[2:].split(b"\0", 2)[-1]
-    return inflate(packet) if rest[0] else packet
+    packet = text[2:].split(b"\0", 2)[-1]
+    return inflate(packet) if text[0] else packet
 
 
 def inflate(data: bytes) -> bytes:

@@ -166,8 +166,8 @@ def _pack_pointed(tiff: TiffFile, source: int, offset: int) -> bytes:
     size = len(pack_directory(tiff.order, [*tags, pointer_tag(tiff.order, INTEROPERABILITY, 0)], offset))
     inner = tiff.directory(tiff.number(directory, INTEROPERABILITY))
     inner_tags = tiff.tags(inner.entries.values())
-    own = [*tags, pointer_tag(tiff.order, INTEROPERABILITY, offset + size)]
-    return pack_directory(tiff.order, own, offset) + pack_directory(tiff.order, inner_tags, offset + size)
+    pointed = [*tags, pointer_tag(tiff.order, INTEROPERABILITY, offset + size)]
+    return pack_directory(tiff.order, pointed, offset) + pack_directory(tiff.order, inner_tags, offset + size)
 
 
 def mend_exif(exif: bytes, thumbnail: Thumbnail | None, upright: bool) -> bytes:

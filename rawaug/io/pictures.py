@@ -110,9 +110,9 @@ def read_crop(
     if part is not None:
         return torch.from_numpy(np.ascontiguousarray(part.transpose(2, 0, 1)))
 
-    whole = read_picture(path, max_pixels)
-    top, left, rows, columns = choose(*whole.shape[1:])
-    return whole[:, top : top + rows, left : left + columns].clone()
+    picture = read_picture(path, max_pixels)
+    top, left, rows, columns = choose(*picture.shape[1:])
+    return picture[:, top : top + rows, left : left + columns].clone()
 
 
 def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:

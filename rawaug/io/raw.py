@@ -336,14 +336,14 @@ def _read_exposure(path: Path, raw: Any) -> Exposure:
 
     LibRaw gives the exposure that a CRW's automatic mode aimed at; the camera's actual one is in its ShotInfo.
     """
-    other = getattr(raw, "other", None)  # rawpy 0.27 or newer
+    shot = getattr(raw, "other", None)  # rawpy 0.27 or newer
     seconds, f_number = read_crw_exposure(path)
-    seconds = _plausible(seconds) or _plausible(getattr(other, "shutter_speed", 0))
-    f_number = _plausible(f_number) or _plausible(getattr(other, "aperture", 0))
-    focal_length = _plausible(getattr(other, "focal_length", 0))
+    seconds = _plausible(seconds) or _plausible(getattr(shot, "shutter_speed", 0))
+    f_number = _plausible(f_number) or _plausible(getattr(shot, "aperture", 0))
+    focal_length = _plausible(getattr(shot, "focal_length", 0))
 
     date = None
-    timestamp = getattr(other, "timestamp", None)
+    timestamp = getattr(shot, "timestamp", None)
     if timestamp is not None and timestamp.year > 1970:
         date = f"{timestamp:%Y:%m:%d %H:%M:%S}"
     return Exposure(seconds, f_number, focal_length, date)
@@ -396,9 +396,9 @@ def _green_is_1(gains: Sequence[float]) -> tuple[float, float, float]:
 
 def _color_matrix(raw: Any) -> tuple[np.ndarray, bool]:
     """Find the file's matrix, else LibRaw's for the model, else a typical one; tell whether it is known."""
-    own = np.asarray(raw.color_matrix, np.float64)[:, :3]
-    if own.any():
-        return own / own.sum(axis=1, keepdims=True), True
+    stated = np.asarray(raw.color_matrix, np.float64)[:, :3]
+    if stated.any():
+        return stated / stated.sum(axis=1, keepdims=True), True
 
     camera = np.asarray(raw.rgb_xyz_matrix, np.float64)[:3] @ XYZ_FROM_SRGB
     if not camera.any():

@@ -432,8 +432,8 @@ def _shading_maps(augment: RawAugment, pair: RawPair) -> tuple[GainMap, ...]:
     rows, columns = _SHADING_NODES
     y = torch.linspace(0, height, rows) - height / 2
     x = torch.linspace(0, width, columns) - width / 2
-    place = torch.stack(torch.meshgrid(y, x, indexing="ij"))[None] / (0.5 * (height**2 + width**2) ** 0.5)
-    mask = lens.mask(place.to(frame_coordinates(1, 1)))[0]
+    coordinates = torch.stack(torch.meshgrid(y, x, indexing="ij"))[None] / (0.5 * (height**2 + width**2) ** 0.5)
+    mask = lens.mask(coordinates.to(frame_coordinates(1, 1)))[0]
 
     correction = GainMap(
         area=(0, 0, height, width),

@@ -151,8 +151,8 @@ def _settings(format: Format, per_image: int, seed: int, config: AugmentConfig) 
 
     target = config.target_name
     if target not in TARGETS.get(format, (target,)):
-        others = [name for name in formats if target in TARGETS.get(name, (target,))]
-        raise ValueError(f"format {format} cannot hold target {target!r}; use {', '.join(others)}")
+        suitable = [name for name in formats if target in TARGETS.get(name, (target,))]
+        raise ValueError(f"format {format} cannot hold target {target!r}; use {', '.join(suitable)}")
 
     isp = Path(config.isp)
     if isp.suffix:
