@@ -12,11 +12,11 @@ from rawaug.data.frames import Readable
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.picture_pairs import is_picture_pairs
 from rawaug.denoising.denoiser import require_classical
-from rawaug.evaluation.evaluate import Evaluation, evaluate_pictures, evaluate_raw, require_finite
+from rawaug.evaluation.evaluate import evaluate_pictures, evaluate_raw, evaluation_facts, require_finite
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import Row, require_numbers, summary
 from rawaug.evaluation.tables import print_scores
-from rawaug.files import find_weights, read_metadata
+from rawaug.files import find_weights, read_metadata, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseSpec
 from rawaug.progress import progress
@@ -71,27 +71,36 @@ def run(
     require_results(json, report, overwrite, [weights, data])
     require_classical(classical or ())
 
-    evaluation = Evaluation(
-        denoiser=weights,
-        data=data,
-        views=views or (8 if self_ensemble else 1),
-        noise=noise,
-        seed=seed,
-        bin=bin,
-        classical=classical or (),
-        device=device,
-        json=json,
-        report=report,
-        settings=settings or PairSettings(),
-    )
+    number_of_views: int = views or (8 if self_ensemble else 1)
+    settings = settings or PairSettings()
+    for_raw = noise is not None or bin != 1 or bool(seed) or report is not None
     if is_isp(weights):
-        result = evaluate_isp(evaluation, as_shot, tone)
+        if for_raw or number_of_views > 1 or classical:
+            options = "--self-ensemble, --views, --noise, --seed, --bin, --classical and --report"
+            raise ValueError(f"{weights}: is an ISP; {options} are for denoisers")
+        result = evaluate_isp(weights, data, as_shot, tone, json, settings)
     elif as_shot or tone is not None:
         raise ValueError(f"{weights}: is a denoiser; --as-shot and --tone are for ISPs")
     elif is_picture_pairs(data):
-        result = evaluate_pictures(evaluation)
+        if for_raw:
+            raise ValueError(f"{data}: has developed pictures; --noise, --bin, --seed and --report are for RAW")
+        result = evaluate_pictures(
+            weights, data, views=number_of_views, classical=classical or (), device=device, json=json, settings=settings
+        )
     else:
-        result = evaluate_raw(evaluation)
+        result = evaluate_raw(
+            weights,
+            data,
+            views=number_of_views,
+            noise=noise,
+            seed=seed,
+            bin=bin,
+            classical=classical or (),
+            device=device,
+            json=json,
+            report=report,
+            settings=settings,
+        )
     require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
     return result
 
@@ -109,37 +118,28 @@ def is_isp(weights: str) -> bool:
     return read_metadata(file).get("kind") == "isp"
 
 
-def evaluate_isp(evaluation: Evaluation, as_shot: bool = False, tone: str | None = None) -> dict[str, Any]:
+def evaluate_isp(
+    weights: str, data: str, as_shot: bool, tone: str | None, json: str | None, settings: PairSettings
+) -> dict[str, Any]:
     """Print and write the PSNR_r of an ISP on the frames of a test set; return the result, as in the JSON.
 
     ``as_shot`` gives the ISP the gains of each frame; ``tone`` gives it the tone curve of all.
     """
-    for_denoisers = (
-        evaluation.views > 1
-        or evaluation.noise is not None
-        or evaluation.bin != 1
-        or evaluation.seed
-        or evaluation.classical
-        or evaluation.report
-    )
-    if for_denoisers:
-        options = "--self-ensemble, --views, --noise, --seed, --bin, --classical and --report"
-        raise ValueError(f"{evaluation.denoiser}: is an ISP; {options} are for denoisers")
-
-    file = find_weights(evaluation.denoiser)
+    file = find_weights(weights)
     isp = DictionaryISP.from_pretrained(file)
-    pairs = Readable(open_pairs(evaluation.data, split="test", **vars(evaluation.settings)))
+    pairs = Readable(open_pairs(data, split="test", **vars(settings)))
 
     rows = []
     for pair in progress(pairs, label="evaluate", unit="image"):
         psnr = require_finite(pair.name, psnr_r(isp, pair, as_shot, tone=tone))
         rows.append(Row("ISP", pair.name, "", "", "raw", psnr))
 
-    result = {**evaluation.facts("isp", file), **summary(rows)}
+    result = {**evaluation_facts("isp", data, file), **summary(rows)}
     if as_shot or tone is not None:
         result |= {"as_shot": as_shot, "tone": tone}
     if pairs.broken:
         result["broken"] = pairs.reasons()
     print_scores(result)
-    evaluation.write(result)
+    if json is not None:
+        write_json(result, json)
     return result

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -31,12 +31,38 @@ PRESET = "cycleisp_sidd"
 """The noise of frames without a capture if the denoiser does not say which noise it was trained with."""
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """The settings of an evaluation by ``rawaug evaluate``.
+def evaluation_facts(kind: str, data: str, file: Path | None = None, bin: int = 1) -> dict[str, Any]:
+    """State the facts of a result besides scores: the kind of weights, denoiser or isp, their file's hash, ..."""
+    facts: dict[str, Any] = {"kind": kind, "data": data}
+    if file is not None:
+        facts["weights_sha256"] = sha256(file)
+    facts["version"] = __version__
+    if bin != 1:
+        facts["bin"] = bin
 
-    Attributes:
-        denoiser: a name or a file, see :meth:`rawaug.RawDenoiser.of`.
+    return facts
+
+
+def evaluate_raw(
+    weights: str,
+    data: str,
+    *,
+    views: int = 1,
+    noise: NoiseSpec | None = None,
+    seed: int = 0,
+    bin: int = 1,
+    classical: Sequence[Spec] = (),
+    device: str = "cpu",
+    json: str | None = None,
+    report: str | None = None,
+    settings: PairSettings | None = None,
+) -> dict[str, Any]:
+    """Score a denoiser of RAW, print its tables and write its files; return the result, as in the JSON.
+
+    The plain scores are printed and written first, then those of the self-ensemble and of filters, which take longer.
+
+    Args:
+        weights: a name or a file, see :meth:`rawaug.RawDenoiser.of`.
         data: the test set, by a path or ``kind:path``.
         views: 1, or 4 or 8 to score the self-ensemble, too.
         noise: noise to add to frames without a capture; None for that of the denoiser's training.
@@ -48,129 +74,107 @@ class Evaluation:
         report: page to write scores and crops to; None for none.
         settings: settings of ``pairs:PATH``.
     """
+    denoiser = replace(named_denoiser(weights, device), checked=False).require_mosaic()
+    filters = [RawDenoiser.of(spec) for spec in classical]
+    test_noise = noise or denoiser.info.get("noise", PRESET)
+    model = noise_model(test_noise, info=denoiser.info)
 
-    denoiser: str
-    data: str
-    views: int = 1
-    noise: NoiseSpec | None = None
-    seed: int = 0
-    bin: int = 1
-    classical: Sequence[Spec] = ()
-    device: str = "cpu"
-    json: str | None = None
-    report: str | None = None
-    settings: PairSettings = field(default_factory=PairSettings)
-
-    def facts(self, kind: str, file: Path | None = None) -> dict[str, Any]:
-        """State the facts of the result besides scores: the kind of weights, denoiser or isp, their file's hash, ..."""
-        facts: dict[str, Any] = {"kind": kind, "data": self.data}
-        if file is not None:
-            facts["weights_sha256"] = sha256(file)
-        facts["version"] = __version__
-        if self.bin != 1:
-            facts["bin"] = self.bin
-
-        return facts
-
-    def write(self, result: Mapping[str, Any]) -> None:
-        """Write the result as JSON, if a file is set for it."""
-        if self.json is not None:
-            write_json(result, self.json)
-
-
-def evaluate_raw(evaluation: Evaluation) -> dict[str, Any]:
-    """Score a denoiser of RAW, print its tables and write its files; return the result, as in the JSON.
-
-    The plain scores are printed and written first, then those of the self-ensemble and of filters, which take longer.
-    """
-    denoiser = replace(named_denoiser(evaluation.denoiser, evaluation.device), checked=False).require_mosaic()
-    filters = [RawDenoiser.of(spec) for spec in evaluation.classical]
-    noise = evaluation.noise or denoiser.info.get("noise", PRESET)
-    model = noise_model(noise, info=denoiser.info)
-
-    pairs = open_pairs(evaluation.data, split="test", **vars(evaluation.settings))
-    frames = Readable(measure_own_noise(pairs).binned(evaluation.bin).kept())
+    pairs = open_pairs(data, split="test", **vars(settings or PairSettings()))
+    frames = Readable(measure_own_noise(pairs).binned(bin).kept())
     for _ in frames:
         pass  # finds the pairs that cannot be read
-    trials = make_trials(frames.readable(), lambda pair: make_trial(pair, model, denoiser.cfa, evaluation.seed))
+    trials = make_trials(frames.readable(), lambda pair: make_trial(pair, model, denoiser.cfa, seed))
 
-    facts = evaluation.facts("denoiser", denoiser_file(evaluation.denoiser))
+    facts = evaluation_facts("denoiser", data, denoiser_file(weights), bin)
     unreadable = {}
     if frames.broken:
         unreadable["broken"] = frames.reasons()
 
     noisy, plain = group_rows(_finite_rows([NOISY, denoiser], trials, "evaluate")).values()
     plain_scores = summary(plain, noisy)
-    result = {**facts, "self_ensemble": False, "seed": evaluation.seed, **plain_scores, **unreadable}
+    result = {**facts, "self_ensemble": False, "seed": seed, **plain_scores, **unreadable}
     print_scores(result)
-    evaluation.write(result)
+    if json is not None:
+        write_json(result, json)
 
-    others = list(filters)
-    if evaluation.views > 1:
-        others.insert(0, replace(denoiser, name="views", views=evaluation.views))
+    compared = list(filters)
+    if views > 1:
+        compared.insert(0, replace(denoiser, name="views", views=views))
 
-    if others:
-        rows = group_rows(_finite_rows(others, trials, "evaluate, the rest"))
+    if compared:
+        rows = group_rows(_finite_rows(compared, trials, "evaluate, the rest"))
 
-        if evaluation.views > 1:
-            about = {"self_ensemble": True, "seed": evaluation.seed, "views": evaluation.views, "plain": plain_scores}
+        if views > 1:
+            about = {"self_ensemble": True, "seed": seed, "views": views, "plain": plain_scores}
             result = {**facts, **about, **summary(rows.pop("views"), noisy), **unreadable}
         for name, of_filter in rows.items():
             result.setdefault("classical", {})[name] = summary(of_filter, noisy)
         print_scores(result)
-        evaluation.write(result)
+        if json is not None:
+            write_json(result, json)
 
     note = own_noise_note({"the denoiser": result, **result.get("classical", {})})
     if note:
         print(note)
-    if evaluation.report:
-        page = _page(evaluation, result, denoiser, filters, trials, noise)
-        settings = {
-            "weights": evaluation.denoiser,
-            "data": evaluation.data,
-            "noise": evaluation.noise,
-            "seed": evaluation.seed,
-        }
-        print(f"page: {page.write(Path(evaluation.report), settings)}")
+    if report:
+        runs = {"plain": result.get("plain", result)}
+        if "plain" in result:
+            runs["self_ensemble"] = result
+        about = {"Noise": test_noise, "Seed": str(seed)}
+        title = f"{denoiser.name} on {data}"
+        page = Page.of_scores(title, {denoiser.name: [runs]}, result.get("classical", {}), about)
+        for trial in select_for_page(trials):
+            page.add_frame(make_panels([*filters, denoiser], trial))
+        command = {"weights": weights, "data": data, "noise": noise, "seed": seed}
+        print(f"page: {page.write(Path(report), command)}")
 
     return result
 
 
-def evaluate_pictures(evaluation: Evaluation) -> dict[str, Any]:
+def evaluate_pictures(
+    weights: str,
+    data: str,
+    *,
+    views: int = 1,
+    classical: Sequence[Spec] = (),
+    device: str = "cpu",
+    json: str | None = None,
+    settings: PairSettings | None = None,
+) -> dict[str, Any]:
     """Score a denoiser of pictures, beside classical filters; return the result, as in the JSON.
 
-    ``plain`` holds the result with the default number of views, if more are requested.
+    ``plain`` holds the result with the default number of views, if more are requested. The arguments are those of
+    :func:`evaluate_raw`.
     """
-    names = PairSettings(noisy=evaluation.settings.noisy, clean=evaluation.settings.clean)
-    if evaluation.noise is not None or evaluation.bin != 1 or evaluation.seed or evaluation.report:
-        raise ValueError(f"{evaluation.data}: has developed pictures; noise=, bin=, seed= and report= are for RAW")
-    if evaluation.settings != names:
-        raise ValueError(f"{evaluation.data}: has developed pictures; a CFA and levels are for RAW")
+    settings = settings or PairSettings()
+    if settings != PairSettings(noisy=settings.noisy, clean=settings.clean):
+        raise ValueError(f"{data}: has developed pictures; a CFA and levels are for RAW")
 
-    plain = PictureDenoiser.of(evaluation.denoiser, evaluation.device)
-    filters = [PictureDenoiser.of(spec) for spec in evaluation.classical]
+    plain = PictureDenoiser.of(weights, device)
+    filters = [PictureDenoiser.of(spec) for spec in classical]
     denoisers = [plain, *filters]
     main = plain
-    if evaluation.views > 1:
-        main = replace(plain, name=f"{plain.name}, {evaluation.views} views", views=evaluation.views)
+    if views > 1:
+        main = replace(plain, name=f"{plain.name}, {views} views", views=views)
         denoisers.insert(1, main)
 
-    pairs = open_picture_pairs(evaluation.data, evaluation.settings.noisy, evaluation.settings.clean)
+    pairs = open_picture_pairs(data, settings.noisy, settings.clean)
     scores = picture_scores(denoisers, pairs)
-    print_pictures(evaluation.data, scores)
+    print_pictures(data, scores)
 
     rows = scores["rows"]
     result = {
-        **evaluation.facts("denoiser"),
+        **evaluation_facts("denoiser", data),
         **rows[main.name][PUBLISHED],
         "registered": rows[main.name][REGISTERED],
     }
-    if evaluation.views > 1:
-        result |= {"self_ensemble": True, "views": evaluation.views, "plain": rows[plain.name][PUBLISHED]}
+    if views > 1:
+        result |= {"self_ensemble": True, "views": views, "plain": rows[plain.name][PUBLISHED]}
     for denoiser in filters:
         result.setdefault("classical", {})[denoiser.name] = rows[denoiser.name]
 
-    evaluation.write(result)
+    if json is not None:
+        write_json(result, json)
     return result
 
 
@@ -204,25 +208,3 @@ def require_finite(frame: str, value: float) -> float:
         raise ValueError(f"{frame}: the result is not finite; the weights are damaged")
 
     return value
-
-
-def _page(
-    evaluation: Evaluation,
-    result: Mapping[str, Any],
-    denoiser: RawDenoiser,
-    filters: Sequence[RawDenoiser],
-    trials: Sequence[Trial],
-    noise: NoiseSpec,
-) -> Page:
-    """Make the page: the scores, and some frames noisy, denoised by each filter and by the denoiser, and clean."""
-    runs = {"plain": result.get("plain", result)}
-    if "plain" in result:
-        runs["self_ensemble"] = result
-
-    facts = {"Noise": noise, "Seed": str(evaluation.seed)}
-    title = f"{denoiser.name} on {evaluation.data}"
-    page = Page.of_scores(title, {denoiser.name: [runs]}, result.get("classical", {}), facts)
-    for trial in select_for_page(trials):
-        page.add_frame(make_panels([*filters, denoiser], trial))
-
-    return page
