@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from rawaug.commands import YAML, require_results
 from rawaug.data.picture_pairs import is_picture_pairs
-from rawaug.evaluation.comparison import BenchmarkSettings, compare_pictures, compare_raw
+from rawaug.evaluation.comparison import compare_pictures, compare_raw
 from rawaug.files import require_output
 from rawaug.registry import require_between
 
@@ -62,14 +62,32 @@ def run(
         if path is not None:
             require_output(path, overwrite, extensions, inputs)
 
-    comparison = BenchmarkSettings(
-        denoisers, data, bin, count, crop, noise, iso, seed, device, json, report, table, figure, harm
-    )
     for option, value in (("count", count), ("crop", crop)):
         if value is not None:
             require_between(f"--{option}", value, 1, 2**20)
 
-    if is_picture_pairs(data):
-        compare_pictures(comparison)
-    else:
-        compare_raw(comparison)
+    if not is_picture_pairs(data):
+        compare_raw(
+            denoisers,
+            data,
+            bin=bin,
+            count=count,
+            crop=crop,
+            noise=noise,
+            iso=iso,
+            seed=seed,
+            device=device,
+            json=json,
+            report=report,
+            table=table,
+            figure=figure,
+            harm=harm,
+        )
+        return
+
+    for_raw: dict[str, Any] = {"bin": bin != 1, "noise": noise, "iso": iso, "seed": seed, "harm": harm}
+    for_raw |= {"report": report, "table": table, "figure": figure}
+    for key, value in for_raw.items():
+        if value:
+            raise ValueError(f"{data}: has developed pictures; --{key} is for RAW")
+    compare_pictures(denoisers, data, count=count, crop=crop, device=device, json=json)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,69 +46,74 @@ _ON_PAGE = 4
 """Largest number of frames on the page."""
 
 
-@dataclass(frozen=True)
-class BenchmarkSettings:
-    """The settings of a comparison by ``rawaug benchmark``.
+def compare_raw(
+    denoisers: Sequence[str],
+    data: str,
+    *,
+    bin: int = 1,
+    count: int | None = None,
+    crop: int | None = None,
+    noise: Any = None,
+    iso: list[float] | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    json: str | None = None,
+    report: str | None = None,
+    table: str | None = None,
+    figure: str | None = None,
+    harm: bool = False,
+) -> None:
+    """Compare denoisers of RAW on the same frozen noise; print the tables, and write them as JSON and as a page.
 
-    Attributes:
+    Args:
         denoisers: names or files.
-        data: clean frames, or real pairs of pictures, by a path or ``kind:path``.
+        data: clean frames, by a path or ``kind:path``.
         bin: the factor by which the frames are binned.
-        count: number of frames; None for 6, and of pictures all.
-        crop: side of the middles that are used, in pixels; None for 384, and of pictures the whole.
+        count: number of frames; None for 6.
+        crop: side of the middles that are used, in pixels; None for 384.
         noise: noise instead of the four strengths; None for these.
         iso: ISO values of the camera that ``noise`` names.
         seed: seed of the noise.
         device: device on which networks run.
         json: file to write the result to; None for none.
         report: page to write tables and crops to; None for none.
-        harm: whether the conditions of :mod:`rawaug.evaluation.harm` are measured, too.
         table: LaTeX file to write the table of known levels to; None for none.
         figure: file to draw crops of some frames into, .pdf or .png; None for none.
+        harm: whether the conditions of :mod:`rawaug.evaluation.harm` are measured, too.
     """
+    count, crop = count or _FRAMES, crop or _CROP
+    settings = {"denoisers": list(denoisers), "data": data, "bin": bin, "count": count, "crop": crop, "noise": noise}
+    settings |= {"iso": iso, "seed": seed, "table": table, "figure": figure, "harm": harm}
+    strengths = choose_strengths(noise, iso)
 
-    denoisers: Sequence[str]
-    data: str
-    bin: int = 1
-    count: int | None = None
-    crop: int | None = None
-    noise: Any = None
-    iso: list[float] | None = None
-    seed: int = 0
-    device: str = "cpu"
-    json: str | None = None
-    report: str | None = None
-    table: str | None = None
-    figure: str | None = None
-    harm: bool = False
+    # The denoisers of the table; one whose name is taken goes by its spec.
+    by_name: dict[str, RawDenoiser] = {}
+    for spec in dict.fromkeys((_ALWAYS, *shipped_of_mosaics(), *denoisers)):
+        denoiser = named_denoiser(spec, device).require_mosaic()
+        if denoiser.name in by_name:
+            denoiser = replace(denoiser, name=spec)
+        by_name[denoiser.name] = denoiser
+    opened = list(by_name.values())
 
-
-def compare_raw(comparison: BenchmarkSettings) -> None:
-    """Compare denoisers of RAW on the same frozen noise; print the tables, and write them as JSON and as a page."""
-    count, crop = comparison.count or _FRAMES, comparison.crop or _CROP
-    comparison = replace(comparison, count=count, crop=crop)
-    strengths = choose_strengths(comparison.noise, comparison.iso)
-    denoisers = _open_denoisers(comparison)
-
-    pairs = open_pairs(comparison.data, split="test")
+    pairs = open_pairs(data, split="test")
     pairs = as_frames(pairs).some(range(len(pairs))[:count])
-    frames = measure_own_noise(pairs, count).binned(comparison.bin)
-    cases = trials(frames, crop, comparison.seed, strengths)
+    frames = measure_own_noise(pairs, count).binned(bin)
+    cases = trials(frames, crop, seed, strengths)
 
-    noise = noise_note(cases, strengths, comparison.seed)
+    note = noise_note(cases, strengths, seed)
     facts = {
-        "data": comparison.data,
-        "bin": comparison.bin,
+        "data": data,
+        "bin": bin,
         "crop": crop,
-        "seed": comparison.seed,
-        "noise": noise,
+        "seed": seed,
+        "noise": note,
         "command": command_line(),
-        "weights_sha256": _hash_weights(denoisers),
+        "weights_sha256": _hash_weights(opened),
     }
-    result = {**facts, **benchmark(denoisers, cases)}
-    if comparison.harm:
-        guarded = [Guarded(denoiser) for denoiser in denoisers if denoiser.name in shipped_of_mosaics()]
-        result["harm"] = measure_harm([*denoisers, *guarded], frames, crop, comparison.seed)
+    result = {**facts, **benchmark(opened, cases)}
+    if harm:
+        guarded = [Guarded(denoiser) for denoiser in opened if denoiser.name in shipped_of_mosaics()]
+        result["harm"] = measure_harm([*opened, *guarded], frames, crop, seed)
 
     for title, head, cells in _all_tables(result):
         print_cells(title, ["denoiser", *head], cells)
@@ -116,59 +121,52 @@ def compare_raw(comparison: BenchmarkSettings) -> None:
     for line in ranking(result):
         print(line)
     notes = _make_notes(result)
-    print("\n".join([*notes, noise]))
+    print("\n".join([*notes, note]))
 
-    if comparison.json:
-        write_json(result, comparison.json)
-    if comparison.table:
-        write_text(benchmark_table(result, command_line()), comparison.table)
-        print(f"table: {comparison.table}")
-    if comparison.figure:
-        print(f"figure: {save_picture(list(crops(denoisers, cases, _ON_PAGE)), Path(comparison.figure))}")
-    if comparison.report:
-        page = _make_page(comparison, result, denoisers, cases, notes)
-        settings = asdict(comparison)
-        for key in ("device", "json", "report"):
-            del settings[key]
-        print(f"page: {page.write(Path(comparison.report), settings)}")
+    if json:
+        write_json(result, json)
+    if table:
+        write_text(benchmark_table(result, command_line()), table)
+        print(f"table: {table}")
+    if figure:
+        print(f"figure: {save_picture(list(crops(opened, cases, _ON_PAGE)), Path(figure))}")
+    if report:
+        page = _make_page(data, crop, display_strength(strengths), result, opened, cases, notes)
+        print(f"page: {page.write(Path(report), settings)}")
 
 
-def compare_pictures(comparison: BenchmarkSettings) -> None:
+def compare_pictures(
+    denoisers: Sequence[str],
+    data: str,
+    *,
+    count: int | None = None,
+    crop: int | None = None,
+    device: str = "cpu",
+    json: str | None = None,
+) -> None:
     """Compare denoisers of pictures; print the table, and write it as JSON.
 
-    Raises:
-        ValueError: if a setting is not the default that has no meaning for pictures.
+    Args:
+        denoisers: names or files.
+        data: real pairs of pictures, by a path or ``kind:path``.
+        count: number of pairs; None for all.
+        crop: side of the middles that are used, in pixels; None for the whole.
+        device: device on which networks run.
+        json: file to write the result to; None for none.
     """
-    usual = BenchmarkSettings(comparison.denoisers, comparison.data)
-    for key in ("bin", "noise", "iso", "seed", "report", "table", "figure", "harm"):
-        if getattr(comparison, key) != getattr(usual, key):
-            raise ValueError(f"{comparison.data}: has developed pictures; --{key} is for RAW")
+    opened = [PictureDenoiser.of(spec, device) for spec in denoisers]
+    pairs: Sequence[Any] = open_picture_pairs(data)
+    facts: dict[str, Any] = {"data": data}
+    if count is not None:
+        pairs = as_frames(pairs).some(range(len(pairs))[:count])
+    if crop is not None:
+        pairs = as_frames(pairs).middles(crop)
+        facts["crop"] = crop
 
-    denoisers = [PictureDenoiser.of(spec, comparison.device) for spec in comparison.denoisers]
-    pairs: Sequence[Any] = open_picture_pairs(comparison.data)
-    facts: dict[str, Any] = {"data": comparison.data}
-    if comparison.count is not None:
-        pairs = as_frames(pairs).some(range(len(pairs))[: comparison.count])
-    if comparison.crop is not None:
-        pairs = as_frames(pairs).middles(comparison.crop)
-        facts["crop"] = comparison.crop
-
-    result = picture_scores(denoisers, pairs)
-    print_pictures(comparison.data, result)
-    if comparison.json:
-        write_json({**facts, **result}, comparison.json)
-
-
-def _open_denoisers(comparison: BenchmarkSettings) -> list[RawDenoiser]:
-    """Open the denoisers of the table; one whose name is taken goes by its spec."""
-    by_name: dict[str, RawDenoiser] = {}
-    for spec in dict.fromkeys((_ALWAYS, *shipped_of_mosaics(), *comparison.denoisers)):
-        denoiser = named_denoiser(spec, comparison.device).require_mosaic()
-        if denoiser.name in by_name:
-            denoiser = replace(denoiser, name=spec)
-        by_name[denoiser.name] = denoiser
-
-    return list(by_name.values())
+    result = picture_scores(opened, pairs)
+    print_pictures(data, result)
+    if json:
+        write_json({**facts, **result}, json)
 
 
 def _hash_weights(denoisers: Sequence[RawDenoiser]) -> dict[str, str]:
@@ -211,25 +209,26 @@ def _make_notes(result: dict[str, Any]) -> list[str]:
 
 
 def _make_page(
-    comparison: BenchmarkSettings,
+    data: str,
+    crop: int,
+    strength: str,
     result: dict[str, Any],
     denoisers: Sequence[RawDenoiser],
     cases: Sequence[Trial],
     notes: Sequence[str],
 ) -> Page:
     """Make the page: tables, quality over cost, and crops of some frames by every denoiser."""
-    page = Page(f"Denoisers on {comparison.data}", result["noise"])
+    page = Page(f"Denoisers on {data}", result["noise"])
     page.add(texts=notes)
     for title, head, cells in _all_tables(result):
         page.add(title, head=["", *head], rows=cells)
 
-    strength = display_strength(choose_strengths(comparison.noise, comparison.iso))
     costs = plot_costs(collect_costs(result))
     chart = Figure(costs, "PSNR over GMAC", "curve", f"{strength}, levels told")
     page.add("Quality and cost", figures=[chart])
 
     page.add("Pictures", texts=[f"Noise: {strength}, levels told; PSNR of RAW."])
     for panels in crops(denoisers, cases, _ON_PAGE):
-        page.add_frame(panels, comparison.crop)
+        page.add_frame(panels, crop)
 
     return page

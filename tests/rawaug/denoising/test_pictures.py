@@ -15,6 +15,7 @@ import denoisers
 import rawaug
 from rawaug import bayer
 from rawaug.cli import main
+from rawaug.commands.benchmark import run as benchmark
 from rawaug.commands.denoise import run as denoise
 from rawaug.data.picture_pairs import open_picture_pairs
 from rawaug.denoising.denoise import files_for
@@ -22,7 +23,6 @@ from rawaug.denoising.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.folder import denoise_folder
 from rawaug.denoising.picture_levels import estimate_level
 from rawaug.denoising.pictures import PictureDenoiser, PictureFiles
-from rawaug.evaluation.comparison import BenchmarkSettings, compare_pictures
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, register
 from rawaug.io.pictures import read_picture, write_picture
 from rawaug.plugin.finishing import gaussian_blur
@@ -193,10 +193,11 @@ def test_a_benchmark_of_pictures_crops_and_counts_and_refuses_what_is_for_raw(tm
     whole, cropped = scores.values()
     assert (whole["pictures"], cropped["pictures"], cropped["crop"]) == (3, 2, 32)
     assert whole["rows"]["noisy input"] != cropped["rows"]["noisy input"]
-    of_raw: dict[str, Any] = {"bin": 2, "noise": "upi", "iso": [100.0], "seed": 1, "report": "r.html", "table": "t.tex"}
+    of_raw: dict[str, Any] = {"bin": 2, "noise": "upi", "iso": [100.0], "seed": 1}
+    of_raw |= {"report": str(tmp_path / "r.html"), "table": str(tmp_path / "t.tex")}
     for key, value in of_raw.items():
         with pytest.raises(ValueError, match=f"--{key} is for RAW"):
-            compare_pictures(replace(BenchmarkSettings(["NonLocalMeans@10"], f"cc15:{tmp_path}"), **{key: value}))
+            benchmark("NonLocalMeans@10", data=f"cc15:{tmp_path}", **{key: value})
 
 
 def test_a_cmyk_picture_is_refused_in_one_line(tmp_path: Path) -> None:
