@@ -100,8 +100,15 @@ def identify_content(path: str | Path) -> Content:
 def identify_opened(file: BinaryIO, path: Path) -> Content:
     """Identify a file that is open at its beginning, as :func:`identify_content` does."""
     content = _by_bytes(file)
-    if content.kind == "other" or content.format == "TIFF":
-        return _by_extension(path.suffix.lower(), content)
+    if content.kind != "other" and content.format != "TIFF":
+        return content
+
+    # The extension decides if the bytes say nothing; those of a TIFF can be either.
+    extension = path.suffix.lower()
+    if extension in (*RAW_EXTENSIONS, *_UNKNOWN_RAW):
+        return Content("raw", extension[1:].upper())
+    if extension in ALL_PICTURE_EXTENSIONS and content.kind == "other":
+        return Content("picture", "unknown")
     return content
 
 
@@ -123,15 +130,6 @@ def _by_bytes(file: BinaryIO) -> Content:
     if head.startswith(_PORTABLE) and head[2:3].isspace():
         return Content("picture", "PNM")
     return _OTHER
-
-
-def _by_extension(extension: str, content: Content) -> Content:
-    """Identify a file by its extension if its bytes do not say; those of a TIFF can be either."""
-    if extension in (*RAW_EXTENSIONS, *_UNKNOWN_RAW):
-        return Content("raw", extension[1:].upper())
-    if extension in ALL_PICTURE_EXTENSIONS and content.kind == "other":
-        return Content("picture", "unknown")
-    return content
 
 
 def _of_boxes(head: bytes) -> Content:

@@ -61,7 +61,7 @@ def find_fault(path: Path, stored: StoredMosaic, numbers: np.ndarray | None) -> 
                 return "its pixels do not match NewRawImageDigest"
             return ""
         if stored.digest is not None:
-            if md5(_bytes(numbers), usedforsecurity=False).digest() != stored.digest:
+            if md5(np.ascontiguousarray(numbers, "<u2").tobytes(), usedforsecurity=False).digest() != stored.digest:
                 return "its pixels do not match RawImageDigest"
             return ""
 
@@ -113,12 +113,8 @@ def tiled_digest(numbers: np.ndarray) -> bytes:
     for top in range(0, height, _TILE):
         for left in range(0, width, _TILE):
             tile = numbers[top : top + _TILE, left : left + _TILE]
-            digests.update(md5(_bytes(tile), usedforsecurity=False).digest())
+            digests.update(md5(np.ascontiguousarray(tile, "<u2").tobytes(), usedforsecurity=False).digest())
     return digests.digest()
-
-
-def _bytes(numbers: np.ndarray) -> bytes:
-    return np.ascontiguousarray(numbers, "<u2").tobytes()
 
 
 def _find_fault_in_streams(path: Path, stored: StoredMosaic) -> str:

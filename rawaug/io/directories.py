@@ -109,7 +109,12 @@ class TiffFile:
                 (at,) = struct.unpack_from(self.order + pointer, table, start + 4 + inside)
             entries[code] = Entry(code, dtype, values, at, size)
 
-        return Directory(entries, self._following(offset + head + count * step, pointer))
+        # Some programs leave out where the next directory begins after the last one.
+        following = 0
+        end = offset + head + count * step
+        if end + inside <= self.end:
+            (following,) = struct.unpack(self.order + pointer, self.read(end, inside))
+        return Directory(entries, following)
 
     def directories(self) -> Iterator[Directory]:
         """Yield the first directories of a file and those that they point at, each once."""
@@ -176,13 +181,6 @@ class TiffFile:
         for numerator, denominator in zip(numbers[0::2], numbers[1::2], strict=True):
             fractions.append(numerator / denominator if denominator else 0.0)
         return fractions
-
-    def _following(self, offset: int, pointer: str) -> int:
-        """Read where the next directory begins. Some programs leave this out after the last one."""
-        size = struct.calcsize(self.order + pointer)
-        if offset + size > self.end:
-            return 0
-        return int(struct.unpack(self.order + pointer, self.read(offset, size))[0])
 
     def read(self, offset: int, size: int) -> bytes:
         """Read bytes of the file; raise DamagedTags if it has fewer."""
