@@ -94,7 +94,9 @@ def run(
     if recipe.noise != "camera":
         noise_model(recipe.noise_at_iso)
     require_networks(recipe)
-    baselines = open_baselines(recipe)
+    baselines = []
+    for file in map(find_denoiser, recipe.baselines):
+        baselines.append(RawDenoiser.of(file, recipe.device, name=file.stem).require_mosaic())
 
     frames, listing = open_frames(recipe, given)
     say(*listing)
@@ -205,15 +207,6 @@ def require_networks(recipe: Recipe) -> None:
             if network.upscale > 1:
                 gives = "full colour: rawaug run demosaic trains it"
             raise ValueError(f"denoiser: {config.start or type(network).__name__} gives {gives}; take another network")
-
-
-def open_baselines(recipe: Recipe) -> list[RawDenoiser]:
-    """Open the trained denoisers to compare with; raise ValueError if one of them also demosaics."""
-    baselines = []
-    for file in map(find_denoiser, recipe.baselines):
-        baselines.append(RawDenoiser.of(file, recipe.device, name=file.stem).require_mosaic())
-
-    return baselines
 
 
 def as_trained(recipe: Recipe, pairs: Sequence[Any], isp: DictionaryISP) -> Sequence[Any]:

@@ -18,6 +18,7 @@ from typing import BinaryIO, NamedTuple
 
 from rawaug.io.colour import ADOBE_RGB, SRGB_COLOUR, Colour, colour_from_chromaticities, colour_from_code_points
 from rawaug.io.directories import EXIF, INTEROPERABILITY, ORIENTATION, DamagedTags, Directory, TiffFile
+from rawaug.io.jpeg_xl import CODESTREAM, MOST_OF_CODESTREAM, read_codestream
 
 EXIF_PREFIX = b"Exif\0\0"
 XMP_PREFIX = b"http://ns.adobe.com/xap/1.0/\0"
@@ -492,130 +493,24 @@ def _properties_of_item(file: BinaryIO, box: MediaBox, item: int) -> list[int]:
 
 
 def _of_jpeg_xl(file: BinaryIO) -> Headers:
-    """Read EXIF and XMP of a file of boxes, and whether the codestream is an animation."""
+    """Read EXIF and XMP of a file of boxes, and whether the codestream is an animation or CMYK."""
     file.seek(0)
-    if file.read(2) == b"\xff\x0a":
-        file.seek(0)
-        return _of_codestream(file.read(_MOST_OF_CODESTREAM))
+    codestream = file.read(MOST_OF_CODESTREAM)
+    exif, xmp = None, None
+    if not codestream.startswith(CODESTREAM):
+        codestream = b""
+        for box in boxes(file, 0, file.seek(0, 2)):
+            file.seek(box.start)
+            size = min(box.end - box.start, _MOST_BYTES)
+            if box.name == b"Exif":
+                exif = file.read(size)[4:]
+            elif box.name == b"xml ":
+                xmp = file.read(size)
+            elif box.name in (b"jxlc", b"jxlp") and not codestream:
+                codestream = file.read(MOST_OF_CODESTREAM)[4 if box.name == b"jxlp" else 0 :]
 
-    exif, xmp, codestream = None, None, b""
-    for box in boxes(file, 0, file.seek(0, 2)):
-        file.seek(box.start)
-        size = min(box.end - box.start, _MOST_BYTES)
-        if box.name == b"Exif":
-            exif = file.read(size)[4:]
-        elif box.name == b"xml ":
-            xmp = file.read(size)
-        elif box.name in (b"jxlc", b"jxlp") and not codestream:
-            codestream = file.read(_MOST_OF_CODESTREAM)[4 if box.name == b"jxlp" else 0 :]
-    return _of_codestream(codestream)._replace(exif=exif, xmp=xmp)
-
-
-_MOST_OF_CODESTREAM = 1024
-
-
-class _Bits:
-    """Bits of a codestream, the lowest of each byte first."""
-
-    def __init__(self, data: bytes) -> None:
-        self._value, self._left = int.from_bytes(data, "little"), 8 * len(data)
-
-    def take(self, count: int) -> int:
-        if count > self._left:
-            raise ValueError("the codestream ends in its header")
-        bits = self._value & ((1 << count) - 1)
-        self._value >>= count
-        self._left -= count
-        return bits
-
-    def choose(self, *widths: int) -> None:
-        """Pass over a number that is written in one of four widths."""
-        self.take(widths[self.take(2)])
-
-    def number(self, *forms: tuple[int, int]) -> int:
-        """Read a number that is written as one of four offsets and widths."""
-        offset, width = forms[self.take(2)]
-        return offset + self.take(width)
-
-
-def _of_codestream(data: bytes) -> Headers:
-    """Read whether a codestream is an animation, or has a black channel, which makes it CMYK."""
-    if not data.startswith(b"\xff\x0a"):
-        return Headers()
-    bits = _Bits(data[2:])
-    _pass_size(bits)
-    all_default = bits.take(1)
-    if all_default:
-        return Headers()
-
-    if bits.take(1):  # more fields
-        bits.take(3)  # orientation
-        if bits.take(1):
-            _pass_size(bits)
-        if bits.take(1):
-            _pass_preview_size(bits)
-        if bits.take(1):
-            return Headers(animated=True)
-
-    _pass_bit_depth(bits)
-    bits.take(1)  # whether 16 bits are enough
-    count = bits.number((0, 0), (1, 0), (2, 4), (1, 12))
-    try:
-        if any(_extra_channel(bits) == _BLACK for _ in range(count)):
-            return Headers(unread="is CMYK in JPEG XL")
-    except ValueError:  # long names; the decoder knows the channels
-        pass
-    return Headers()
-
-
-_ALPHA, _SPOT, _BLACK, _CFA = 0, 2, 4, 5
-
-
-def _extra_channel(bits: _Bits) -> int:
-    """Read what a further channel is."""
-    if bits.take(1):  # all is as usual
-        return _ALPHA
-    kind = bits.number((0, 0), (1, 0), (2, 4), (18, 6))
-    _pass_bit_depth(bits)
-    bits.choose(0, 0, 0, 3)  # subsampling
-    bits.take(8 * bits.number((0, 0), (0, 4), (16, 5), (48, 10)))  # name
-    if kind == _ALPHA:
-        bits.take(1)
-    elif kind == _SPOT:
-        bits.take(4 * 16)
-    elif kind == _CFA:
-        bits.choose(0, 2, 4, 8)
-    return kind
-
-
-def _pass_bit_depth(bits: _Bits) -> None:
-    is_floating = bits.take(1)
-    bits.choose(0, 0, 0, 6)
-    if is_floating:
-        bits.take(4)
-
-
-def _pass_size(bits: _Bits) -> None:
-    """Pass over height and width; the latter is left out if a ratio gives it."""
-    small = bits.take(1)
-    for what in ("height", "width"):
-        if small:
-            bits.take(5)
-        else:
-            bits.choose(9, 13, 18, 30)
-        if what == "height" and bits.take(3):
-            return
-
-
-def _pass_preview_size(bits: _Bits) -> None:
-    small = bits.take(1)
-    for what in ("height", "width"):
-        if small:
-            bits.choose(0, 0, 5, 9)
-        else:
-            bits.choose(6, 8, 10, 12)
-        if what == "height" and bits.take(3):
-            return
+    animated, has_black = read_codestream(codestream)
+    return Headers(exif, xmp, animated=animated, unread="is CMYK in JPEG XL" if has_black else "")
 
 
 _READERS = {
