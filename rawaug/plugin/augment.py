@@ -491,6 +491,12 @@ class RawAugment(PairMaker):
         """The pattern of the RAW, such as ``"RGGB"`` or ``"XTRANS"``."""
         return str(self.isp.cfa) if self.pattern is None else self.pattern.name
 
+    def load_kernels(self) -> None:
+        """Load the compiled code, 0.3 s, in the process that will be forked: else every worker of every pass does."""
+        if self.device.type == "cpu":
+            black = torch.zeros(1, 3, 2, 2, dtype=torch.uint8)
+            self.baked(black, self.settings.constants)
+
     @property
     def is_row_exact(self) -> bool:
         """Whether the pairs of a batch have the bits that each has alone: RAW has, a development is off by rounding."""

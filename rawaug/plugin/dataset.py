@@ -68,6 +68,8 @@ class _Pairs(Dataset[Sample], Generic[Sample]):
         self.seed, self.key, self.views, self.bgr, self.zoom = seed, key, views, bgr, zoom
         self.dataset = self._open(dataset)
         self._epochs = self._make_epochs(self.dataset)
+        if isinstance(self.augment, RawAugment):
+            self.augment.load_kernels()
 
     def _open(self, dataset: Any) -> Any:
         """Open the folder of pictures if a path is given."""
