@@ -136,7 +136,7 @@ def run_d5000(folder: Path, photographs: Path, out: str, beside: Sequence[str]) 
     recipe = make_recipe("d5000", photographs, out, blur or 0.0, isp=str(file), noise=short.levels)
     for arm in ("own", "sharp"):  # the shot's own picture is as noisy as the shot
         del recipe.arms[arm]
-    recipe.arms["soft"].draw = Draw("perturb", blur=blur or 0.0, exposure=2.0)
+    recipe.arms["soft"].draw = Draw("perturb", blur=blur or 0.0, exposure=-2.0)
     run(recipe, overwrite=True, pairs=train, validation=watched, test=[block_pair(block, short) for block in right])
 
     # The errors of the bracket, which know the noise of the reference.
