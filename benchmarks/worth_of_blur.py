@@ -73,7 +73,7 @@ def main() -> None:
 
     pictures = open_pictures(options.photographs, CROP)
     isp = DictionaryISP.from_pretrained("universal")
-    noise = noise_model("any camera")
+    noise = noise_model("cycleisp_sidd")
     sets = noisy_sets(options.sets)
     rows: dict[tuple[str, str], dict[str, list[float]]] = {key: {} for key in sets}
     for seed in range(options.seeds):
