@@ -52,7 +52,7 @@ def unprocess(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
     scale = np.float32((entries - 1) / largest_code)
 
     codes, pieces, curves = None, None, _present(camera.curves)
-    if in_bytes and entries == 256:
+    if in_bytes and entries == 256 and curves is not None:
         codes, curves = curves, None
         pieces = np.ascontiguousarray(codes.view(np.uint8).reshape(batch, 256, 4).swapaxes(1, 2)).reshape(batch, 1024)
     settings = (
