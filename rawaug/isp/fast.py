@@ -31,7 +31,7 @@ from rawaug.isp.functional import highlight_rise
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import BatchParams, Stage, Tables, node_colours
 from rawaug.isp.tone import STEPS, to_code
-from rawaug.kernels import fastest
+from rawaug.kernels import can_use_triton, fastest
 from rawaug.kernels.reference import Display, Unprocessing, blur_taps, fall_off, look_up, mask_frame, render, unprocess
 from rawaug.kernels.runtime import move_together, one_thread
 
@@ -171,7 +171,7 @@ class BakedISP(nn.Module):
             noise have to make them one after the other.
         """
         _require_batch(srgb, params, place, blur)
-        if self._gain(srgb, params, place) is not None:
+        if not can_use_triton(srgb) or self._gain(srgb, params, place) is not None:
             return None
         camera = self._unprocessing(srgb, params, place, blur)
         return fastest(
