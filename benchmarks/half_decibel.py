@@ -1,9 +1,9 @@
-"""Why five whole frames beat augmentation in a short training: one suspect changed at a time, at equal real crops.
+"""Whether five whole frames beat augmentation in a short training: one suspect changed at a time, at equal real crops.
 
     python -m benchmarks.half_decibel PHOTOS --out RUNS --seed 0 --arms real mixtures more
 
 Every arm but ``real8`` sees two real crops a step, and those with more in a batch have six of elsewhere. The set-up is
-a short training in which augmentation loses: five whole frames of ``phones:``, one of each phone, the ISP fitted to
+a short training in which augmentation has lost: five whole frames of ``phones:``, one of each phone, the ISP fitted to
 them, a U-Net of width 8 without a domain, 2,400 steps with a linear loss, weights by ten validation frames, 40 test
 frames.
 
