@@ -5,8 +5,8 @@
 Every method makes clean RAW, noisy RAW and the variance map, packed, of photographs: a training batch of 16 crops, and
 pictures of 12 Mpix. *upi* is Brooks' pipeline as published: picture by picture and operation by operation, from floats,
 with its own noise. *copy* turns bytes into as many floats as are made of them, and does no more; *drawn before* is
-rawaug without the draw of its parameters; *rgb* and *srgb* are its other targets. All are timed in turn, and the
-fastest run of each counts.
+rawaug without the draw of its parameters; *rgb*, *srgb* and *burst* are its other targets; *blurred* softens linear
+light. All are timed in turn, and the fastest run of each counts.
 
 The roofline is the bandwidth of a large copy in the same run, bytes read plus bytes written a second. A pixel counts
 as :data:`COUNTED` bytes, whatever a method moves; rawaug's two passes move :data:`MOVED`.
@@ -31,7 +31,8 @@ from rawaug import bayer
 from rawaug.data.demo import demo_photographs
 from rawaug.paper.baselines.upi import UPI, unprocess_pixels
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.targets import Target
+from rawaug.plugin.draw import Draw
+from rawaug.plugin.targets import Burst, Srgb, Target
 
 COUNTED = 3 + 4 + 4
 """Bytes a pixel that any augmentation must move: uint8 in, noisy and clean RAW out in float32."""
@@ -68,10 +69,22 @@ def methods(batch: Tensor) -> dict[str, Callable[[], object]]:
     targets: tuple[Target, ...] = ("raw", "rgb", "srgb")
     ours = {target: RawAugment.from_pretrained("universal", target=target).to(batch.device) for target in targets}
     drawn = ours["raw"].sample(batch)
+    soft, targets_of_finish = Draw(blur=0.6), Srgb(finish=True)
+    blurred = {target: RawAugment.from_pretrained("universal", target=target, draw=soft) for target in targets}
+    bursts = [RawAugment.from_pretrained("universal", burst=Burst(4), draw=draw) for draw in (Draw(), soft)]
+    finished = RawAugment.from_pretrained("universal", target=targets_of_finish)
+    for augment in (*blurred.values(), *bursts, finished):
+        augment.to(batch.device)
     return {
         "rawaug": lambda: ours["raw"](batch),
         "rgb": lambda: ours["rgb"](batch),
         "srgb": lambda: ours["srgb"](batch),
+        "srgb, finished": lambda: finished(batch),
+        "burst of 4": lambda: bursts[0](batch),
+        "rawaug, blurred": lambda: blurred["raw"](batch),
+        "rgb, blurred": lambda: blurred["rgb"](batch),
+        "srgb, blurred": lambda: blurred["srgb"](batch),
+        "burst of 4, blurred": lambda: bursts[1](batch),
         "rawaug, drawn before": lambda: ours["raw"].apply(batch, drawn),
         "copy": lambda: batch.float(),
         "upi": lambda: [published_upi(picture[None], generator) for picture in floats],

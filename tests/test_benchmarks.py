@@ -15,6 +15,7 @@ from benchmarks import (
     crops,
     denoise,
     figures,
+    gpu,
     ingredients,
     measure,
     patterns,
@@ -41,6 +42,17 @@ def test_augmentation_is_compared_in_one_unit() -> None:
     assert ours["moved"] == pytest.approx(ours["counted"] * 19 / 11)
     assert rows["upi"]["ratio"] == pytest.approx(ours["mpix_s"] / rows["upi"]["mpix_s"])
     assert "moved" not in rows["upi"], "what other methods move is not known"
+
+
+def test_the_benchmark_of_gpus_runs_every_part_and_judges_its_bars(tmp_path: Path) -> None:
+    out = tmp_path / "figures.json"
+    figures = gpu.main(["--device", "cpu", "--quick", "--threads", "1", "--json", str(out)])
+    assert json.loads(out.read_text()).keys() == figures.keys()
+    assert {"crops", "whole frames", "steps", "training", "loaders", "rawaug-small", "rawaug-base"} <= set(figures)
+    assert len(figures["bars"]) == len(gpu.BARS), "every bar finds its figure"
+    part, row, figure, limit, _ = gpu.BARS[0]
+    assert gpu.judge({part: {row: {figure: limit / 2}}}) == {f"{part}, {row}: {figure} at most {limit:g}": True}
+    assert not any(gpu.judge({part: {row: {figure: 2 * limit}}}).values())
 
 
 def test_denoising_is_timed_whole_and_in_tiles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,11 +7,21 @@ from json import dumps
 from pathlib import Path
 from typing import Any
 
+import torch
+
 import denoisers
 from denoisers.files import FOLDER
 from rawaug.camera.matrices import load_cameras
 from rawaug.camera.names import camera_key, similar_cameras
 from rawaug.camera.own import Camera, is_camera_file
+from rawaug.denoising.convolutions import (
+    SIZE_OF_NETWORKS,
+    USUAL,
+    convolution_speeds,
+    expect_seconds,
+    has_fast_bfloat16,
+    processor_name,
+)
 from rawaug.errors import count_of
 from rawaug.files import find_weights, read_header, sha256
 from rawaug.isp.description import describe_isp, tone_table
@@ -25,11 +35,12 @@ _WITH_LEVELS = 3
 
 
 def run(weights: str, /, *part: str, json: bool = False) -> None:
-    """Describe a weights file, or list the known cameras: rawaug info cameras [PART].
+    """Describe a weights file, list the known cameras (rawaug info cameras [PART]), or time this machine.
 
     Args:
         weights: a .safetensors file, the name of a shipped ISP or denoiser, or the YAML file of a camera of your own;
-            or the word cameras.
+            or the word cameras, or the word machine: how fast its convolutions are in float32 and bfloat16, which of
+            them the networks use, and how long each takes for 12 megapixels.
         part: of the names of the cameras to list, such as A7 III.
         json: print one JSON object, for programs; an ISP's has its tone curve at 256 codes, and cameras' have their
             matrices.
@@ -37,11 +48,37 @@ def run(weights: str, /, *part: str, json: bool = False) -> None:
     if weights == "cameras":
         rows = cameras(" ".join(part))
         text = dumps({"cameras": rows}) if json else _table(rows)
+    elif weights == "machine" and not part:
+        text = dumps(machine_as_json()) if json else describe_machine()
     elif part:
         raise ValueError(f"{' '.join(part)}: too many arguments; use rawaug info cameras to look for a camera")
     else:
         text = dumps(read_facts(weights)) if json else describe_file(weights)
     print(text)
+
+
+def machine_as_json() -> dict[str, Any]:
+    """Collect the speed of this processor's convolutions, and what follows from it for the shipped networks."""
+    return {
+        "processor": processor_name(),
+        "threads": torch.get_num_threads(),
+        "gmac_per_second": convolution_speeds(),
+        "precision": "bfloat16" if has_fast_bfloat16(torch.device("cpu")) else "float32",
+        "seconds_of_12_megapixels": {name: round(expect_seconds(name, USUAL), 1) for name in SIZE_OF_NETWORKS},
+    }
+
+
+def describe_machine() -> str:
+    """Write :func:`machine_as_json` as lines."""
+    machine = machine_as_json()
+    speeds = ", ".join(f"{speed:g} in {precision}" for precision, speed in machine["gmac_per_second"].items())
+    lines = [
+        f"{machine['processor']}, {count_of(machine['threads'], 'thread')}",
+        f"convolutions, GMAC a second: {speeds}; networks compute in {machine['precision']}",
+    ]
+    for name, seconds in machine["seconds_of_12_megapixels"].items():
+        lines.append(f"{name}: about {seconds:g} s for {USUAL:.0f} megapixels, without start, reading and writing")
+    return "\n".join(lines)
 
 
 def cameras(part: str = "") -> list[dict[str, Any]]:

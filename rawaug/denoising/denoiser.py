@@ -35,9 +35,10 @@ from denoisers.published import Image, NetworkFile, find_image_kind, read_networ
 from denoisers.tiles import TILE
 from rawaug import bayer
 from rawaug.bayer import CFA, noise_variance
+from rawaug.denoising.convolutions import has_fast_bfloat16
 from rawaug.files import read_header, sha256
 from rawaug.io import RawFrame
-from rawaug.kernels.runtime import find_device, has_fast_bfloat16
+from rawaug.kernels.runtime import find_device
 from rawaug.progress import progress
 from rawaug.registry import Spec, spec_label, split_spec, suggest
 

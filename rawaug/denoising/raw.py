@@ -30,6 +30,7 @@ from torch import Tensor
 from denoisers.files import JOINT
 from rawaug import bayer
 from rawaug.bayer import CFA, GreenDifference
+from rawaug.denoising.convolutions import choose_network
 from rawaug.denoising.defects import find_lone_sites, mend_sites, read_defects
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.denoising.folder import Files
@@ -43,6 +44,7 @@ from rawaug.io.content import RAW_EXTENSIONS, Listing, list_files
 from rawaug.io.dng import LINEAR_WHITE, cell_of_planes
 from rawaug.io.isolated import isolated
 from rawaug.io.raw import develop
+from rawaug.kernels.runtime import find_device
 
 MID_GREY = 0.18
 """The signal whose noise is stated for photographers, on the scale black 0, white 1."""
@@ -199,7 +201,7 @@ class RawFiles(Files[Denoised]):
         self._by_pattern = denoiser is None and not linear
 
         if denoiser is None:
-            denoiser = JOINT if linear else RawDenoiser.default
+            denoiser = JOINT if linear else choose_network(find_device(device))
         if not isinstance(denoiser, RawDenoiser) or changes or device != "auto":
             denoiser = RawDenoiser.of(denoiser, **self._options)
         self.denoiser: RawDenoiser = denoiser

@@ -54,18 +54,6 @@ def find_device(name: str, key: str = "device", count: int = 1) -> torch.device:
     return torch.device(kind)
 
 
-def has_fast_bfloat16(device: torch.device) -> bool:
-    """Tell whether dense convolutions are faster in bfloat16 there: with AVX-512 BF16, AMX, or on newer GPUs."""
-    if device.type == "cuda":
-        return torch.cuda.is_bf16_supported()
-    if device.type != "cpu":
-        return False
-
-    get_capabilities = getattr(torch.cpu, "get_capabilities", dict)  # PyTorch has it from 2.7 on
-    capabilities: dict[str, Any] = get_capabilities()
-    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
-
-
 _ALIGNMENT = 16
 """A tensor among others begins at a multiple of this many bytes, as any type may."""
 

@@ -20,8 +20,8 @@ from torch import Tensor
 import denoisers
 from denoisers.files import find_denoiser
 from denoisers.network import Denoiser
+from rawaug.denoising.convolutions import has_fast_bfloat16
 from rawaug.files import sha256
-from rawaug.kernels.runtime import has_fast_bfloat16
 from rawaug.registry import require_between
 from rawaug.training.estimators import ESTIMATORS, Supervised
 from rawaug.training.losses import Criterion
