@@ -40,7 +40,7 @@ COMMANDS = {
     "export": "Write a denoiser as ONNX, or an ISP as a .cube.",
     "fit": "Fit a dictionary ISP to RAW files of a camera.",
     "hdr": "Merge exposures of a scene in RAW, or change the exposure of a single picture.",
-    "info": "Describe a weights file, or list the known cameras: rawaug info cameras [PART].",
+    "info": "Describe a weights file, list the known cameras (rawaug info cameras [PART]), or time this machine.",
     "judge": "Estimate the PSNR of denoisers on your own RAW files, without clean ones.",
     "preview": "Draw a picture at every stage of an ISP, and as augmented RAW.",
     "run": "Run a recipe: rawaug run RECIPE [--key value ...]; resumable, writes runs/NAME.",

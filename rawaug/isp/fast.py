@@ -317,7 +317,12 @@ class FastForward(nn.Module):
         matrix, floor, frame, curves, shading = _batch_params(self._host[0].ordered_stages, linear, params, place)
         if curves.numel():
             table = table[:0]
-            light = torch.linspace(0.0, 1.0, _CURVE_NODES).square().to(curves).expand(len(curves), 1, 1, -1)
+            light = (
+                torch.linspace(0.0, 1.0, _CURVE_NODES, dtype=torch.float32)
+                .square()
+                .to(curves)
+                .expand(len(curves), 1, 1, -1)
+            )
             curves = to_code(light, curves)[:, 0, 0]
 
         gains = 1.0 / floor[:, 0]
@@ -357,11 +362,11 @@ def _copy_to_host(isp: DictionaryISP) -> list[DictionaryISP]:
 def _batch_params(stages: Sequence[Stage], image: Tensor, params: ISPParams, place: Tensor | None) -> BatchParams:
     batch, _, height, width = image.shape
     batch_params = BatchParams(
-        matrix=torch.eye(3).expand(batch, 3, 3),
-        floor=torch.ones(batch, 1, 3),
-        frame=torch.zeros(batch, 6),
-        curves=torch.empty(batch, 0),
-        shading=torch.empty(0),
+        matrix=torch.eye(3, dtype=torch.float32).expand(batch, 3, 3),
+        floor=torch.ones(batch, 1, 3, dtype=torch.float32),
+        frame=torch.zeros(batch, 6, dtype=torch.float32),
+        curves=torch.empty(batch, 0, dtype=torch.float32),
+        shading=torch.empty(0, dtype=torch.float32),
     )
     params = params.map(Tensor.cpu)
     for stage in stages:
@@ -393,12 +398,13 @@ def _place_gain(
     places = [[0, 0, height, width]] * len(params.gains)
     if place is not None:
         places = place.tolist()
-    frame = torch.tensor([mask_frame(row, height, width, (0.0, 0.0)) for row in places])
+    frames = [mask_frame(row, height, width, (0.0, 0.0)) for row in places]
+    frame = torch.tensor(frames, dtype=torch.float32)
     sides = torch.tensor(places, dtype=torch.float32)[:, 2:4]
     edges = sides / sides.square().sum(dim=1, keepdim=True).sqrt()
 
-    down = torch.linspace(0.0, height - 1.0, min(_PLACE_NODES, height))[:, None]
-    right = torch.linspace(0.0, width - 1.0, min(_PLACE_NODES, width))
+    down = torch.linspace(0.0, height - 1.0, min(_PLACE_NODES, height), dtype=torch.float32)[:, None]
+    right = torch.linspace(0.0, width - 1.0, min(_PLACE_NODES, width), dtype=torch.float32)
     start_y, start_x, down_y, down_x, right_y, right_x = frame[:, :, None, None].unbind(1)
     y = start_y + down * down_y + right * right_y
     x = start_x + down * down_x + right * right_x
