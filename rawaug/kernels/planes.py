@@ -99,12 +99,14 @@ def _rows(mosaic, red_row, red_column, homogeneous, gains, rgb, start, stop):  #
         _leads(pictures, lead)
 
     sums, total = np.zeros(width, np.int32), np.ones(width, np.int32)
+    left, middle, right, inner = sums[:-2], sums[1:-1], sums[2:], total[1:-1]
     for i in range(_MARGIN, rows - _MARGIN):
         if homogeneous:
+            above, here, below = lead[i - 1], lead[i], lead[i + 1]
             for j in range(width):
-                sums[j] = np.int32(lead[i - 1, j]) + np.int32(lead[i, j]) + np.int32(lead[i + 1, j])
-            for j in range(1, width - 1):
-                total[j] = sums[j - 1] + sums[j] + sums[j + 1]
+                sums[j] = np.int32(above[j]) + np.int32(here[j]) + np.int32(below[j])
+            for j in range(len(inner)):
+                inner[j] = left[j] + middle[j] + right[j]
         for c in range(3):
             along_row, along_column = pictures[0, c, i], pictures[directions - 1, c, i]
             _pick(along_row, along_column, total, gains[c], rgb[c, start + i - _MARGIN])
@@ -120,92 +122,131 @@ def _pick(along_row, along_column, total, gain, out):  # type: ignore[no-untyped
         out[j] = value / gain
 
 
+# Below, neighbours are slices that begin earlier or later: an index that could be negative keeps a loop from vectors.
+
+
 @compile_part
-def _green_in_row(own, measured, out):  # type: ignore[no-untyped-def]
+def _green_in_row(row, measured, out):  # type: ignore[no-untyped-def]
     """Fill in the green of a row from the row itself; columns of the parity ``measured`` hold green."""
-    for j in range(2, len(own) - 2):
-        here = own[j]
-        bend = _TWO * here - own[j - 2] - own[j + 2]
-        value = (own[j - 1] + own[j + 1]) * _HALF + bend * _QUARTER
-        out[j] = here if (j & 1) == measured else value
+    count = len(row) - 4
+    second_left, left, here, right, second_right = row[:count], row[1:], row[2:], row[3:], row[4:]
+    green = out[2:]
+    for j in range(count):
+        bend = _TWO * here[j] - second_left[j] - second_right[j]
+        value = (left[j] + right[j]) * _HALF + bend * _QUARTER
+        green[j] = here[j] if (j & 1) == measured else value
 
 
 @compile_part
-def _green_in_column(second_above, above, own, below, second_below, measured, out):  # type: ignore[no-untyped-def]
+def _green_in_column(second_above, above, row, below, second_below, measured, out):  # type: ignore[no-untyped-def]
     """Fill in the green of a row from the columns, as :func:`_green_in_row`."""
-    for j in range(2, len(own) - 2):
-        here = own[j]
-        bend = _TWO * here - second_above[j] - second_below[j]
+    for j in range(len(row)):
+        bend = _TWO * row[j] - second_above[j] - second_below[j]
         value = (above[j] + below[j]) * _HALF + bend * _QUARTER
-        out[j] = here if (j & 1) == measured else value
+        out[j] = row[j] if (j & 1) == measured else value
 
 
 @compile_part
-def _green_of_lesser_change(second_above, above, own, below, second_below, measured, out):  # type: ignore[no-untyped-def]
+def _green_of_lesser_change(second_above, above, row, below, second_below, measured, out):  # type: ignore[no-untyped-def]
     """Fill in the green of a row from row or column, whichever changes less, or from both if they change alike."""
-    for j in range(2, len(own) - 2):
-        here = own[j]
-        bend = _TWO * here - own[j - 2] - own[j + 2]
-        bend_down = _TWO * here - second_above[j] - second_below[j]
-        row = (own[j - 1] + own[j + 1]) * _HALF + bend * _QUARTER
-        column = (above[j] + below[j]) * _HALF + bend_down * _QUARTER
-        change = abs(own[j - 1] - own[j + 1]) + abs(bend)
-        change_down = abs(above[j] - below[j]) + abs(bend_down)
+    count = len(row) - 4
+    second_left, left, here, right, second_right = row[:count], row[1:], row[2:], row[3:], row[4:]
+    second_up, up, down, second_down = second_above[2:], above[2:], below[2:], second_below[2:]
+    green = out[2:]
+    for j in range(count):
+        bend = _TWO * here[j] - second_left[j] - second_right[j]
+        bend_down = _TWO * here[j] - second_up[j] - second_down[j]
+        in_row = (left[j] + right[j]) * _HALF + bend * _QUARTER
+        in_column = (up[j] + down[j]) * _HALF + bend_down * _QUARTER
+        change = abs(left[j] - right[j]) + abs(bend)
+        change_down = abs(up[j] - down[j]) + abs(bend_down)
 
-        value = column if change > change_down else row
-        value = _HALF * (row + column) if change == change_down else value
-        out[j] = here if (j & 1) == measured else value
+        value = in_column if change > change_down else in_row
+        value = _HALF * (in_row + in_column) if change == change_down else value
+        green[j] = here[j] if (j & 1) == measured else value
 
 
 @compile_part
-def _colour_in_row(own, green, sites, out):  # type: ignore[no-untyped-def]
+def _colour_in_row(row, green, sites, out):  # type: ignore[no-untyped-def]
     """Fill in the colour that a row measures in columns of the parity ``sites``: green plus the difference nearby."""
-    for j in range(3, len(own) - 3):
-        across = (own[j - 1] - green[j - 1]) + (own[j + 1] - green[j + 1])
-        out[j] = own[j] if (j & 1) == sites else green[j] + across * _HALF
+    count = len(row) - 2
+    left, here, right = row[:count], row[1:], row[2:]
+    green_left, green_here, green_right = green[:count], green[1:], green[2:]
+    colour = out[1:]
+    for j in range(count):
+        across = (left[j] - green_left[j]) + (right[j] - green_right[j])
+        colour[j] = here[j] if (j & 1) != sites else green_here[j] + across * _HALF
 
 
 @compile_part
 def _colour_between_rows(above, below, green_above, green, green_below, sites, out):  # type: ignore[no-untyped-def]
     """Fill in the colour that the rows above and below measure; columns of the parity ``sites`` hold the row's own."""
-    for j in range(3, len(green) - 3):
-        down = (above[j] - green_above[j]) + (below[j] - green_below[j])
-        corners = above[j - 1] - green_above[j - 1] + above[j + 1] - green_above[j + 1]
-        corners += below[j - 1] - green_below[j - 1] + below[j + 1] - green_below[j + 1]
-        out[j] = green[j] + corners * _QUARTER if (j & 1) == sites else green[j] + down * _HALF
+    count = len(green) - 2
+    left, middle, right = above[:count], above[1:], above[2:]
+    low_left, low_middle, low_right = below[:count], below[1:], below[2:]
+    green_left, green_middle, green_right = green_above[:count], green_above[1:], green_above[2:]
+    green_low_left, green_low_middle, green_low_right = green_below[:count], green_below[1:], green_below[2:]
+    here, colour = green[1:], out[1:]
+    for j in range(count):
+        down = (middle[j] - green_middle[j]) + (low_middle[j] - green_low_middle[j])
+        corners = left[j] - green_left[j] + right[j] - green_right[j]
+        corners += low_left[j] - green_low_left[j] + low_right[j] - green_low_right[j]
+        colour[j] = here[j] + corners * _QUARTER if (j & 1) != sites else here[j] + down * _HALF
+
+
+@compile_part
+def _steps(red, green, blue, next_red, next_green, next_blue, light, colour):  # type: ignore[no-untyped-def]
+    """Square the steps of a row to its neighbours, of light and of colour."""
+    for j in range(len(next_red)):
+        step = green[j] - next_green[j]
+        warm, cold = red[j] - next_red[j] - step, blue[j] - next_blue[j] - step
+        light[j], colour[j] = step * step, warm * warm + cold * cold
+
+
+@compile_part
+def _lesser_step(across, above, below, out):  # type: ignore[no-untyped-def]
+    """Take the lesser of the largest step along the row and the largest along the column, from the second site on."""
+    before, after, up, down, least = across[:-1], across[1:], above[1:], below[1:], out[1:]
+    for j in range(len(before)):
+        least[j] = min(max(before[j], after[j]), max(up[j], down[j]))
+
+
+@compile_part
+def _count_alike(across, above, below, light, colour, sign, lead):  # type: ignore[no-untyped-def]
+    """Add to ``lead``, or subtract by ``sign``, how many of four neighbours are within the steps allowed at a site."""
+    left, left_colour = across[0, :-1], across[1, :-1]
+    right, right_colour = across[0, 1:], across[1, 1:]
+    up, up_colour = above[0, 1:], above[1, 1:]
+    down, down_colour = below[0, 1:], below[1, 1:]
+    most, most_colour, out = light[1:], colour[1:], lead[1:]
+    for j in range(len(left)):
+        alike = np.int32((left[j] <= most[j]) & (left_colour[j] <= most_colour[j]))
+        alike += np.int32((right[j] <= most[j]) & (right_colour[j] <= most_colour[j]))
+        alike += np.int32((up[j] <= most[j]) & (up_colour[j] <= most_colour[j]))
+        alike += np.int32((down[j] <= most[j]) & (down_colour[j] <= most_colour[j]))
+        out[j] += np.int8(sign * alike)
 
 
 @partial(compile_part, allocates=True)
 def _leads(pictures, lead):  # type: ignore[no-untyped-def]
     """Count how many more of a site's four neighbours are like it in the first picture than in the second."""
     rows, width = lead.shape
-    steps = np.zeros((2, 2, 2, rows, width), np.float32)  # picture; to the right, below; of light, of colour
+    steps = np.zeros((2, 2, rows, 2, width), np.float32)  # picture; to the right, below; row; of light, of colour
     for d in range(2):
         red, green, blue = pictures[d]
-        for down in range(2):
-            for i in range(3, rows - 4):
-                for j in range(3, width - 4):
-                    i2, j2 = i + down, j + 1 - down
-                    light = green[i, j] - green[i2, j2]
-                    warm, cold = red[i, j] - red[i2, j2] - light, blue[i, j] - blue[i2, j2] - light
-                    steps[d, down, 0, i, j], steps[d, down, 1, i, j] = light * light, warm * warm + cold * cold
+        for i in range(3, rows - 3):
+            right, down = steps[d, 0, i], steps[d, 1, i]
+            _steps(red[i], green[i], blue[i], red[i, 1:], green[i, 1:], blue[i, 1:], right[0], right[1])
+            _steps(red[i], green[i], blue[i], red[i + 1], green[i + 1], blue[i + 1], down[0], down[1])
 
     # The picture along rows is judged by its steps along rows, the one along columns by its steps along columns.
-    of_rows, of_columns = steps[0, 0], steps[1, 1]
+    light, colour = np.zeros(width, np.float32), np.zeros(width, np.float32)
     for i in range(4, rows - 4):
-        for j in range(4, width - 4):
-            light = min(max(of_rows[0, i, j - 1], of_rows[0, i, j]), max(of_columns[0, i - 1, j], of_columns[0, i, j]))
-            colour = min(max(of_rows[1, i, j - 1], of_rows[1, i, j]), max(of_columns[1, i - 1, j], of_columns[1, i, j]))
-
-            more = 0
-            for d in range(2):
-                across, down = steps[d, 0], steps[d, 1]
-                number = np.int32((across[0, i, j - 1] <= light) & (across[1, i, j - 1] <= colour))
-                number += (across[0, i, j] <= light) & (across[1, i, j] <= colour)
-                number += (down[0, i - 1, j] <= light) & (down[1, i - 1, j] <= colour)
-                number += (down[0, i, j] <= light) & (down[1, i, j] <= colour)
-                more += number if d == 0 else -number
-            lead[i, j] = more
+        across, above, below = steps[0, 0, i], steps[1, 1, i - 1], steps[1, 1, i]
+        _lesser_step(across[0], above[0], below[0], light)
+        _lesser_step(across[1], above[1], below[1], colour)
+        for d in range(2):
+            _count_alike(steps[d, 0, i], steps[d, 1, i - 1], steps[d, 1, i], light, colour, 1 - 2 * d, lead[i])
 
 
 def smooth(planes: Tensor, taps: Tensor) -> Tensor:
