@@ -346,3 +346,16 @@ def test_an_enlarged_crop_keeps_its_place_in_the_frame() -> None:
     y, x, down, _, _, right = large
     assert (down, right) == pytest.approx((plain[2] / 2, plain[5] / 2))
     assert (y, x) == pytest.approx((plain[0] - plain[2] / 4, plain[1] - plain[5] / 4))
+
+
+def test_compiled_code_is_loaded_where_pairs_are_made_not_in_every_worker() -> None:
+    """A process without compiled code makes RawPairs, and then has what its forked workers take over."""
+    script = (
+        "import torch, rawaug\n"
+        "from rawaug.kernels import cpu\n"
+        "assert not cpu._raw_rows.signatures\n"
+        "rawaug.RawPairs([torch.rand(3, 32, 32)], 'universal', crop=16)\n"
+        "assert cpu._raw_rows.signatures\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
