@@ -25,14 +25,16 @@ from rawaug.noise import (
 )
 from rawaug.noise.names import CAMERA
 from rawaug.noise.profiles import ProfileLevels
+from rawaug.registry import split_spec
 from rawaug.seeding import keyed_generator
 
 Shots = Mapping[tuple[str, float | None], tuple[float, float]]
 """Levels by camera and ISO."""
 Noise = str | Mapping[Any, Any] | Sequence[float] | MeasuredLevels
 """Where levels come from: ``"auto"``, ``"profile"`` (the tag), ``"estimate"``, a measured camera's name or law (at the
-file's ISO), ``"camera"`` (the law that the denoiser was trained for), an ISP's file or a camera's sheet, a law as
-``{"name": "MeasuredNoise", ...}``, two variances, or the levels of other files."""
+file's ISO, or at another one as ``{"name": ..., "iso": ...}``), ``"camera"`` (the law that the denoiser was trained
+for), an ISP's file or a camera's sheet, a law as ``{"name": "MeasuredNoise", ...}``, two variances, or the levels of
+other files."""
 
 LOOSE = 0.9
 """The least R^2 of a reliable estimate."""
@@ -179,8 +181,13 @@ def load_noise(noise: Noise, denoiser: ImageDenoiser) -> Noise:
     """
     if isinstance(noise, Mapping) and "name" in noise:
         law = noise_levels(noise, info=denoiser.info)
+        if isinstance(law, ProfileLevels) and isinstance(split_spec(noise)[1].get("iso"), (int, float)):
+            shot_var, read_var = law.sample(1, keyed_generator(0, "denoise"))  # at one ISO the draw is deterministic
+            return float(shot_var), float(read_var)
         if not isinstance(law, (MeasuredLevels, FixedLevels)):
-            raise ValueError(f"noise {noise}: has no levels by ISO; give MeasuredNoise, or a camera's name")
+            raise ValueError(
+                f"noise {noise}: has no levels by ISO; give MeasuredNoise, a camera's name, or that with one iso"
+            )
         return law if isinstance(law, MeasuredLevels) else (law.shot_var, law.read_var)
     if not isinstance(noise, str) or noise in ("auto", "profile", "estimate"):
         return noise

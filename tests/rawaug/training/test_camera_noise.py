@@ -157,3 +157,11 @@ def test_denoise_takes_the_law_at_the_files_iso(noisy_pair: Pair, tmp_path: Path
         find_levels(replace(frame, iso=800), stored)
     with pytest.raises(ValueError, match=r"rawaug-small: .*camera"):
         load_noise("camera", RawDenoiser.of("rawaug-small"))
+
+
+def test_a_published_camera_at_one_iso_is_spelled_as_everywhere() -> None:
+    levels = load_noise({"name": "Nikon D750", "iso": 400}, RawDenoiser.of("rawaug-small"))
+    frame = RawFrame(torch.zeros(1, 1, 8, 8), CFA.RGGB, name="frame.dng", camera="Nikon D750", iso=400)
+    assert levels == find_levels(frame, "Nikon D750")[:2]
+    with pytest.raises(ValueError, match="with one iso"):
+        load_noise({"name": "Nikon D750"}, RawDenoiser.of("rawaug-small"))
