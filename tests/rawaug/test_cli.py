@@ -271,8 +271,12 @@ def test_sigterm_ends_a_command_as_ctrl_c_does(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = signal.getsignal(signal.SIGTERM)
-    for number in (signal.SIGTERM, signal.SIGINT):
-        monkeypatch.setattr("rawaug.cli._add_plugins", lambda _, number=number: signal.raise_signal(number))
-        assert main(["info"]) == 128 + number
-        assert "stopped; run the same command again" in capsys.readouterr().err
+    interrupt = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    try:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            monkeypatch.setattr("rawaug.cli._add_plugins", lambda _, number=number: signal.raise_signal(number))
+            assert main(["info"]) == 128 + number
+            assert "stopped; run the same command again" in capsys.readouterr().err
+    finally:
+        signal.signal(signal.SIGINT, interrupt)
     assert signal.getsignal(signal.SIGTERM) is before
