@@ -106,8 +106,8 @@ if __name__ == "__main__":
     for white in (1.0, float("inf")):
         check_noise(white)
         print("noise")
-    for settings in CONFIGURATIONS.values():
-        check_developed(settings)
+    for name in FLOATS:
+        check_developed(CONFIGURATIONS[name])
         print("developed")
     check_finishing()
     print("finishing")
