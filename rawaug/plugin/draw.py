@@ -59,6 +59,18 @@ class Draw:
             an ISP was fitted or what a :class:`rawaug.Camera` states, else 0; :data:`rawaug.camera.softness.PUBLISHED`
             is a range for cameras of which nothing is known.
 
+    Example:
+        An exposure of +1 makes the RAW brighter by a stop.
+
+        >>> import rawaug
+        >>> grey = torch.full((3, 16, 16), 0.4)
+        >>> means = []
+        >>> for exposure in (0.0, 1.0):
+        ...     augment = rawaug.RawAugment.from_pretrained("universal", draw=rawaug.Draw(exposure=exposure))
+        ...     means.append(augment(grey, torch.Generator().manual_seed(0)).clean.mean())
+        >>> round(float(means[1] / means[0]), 3)
+        2.0
+
     Raises:
         ValueError: if the sampling is unknown, or the strength, the exposure or the blur is out of range.
     """
