@@ -18,6 +18,7 @@ from torch import Tensor
 
 from rawaug.data import demo_pictures
 from rawaug.data.pairs import centre
+from rawaug.denoising.convolutions import processor_name
 from rawaug.io import write_picture
 
 
@@ -39,11 +40,8 @@ def arguments(description: str | None, repeats: int, quick: str) -> argparse.Arg
 
 def machine(device: torch.device, threads: int) -> dict[str, object]:
     """What the figures are measured on."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     known: dict[str, object] = {
-        "cpu": names[0] if names else platform.processor() or platform.machine(),
+        "cpu": processor_name(),
         "cores": os.cpu_count(),
         "threads": threads,
         "torch": torch.__version__,

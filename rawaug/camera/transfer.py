@@ -55,7 +55,8 @@ def measure_noise(darks: Iterable[Any], flats: Iterable[Any]) -> tuple[dict[Any,
         was left out and why.
 
     Raises:
-        ValueError: if nothing can be measured, or the frames are of several cameras or patterns.
+        ValueError: if nothing can be measured, the frames are of several cameras or patterns, or only some state their
+            ISO.
     """
     darks_by_iso, flats_by_iso = _group_by_iso(darks, "dark"), _group_by_iso(flats, "flat")
     _require_one_camera([*darks_by_iso.values(), *flats_by_iso.values()])
@@ -81,6 +82,8 @@ def measure_noise(darks: Iterable[Any], flats: Iterable[Any]) -> tuple[dict[Any,
         )
         reasons += [f"{where}: {reason}" for reason in left_out]
 
+    if None in levels and len(levels) > 1:
+        raise ValueError("some files state an ISO and some do not; measure them separately")
     if not levels:
         raise ValueError(f"nothing can be measured; {'; '.join(reasons) or 'there are no frames'}")
     return levels, [*lines, *[f"left out {reason}" for reason in reasons]]
@@ -112,7 +115,7 @@ def _require_one_camera(groups: Sequence[Sequence[Any]]) -> None:
 
 
 def _in_dn(frame: Any) -> Tensor:
-    """The planes ``(4, h, w)`` of a frame in DN above its black level, float64."""
+    """Compute the planes ``(4, h, w)`` of a frame in DN above its black level, float64."""
     scale = frame.white - torch.tensor(frame.black, dtype=torch.float64)
     return pack(frame.mosaic[None].double(), frame.cfa)[0] * scale[:, None, None]
 

@@ -24,6 +24,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.denoising.denoiser import Levels
 from rawaug.denoising.levels import Noise, find_levels
+from rawaug.files import write_text
 from rawaug.io import RawFrame, read_raw
 from rawaug.io.cells import MONOCHROME
 
@@ -83,7 +84,7 @@ def write_defects(mask: Tensor, path: str | Path) -> None:
     lines = ["# column row"]
     for row, column in mask.nonzero().tolist():
         lines.append(f"{column} {row}")
-    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")
+    write_text("\n".join(lines) + "\n", path)
 
 
 def read_defects(path: str | Path) -> Tensor:

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -81,14 +80,6 @@ class Guarded:
         return guard_result(self.denoiser, noisy, self.denoiser(noisy), self.denoiser.strength)[0]
 
 
-class _Blend(NamedTuple):
-    """The weights of the denoiser and of the filter, and the energy per value that noise explains."""
-
-    first: float
-    second: float
-    expected: float
-
-
 @torch.no_grad()
 def guard_result(
     denoise: Callable[[Noisy], Tensor], noisy: Noisy, denoised: Tensor, strength: float = 1.0
@@ -110,25 +101,31 @@ def guard_result(
     if noisy.levels is None:
         raise ValueError("guard: needs the levels of the noise")
     second = RawDenoiser.of(SECOND, strength=strength)
-    blend = _choose_blend(denoise, second, noisy)
+    first_weight, second_weight, explained = _choose_blend(denoise, second, noisy)
 
     mended = _mend(noisy, denoised)
-    change = blend.first * (denoised - mended)
-    if blend.second > 0.0:
-        change += blend.second * (second(noisy) - mended)
+    change = first_weight * (denoised - mended)
+    if second_weight > 0.0:
+        change += second_weight * (second(noisy) - mended)
 
     # Where more was removed than noise can explain, the place is nearly as its input.
     variance = noise_variance(denoised, *noisy.levels).clamp_min(1e-12)
     removed = (change.square() / variance).mean(1, keepdim=True)
     energy = F.avg_pool2d(removed, _PLACE, ceil_mode=True, count_include_pad=False)
-    share = (blend.expected / energy.clamp_min(1e-6)).clamp(max=1.0)
-    share = share.where(energy > EXCESS * blend.expected, torch.tensor(1.0))
+    share = (explained / energy.clamp_min(1e-6)).clamp(max=1.0)
+    share = share.where(energy > EXCESS * explained, torch.tensor(1.0))
     share = F.interpolate(share, size=removed.shape[-2:], mode="bilinear")
-    return mended + share * change, blend.first * float(share.mean())
+    return mended + share * change, first_weight * float(share.mean())
 
 
-def _choose_blend(denoise: Callable[[Noisy], Tensor], second: Callable[[Noisy], Tensor], noisy: Noisy) -> _Blend:
-    """Choose the weights for a frame; the filter is run only if the denoiser cannot be trusted alone."""
+def _choose_blend(
+    denoise: Callable[[Noisy], Tensor], second: Callable[[Noisy], Tensor], noisy: Noisy
+) -> tuple[float, float, float]:
+    """Choose the weights for a frame; the filter is run only if the denoiser cannot be trusted alone.
+
+    Returns:
+        The weights of the denoiser and of the filter, and the energy per value that noise explains.
+    """
     parts = []
     count = flat_removed = flat_explained = 0.0
     product = torch.zeros(2, 2)
@@ -158,7 +155,7 @@ def _choose_blend(denoise: Callable[[Noisy], Tensor], second: Callable[[Noisy], 
     expected = scale * min(1.0, max(0.05, float(explained[0]) / max(count, 1.0)))
     is_trusted = scale * explained[0] > TRUSTED * product[0, 0]
     if is_trusted or product[0, 0] < _NOTHING * count:
-        return _Blend(1.0, 0.0, expected)
+        return 1.0, 0.0, expected
 
     for part, mended, removed, weight, is_whole in parts:
         probe = probe_denoiser(second, part)
@@ -172,7 +169,7 @@ def _choose_blend(denoise: Callable[[Noisy], Tensor], second: Callable[[Noisy], 
     weights = steps[steps.sum(1) <= _STEPS] / _STEPS
     risk = ((weights @ product) * weights).sum(1) - 2.0 * scale * (weights @ explained)
     first, filtered = weights[risk.argmin()].tolist()
-    return _Blend(first, filtered, expected)
+    return first, filtered, expected
 
 
 def _sample(image: Tensor) -> list[Tensor]:

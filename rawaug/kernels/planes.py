@@ -68,20 +68,20 @@ def _reflect(k, size):  # type: ignore[no-untyped-def]
 @partial(compile_loop, allocates=True)
 def _rows(mosaic, red_row, red_column, homogeneous, gains, rgb, start, stop):  # type: ignore[no-untyped-def]
     """Demosaic rows ``start`` to ``stop`` of a picture whose mosaic has margins, and divide them by the gains."""
-    own = mosaic[start : stop + 2 * _MARGIN]
-    rows, width = own.shape
+    strip = mosaic[start : stop + 2 * _MARGIN]
+    rows, width = strip.shape
     first = (start + red_row) % 2  # of the rows with red
     directions = 2 if homogeneous else 1
     pictures = np.zeros((directions, 3, rows, width), np.float32)  # along rows, along columns
 
     for i in range(2, rows - 2):
         measured = (i + first + red_column + 1) % 2  # columns of this parity hold green
-        above, below = (own[i - 2], own[i - 1]), (own[i + 1], own[i + 2])
+        above, below = (strip[i - 2], strip[i - 1]), (strip[i + 1], strip[i + 2])
         if homogeneous:
-            _green_in_row(own[i], measured, pictures[0, 1, i])
-            _green_in_column(above[0], above[1], own[i], below[0], below[1], measured, pictures[1, 1, i])
+            _green_in_row(strip[i], measured, pictures[0, 1, i])
+            _green_in_column(above[0], above[1], strip[i], below[0], below[1], measured, pictures[1, 1, i])
         else:
-            _green_of_lesser_change(above[0], above[1], own[i], below[0], below[1], measured, pictures[0, 1, i])
+            _green_of_lesser_change(above[0], above[1], strip[i], below[0], below[1], measured, pictures[0, 1, i])
     for d in range(directions):
         for i in range(3, rows - 3):
             near, far = 2, 0
@@ -91,8 +91,10 @@ def _rows(mosaic, red_row, red_column, homogeneous, gains, rgb, start, stop):  #
             if near == 2:
                 sites = 1 - red_column
             picture, green = pictures[d], pictures[d, 1]
-            _colour_in_row(own[i], green[i], sites, picture[near, i])
-            _colour_between_rows(own[i - 1], own[i + 1], green[i - 1], green[i], green[i + 1], sites, picture[far, i])
+            _colour_in_row(strip[i], green[i], sites, picture[near, i])
+            _colour_between_rows(
+                strip[i - 1], strip[i + 1], green[i - 1], green[i], green[i + 1], sites, picture[far, i]
+            )
 
     lead = np.zeros((rows, width), np.int8)
     if homogeneous:

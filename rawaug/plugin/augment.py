@@ -283,7 +283,7 @@ class RawAugment(PairMaker):
         """Make noisy, clean and variance of single shots, in one pass where there is one."""
         in_colour = self.target == "rgb"
         if self.pattern is None and isinstance(self.noise, ShotReadNoise) and self.noise.is_plain:
-            made = self.baked.with_noise(
+            in_one_pass = self.baked.with_noise(
                 srgb,
                 params.isp,
                 *self.noise.levels_and_keys(params.noise),
@@ -292,8 +292,8 @@ class RawAugment(PairMaker):
                 colours=in_colour,
                 mapped=self.srgb is None,
             )
-            if made is not None:
-                noisy, clean, variance = made
+            if in_one_pass is not None:
+                noisy, clean, variance = in_one_pass
                 if self.srgb is not None:
                     return self._developed(self.srgb, noisy, clean, params)
                 return noisy, clean, variance

@@ -113,9 +113,9 @@ def transform_jpeg(codes: Tensor, quality: Tensor, subsampling: Sequence[str]) -
 
 def _nearest(pixels: Tensor, step: Tensor, size: int) -> Tensor:
     """Number the sample that each pixel is in and the one beside it ``(B, size, 2)``, for steps ``(B, 1)``."""
-    own = pixels // step
-    beside = torch.minimum((own + pixels % 2 * 2 - 1).clamp_min(0), -(-size // step) - 1)
-    return torch.stack([own, torch.where(step == 2, beside, own)], dim=-1)
+    sample = pixels // step
+    beside = torch.minimum((sample + pixels % 2 * 2 - 1).clamp_min(0), -(-size // step) - 1)
+    return torch.stack([sample, torch.where(step == 2, beside, sample)], dim=-1)
 
 
 def _quantisation(quality: Tensor) -> Tensor:

@@ -84,6 +84,14 @@ def test_what_is_left_out_is_counted_by_its_reason() -> None:
         measure_noise(sensor.darks(2), Sensor(0.48, 3.0, 0.0, 0.0, side=32).flats())
 
 
+def test_frames_of_which_only_some_state_an_iso_are_refused() -> None:
+    sensor = Sensor(gain=0.48, sigma=3.0, row=0.0, pattern=0.0, side=64)
+    darks = [*sensor.darks(2), *sensor.darks(2, iso=None)]
+    flats = [*sensor.flats(LEVELS[:1]), *sensor.flats(LEVELS[:1], iso=None)]
+    with pytest.raises(ValueError, match="ISO"):
+        measure_noise(darks, flats)
+
+
 def test_a_sheet_is_measured_from_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sensors: dict[float, Any] = {100: Sensor(0.3, 2.0, 0.5, 0.01, side=128), 400: Sensor(1.2, 4.0, 2.0, 0.01, side=128)}
     for kind in ("dark", "flat"):
