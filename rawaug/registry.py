@@ -19,7 +19,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from importlib import import_module
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from annotated_types import Interval
 
@@ -142,7 +142,7 @@ def list_bounds(settings: type[Any]) -> dict[str, Interval]:
 
 
 def require_bounds(settings: Any, above: str = "") -> None:
-    """Refuse a number in a dataclass that is out of the bounds of its field.
+    """Refuse a value in a dataclass that is out of the bounds of its field, or none of the choices of its Literal.
 
     Args:
         settings: an instance of the dataclass.
@@ -153,8 +153,18 @@ def require_bounds(settings: Any, above: str = "") -> None:
     """
     for name, bounds in list_bounds(type(settings)).items():
         value = getattr(settings, name)
-        if value is not None:
+        if value is None:
+            continue
+        if bounds.lt is None:
             require_between(f"{above}{name}", value, bounds.ge, bounds.le)  # type: ignore[arg-type]
+        elif not bounds.ge <= value < bounds.lt:
+            raise ValueError(f"{above}{name} must be at least {bounds.ge} and below {bounds.lt}, got {value!r:.100}")
+
+    for name, hint in get_type_hints(type(settings)).items():
+        choices = get_args(hint)
+        if get_origin(hint) is Literal and getattr(settings, name) not in choices:
+            choices_in_words = " or ".join(map(str, choices))
+            raise ValueError(f"{above}{name} must be {choices_in_words}, got {getattr(settings, name)!r:.100}")
 
 
 def suggest(name: object, known: Iterable[str]) -> str:

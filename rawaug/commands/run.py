@@ -255,6 +255,9 @@ def list_keys(settings: type[Any], above: str = "") -> Iterator[Key]:
 def describe_bounds(bounds: Interval) -> str:
     """Write the bounds of a number as a sentence; those that only keep memory from being filled are left out."""
     least: Any = bounds.ge
+    if bounds.lt is not None:
+        return f" At least {least} and below {bounds.lt}."
+
     most: Any = bounds.le
     if least < -_LARGE:
         return ""

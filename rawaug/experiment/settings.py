@@ -20,7 +20,7 @@ from rawaug.noise import noise_model
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.targets import Srgb, Target
 from rawaug.registry import require_bounds, split_spec
-from rawaug.training.config import MOST, SAME_WEIGHTS, Count, DenoiserConfig, TrainConfig, Weighing
+from rawaug.training.config import MOST, SAME_WEIGHTS, Count, DenoiserConfig, Rate, TrainConfig, Weighing
 from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.srgb_noise import noise_on_srgb
 from rawaug.training.srgb_samples import Conditioning
@@ -96,7 +96,7 @@ class DataConfig(PairSettings):
     select: str | list[str] = "first"
     crop: Side | None = None
     pictures: str | list[str] = "demo:"
-    memory_mb: int = 0
+    memory_mb: Annotated[int, Interval(ge=0, le=MOST)] = 0
     max_pixels: Annotated[int, Interval(ge=4, le=2**40)] | None = None
     validation: str | None = _USUAL
     validation_count: Count | None = None
@@ -211,13 +211,13 @@ class ArmConfig:
     batch: Count | None = None
     draw: Draw | None = None
     srgb: Srgb | None = None
-    zoom: float = 1.0
+    zoom: Annotated[float, Interval(ge=1.0, le=float(MOST))] = 1.0
     srgb_noise: str | dict[str, Any] | None = None
     srgb_share: Share = 1.0
     noise_level: Conditioning | None = None
     estimator: str | dict[str, Any] = "supervised"
     denoiser: DenoiserConfig | None = None
-    learning_rate: float | None = None
+    learning_rate: Rate | None = None
     weigh: Weighing | None = None
     steps: Count | None = None
 
@@ -295,7 +295,7 @@ class Recipe:
     seed: Annotated[int, Interval(ge=-(2**63), le=2**62)] = 0
     seeds: Annotated[int, Interval(ge=1, le=1000)] = 1
     device: str = "auto"
-    devices: int = 1
+    devices: Count = 1
     out: str = "runs"
 
     def __post_init__(self) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypedDict
+from typing import Annotated, Any, NamedTuple, TypedDict
 
+from annotated_types import Interval
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.registry import require_between
+from rawaug.registry import require_between, require_bounds
 
 HIGHLIGHT_KNEE = 0.9
 """The mean linear value above which Brooks' inverse gains bend towards 1."""
@@ -41,16 +42,16 @@ class ISPConfig:
             light; 0 if the atoms are fitted.
     """
 
-    colour_atoms: int = 16
-    gain_atoms: int = 16
+    colour_atoms: Annotated[int, Interval(ge=1, le=MOST_ATOMS)] = 16
+    gain_atoms: Annotated[int, Interval(ge=1, le=MOST_ATOMS)] = 16
     encoder_widths: tuple[int, int, int] = (32, 64, 160)
     cfa: str = "RGGB"
     stages: tuple[str, ...] = POINTWISE_STAGES
     encoders: bool = False
     attention: bool = True
-    knee: float | None = HIGHLIGHT_KNEE
-    tone_atoms: int = 0
-    cameras: int = 0
+    knee: Annotated[float, Interval(ge=0.0, le=0.999)] | None = HIGHLIGHT_KNEE
+    tone_atoms: Annotated[int, Interval(ge=0, le=MOST_ATOMS)] = 0
+    cameras: Annotated[int, Interval(ge=0, le=MOST_CAMERAS)] = 0
 
     def __post_init__(self) -> None:
         CFA(self.cfa)  # raises ValueError for an unknown pattern
@@ -66,27 +67,15 @@ class ISPConfig:
             if not isinstance(flag, bool):
                 raise ValueError(f"{key} must be true or false, got {flag!r:.100}")
 
-        require_between("colour_atoms", self.colour_atoms, 1, MOST_ATOMS)
-        require_between("gain_atoms", self.gain_atoms, 1, MOST_ATOMS)
-        require_between("tone_atoms", self.tone_atoms, 0, MOST_ATOMS)
-        require_between("cameras", self.cameras, 0, MOST_CAMERAS)
-
-        self._check_encoder_widths()
-        if self.knee is not None:
-            require_between("knee", self.knee, 0.0, 0.999)
-        self._check_stages()
-
-    def _check_encoder_widths(self) -> None:
+        require_bounds(self)
         if len(self.encoder_widths) != 3:
             raise ValueError(f"encoder_widths must be three numbers, got {self.encoder_widths!r:.100}")
         for width in self.encoder_widths:
             require_between("encoder_widths", width, 1, MOST_FEATURES)
 
-    def _check_stages(self) -> None:
         are_names = all(isinstance(stage, str) for stage in self.stages)
         if not self.stages or not are_names or len({*self.stages}) < len(self.stages):
             raise ValueError(f"stages must be one or more names, each at most once, got {self.stages!r:.100}")
-
         if (self.tone_atoms > 0) != ("curve" in self.stages):
             raise ValueError(f"tone_atoms must be at least 1 with the stage curve and 0 without, got {self.tone_atoms}")
 

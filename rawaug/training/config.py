@@ -21,6 +21,12 @@ VALIDATIONS = 5
 Count = Annotated[int, Interval(ge=1, le=MOST)]
 """A number of steps, samples, frames or processes."""
 
+Rate = Annotated[float, Interval(ge=0.0, le=float(MOST))]
+"""A learning rate, or another limit of a step."""
+
+Decay = Annotated[float, Interval(ge=0.0, lt=1.0)]
+"""A share of what was before, which must leave room for what comes."""
+
 Weighing = Literal["linear", "normalised", "stabilised", "mixed", "relative"]
 """The loss weighs light and shade in one of these ways; :mod:`rawaug.training.weighing` has the formulas."""
 
@@ -78,15 +84,15 @@ class TrainConfig:
     steps: Count = 1500
     batch: Count = 8
     crop: Annotated[int, Interval(ge=8, le=MOST)] = 64
-    learning_rate: Annotated[float, Interval(ge=0.0, le=float(MOST))] = 7e-4
+    learning_rate: Rate = 7e-4
     warmup: Annotated[int, Interval(ge=0, le=MOST)] = 50
     schedule: Literal["cosine", "step"] = "cosine"
     halve_every: Count = 20000
     loss: str | dict[str, Any] = "l1"
     weigh: Weighing = "linear"
-    ema: float = 0.99
-    start_share: float = 0.0
-    clip_norm: Annotated[float, Interval(ge=0.0, le=float(MOST))] = 0.1
+    ema: Decay = 0.99
+    start_share: Decay = 0.0
+    clip_norm: Rate = 0.1
     validate_every: Count = 100
     checkpoint_every: Count = 200
     workers: Annotated[int, Interval(ge=0, le=MOST)] = 0
@@ -104,10 +110,6 @@ class TrainConfig:
 
         if self.crop % 2:
             raise ValueError(f"train.crop must be even, got {self.crop}")
-        if not 0.0 <= self.ema < 1.0:
-            raise ValueError(f"train.ema must be in [0, 1), got {self.ema}")
-        if not 0.0 <= self.start_share < 1.0:
-            raise ValueError(f"train.start_share must be in [0, 1), got {self.start_share}")
 
     @property
     def validation_period(self) -> int:

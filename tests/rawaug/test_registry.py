@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from denoisers.classical import FILTERS
 from rawaug.data.pairs import DATASETS
 from rawaug.experiment.settings import ArmConfig
+from rawaug.isp.fit import FitConfig
 from rawaug.noise import EldNoise, SensorNoise, noise_model
 from rawaug.paper.baselines.base import BASELINES
 from rawaug.registry import Registry, split_spec
+from rawaug.training.config import TrainConfig
 from rawaug.training.estimators import ESTIMATORS, R2R, Noisier
 from rawaug.training.losses import LOSSES
 
@@ -61,3 +65,15 @@ def test_an_arm_names_its_estimator() -> None:
     estimator = ESTIMATORS.make({"name": "noisier", "settings": {"alpha": 0.7, "correct": True}})
     assert isinstance(estimator, Noisier) and (estimator.alpha, estimator.correct) == (0.7, True)
     assert split_spec(ArmConfig().estimator) == ("supervised", {})
+
+
+def test_bounds_and_choices_hold_for_settings_made_in_python_too() -> None:
+    for settings in ({"atoms": 0}, {"reach": 0.9}, {"mse_floor": -1.0}, {"tone": "straight"}, {"joint_steps": 0.5}):
+        with pytest.raises(ValueError, match=next(iter(settings))):
+            FitConfig(**settings)
+    assert FitConfig(joint_steps=None, curve_steps=0).settled()
+    for share in (-0.1, 1.0, math.nan):
+        with pytest.raises(ValueError, match=r"train\.ema"):
+            TrainConfig(ema=share)
+    with pytest.raises(ValueError, match="zoom"):
+        ArmConfig(zoom=0.5)

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from annotated_types import Interval
 
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.stages import STAGES
-from rawaug.registry import require_between
+from rawaug.registry import require_bounds
 
 _PUBLISHED_STEPS = 3000
 """Number of end-to-end steps of the published fit."""
 MOST = 2**31
 """Upper limit of settings that count steps or pixels."""
 
-_SWITCH = ("auto", "on", "off")
+Steps = Annotated[int, Interval(ge=0, le=MOST)]
+"""A number of steps."""
+
+Weight = Annotated[float, Interval(ge=0.0, le=float(MOST))]
+"""A weight of a loss, or a rate."""
 
 
 @dataclass(frozen=True)
@@ -68,26 +74,26 @@ class FitConfig:
     method: Literal["staged", "published"] = "staged"
     start: str | None = None
     size: Literal["default", "small"] = "default"
-    atoms: int = 16
-    reach: float = 1.6
-    steps: int = 200
-    pixels: int = 32768
-    batch: int = 4096
-    learning_rate: float = 2e-3
+    atoms: Annotated[int, Interval(ge=1, le=MOST)] = 16
+    reach: Annotated[float, Interval(ge=1.0, le=float(MOST))] = 1.6
+    steps: Steps = 200
+    pixels: Annotated[int, Interval(ge=1, le=MOST)] = 32768
+    batch: Annotated[int, Interval(ge=1, le=MOST)] = 4096
+    learning_rate: Weight = 2e-3
     shading: Literal["auto", "on", "off"] = "auto"
     tone: Literal["auto", "learned", "curve"] = "learned"
     attention: bool = False
     encoders: Literal["auto", "on", "off"] = "auto"
-    encoder_steps: int = 200
-    joint_steps: int | None = None
-    curve_steps: int | None = None
-    prior_steps: int = 400
-    mse_floor: float = 1e-5
+    encoder_steps: Steps = 200
+    joint_steps: Steps | None = None
+    curve_steps: Steps | None = None
+    prior_steps: Steps = 400
+    mse_floor: Weight = 1e-5
     raw_loss: Literal["l2", "log"] = "l2"
-    intermediate: float = 0.1
-    consistency: float = 1.0
+    intermediate: Weight = 0.1
+    consistency: Weight = 1.0
     noisy: bool = False
-    seed: int = 0
+    seed: Annotated[int, Interval(ge=-(2**63), le=2**63 - 1)] = 0
     isp: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -114,27 +120,7 @@ class FitConfig:
         return replace(short, joint_steps=4) if self.method == "published" else short
 
     def __post_init__(self) -> None:
-        steps = ("steps", "joint_steps", "curve_steps", "prior_steps", "encoder_steps")
-        for key in ("atoms", "pixels", "batch", *steps):
-            if getattr(self, key) is not None:
-                require_between(key, getattr(self, key), 0 if key in steps else 1, MOST)
-
-        require_between("seed", self.seed, -(2**63), 2**63 - 1)
-        require_between("reach", self.reach, 1.0, float(MOST))
-        for key in ("learning_rate", "mse_floor", "intermediate", "consistency"):
-            require_between(key, getattr(self, key), 0.0, float(MOST))
-
-        choices = {
-            "raw_loss": ("l2", "log"),
-            "method": ("staged", "published"),
-            "size": ("default", "small"),
-            "shading": _SWITCH,
-            "encoders": _SWITCH,
-        }
-        for key, values in choices.items():
-            if getattr(self, key) not in values:
-                raise ValueError(f"{key} must be {' or '.join(values)}, got {getattr(self, key)!r}")
-
+        require_bounds(self)
         keys = [field.name for field in fields(ISPConfig)]
         unknown = sorted(set(self.isp).difference(keys))
         if unknown:

@@ -186,7 +186,13 @@ def test_recipes_are_listed_and_explained_with_their_own_values(capsys: pytest.C
         assert value in shown and "--train.learning-rate" in shown and "--arms.NAME.augmented" in shown
         assert ":class:" not in shown
         words = " ".join(shown.split())
-        for bounds in ("At least 1.", "From 1 to 1000.", "From 0.0 to 1.0.", "From 1 to 16."):
+        for bounds in (
+            "At least 1.",
+            "From 1 to 1000.",
+            "From 0.0 to 1.0.",
+            "From 1 to 16.",
+            "At least 0.0 and below 1.0.",
+        ):
             assert bounds in words
 
 
