@@ -10,8 +10,9 @@ use_sample_covariance=False, data_range=1)``.
 
 from __future__ import annotations
 
+import math
+
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 WINDOW = 11
@@ -40,15 +41,26 @@ def psnr(a: Tensor, b: Tensor) -> Tensor:
     return -10.0 * ((a - b) ** 2).flatten(1).mean(1).log10()
 
 
-def patch_psnr(a: Tensor, b: Tensor, patch: int = PATCH) -> Tensor:
-    """Compute PSNR_r ``(B,)``, the mean PSNR over whole ``patch`` x ``patch`` pieces of ``(B, 1, H, W)``.
+def patch_psnr(a: Tensor, b: Tensor) -> Tensor:
+    """Compute PSNR_r ``(B,)``, the mean PSNR over patches of 256 x 256 that cover ``(B, 1, H, W)``.
 
-    The pieces start at the top left. A picture shorter than a patch is one patch.
+    Patches that do not fit exactly overlap. A picture shorter than a patch is one patch.
     """
     a, b = _as_floats(a, b)
-    size = (min(patch, a.shape[-2]), min(patch, a.shape[-1]))
-    error = F.avg_pool2d((a - b) ** 2, size)
-    return (-10.0 * error.log10()).flatten(1).mean(1)
+    error = (a - b) ** 2
+    values = []
+    for y in patch_starts(error.shape[-2]):
+        for x in patch_starts(error.shape[-1]):
+            patch = error[..., y : y + PATCH, x : x + PATCH]
+            values.append(-10.0 * patch.flatten(1).mean(1).log10())
+    return torch.stack(values).mean(0)
+
+
+def patch_starts(length: int) -> list[int]:
+    """Spread as few patches as cover ``length`` sites evenly; each starts at an even site."""
+    count = math.ceil(length / PATCH)
+    spare = max(length - PATCH, 0)
+    return [spare * k // max(count - 1, 1) // 2 * 2 for k in range(count)]
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:

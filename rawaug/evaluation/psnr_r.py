@@ -15,7 +15,7 @@ from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.functional import as_float, frame_coordinates
 from rawaug.isp.fusion import Tone
 from rawaug.isp.model import DictionaryISP
-from rawaug.metrics import PATCH, patch_psnr
+from rawaug.metrics import PATCH, patch_psnr, patch_starts
 from rawaug.seeding import keyed_generator
 
 
@@ -69,11 +69,9 @@ def block_psnr(estimate: Tensor, raw: Tensor, clipped: Tensor) -> float:
 
 
 def draw_windows(pair: Pair, count: int | None) -> list[tuple[int, int]]:
-    """Choose corners of ``count`` random patches of a frame, keyed by its name; None for all of :func:`patch_psnr`."""
+    """Choose corners of ``count`` random patches of a frame, keyed by its name; None for patches that cover it."""
     height, width = pair.raw.shape[-2:]
-    rows = range(0, max(height - PATCH, 0) + 1, PATCH)
-    columns = range(0, max(width - PATCH, 0) + 1, PATCH)
-    every = list(product(rows, columns))
+    every = list(product(patch_starts(height), patch_starts(width)))
     if count is None or count >= len(every):
         return every
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from rawaug.metrics import patch_psnr, psnr, ssim, worst_and_best_quarter
+from rawaug.metrics import patch_psnr, patch_starts, psnr, ssim, worst_and_best_quarter
 
 
 @pytest.fixture
@@ -27,6 +27,16 @@ def test_psnr_and_ssim_equal_scikit_image(images: tuple[torch.Tensor, torch.Tens
         settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "full": True}
         _, full = structural_similarity(one, other, data_range=1, **settings)
         assert ssim(a, b)[k].item() == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-9)
+
+
+@pytest.mark.parametrize("length", [200, 256, 510, 512, 600, 1704])
+def test_patches_cover_every_site(length: int) -> None:
+    covered = torch.zeros(length, dtype=torch.bool)
+    for start in patch_starts(length):
+        assert start % 2 == 0
+        assert start + 256 <= max(length, 256)
+        covered[start : start + 256] = True
+    assert covered.all()
 
 
 def test_patch_psnr_averages_decibels_not_errors() -> None:
