@@ -103,8 +103,9 @@ def _present(part: Tensor) -> np.ndarray | None:
 
 def render(linear: Tensor, display: Display) -> Tensor:
     """Develop camera colour x5 ``(B, 3, H, W)``, float32 on the CPU, to sRGB in [0, 1]."""
-    mosaics = linear.new_empty(0, 1, 1, 1)
-    return _render_rows(linear, mosaics, np.full(len(linear), -1), np.arange(len(linear)), CFA.RGGB, display)
+    mosaics, srgb = linear.new_empty(0, 1, 1, 1), torch.empty(linear.shape)
+    _render_rows(linear, mosaics, np.full(len(linear), -1), np.arange(len(linear)), CFA.RGGB, display, srgb)
+    return srgb
 
 
 def develop(raw: Tensor, display: Display, cfa: CFA | str, methods: Tensor) -> Tensor:
@@ -124,28 +125,33 @@ def develop(raw: Tensor, display: Display, cfa: CFA | str, methods: Tensor) -> T
     demosaiced = raw if by_stencil.all() else raw[by_stencil]
     mosaics = F.pad(demosaiced, (2, 2, 2, 2), mode="reflect")  # about the border sites, so the pattern stays
 
-    directional = np.flatnonzero(~by_stencil)
-    linear = torch.empty(len(directional), 3, *raw.shape[2:])
-    for picture, rgb in zip(directional, linear.numpy(), strict=True):
+    srgb = torch.empty(len(raw), 3, *raw.shape[2:])  # camera colour is developed where it is
+    for picture in np.flatnonzero(~by_stencil):
         homogeneous, gains = METHODS[numbers[picture]] == "ahd", display.gains[picture, :3].numpy()
-        demosaic_balanced(raw[picture, 0].numpy(), gains, True, CFA(cfa), homogeneous, rgb)
+        demosaic_balanced(raw[picture, 0].numpy(), gains, True, CFA(cfa), homogeneous, srgb[picture].numpy())
 
-    places = np.where(by_stencil, np.cumsum(by_stencil), np.cumsum(~by_stencil)) - 1
-    return _render_rows(linear, mosaics, np.where(by_stencil, numbers, -1), places, CFA(cfa), display)
+    places = np.where(by_stencil, np.cumsum(by_stencil) - 1, np.arange(len(raw)))
+    _render_rows(srgb, mosaics, np.where(by_stencil, numbers, -1), places, CFA(cfa), display, srgb)
+    return srgb
 
 
 def _render_rows(
-    linear: Tensor, mosaics: Tensor, stencils: np.ndarray, places: np.ndarray, cfa: CFA, display: Display
-) -> Tensor:
-    """Develop pictures of camera colour and padded mosaics.
+    linear: Tensor,
+    mosaics: Tensor,
+    stencils: np.ndarray,
+    places: np.ndarray,
+    cfa: CFA,
+    display: Display,
+    srgb: Tensor,
+) -> None:
+    """Develop pictures of camera colour and padded mosaics to ``srgb``.
 
     ``stencils`` ``(B,)`` are the numbers of the mosaics' stencils, -1 for camera colour, and ``places`` ``(B,)`` where
     each picture is among its like.
     """
-    height, width = linear.shape[-2:]
-    srgb = torch.empty(len(places), 3, height, width)
+    height, width = srgb.shape[-2:]
     if not srgb.numel():
-        return srgb
+        return
 
     display = display._replace(frame=display.frame * _EVERY_SECOND.to(display.frame))
     sources = linear.detach().contiguous().numpy(), mosaics.numpy(), _site_weights(cfa), stencils, places
@@ -164,7 +170,6 @@ def _render_rows(
         _srgb_rows(*settings, *scratch, start, stop)
 
     run_over_rows(len(places) * height, 3 * width, convert)
-    return srgb
 
 
 @lru_cache
@@ -374,13 +379,12 @@ def _pairs(one, other, out):  # type: ignore[no-untyped-def]
 
 
 @compile_part
-def _demosaic(mosaic, row, first, weights, sums, out):  # type: ignore[no-untyped-def]
-    """Demosaic a row from ``first`` on to colours ``(3, n)``; the mosaic has margins of 2.
+def _demosaic(mosaic, row, first, n, weights, sums, out):  # type: ignore[no-untyped-def]
+    """Demosaic n sites of a row from ``first`` on to colours ``(3, ...)``; the mosaic has margins of 2.
 
     Stencils are symmetric: with the weights of its site, a colour is the sum of the site's own value, of the values of
     its neighbours along the row, the column and the diagonals, and of those two sites away along row and column.
     """
-    n = out.shape[1]
     above, own, below = mosaic[row + 1, first:], mosaic[row + 2, first:], mosaic[row + 3, first:]
     _pairs(own[1:], own[3:], sums[1, :n])
     _pairs(above[2:], below[2:], sums[2, :n])
@@ -391,9 +395,9 @@ def _demosaic(mosaic, row, first, weights, sums, out):  # type: ignore[no-untype
     _pairs(mosaic[row, first + 2 :], mosaic[row + 4, first + 2 :], sums[5, :n])
 
     for c in range(3):
-        _add_weighted(weights[c, 0], own[2:], weights[c, 1], sums[1], False, out[c])
+        _add_weighted(weights[c, 0], own[2:], weights[c, 1], sums[1], False, out[c, :n])
         for k in (2, 4):
-            _add_weighted(weights[c, k], sums[k], weights[c, k + 1], sums[k + 1], True, out[c])
+            _add_weighted(weights[c, k], sums[k], weights[c, k + 1], sums[k + 1], True, out[c, :n])
 
 
 @compile_part
@@ -444,7 +448,7 @@ def _srgb_rows(  # type: ignore[no-untyped-def]
                     for j in range(n):  # faster than slices
                         x[c, j] = linear[place, c, i, first + j]
             else:
-                _demosaic(mosaics[place, 0], i, first, weights[stencils[b], i % 2], sums, x[:, :n])
+                _demosaic(mosaics[place, 0], i, first, n, weights[stencils[b], i % 2], sums, x)
 
             if shading is not None:
                 _fall_off(frame[b], i, 2 * first, shading, mask[:n])

@@ -39,7 +39,15 @@ def demosaic_balanced(
     site_gains = gains[np.array(cfa.channels)]
     padded = np.empty((height + 2 * _MARGIN, width + 2 * _MARGIN), np.float32)
     _balance(mosaic, site_gains, np.float32(0 if clipped else -np.inf), padded)
-    run_over_rows(height, width, partial(_rows, padded, *cfa.sites[0], homogeneous, gains, rgb))
+
+    def fill(start: int, stop: int) -> None:
+        pictures = np.zeros((2 if homogeneous else 1, 3, 4, padded.shape[1]), np.float32)
+        steps = np.zeros((3, 3, 2, padded.shape[1]), np.float32)
+        lead = np.zeros((4, padded.shape[1]), np.int8)
+        sums, total = np.zeros(padded.shape[1], np.int32), np.ones(padded.shape[1], np.int32)
+        _rows(padded, *cfa.sites[0], homogeneous, gains, rgb, pictures, steps, lead, sums, total, start, stop)
+
+    run_over_rows(height, width, fill)
 
 
 @compile_loop
@@ -48,9 +56,10 @@ def _balance(mosaic, gains, black, padded):  # type: ignore[no-untyped-def]
     height, width = mosaic.shape
     for i in range(height + 2 * _MARGIN):
         y = _reflect(i - _MARGIN, height)
-        row = padded[i]
+        even, odd = gains[y & 1, 0], gains[y & 1, 1]
+        values, row, inner = mosaic[y], padded[i], padded[i, _MARGIN:]
         for j in range(width):
-            row[_MARGIN + j] = max(mosaic[y, j] * gains[y & 1, j & 1], black)
+            inner[j] = max(values[j] * (odd if j & 1 else even), black)
         for j in range(-_MARGIN, 0):
             row[_MARGIN + j] = row[_MARGIN + _reflect(j, width)]
         for j in range(width, width + _MARGIN):
@@ -65,53 +74,50 @@ def _reflect(k, size):  # type: ignore[no-untyped-def]
     return period - k if k >= size else k
 
 
-@partial(compile_loop, allocates=True)
-def _rows(mosaic, red_row, red_column, homogeneous, gains, rgb, start, stop):  # type: ignore[no-untyped-def]
-    """Demosaic rows ``start`` to ``stop`` of a picture whose mosaic has margins, and divide them by the gains."""
-    strip = mosaic[start : stop + 2 * _MARGIN]
-    rows, width = strip.shape
-    first = (start + red_row) % 2  # of the rows with red
-    directions = 2 if homogeneous else 1
-    pictures = np.zeros((directions, 3, rows, width), np.float32)  # along rows, along columns
+@compile_loop
+def _rows(  # type: ignore[no-untyped-def]
+    mosaic, red_row, red_column, homogeneous, gains, rgb, pictures, steps, lead, sums, total, start, stop
+):
+    """Demosaic rows ``start`` to ``stop`` of a picture whose mosaic has margins, and divide them by the gains.
 
-    for i in range(2, rows - 2):
-        measured = (i + first + red_column + 1) % 2  # columns of this parity hold green
-        above, below = (strip[i - 2], strip[i - 1]), (strip[i + 1], strip[i + 2])
+    A row of green is filled in at a time, then what has become possible above it. Of what is filled in, along rows and
+    along columns, the last four rows are kept, which fit the fastest cache.
+    """
+    directions = len(pictures)
+    for row in range(start - 3, stop + 3):
+        i = row + _MARGIN  # green of this row
+        above, below = (mosaic[i - 2], mosaic[i - 1]), (mosaic[i + 1], mosaic[i + 2])
+        measured = (row + red_row + red_column + 1) % 2  # columns of this parity hold green
         if homogeneous:
-            _green_in_row(strip[i], measured, pictures[0, 1, i])
-            _green_in_column(above[0], above[1], strip[i], below[0], below[1], measured, pictures[1, 1, i])
+            _green_in_row(mosaic[i], measured, pictures[0, 1, i % 4])
+            _green_in_column(above[0], above[1], mosaic[i], below[0], below[1], measured, pictures[1, 1, i % 4])
         else:
-            _green_of_lesser_change(above[0], above[1], strip[i], below[0], below[1], measured, pictures[0, 1, i])
-    for d in range(directions):
-        for i in range(3, rows - 3):
-            near, far = 2, 0
-            if (i + first) % 2 == 0:
-                near, far = 0, 2
-            sites = red_column
-            if near == 2:
-                sites = 1 - red_column
+            _green_of_lesser_change(above[0], above[1], mosaic[i], below[0], below[1], measured, pictures[0, 1, i % 4])
+
+        i -= 1  # red and blue of the row above
+        near, far, sites = 2, 0, 1 - red_column
+        if (row - 1 + red_row) % 2 == 0:  # it measures red
+            near, far, sites = 0, 2, red_column
+        for d in range(directions):
             picture, green = pictures[d], pictures[d, 1]
-            _colour_in_row(strip[i], green[i], sites, picture[near, i])
+            green_above, green_here, green_below = green[(i - 1) % 4], green[i % 4], green[(i + 1) % 4]
+            _colour_in_row(mosaic[i], green_here, sites, picture[near, i % 4])
             _colour_between_rows(
-                strip[i - 1], strip[i + 1], green[i - 1], green[i], green[i + 1], sites, picture[far, i]
+                mosaic[i - 1], mosaic[i + 1], green_above, green_here, green_below, sites, picture[far, i % 4]
             )
 
-    lead = np.zeros((rows, width), np.int8)
-    if homogeneous:
-        _leads(pictures, lead)
-
-    sums, total = np.zeros(width, np.int32), np.ones(width, np.int32)
-    left, middle, right, inner = sums[:-2], sums[1:-1], sums[2:], total[1:-1]
-    for i in range(_MARGIN, rows - _MARGIN):
+        i -= 1  # which picture is more homogeneous there, two rows above
         if homogeneous:
-            above, here, below = lead[i - 1], lead[i], lead[i + 1]
-            for j in range(width):
-                sums[j] = np.int32(above[j]) + np.int32(here[j]) + np.int32(below[j])
-            for j in range(len(inner)):
-                inner[j] = left[j] + middle[j] + right[j]
+            _lead(pictures, i, steps, lead[i % 4])
+
+        i -= 1  # and the choice, three rows above
+        if row - 3 < start:
+            continue
+        if homogeneous:
+            _add_around(lead[(i - 1) % 4], lead[i % 4], lead[(i + 1) % 4], sums, total)
         for c in range(3):
-            along_row, along_column = pictures[0, c, i], pictures[directions - 1, c, i]
-            _pick(along_row, along_column, total, gains[c], rgb[c, start + i - _MARGIN])
+            along_row, along_column = pictures[0, c, i % 4], pictures[directions - 1, c, i % 4]
+            _pick(along_row, along_column, total, gains[c], rgb[c, row - 3])
 
 
 @compile_part
@@ -193,7 +199,8 @@ def _colour_between_rows(above, below, green_above, green, green_below, sites, o
         down = (middle[j] - green_middle[j]) + (low_middle[j] - green_low_middle[j])
         corners = left[j] - green_left[j] + right[j] - green_right[j]
         corners += low_left[j] - green_low_left[j] + low_right[j] - green_low_right[j]
-        colour[j] = here[j] + corners * _QUARTER if (j & 1) != sites else here[j] + down * _HALF
+        at_corners, in_column = here[j] + corners * _QUARTER, here[j] + down * _HALF
+        colour[j] = at_corners if (j & 1) != sites else in_column
 
 
 @compile_part
@@ -229,26 +236,38 @@ def _count_alike(across, above, below, light, colour, sign, lead):  # type: igno
         out[j] += np.int8(sign * alike)
 
 
-@partial(compile_part, allocates=True)
-def _leads(pictures, lead):  # type: ignore[no-untyped-def]
-    """Count how many more of a site's four neighbours are like it in the first picture than in the second."""
-    rows, width = lead.shape
-    steps = np.zeros((2, 2, rows, 2, width), np.float32)  # picture; to the right, below; row; of light, of colour
+@compile_part
+def _lead(pictures, i, steps, lead):  # type: ignore[no-untyped-def]
+    """Count how many more of a site's four neighbours are like it in the first picture than in the second, in row i.
+
+    ``steps`` are of a picture: to the right, and down from rows of even and of odd numbers; of light, of colour.
+    """
+    down, down_above = 1 + i % 2, 2 - i % 2
     for d in range(2):
-        red, green, blue = pictures[d]
-        for i in range(3, rows - 3):
-            right, down = steps[d, 0, i], steps[d, 1, i]
-            _steps(red[i], green[i], blue[i], red[i, 1:], green[i, 1:], blue[i, 1:], right[0], right[1])
-            _steps(red[i], green[i], blue[i], red[i + 1], green[i + 1], blue[i + 1], down[0], down[1])
+        red, green, blue = pictures[d, 0, i % 4], pictures[d, 1, i % 4], pictures[d, 2, i % 4]
+        k = (i + 1) % 4
+        red_below, green_below, blue_below = pictures[d, 0, k], pictures[d, 1, k], pictures[d, 2, k]
+        _steps(red, green, blue, red[1:], green[1:], blue[1:], steps[d, 0, 0], steps[d, 0, 1])
+        _steps(red, green, blue, red_below, green_below, blue_below, steps[d, down, 0], steps[d, down, 1])
 
     # The picture along rows is judged by its steps along rows, the one along columns by its steps along columns.
-    light, colour = np.zeros(width, np.float32), np.zeros(width, np.float32)
-    for i in range(4, rows - 4):
-        across, above, below = steps[0, 0, i], steps[1, 1, i - 1], steps[1, 1, i]
-        _lesser_step(across[0], above[0], below[0], light)
-        _lesser_step(across[1], above[1], below[1], colour)
-        for d in range(2):
-            _count_alike(steps[d, 0, i], steps[d, 1, i - 1], steps[d, 1, i], light, colour, 1 - 2 * d, lead[i])
+    light, colour = steps[2, 0, 0], steps[2, 0, 1]
+    across, above, below = steps[0, 0], steps[1, down_above], steps[1, down]
+    _lesser_step(across[0], above[0], below[0], light)
+    _lesser_step(across[1], above[1], below[1], colour)
+    lead[:] = 0
+    for d in range(2):
+        _count_alike(steps[d, 0], steps[d, down_above], steps[d, down], light, colour, 1 - 2 * d, lead)
+
+
+@compile_part
+def _add_around(above, here, below, sums, total):  # type: ignore[no-untyped-def]
+    """Add the 3 x 3 numbers around each site of a row, except for the first and the last."""
+    for j in range(len(sums)):
+        sums[j] = np.int32(above[j]) + np.int32(here[j]) + np.int32(below[j])
+    left, middle, right, inner = sums[:-2], sums[1:-1], sums[2:], total[1:-1]
+    for j in range(len(inner)):
+        inner[j] = left[j] + middle[j] + right[j]
 
 
 def smooth(planes: Tensor, taps: Tensor) -> Tensor:
