@@ -29,24 +29,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, fields, replace
 from numbers import Real
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, PATTERNS
-from rawaug.camera.lights import (
-    REFERENCE,
-    XYZ_TO_SRGB,
-    adaptation,
-    compute_mired,
-    light_mired,
-    light_xyz,
-    mix_by_light,
-    weights_in_light,
-)
-from rawaug.camera.matrices import camera_from_srgb, gains_in_light, load_cameras
+from rawaug.camera.lights import compute_mired, light_xyz, mix_by_light, weights_in_light
+from rawaug.camera.matrices import gains_in_light, load_cameras
+from rawaug.camera.sheet_colour import Anchor, MatrixKind, check_colours, read_anchors, read_shading
+from rawaug.camera.sheet_noise import Level, check_levels, is_number, read_levels
 from rawaug.camera.softness import MTF50
 from rawaug.camera.transfer import measure_noise
 from rawaug.camera.tuning import read_tuning
@@ -58,50 +51,10 @@ _YAML_EXTENSIONS = (".yaml", ".yml")
 _TUNING_EXTENSION = ".json"
 """Extension of a tuning file of libcamera."""
 
-MatrixKind = Literal["xyz_to_camera", "srgb_to_camera", "camera_to_srgb"]
 NoiseUnit = Literal["variance", "DN"]
 
-_INVERSE_DIAGONAL = 1.1
-"""A matrix to the camera whose diagonal is above this is the inverse of one: of 1,427 cameras none is like that."""
 _LARGEST = 1e9
 """No figure of a camera is larger."""
-_MOST_GAIN = 100.0
-"""Gains are between this and one over it."""
-_LONGEST_SHADING = 256
-"""Most rows and columns of a table of lens shading."""
-_MOST_HOT = 0.1
-_LARGEST_VAR = 0.2
-"""A shot_var above it means fewer than five electrons at white; such numbers are more likely in DN."""
-
-
-class Level(NamedTuple):
-    """The noise of a camera at one ISO, as variances with white = 1; what is not stated is None."""
-
-    iso: float | None
-    shot_var: float
-    read_var: float
-    row_var: float | None = None
-    column_var: float | None = None
-    tukey_lambda: float | None = None
-    hot_share: float | None = None
-
-
-class Anchor(NamedTuple):
-    """A camera in one light of its data sheet.
-
-    Args:
-        light: the name of the light.
-        mired: a million over its correlated colour temperature in kelvin.
-        matrix: float64 ``(3, 3)``, from linear sRGB to white-balanced camera RGB, rows of sum 1.
-        gains: float64 ``(3,)``, green 1.
-        from_xyz: float64 ``(3, 3)``, X of this module.
-    """
-
-    light: str
-    mired: float
-    matrix: Tensor
-    gains: Tensor
-    from_xyz: Tensor
 
 
 @dataclass(frozen=True)
@@ -190,11 +143,14 @@ class Camera:
 
         self._check_choices()
         self._check_grid()
-        self._check_colours(self.anchors())
-        self._check_levels()
         self._check_blur()
-        self.shading_by_light()
         self.inverse_curve(2)  # raises ValueError for points of the tone curve
+        try:
+            check_colours(self.anchors(), self.matrix_is, self.white_balance is not None)
+            check_levels(self.levels, self.quantum)
+            self.shading_by_light()
+        except ValueError as error:
+            raise ValueError(f"camera {self.name!r}: {error}") from None
 
     def _check_choices(self) -> None:
         if self.matrix_is not in get_args(MatrixKind):
@@ -210,24 +166,13 @@ class Camera:
                 "cfa", f"is unknown: {self.cfa!r:.40}; use one of {', '.join(dict.fromkeys(patterns))}{hint}"
             )
 
-    def _check_colours(self, anchors: Sequence[Anchor]) -> None:
-        """Refuse matrices in the wrong direction, and neutral colours in place of gains."""
-        for light, _, matrix, gains, _ in anchors:
-            if self.matrix_is != "xyz_to_camera" and bool((matrix.diagonal() > _INVERSE_DIAGONAL).all()):
-                other = "srgb_to_camera" if self.matrix_is == "camera_to_srgb" else "camera_to_srgb"
-                reason = f"of light {light} adds colour on the way to the camera, whose colours overlap"
-                raise self._error("matrix", f"{reason}; is it {other}?")
-            if self.white_balance is not None and float(gains[0]) < 0.95 and float(gains[2]) < 0.95:
-                reason = f"of light {light} makes green the strongest, as no sensor needs"
-                raise self._error("white_balance", f"{reason}; of an AsShotNeutral give the reciprocals")
-
     def _check_grid(self) -> None:
         if self.bits is not None and (not isinstance(self.bits, int) or not 1 <= self.bits <= 16):
             raise self._error("bits", f"must be a whole number from 1 to 16, got {self.bits!r}")
 
         for key in ("black_level", "white_level"):
             value = getattr(self, key)
-            if value is not None and not (_is_number(value) and value >= 0):
+            if value is not None and not (is_number(value) and value >= 0):
                 raise self._error(key, f"must be a number of DN, at least 0, got {value!r:.100}")
 
         if self.white_level is None and self.bits is None:
@@ -240,46 +185,17 @@ class Camera:
         if self.bits is not None and self.white > 2**self.bits - 1:
             raise self._error("white_level", f"{self.white:g} DN does not fit {count_of(self.bits, 'bit')}")
 
-    def _check_levels(self) -> None:
-        values = [level.iso for level in self.levels]
-        if len(set(values)) < len(values) or (None in values and len(values) > 1):
-            raise self._error("noise", f"must have a level for each ISO, or a single one without, got {values}")
-
-        known = [level for level in self.levels if level.iso is not None and level.shot_var > 0]
-        if len(known) > 1 and known[-1].shot_var < 0.9 * known[0].shot_var:
-            raise self._error("noise", "falls with ISO; K is in DN per electron, the reciprocal of electrons per DN")
-        if len(known) > 1 and known[-1].iso >= 4 * known[0].iso:  # type: ignore[operator]
-            growth = math.log(known[-1].shot_var / known[0].shot_var) / math.log(known[-1].iso / known[0].iso)  # type: ignore[operator]
-            if 0.45 < growth < 0.55:
-                raise self._error("noise", "grows with the root of ISO; are these deviations? Give their squares")
-        for level in self.levels:
-            if level.read_var > level.shot_var > 0:
-                reason = (
-                    f"of {level.read_var:.3g} in read_var is more than the shot noise at white, {level.shot_var:.3g}"
-                )
-                raise self._error("noise", f"{reason}, as no sensor has; is it a deviation?")
-
-        if len({tuple(value is None for value in level[3:]) for level in self.levels}) > 1:
-            raise self._error("noise", "states row, column, lambda or hot at some ISO values only; state it at all")
-
-        rounding = self.quantum**2 / 12
-        for level in self.levels:
-            if level.shot_var < 0 or level.read_var < rounding:
-                at = "" if level.iso is None else f" at ISO {level.iso:g}"
-                reason = f"{level.read_var:.3g} of read_var{at} is less than rounding alone makes, {rounding:.3g}"
-                raise self._error("noise", f"{reason}; leave out bits to round nothing")
-
     def _check_blur(self) -> None:
         if self.mtf50 is not None:
             if self.blur is not None:
                 raise self._error("mtf50", "is another form of blur; leave one of them out")
-            if not (_is_number(self.mtf50) and self.mtf50 >= MTF50):
+            if not (is_number(self.mtf50) and self.mtf50 >= MTF50):
                 raise self._error("mtf50", f"must be at least {MTF50:.3f} cycles a pixel, got {self.mtf50!r:.100}")
         if self.blur is None:
             return
 
         ends = self.blur if isinstance(self.blur, list) else [self.blur, self.blur]
-        if len(ends) != 2 or not all(_is_number(end) and 0 <= end <= 1 for end in ends) or ends[0] > ends[1]:
+        if len(ends) != 2 or not all(is_number(end) and 0 <= end <= 1 for end in ends) or ends[0] > ends[1]:
             rule = "must be a number of pixels from 0 to 1, or the lowest and the highest"
             raise self._error("blur", f"{rule}, got {self.blur!r:.100}")
 
@@ -321,68 +237,8 @@ class Camera:
     @property
     def levels(self) -> list[Level]:
         """The noise by ISO, ascending, as variances with white = 1; empty if it is not known."""
-        if self.noise is None:
-            return []
-        if not isinstance(self.noise, dict) or set(self.noise) & {"shot_var", "read_var", "K", "sigma"}:
-            return [self._level(None, self.noise, "")]
-
-        levels = []
-        for iso, values in self.noise.items():
-            try:
-                number = float(iso)
-            except (TypeError, ValueError):
-                number = math.nan
-
-            if not 0 < number < math.inf:
-                raise self._error("noise", f"has levels by ISO, a positive number, got {iso!r:.100}")
-
-            levels.append(self._level(number, values, f" at ISO {number:g}"))
-
-        return sorted(levels, key=lambda level: level.iso or 0.0)
-
-    def _level(self, iso: float | None, values: Any, where: str) -> Level:
-        """Read the level of one ISO."""
-        in_dn = self.noise_in == "DN"
-        further: dict[str, Any] = {}
-        if isinstance(values, dict):
-            in_dn = bool(set(values) & {"K", "sigma", "row", "column"})
-            pair = ("K", "sigma") if in_dn else ("shot_var", "read_var")
-            lines = ("row", "column") if in_dn else ("row_var", "column_var")
-            known = (*pair, *lines, "lambda", "hot")
-            if not set(pair) <= set(values) <= set(known):
-                further_keys = ", ".join(known[2:])
-                rule = f"is {{{pair[0]}, {pair[1]}}} and, if known, {further_keys}"
-                raise self._error("noise", f"{where} {rule}, got {', '.join(map(str, values))}")
-            further = {key: values[key] for key in known[2:] if key in values}
-            values = [values[pair[0]], values[pair[1]]]
-
-        if not isinstance(values, list) or len(values) != 2 or not all(map(_is_number, [*values, *further.values()])):
-            raise self._error("noise", f"{where} must be two numbers, got {values!r:.100} {further or ''}".rstrip())
-
-        first, second = float(values[0]), float(values[1])
-        row, column = further.get("row_var"), further.get("column_var")
-        if min(first, second, *[value for key, value in further.items() if key != "lambda"]) < 0:
-            raise self._error("noise", f"{where} must not be negative, got {first:g} and {second:g} {further or ''}")
-        advice = "(K, sigma) in DN needs noise_in='DN'"
-        if in_dn:
-            if self.bits is None and self.white_level is None:
-                raise self._error("noise", f"{where} is in DN: give white_level or bits, and black_level")
-            first, second = first / self.full_scale, (second / self.full_scale) ** 2
-            row, column = self._line_var(further.get("row")), self._line_var(further.get("column"))
-            advice = "check K, sigma and the levels"
-
-        if max(first, second, row or 0.0, column or 0.0) > _LARGEST_VAR:
-            raise self._error("noise", f"{where} has variances {first:g} and {second:g}, as no sensor has; {advice}")
-        if not -0.5 < further.get("lambda", 0.0) <= 2.0 or further.get("hot", 0.0) > _MOST_HOT:
-            rule = f"has a lambda above -0.5 and at most 2, and at most {_MOST_HOT:g} of its pixels are hot"
-            raise self._error("noise", f"{where} {rule}, got {further}")
-        return Level(iso, first, second, row, column, further.get("lambda"), further.get("hot"))
-
-    def _line_var(self, deviation: float | None) -> float | None:
-        """The variance of banding of a deviation in DN."""
-        if deviation is None:
-            return None
-        return (deviation / self.full_scale) ** 2
+        full_scale = None if self.bits is None and self.white_level is None else self.full_scale
+        return read_levels(self.noise, self.noise_in == "DN", full_scale)
 
     def noise_spec(self) -> dict[str, Any] | None:
         """The noise as a name with settings, which :func:`rawaug.noise.noise_model` reads; None if unknown.
@@ -406,86 +262,7 @@ class Camera:
 
     def anchors(self) -> list[Anchor]:
         """The camera in each light that its figures name, warmest first."""
-        matrices = self._by_light("matrix", self.matrix, (3, 3))
-        gains = self._by_light("white_balance", self.white_balance, (3,))
-        if len(matrices) == 1 and gains and not isinstance(self.white_balance, dict):
-            gains = dict.fromkeys(matrices, gains[REFERENCE])  # both are for the same light, that of the matrix
-
-        from_srgb = {}
-        for light, matrix in matrices.items():
-            from_srgb[light] = self._from_srgb(light, matrix)
-        lights = {*matrices, *gains}
-        if gains and not isinstance(self.matrix, dict):
-            lights = {*gains}  # the single matrix serves in all of them
-
-        anchors = []
-        for light in sorted(lights, key=light_mired, reverse=True):
-            matrix = mix_by_light(from_srgb, light)
-            stated = gains.get(light)
-            if stated is None:
-                stated = self._implied_gains(light, matrices)
-
-            stated = stated / stated[1]
-            to_d65 = adaptation(light_xyz(light), light_xyz(REFERENCE))
-            from_xyz = torch.diag(1.0 / stated) @ matrix @ XYZ_TO_SRGB @ to_d65
-            anchors.append(Anchor(light, light_mired(light), matrix, stated, from_xyz))
-
-        return anchors
-
-    def _by_light(self, key: str, value: Any, shape: tuple[int, ...]) -> dict[str, Tensor]:
-        if value is None:
-            return {}
-        if not isinstance(value, dict):
-            value = {REFERENCE: value}
-
-        by_light = {}
-        for light, numbers in value.items():
-            name = str(light)
-            try:
-                light_xyz(name)
-                by_light[name] = torch.tensor(numbers, dtype=torch.float64)
-            except (TypeError, ValueError) as error:
-                raise self._error(key, f"of light {name!r:.40} cannot be read: {error}") from None
-
-            if by_light[name].shape != shape or not by_light[name].isfinite().all():
-                size = " x ".join(map(str, shape))
-                raise self._error(key, f"of light {name} must be {size} finite numbers, got {numbers!r:.100}")
-
-            if key == "white_balance" and not _are_gains(by_light[name]):
-                reason = f"must be from {1 / _MOST_GAIN:g} to {_MOST_GAIN:g}"
-                raise self._error(key, f"of light {name} {reason}, got {numbers!r:.100}")
-
-        if not by_light:
-            raise self._error(key, "names no light")
-        return by_light
-
-    def _from_srgb(self, light: str, matrix: Tensor) -> Tensor:
-        """The matrix of a light from linear sRGB to white-balanced camera RGB, rows of sum 1."""
-        if self.matrix_is == "xyz_to_camera":
-            under_light = adaptation(light_xyz(REFERENCE), light_xyz(light))
-            return camera_from_srgb(matrix @ under_light)
-
-        if self.matrix_is == "camera_to_srgb":
-            if not float(torch.linalg.cond(matrix)) <= 1e6:  # NaN for a matrix of zeros
-                raise self._error("matrix", f"of light {light} cannot be inverted")
-
-            matrix = torch.linalg.inv(matrix)
-
-        rows = matrix.sum(dim=1, keepdim=True)
-        if not ((rows - 1.0).abs() < 0.05).all():
-            sums = ", ".join(f"{value:.3f}" for value in rows.flatten().tolist())
-            raise self._error("matrix", f"of light {light} must keep white: its rows sum to {sums}, not to 1")
-        return matrix / rows
-
-    def _implied_gains(self, light: str, matrices: Mapping[str, Tensor]) -> Tensor:
-        """The gains of a light that follow from the matrix from XYZ."""
-        if self.matrix_is != "xyz_to_camera":
-            raise self._error("white_balance", f"needs the gains of light {light} as well")
-
-        response = matrices[light] @ light_xyz(light)
-        if not (response > 0).all():
-            raise self._error("matrix", f"of light {light} makes white negative: {response.tolist()}")
-        return gains_in_light(matrices[light], light_xyz(light))
+        return read_anchors(self.matrix, self.matrix_is, self.white_balance)
 
     def matrix_for(self, white_balance: Sequence[float]) -> Tensor:
         """Compute the matrix ``(3, 3)`` from linear sRGB to white-balanced camera RGB in the light of as-shot gains.
@@ -516,33 +293,7 @@ class Camera:
 
     def shading_by_light(self) -> dict[str, Tensor]:
         """Get the tables ``(3, rows, columns)`` of each light of the sheet; none if no shading is stated."""
-        if self.shading is None:
-            return {}
-        shading = self.shading
-        if not isinstance(shading, dict):
-            shading = {REFERENCE: shading}
-
-        by_light = {}
-        for light, numbers in shading.items():
-            try:
-                light_xyz(str(light))
-                table = torch.tensor(numbers, dtype=torch.float64)
-            except (TypeError, ValueError) as error:
-                raise self._error("shading", f"of light {light!r:.40} cannot be read: {error}") from None
-
-            if table.ndim == 2:
-                table = table.expand(3, -1, -1)
-            if table.ndim != 3 or len(table) != 3 or min(table.shape) < 2 or max(table.shape) > _LONGEST_SHADING:
-                sides = " x ".join(map(str, table.shape))
-                rule = f"must be a table of 2 to {_LONGEST_SHADING} rows and columns, or three of them"
-                raise self._error("shading", f"of light {light} {rule}, got {sides or 'a number'}")
-            if not bool(((table > 0) & (table <= 1)).all()):
-                raise self._error("shading", f"of light {light} must be above 0 and at most 1; are these gains?")
-            by_light[str(light)] = table
-
-        if len({table.shape for table in by_light.values()}) != 1:
-            raise self._error("shading", "needs tables of one size for all lights")
-        return by_light
+        return read_shading(self.shading)
 
     # -- tone ---------------------------------------------------------------------------------------------------------
 
@@ -701,15 +452,6 @@ def own_cameras(info: Mapping[str, Any]) -> list[Camera]:
     """Get the user's own cameras that an ISP was made of, from its ``info``; other ISPs have none."""
     contents: Sequence[Mapping[str, Any]] = info.get("own_cameras", [])
     return [Camera.from_json(content, "the ISP's camera") for content in contents]
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _are_gains(values: Tensor) -> bool:
-    """Tell whether values are between :data:`_MOST_GAIN` and one over it."""
-    return bool(((values >= 1 / _MOST_GAIN) & (values <= _MOST_GAIN)).all())
 
 
 def _numbers(value: Any) -> Iterator[Any]:
