@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 
 from rawaug.commands import YAML, as_options, network_or_filter, require_results
 from rawaug.denoising.convolutions import USUAL, expect_seconds
-from rawaug.denoising.denoise import files_for, is_mixed
+from rawaug.denoising.denoise import files_for, is_mixed, open_denoiser
 from rawaug.denoising.folder import DenoisedFolder, denoise_file, denoise_folder
-from rawaug.denoising.pictures import PictureFiles
+from rawaug.denoising.pictures import PictureDenoiser, PictureFiles
 from rawaug.denoising.raw import Denoised, Greens, RawFiles
 from rawaug.errors import count_of, escape
 from rawaug.files import write_json
@@ -76,18 +76,9 @@ def run(
     """
     spec = network_or_filter(denoiser, classical, self_ensemble, linear)
     require_results(json, None, overwrite, [source])
-    kind = files_for(
-        source,
-        spec,
-        noise=noise,
-        strength=strength,
-        linear=linear,
-        self_ensemble=self_ensemble,
-        greens=greens,
-        defects=defects,
-        guard=None if guard == "auto" else guard == "on",
-        device=device,
-    )
+    guarded = None if guard == "auto" else guard == "on"
+    for_raw = {"noise": noise, "greens": greens, "defects": defects, "guard": guarded}
+    kind = files_for(source, spec, strength, linear, self_ensemble, device, **for_raw)
     if spec is None and isinstance(kind, RawFiles) and kind.denoiser.name == "rawaug-small":
         seconds = expect_seconds("rawaug-base", USUAL)
         print(
@@ -100,7 +91,8 @@ def run(
             extension = Path(out).suffix
             raise ValueError(f"{out}: {source} is a folder, and so is its output; give a name without {extension}")
         if spec is None and is_mixed(Path(source)):
-            pictures = PictureFiles(strength=strength, self_ensemble=self_ensemble, device=device)
+            spec = PictureDenoiser.default
+            pictures = PictureFiles(open_denoiser(PictureDenoiser, spec, strength, self_ensemble, device))
             result = denoise_folder(
                 source, out, kind, previews=preview, overwrite=overwrite, elsewhere=("rendering", *PICTURE_KINDS)
             )

@@ -5,13 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from denoisers.files import JOINT
+from rawaug.denoising.convolutions import choose_network
+from rawaug.denoising.denoiser import D, RawDenoiser
 from rawaug.denoising.folder import Files, denoise_file
 from rawaug.denoising.levels import Noise
-from rawaug.denoising.pictures import LINEAR, PictureFiles
+from rawaug.denoising.pictures import LINEAR, PictureDenoiser, PictureFiles
 from rawaug.denoising.raw import Greens, RawFiles
 from rawaug.files import files_below, require_output
 from rawaug.io import RawFrame
 from rawaug.io.content import ALL_PICTURE_EXTENSIONS, RAW_EXTENSIONS, identify_content, picture_extensions
+from rawaug.kernels.runtime import find_device
 
 
 def denoise(
@@ -65,18 +69,8 @@ def denoise(
         >>> frame = rawaug.denoise("in.dng", "out.dng", denoiser="rawaug-base")  # doctest: +SKIP
         >>> srgb = rawaug.denoise("in.jpg")  # doctest: +SKIP
     """
-    files = files_for(
-        source,
-        denoiser,
-        noise=noise,
-        strength=strength,
-        linear=linear,
-        self_ensemble=self_ensemble,
-        greens=greens,
-        defects=defects,
-        guard=guard,
-        device=device,
-    )
+    for_raw = {"noise": noise, "greens": greens, "defects": defects, "guard": guard}
+    files = files_for(source, denoiser, strength, linear, self_ensemble, device, **for_raw)
     if not isinstance(source, RawFrame):
         image, _ = denoise_file(source, out, files, preview=preview, overwrite=overwrite)
         return image
@@ -87,26 +81,58 @@ def denoise(
     return image
 
 
-def files_for(source: str | Path | RawFrame, denoiser: Any = None, **settings: Any) -> Files[Any]:
+def files_for(
+    source: str | Path | RawFrame,
+    denoiser: Any = None,
+    strength: float = 1.0,
+    linear: bool = False,
+    self_ensemble: bool = False,
+    device: str = "auto",
+    **for_raw: Any,
+) -> Files[Any]:
     """Say how the files of a source are denoised: by its content; a folder is of pictures if it has no RAW file.
 
     Args:
         source: a file, a folder or a frame.
         denoiser: None for the shipped one.
-        settings: those of :class:`RawFiles`; a picture takes only those of :class:`PictureFiles`.
+        strength, linear, self_ensemble, device: as in :func:`denoise`, for the denoiser.
+        for_raw: ``noise``, ``greens``, ``defects`` and ``guard`` of :func:`denoise`; a picture takes none.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is a file of no kind, or a setting does not fit it.
     """
-    if _is_raw(source):
-        return RawFiles(denoiser, **settings)
+    if not _is_raw(source):
+        defaults = {"linear": False, "noise": "auto", "greens": "auto", "defects": "mend", "guard": None}
+        for argument, value in {"linear": linear, **for_raw}.items():
+            if value != defaults[argument]:
+                raise ValueError(f"{source}: is a developed picture; {argument}= is for RAW")
+        denoiser = denoiser or PictureDenoiser.default
+        return PictureFiles(open_denoiser(PictureDenoiser, denoiser, strength, self_ensemble, device))
 
-    for_raw = {"linear": False, "greens": "auto", "defects": "mend", "guard": None, "noise": "auto"}
-    for argument, default in for_raw.items():
-        if settings.pop(argument, default) != default:
-            raise ValueError(f"{source}: is a developed picture; {argument}= is for RAW")
-    return PictureFiles(denoiser, **settings)
+    by_pattern = denoiser is None and not linear
+    if denoiser is None:
+        denoiser = JOINT if linear else choose_network(find_device(device))
+    denoiser = open_denoiser(RawDenoiser, denoiser, strength, self_ensemble, device)
+    if linear and not denoiser.demosaics:
+        raise ValueError(f"{denoiser.name}: denoises the mosaic; linear=True demosaics, too, use {JOINT}")
+    if denoiser.demosaics and not linear:
+        raise ValueError(f"{denoiser.name}: demosaics too, to a linear DNG; add linear=True")
+    return RawFiles(denoiser, by_pattern=by_pattern, **for_raw)
+
+
+def open_denoiser(
+    kind: type[D], spec: Any, strength: float = 1.0, self_ensemble: bool = False, device: str = "auto"
+) -> D:
+    """Open a denoiser of this kind; one that is open is changed only as far as an argument differs from its default."""
+    changes: dict[str, Any] = {}
+    if strength != 1.0:
+        changes["strength"] = strength
+    if self_ensemble:
+        changes["views"] = 8
+    if isinstance(spec, kind) and not changes and device == "auto":
+        return spec
+    return kind.of(spec, device, "auto", **changes)
 
 
 def is_mixed(folder: Path) -> bool:

@@ -28,13 +28,11 @@ from rawaug.noise.profiles import ProfileLevels
 from rawaug.registry import split_spec
 from rawaug.seeding import keyed_generator
 
-Shots = Mapping[tuple[str, float | None], tuple[float, float]]
-"""Levels by camera and ISO."""
 Noise = str | Mapping[Any, Any] | Sequence[float] | MeasuredLevels
 """Where levels come from: ``"auto"``, ``"profile"`` (the tag), ``"estimate"``, a measured camera's name or law (at the
 file's ISO, or at another one as ``{"name": ..., "iso": ...}``), ``"camera"`` (the law that the denoiser was trained
 for), an ISP's file or a camera's sheet, a law as ``{"name": "MeasuredNoise", ...}``, two variances, or the levels of
-other files."""
+other files by (camera, ISO)."""
 
 LOOSE = 0.9
 """The least R^2 of a reliable estimate."""
@@ -59,43 +57,40 @@ def find_levels(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, s
         UnknownNoise: if the levels are not known.
         ValueError: if ``noise`` names no camera, or one other than the frame's.
     """
+    # Levels or a law of levels.
     if isinstance(noise, MeasuredLevels):
-        return *_of_law(noise, frame), "camera"
+        return *_measured_levels(frame, noise), "camera"
     if isinstance(noise, Mapping):
-        return _of_other_files(noise, frame)
+        shot = frame.camera, frame.iso
+        if shot not in noise:
+            raise UnknownNoise(f"{frame.name}: no other file is of {frame.camera} at its ISO")
+        return *noise[shot], f"other files of {frame.camera} at ISO {frame.iso:g}"
     if not isinstance(noise, str):
         fixed = FixedLevels.of(noise)
         return fixed.shot_var, fixed.read_var, "given"
 
-    if noise == "auto":
-        return _automatic(frame)
-    if noise == "estimate":
-        return _estimate(frame)
-    if noise == "profile":
-        return _profile(frame)
-    return *_published_levels(frame, noise), noise
-
-
-def _automatic(frame: RawFrame) -> tuple[float, float, str]:
-    if frame.noise_profile is not None:
+    # The file's own statement, or an estimate.
+    if noise == "auto" and frame.noise_profile is not None:
         return _check_profile(frame, frame.noise_profile)
+    if noise == "profile":
+        if frame.noise_profile is not None:
+            return *frame.noise_profile, "profile"
+        reason = "; ".join(frame.remarks) or "has no NoiseProfile tag"
+        raise UnknownNoise(f'{frame.name}: {reason}; pass noise="estimate" or {_BY_HAND}')
+    if noise not in ("auto", "estimate"):
+        return *_published_levels(frame, noise), noise
+
     try:
         shot_var, read_var, source = _estimate(frame)
     except UnknownNoise:
-        with suppress(ValueError):
-            return *_published_levels(frame, frame.camera), f"the law published for {frame.camera}"
+        if noise == "auto":
+            with suppress(ValueError):
+                return *_published_levels(frame, frame.camera), f"the law published for {frame.camera}"
         raise
-
-    for remark in frame.remarks:
-        source += f"; {remark}, and is not used"
+    if noise == "auto":
+        for remark in frame.remarks:
+            source += f"; {remark}, and is not used"
     return shot_var, read_var, source
-
-
-def _profile(frame: RawFrame) -> tuple[float, float, str]:
-    if frame.noise_profile is not None:
-        return *frame.noise_profile, "profile"
-    reason = "; ".join(frame.remarks) or "has no NoiseProfile tag"
-    raise UnknownNoise(f'{frame.name}: {reason}; pass noise="estimate" or {_BY_HAND}')
 
 
 def _estimate(frame: RawFrame) -> tuple[float, float, str]:
@@ -156,7 +151,7 @@ def _check_profile(frame: RawFrame, profile: tuple[float, float]) -> tuple[float
     return estimate.shot_var, estimate.read_var, f"estimate; the NoiseProfile tag says {ratio:.2g} times as much"
 
 
-def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:
+def _measured_levels(frame: RawFrame, law: MeasuredLevels) -> tuple[float, float]:
     cameras = {law.camera, frame.camera} - {"unknown"}
     if len(cameras) > 1:
         raise ValueError(f"{frame.name}: is from {frame.camera}, but the noise law is of {law.camera}; use another")
@@ -164,13 +159,6 @@ def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:
         return law.at(frame.iso)
     except ValueError as error:
         raise UnknownNoise(f'{frame.name}: {error}; pass noise="estimate" or {_BY_HAND}') from None
-
-
-def _of_other_files(levels: Shots, frame: RawFrame) -> tuple[float, float, str]:
-    shot = frame.camera, frame.iso
-    if shot not in levels:
-        raise UnknownNoise(f"{frame.name}: no other file is of {frame.camera} at its ISO")
-    return *levels[shot], f"other files of {frame.camera} at ISO {frame.iso:g}"
 
 
 def load_noise(noise: Noise, denoiser: ImageDenoiser) -> Noise:

@@ -209,34 +209,15 @@ class PictureFiles(Files[DenoisedPicture]):
     """Developed pictures, which are denoised to pictures with their EXIF, ICC profile and orientation.
 
     Args:
-        denoiser: whatever :meth:`rawaug.denoising.pictures.PictureDenoiser.of` takes; None for the shipped one.
-        strength: a factor on the estimated level of the noise.
-        self_ensemble: whether eight views are averaged.
-        device: where a network runs: auto, cpu, cuda, ...
-
-    Raises:
-        FileNotFoundError: if a file is missing.
-        ValueError: if there is no such denoiser, or a setting does not fit it.
+        denoiser: it says where and how strongly pictures are denoised.
     """
 
     what = "picture"
     formats = PICTURE_FORMATS
     format_advice = f"the source is a developed picture; its output is one of {', '.join(PICTURE_FORMATS)}"
 
-    def __init__(
-        self, denoiser: Any = None, *, strength: float = 1.0, self_ensemble: bool = False, device: str = "auto"
-    ) -> None:
-        changes: dict[str, Any] = {}
-        if strength != 1.0:
-            changes["strength"] = strength
-        if self_ensemble:
-            changes["views"] = 8
-
-        if denoiser is None:
-            denoiser = PictureDenoiser.default
-        if not isinstance(denoiser, PictureDenoiser) or changes or device != "auto":
-            denoiser = PictureDenoiser.of(denoiser, device, "auto", **changes)
-        self.denoiser: PictureDenoiser = denoiser
+    def __init__(self, denoiser: PictureDenoiser) -> None:
+        self.denoiser = denoiser
 
     def listing(self, folder: Path) -> Listing:
         """List the pictures; one with the stem of a RAW file is left out, as the camera's own rendering of it."""

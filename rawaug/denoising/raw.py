@@ -27,7 +27,6 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from denoisers.files import JOINT
 from rawaug import bayer
 from rawaug.bayer import CFA, GreenDifference
 from rawaug.denoising.convolutions import choose_network
@@ -151,18 +150,10 @@ class RawFiles(Files[Denoised]):
     """RAW files and frames, with the denoiser of their pattern and the noise levels of each.
 
     Args:
-        denoiser: whatever :meth:`rawaug.RawDenoiser.of` takes; None for the shipped one of each frame's pattern.
-        noise: where the noise levels come from, see :data:`rawaug.denoising.levels.Noise`.
-        strength: 1 removes the noise, 0.7 leaves 30% of it, 0 changes nothing.
-        linear: whether the result is demosaiced, too.
-        self_ensemble: whether eight views are averaged.
-        greens: ``"keep"`` leaves greens that differ.
-        defects: ``"mend"`` leaves single hot and dead pixels to the denoiser, which replaces them; ``"keep"`` keeps
-            them as they are; or the file of a map (:mod:`rawaug.denoising.defects`), whose sites are replaced while
-            all others are kept.
-        guard: whether a result that is estimated to be worse than its input is blended with it
-            (:mod:`rawaug.denoising.guard`); for Bayer mosaics with known levels. None guards networks.
-        device: where a network runs: auto, cpu, cuda, ...
+        denoiser: whatever :meth:`rawaug.RawDenoiser.of` takes; it says where and how strongly it denoises, and whether
+            it demosaics, too. None stands for the shipped one of Bayer's patterns.
+        noise, greens, defects, guard: as in :func:`rawaug.denoise`.
+        by_pattern: denoise frames of patterns that are not Bayer's by the shipped denoiser of those.
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -181,49 +172,34 @@ class RawFiles(Files[Denoised]):
         denoiser: Any = None,
         *,
         noise: Noise = "auto",
-        strength: float = 1.0,
-        linear: bool = False,
-        self_ensemble: bool = False,
         greens: Greens = "auto",
         defects: str | Path = "mend",
         guard: bool | None = None,
-        device: str = "auto",
+        by_pattern: bool = False,
     ) -> None:
         if greens not in get_args(Greens):
             raise ValueError(f"greens: {greens!r} is unknown; use one of {', '.join(get_args(Greens))}")
 
-        changes: dict[str, Any] = {}
-        if strength != 1.0:
-            changes["strength"] = strength
-        if self_ensemble:
-            changes["views"] = 8
-        self._options: dict[str, Any] = {"device": device, "precision": "auto", **changes}
-        self._by_pattern = denoiser is None and not linear
-
         if denoiser is None:
-            denoiser = JOINT if linear else choose_network(find_device(device))
-        if not isinstance(denoiser, RawDenoiser) or changes or device != "auto":
-            denoiser = RawDenoiser.of(denoiser, **self._options)
+            denoiser = choose_network(find_device("auto"))
+        if not isinstance(denoiser, RawDenoiser):
+            denoiser = RawDenoiser.of(denoiser, "auto", "auto")
         self.denoiser: RawDenoiser = denoiser
-
-        if linear and not denoiser.demosaics:
-            raise ValueError(f"{denoiser.name}: denoises the mosaic; linear=True demosaics, too, use {JOINT}")
-        if denoiser.demosaics and not linear:
-            raise ValueError(f"{denoiser.name}: demosaics too, to a linear DNG; add linear=True")
-        if guard and denoiser.demosaics:
+        if denoiser.demosaics and guard:
             raise ValueError(f"{denoiser.name}: demosaics, too; guard compares mosaics")
-        if defects != "mend" and denoiser.demosaics:
+        if denoiser.demosaics and defects != "mend":
             raise ValueError(f"{denoiser.name}: demosaics, too; defects is for mosaics")
+        if guard is None:
+            guard = denoiser.reads_levels and not denoiser.demosaics and "classical" not in denoiser.settings
 
+        self.noise = load_noise(noise, denoiser)
         self.greens = greens
         self.defects = defects
         self.sites: Tensor | None = None
         if defects not in ("mend", "keep"):
             self.sites = read_defects(defects)
-        if guard is None:
-            guard = denoiser.reads_levels and not denoiser.demosaics and "classical" not in denoiser.settings
         self.guard = guard
-        self.noise = load_noise(noise, denoiser)
+        self.by_pattern = by_pattern
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -247,11 +223,12 @@ class RawFiles(Files[Denoised]):
 
     @cached_property
     def _of_other_patterns(self) -> RawDenoiser:
-        return RawDenoiser.of(OTHER_PATTERNS, **self._options)
+        like = self.denoiser
+        return RawDenoiser.of(OTHER_PATTERNS, like.device, "auto", views=like.views, strength=like.strength)
 
     def denoiser_for(self, cfa: str) -> RawDenoiser:
         """The denoiser of frames of a pattern: the one that was named, or the shipped one of this pattern."""
-        if self._by_pattern and cfa not in (*CFA.__members__, MONOCHROME):
+        if self.by_pattern and cfa not in (*CFA.__members__, MONOCHROME):
             return self._of_other_patterns
         return self.denoiser
 
@@ -269,61 +246,59 @@ class RawFiles(Files[Denoised]):
             ``(3, H, W)``; and what was done.
         """
         start = time.perf_counter()
-        file = None if isinstance(source, RawFrame) else source
-        frame: RawFrame
+        file: Path | None = None
         if isinstance(source, RawFrame):
             frame = source
-        elif isolate:
-            frame = isolated(read_raw, source, True)
         else:
-            frame = read_raw(source, monochrome=True)
+            file = source
+            frame = isolated(read_raw, file, True) if isolate else read_raw(file, monochrome=True)
 
         # The denoiser of this pattern; greens that agree; a monochrome frame as the mosaic of a grey scene.
         denoiser = self.denoiser_for(frame.cfa)
-        greens, balanced = None, False
+        difference: GreenDifference | None = None
+        balanced = False
         if denoiser.strength > 0:
-            equal, greens = equalise_greens(frame, self.greens)
+            equal, difference = equalise_greens(frame, self.greens)
             frame, balanced = equal, equal is not frame
         if self.sites is not None:
             frame = mend_sites(frame, self.sites)
-        mosaic = frame
+        noisy = frame
         if frame.cfa == MONOCHROME:
             if denoiser.demosaics:
                 raise ValueError(f"{frame.name}: is monochrome; there is nothing to demosaic, omit linear=True")
-            mosaic = replace(frame, cfa=CFA.RGGB)
+            noisy = replace(frame, cfa=CFA.RGGB)
 
         # The levels of its noise.
         levels, noise_source = None, "not needed"
         if denoiser.reads_levels or self.guard or self.defects != "mend":
-            shot_var, read_var, noise_source = find_levels(mosaic, self.noise)
+            shot_var, read_var, noise_source = find_levels(noisy, self.noise)
             levels = shot_var, read_var
 
-        # The result: full colour, or a mosaic that digital numbers can hold, with the noise that is left.
-        image = denoiser.frame(mosaic, levels)
+        # The result: full colour, or a mosaic that is no worse than its input, with single sites as they were.
+        image = denoiser.frame(noisy, levels)
         blended, kept = 1.0, 0
-        if self.guard and denoiser.strength > 0 and levels is not None and mosaic.cfa in CFA.__members__:
-            noisy = Noisy.of(bayer.pack(mosaic.mosaic[None], mosaic.cfa), levels, mosaic.cfa)
-            packed = bayer.pack(image[None], mosaic.cfa)
-            guarded, blended = guard_result(denoiser, noisy, packed, denoiser.strength)
-            image = bayer.unpack(guarded, mosaic.cfa)[0].clamp(max=1.0)
+        if self.guard and denoiser.strength > 0 and levels is not None and noisy.cfa in CFA.__members__:
+            packed = Noisy.of(bayer.pack(noisy.mosaic[None], noisy.cfa), levels, noisy.cfa)
+            denoised = bayer.pack(image[None], noisy.cfa)
+            guarded, blended = guard_result(denoiser, packed, denoised, denoiser.strength)
+            image = bayer.unpack(guarded, noisy.cfa)[0].clamp(max=1.0)
         if self.defects != "mend" and levels is not None:
-            lone = find_lone_sites(mosaic, levels)
-            image = torch.where(lone, mosaic.mosaic.clamp(max=1.0), image)
+            lone = find_lone_sites(noisy, levels)
+            image = torch.where(lone, noisy.mosaic.clamp(max=1.0), image)
             kept = int(lone.sum())
-        rgb = None
+
+        # What is written: linear RGB, or digital numbers and the noise that is left.
         if denoiser.demosaics:
-            rgb = image
             below_zero = (image < -0.5 / LINEAR_WHITE).float().mean().item()
         else:
             below_zero = clip_below_zero(image, frame)
-            left = (1.0 - denoiser.strength) ** 2
+            share_left = (1.0 - denoiser.strength) ** 2
             profile = levels or frame.noise_profile
             if profile is not None:
-                profile = (left * profile[0], left * profile[1]) if left else None
+                profile = (share_left * profile[0], share_left * profile[1]) if share_left else None
             frame = replace(frame, mosaic=image, noise_profile=profile)
-
         if out is not None:
-            write_dng(out, frame, file, rgb=rgb)
+            write_dng(out, frame, file, rgb=image if denoiser.demosaics else None)
         seconds = time.perf_counter() - start
         if out is not None and preview is not None:
             self.write_preview(out, preview)
@@ -339,14 +314,14 @@ class RawFiles(Files[Denoised]):
             seconds=seconds,
             camera=frame.camera,
             iso=frame.iso,
-            greens=greens,
+            greens=difference,
             balanced=balanced,
             mended=0 if self.sites is None else len(self.sites),
             kept=kept,
             blended=blended,
             strength=denoiser.strength,
         )
-        return (frame if rgb is None else rgb), done
+        return (image if denoiser.demosaics else frame), done
 
     # -- files of a folder ---------------------------------------------------------------------------------------------
 

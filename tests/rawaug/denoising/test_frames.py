@@ -185,7 +185,7 @@ def test_an_uncertain_estimate_says_what_to_compare(capsys: pytest.CaptureFixtur
     extra = torch.randn(frame.mosaic.shape, generator=torch.Generator().manual_seed(1))
     extra[..., frame.mosaic.shape[-1] // 2 :] = 0
     frame = dataclasses.replace(frame, mosaic=(frame.mosaic + 0.06 * extra).clamp(max=1.0))
-    _, done = RawFiles("NonLocalMeans", noise="estimate", strength=0.5).denoise(frame)
+    _, done = RawFiles(RawDenoiser.of("NonLocalMeans", strength=0.5), noise="estimate").denoise(frame)
     assert ", estimated, 50% of it removed" in str(done)
     assert "uncertain" in str(done) and 'noise="Nikon D5000"' in str(done)
     assert "shot_var" not in str(done) and "R^2" not in str(done)
@@ -471,7 +471,7 @@ def test_a_mixed_folder_is_denoised_whole_but_for_the_cameras_own_renderings(
 
 
 def test_the_shipped_denoiser_of_each_pattern_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    by_pattern = RawFiles(noise=LEVELS)
+    by_pattern = RawFiles(noise=LEVELS, by_pattern=True)
     for cfa in ("GBRG", "XTRANS", "QUAD-RGGB", MONOCHROME):
         expected = OTHER_PATTERNS if cfa in ("XTRANS", "QUAD-RGGB") else "rawaug-base"
         assert by_pattern.denoiser_for(cfa).name == expected
