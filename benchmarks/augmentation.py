@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from statistics import fmean, stdev
 
 import torch
@@ -167,7 +168,7 @@ def sources(
         return PictureCrops(RawPairs(pictures, augment(draw), CROP))
 
     sharp, soft = Draw(sampling="perturb", blur=0.0), Draw(sampling="perturb", blur=LENS)
-    without_noise = [Pair(pair.name, pair.srgb, pair.raw, pair.cfa) for pair in pairs]
+    without_noise = [replace(pair, noisy=None) for pair in pairs]
     return {
         "more pairs (the ceiling)": RealCrops(more, noise, CROP, isp.cfa),
         "the same frames, fresh noise": RealCrops(without_noise, noise, CROP, isp.cfa),

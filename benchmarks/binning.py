@@ -50,7 +50,7 @@ def main(command: Sequence[str] | None = None) -> None:
     for way, together in WAYS.items():
         found: dict[str, list[float]] = {one.name: [] for one in everyone}
         for pair in progress(as_frames(pairs).binned(args.bin, together), label=f"binned by {way}", unit="frame"):
-            raw = pack(crop_to_cfa(pair.raw, pair.cfa, CFA.RGGB)[None], CFA.RGGB)
+            raw = pack(crop_to_cfa(pair.clean.mosaic, pair.cfa, CFA.RGGB)[None], CFA.RGGB)
             clean = centre(raw, side, side, step=1)
             params = noise.sample(1, keyed_generator(0, "binning", pair.name))
             levels = params["shot_var"].item(), params["read_var"].item()

@@ -62,14 +62,14 @@ def page() -> Pair:
 def row(pair: Pair, place: tuple[int, int], noise: NoiseModel, names: list[str], cfa: CFA) -> Panels:
     """The panels of one piece, packed by ``cfa``; its margin is denoised with it and cut off by the figure."""
     top, left = place
-    height, width = pair.raw.shape[-2:]
+    height, width = pair.clean.mosaic.shape[-2:]
     margin = min(MARGIN, top, left, height - PANEL - top, width - PANEL - left) // 2 * 2
     if margin < 0:
         raise SystemExit(f"{pair.name}: {PANEL} x {PANEL} at {top}, {left} is not within {height} x {width}")
     rows = slice(top - margin, top + PANEL + margin)
     columns = slice(left - margin, left + PANEL + margin)
-    raw, srgb = pair.raw[:, rows, columns], pair.srgb[:, rows, columns]
-    piece = replace(pair, raw=raw, srgb=srgb, noisy=None, shot_var=None, read_var=None)
+    raw, srgb = pair.clean.mosaic[:, rows, columns], pair.srgb[:, rows, columns]
+    piece = replace(pair, clean=replace(pair.clean, mosaic=raw), srgb=srgb, noisy=None)
     return make_panels([RawDenoiser.of(name) for name in ("NonLocalMeans", *names)], make_trial(piece, noise, cfa))
 
 

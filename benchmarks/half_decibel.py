@@ -85,8 +85,11 @@ class LikeFrames:
 
     def __init__(self, source: Source, pairs: Sequence[Pair], how: str, noise: NoiseModel) -> None:
         self.source, self.how, self.noise = source, how, noise
-        self.levels = [(pair.shot_var or 0.0, pair.read_var or 0.0) for pair in pairs]
-        self.stops = [math.log2(pair.raw.mean()) for pair in pairs]
+        self.levels = []
+        for pair in pairs:
+            levels = None if pair.noisy is None else pair.noisy.noise_profile
+            self.levels.append(levels or (0.0, 0.0))
+        self.stops = [math.log2(pair.clean.mosaic.mean()) for pair in pairs]
 
         stops = [self.measure(source.draw(torch.Generator().manual_seed(seed))) for seed in range(500)]
         self.shift = fmean(self.stops) - fmean(stops)

@@ -51,7 +51,7 @@ def draw_frames(path: str, split: str, seeds: Sequence[int], step: int = 1) -> I
 
 def says_its_colour(pair: Pair) -> bool:
     """Whether a frame has enough sites of each colour that are not clipped, and enough colours in its picture."""
-    unclipped = (pair.srgb.amax(0) < 250) & (pair.srgb.amin(0) > 0) & (pair.raw[0] < CLIPPED_RAW)
+    unclipped = (pair.srgb.amax(0) < 250) & (pair.srgb.amin(0) > 0) & (pair.clean.mosaic[0] < CLIPPED_RAW)
     shares = pack(unclipped[None].float(), pair.cfa).mean(dim=(1, 2))
     if shares.min() < FEWEST_UNCLIPPED:
         return False

@@ -48,8 +48,8 @@ FIT = FitConfig(method="published", steps=60, joint_steps=400, pixels=16384, bat
 def window(pair: Pair, top: int, left: int, side: int) -> Pair:
     """Cut a square out of a pair, at even coordinates so that the pattern stays."""
     rows, columns = slice(top, top + side), slice(left, left + side)
-    raw, srgb = (image[:, rows, columns].contiguous() for image in (pair.raw, pair.srgb))
-    return replace(pair, name=f"{pair.name}_{top}_{left}", raw=raw, srgb=srgb)
+    raw, srgb = (image[:, rows, columns].contiguous() for image in (pair.clean.mosaic, pair.srgb))
+    return replace(pair, name=f"{pair.name}_{top}_{left}", clean=replace(pair.clean, mosaic=raw), srgb=srgb)
 
 
 def make_recipe(name: str, photographs: Path, out: str, blur: float, **settings: Any) -> Recipe:
@@ -82,15 +82,15 @@ def make_recipe(name: str, photographs: Path, out: str, blur: float, **settings:
 def run_canon(folder: Path, photographs: Path, out: str, beside: Sequence[str]) -> None:
     """Few-shot on the S40, tested on the G2."""
     pairs = list(open_pairs(folder))
-    train = [pair for pair in pairs if "S40" in pair.camera]
-    blur = measure_blur((pair.raw[0].numpy(), pair.cfa) for pair in train)
+    train = [pair for pair in pairs if "S40" in pair.clean.camera]
+    blur = measure_blur((pair.clean.mosaic[0].numpy(), pair.cfa) for pair in train)
     print(f"softness of the S40: {blur:.2f} pixels")
 
     validation = [window(pair, top, top, WINDOW) for pair in train for top in (200, 500)]
     test = []
     for pair in pairs:
-        if "G2" in pair.camera:
-            height, width = pair.raw.shape[-2:]
+        if "G2" in pair.clean.camera:
+            height, width = pair.clean.mosaic.shape[-2:]
             places = [(y, x) for y in range(0, height - WINDOW, WINDOW) for x in range(0, width - WINDOW, WINDOW)]
             test += [window(pair, top, left, WINDOW) for top, left in places]
 
@@ -107,7 +107,7 @@ def block_pair(block: bracket.Block, shot: bracket.Shot) -> Pair:
     noisy = frame.mosaic[:, rows, columns].contiguous()
     picture = torch.zeros(3, *mosaic.shape[-2:], dtype=torch.uint8)
     pair = Pair.of_frame(f"{frame.name}_{block.top}_{block.left}", replace(frame, mosaic=mosaic), picture)
-    return replace(pair, noisy=noisy, shot_var=shot.levels[0], read_var=shot.levels[1])
+    return replace(pair, noisy=replace(pair.clean, mosaic=noisy, noise_profile=shot.levels))
 
 
 def run_d5000(folder: Path, photographs: Path, out: str, beside: Sequence[str]) -> None:
@@ -125,7 +125,7 @@ def run_d5000(folder: Path, photographs: Path, out: str, beside: Sequence[str]) 
 
     # The ISP sees the same places in the longer shot, two stops brighter, with its picture; a clipped sky says nothing.
     (frame,) = [pair for pair in open_pairs(folder) if pair.name == middle.frame.name]
-    blur = measure_blur([(frame.raw[0, :, :half].numpy(), frame.cfa)])
+    blur = measure_blur([(frame.clean.mosaic[0, :, :half].numpy(), frame.cfa)])
     print(f"softness of the D5000: {blur:.2f} pixels")
     squares = [window(frame, left[k].top, left[k].left, bracket.BLOCK) for k in chosen]
     squares = [square for square in squares if (square.srgb < 250).float().mean((1, 2)).min() > 0.5]

@@ -121,7 +121,7 @@ def main() -> None:
     args = parser.parse_args()
     figures = start(args)
     pairs = list(open_pairs(args.data, bin=args.bin))[: 1 if args.quick else None]
-    packed = [(p.name, bayer.pack(bayer.crop_to_cfa(p.raw, p.cfa, CFA.RGGB)[None], CFA.RGGB)) for p in pairs]
+    packed = [(p.name, bayer.pack(bayer.crop_to_cfa(p.clean.mosaic, p.cfa, CFA.RGGB)[None], CFA.RGGB)) for p in pairs]
     side = (96 if args.quick else args.crop) // 2
     middles = [(name, centre(raw, side, side, step=1)) for name, raw in packed]
     wholes = middles if args.quick else [(name, balanced(raw)) for name, raw in packed]

@@ -42,7 +42,7 @@ def noisy_sets(specs: list[str]) -> dict[tuple[str, str], list[Sample]]:
     for spec in specs:
         data, _, factor = spec.partition("@")
         for pair in open_pairs(data, bin=int(factor or 1)):
-            packed = bayer.pack(pair.middle(MIDDLE).raw[None], pair.cfa)
+            packed = bayer.pack(pair.middle(MIDDLE).clean.mosaic[None], pair.cfa)
             for strength, levels in STRENGTHS.items():
                 generator = keyed_generator(0, "worth of blur", pair.name, strength)
                 samples.setdefault((spec, strength), []).append(add_noise(packed, noise_model(levels), generator))

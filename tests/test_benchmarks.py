@@ -75,7 +75,7 @@ def test_pairs_on_disk_and_online_are_compared_with_decoding(tmp_path: Path) -> 
 
 def test_pieces_of_frames_are_drawn_beside_a_filter(tmp_path: Path) -> None:
     print_ = crops.page()
-    assert print_.raw.shape == (1, *FRAME) and print_.raw.std() > 0.05, "there is print on the paper"
+    assert print_.clean.mosaic.shape == (1, *FRAME) and print_.clean.mosaic.std() > 0.05, "there is print on the paper"
     crops.main(["demo:test", "--place", "page", "0", "0", "--iso", "6400", "--out", str(tmp_path / "crops.png")])
     assert read_picture(tmp_path / "crops.png").shape == (3, 325, 1092), "noisy, filtered, by the network, clean"
     with pytest.raises(SystemExit, match="page:"):

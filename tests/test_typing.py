@@ -45,7 +45,7 @@ class Banded(Compose):
 
 def read_frames(path: str, split: str) -> Sequence[Pair]:
     raw = torch.load(Path(path), weights_only=True)
-    return [Pair("frame", torch.zeros(3, *raw.shape[-2:], dtype=torch.uint8), raw, CFA.RGGB)]
+    return [Pair("frame", RawFrame(raw, CFA.RGGB), torch.zeros(3, *raw.shape[-2:], dtype=torch.uint8))]
 
 
 def count(data: str) -> None:
@@ -57,6 +57,7 @@ SCRIPT = """
 import rawaug
 import torch
 from rawaug.data import demo_pictures
+from rawaug.io import RawFrame
 from torch.utils.data import DataLoader, Dataset
 from typing import assert_type
 

@@ -292,10 +292,10 @@ def _(pair: PicturePair) -> dict[str, str]:
 
 @_describe_item.register
 def _(pair: Pair) -> dict[str, str]:
-    facts = {"sizes": _size(pair.raw), "cfas": str(pair.cfa)}
-    if pair.shot_var is not None and pair.read_var is not None:
-        facts["levels"] = _variances(pair.shot_var, pair.read_var)
-    return facts | _origin(pair)
+    facts = {"sizes": _size(pair.clean.mosaic), "cfas": str(pair.cfa)}
+    if pair.noisy is not None and pair.noisy.noise_profile is not None:
+        facts["levels"] = _variances(*pair.noisy.noise_profile)
+    return facts | _origin(pair.clean)
 
 
 @_describe_item.register
@@ -316,13 +316,13 @@ def _variances(shot_var: float, read_var: float) -> str:
     return f"shot_var {shot_var:.1e}, read_var {read_var:.1e}"
 
 
-def _origin(item: Pair | RawFrame) -> dict[str, str]:
+def _origin(frame: RawFrame) -> dict[str, str]:
     """The camera and the ISO, if they are known."""
     facts = {}
-    if item.camera != "unknown":
-        facts["cameras"] = item.camera
-    if item.iso:
-        facts["iso"] = f"{item.iso:g}"
+    if frame.camera != "unknown":
+        facts["cameras"] = frame.camera
+    if frame.iso:
+        facts["iso"] = f"{frame.iso:g}"
     return facts
 
 

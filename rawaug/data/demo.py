@@ -16,7 +16,7 @@ of texture. As in practice, there are few RAW pairs and many sRGB pictures.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple, overload
@@ -29,7 +29,7 @@ from rawaug.bayer import CFA, demosaic, mosaic
 from rawaug.data.drawn import dead_leaves
 from rawaug.data.pairs import DATASETS, PICTURES, Pair, require_split
 from rawaug.errors import extra
-from rawaug.io import decode_srgb, encode_srgb, read_picture
+from rawaug.io import RawFrame, decode_srgb, encode_srgb, read_picture
 from rawaug.seeding import keyed_generator
 
 BLACK, WHITE = 512, 4095
@@ -71,7 +71,7 @@ class DemoCamera:
     Example:
         >>> picture = torch.randint(0, 256, (3, 64, 96), dtype=torch.uint8)
         >>> pair = DemoCamera().capture(picture, torch.Generator().manual_seed(0))
-        >>> pair.raw.shape, pair.noisy.shape, pair.srgb.shape
+        >>> pair.clean.mosaic.shape, pair.noisy.mosaic.shape, pair.srgb.shape
         (torch.Size([1, 64, 96]), torch.Size([1, 64, 96]), torch.Size([3, 64, 96]))
     """
 
@@ -109,18 +109,16 @@ class DemoCamera:
         generator = torch.Generator().manual_seed(shot.noise_seed)
         electrons = torch.poisson(exposed / shot_var, generator=generator)
         read_noise = torch.randn(exposed.shape, generator=generator) * read_var**0.5
-        return Pair(
-            name=name,
-            srgb=self._render(clean, shot),
-            raw=clean,
-            cfa=self.cfa,
+        frame = RawFrame(
+            clean,
+            self.cfa,
             white_balance=shot.white_balance,
             color_matrix=torch.tensor(_COLOR_MATRIX),
-            noisy=_digitise(shot_var * electrons + read_noise),
-            shot_var=shot_var,
-            read_var=read_var,
             camera="rawaug demo camera",
         )
+        mosaic = _digitise(shot_var * electrons + read_noise)
+        noisy = replace(frame, mosaic=mosaic, noise_profile=(shot_var, read_var))
+        return Pair(name, frame, self._render(clean, shot), noisy)
 
     def capture(self, picture: Tensor, generator: torch.Generator, name: str = "demo", iso: int | None = None) -> Pair:
         """Call :meth:`sample` and :meth:`apply` in one step."""
@@ -217,7 +215,7 @@ def demo_pairs(split: str, count: int | None = None) -> list[Pair]:
 
     Example:
         >>> pair = demo_pairs("train", count=1)[0]
-        >>> pair.raw.shape, pair.cfa, pair.noisy is not None
+        >>> pair.clean.mosaic.shape, pair.cfa, pair.noisy is not None
         (torch.Size([1, 288, 448]), <CFA.GRBG: 'GRBG'>, True)
     """
     require_split("demo", split, PHOTOGRAPHS)

@@ -22,7 +22,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.io import encode_srgb
+from rawaug.io import RawFrame, encode_srgb
 from rawaug.io.raw import XYZ_FROM_SRGB
 
 UNKNOWN_COLOUR = (1.0, 1.0, 1.0), torch.eye(3, device="cpu")
@@ -79,25 +79,23 @@ def render_rgb(
     return encode_srgb(linear)
 
 
-def develop_mosaic(raw: Tensor, cfa: CFA, gains: tuple[float, float, float], matrix: Tensor) -> Tensor:
-    """Develop a mosaic ``(1, H, W)`` to the picture of a pair, uint8 ``(3, H, W)``."""
-    picture = render_raw(raw, cfa, gains, matrix)
+def develop_mosaic(frame: RawFrame) -> Tensor:
+    """Develop the mosaic of a frame to the picture of a pair, uint8 ``(3, H, W)``."""
+    picture = render_raw(frame.mosaic, frame.cfa, frame.white_balance, frame.color_matrix)
     return (picture * 255).round_().to(torch.uint8)
 
 
-def develop_pair(
-    name: str, raw: Tensor, cfa: CFA, white_balance: tuple[float, float, float], color_matrix: Tensor, **attributes: Any
-) -> Pair:
-    """Make a pair with further ``attributes``; without ``srgb`` its picture is a plain development of its RAW."""
+def develop_pair(name: str, clean: RawFrame, noisy: RawFrame | None = None, **attributes: Any) -> Pair:
+    """Make a pair with further ``attributes``; without ``srgb`` its picture is a plain development of ``clean``."""
     if "srgb" not in attributes:
-        attributes["srgb"] = develop_mosaic(raw, cfa, white_balance, color_matrix)
-    return Pair(name, raw=raw, cfa=cfa, white_balance=white_balance, color_matrix=color_matrix, **attributes)
+        attributes["srgb"] = develop_mosaic(clean)
+    return Pair(name, clean, noisy=noisy, **attributes)
 
 
 def develop_packed(packed: Tensor, cfa: CFA, pair: Pair, exposure: float = 1.0) -> Tensor:
     """Develop packed RAW ``(1, 4, h, w)`` to sRGB ``(3, H, W)`` in [0, 1] with the colours of ``pair``, for scores."""
     raw = bayer.unpack(packed, cfa)[0]
-    return render_raw(raw, cfa, pair.white_balance, pair.color_matrix, "bilinear", exposure, least=None)
+    return render_raw(raw, cfa, pair.clean.white_balance, pair.clean.color_matrix, "bilinear", exposure, least=None)
 
 
 def exposure_gain(packed: Tensor, pair: Pair) -> float:
@@ -106,5 +104,5 @@ def exposure_gain(packed: Tensor, pair: Pair) -> float:
     stride = max(1, green.numel() // 1_000_000)
     brightest = torch.quantile(green[::stride], 0.99).clamp_min(1e-3)
 
-    least_gain = max(1.0, min(pair.white_balance))
+    least_gain = max(1.0, min(pair.clean.white_balance))
     return float(0.9 / brightest) / least_gain

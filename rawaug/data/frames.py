@@ -68,7 +68,7 @@ class Frames(Lazy[Pair]):
 
     Example:
         >>> from rawaug.data import demo_pairs
-        >>> as_frames(demo_pairs("test", count=2)).some([1]).binned(4)[0].raw.shape
+        >>> as_frames(demo_pairs("test", count=2)).some([1]).binned(4)[0].clean.mosaic.shape
         torch.Size([1, 72, 112])
     """
 
@@ -82,11 +82,7 @@ class Frames(Lazy[Pair]):
     def frame(self, index: int) -> RawFrame:
         """Read the captured mosaic of a pair, the noisy one if there is one, without its picture."""
         pair = self[index]
-        mosaic = pair.noisy
-        if mosaic is None:
-            mosaic = pair.raw
-
-        return RawFrame(mosaic, pair.cfa, camera=pair.camera, iso=pair.iso)
+        return pair.noisy or pair.clean
 
     def frame_files(self, index: int) -> Sequence[Path]:
         """The files that identify a pair; empty if its name identifies it."""
@@ -189,11 +185,14 @@ class _InMemory(Frames):
 
     def stamp(self, index: int) -> str:
         pair = self.pairs[index]
-        parts = [repr((pair.name, pair.camera, pair.cfa, pair.white_balance, pair.raw.shape)).encode()]
-        for image in (pair.srgb, pair.raw, pair.noisy):
-            if image is not None:
-                sites = image.flatten()[::_STAMP_STEP]
-                parts.append(sites.numpy().tobytes())
+        clean = pair.clean
+        parts = [repr((pair.name, clean.camera, pair.cfa, clean.white_balance, clean.mosaic.shape)).encode()]
+        images = [pair.srgb, clean.mosaic]
+        if pair.noisy is not None:
+            images.append(pair.noisy.mosaic)
+        for image in images:
+            sites = image.flatten()[::_STAMP_STEP]
+            parts.append(sites.numpy().tobytes())
         return digest(*parts)[:16]
 
 
@@ -251,14 +250,14 @@ class Cached(Dataset[T]):
 
 
 def _count_bytes(item: Any) -> int:
-    """The memory of a tensor, or of the tensors among the attributes of an object."""
+    """The memory of a tensor, or of the tensors among the attributes of an object and of the frames that it holds."""
     if isinstance(item, Tensor):
         return item.nbytes
 
     size = 0
     for value in vars(item).values():
-        if isinstance(value, Tensor):
-            size += value.nbytes
+        if isinstance(value, (Tensor, RawFrame)):
+            size += _count_bytes(value)
     return size
 
 

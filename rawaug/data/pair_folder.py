@@ -11,7 +11,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +23,7 @@ from rawaug.data.frames import Frames
 from rawaug.data.mosaic_metadata import parse_metadata
 from rawaug.data.pairs import DATASETS, Pair
 from rawaug.files import files_below
+from rawaug.io import RawFrame
 
 NOISY, CLEAN = "*_noisy.*", "*_clean.*"
 """The file names of ``rawaug synth``."""
@@ -128,20 +129,17 @@ class PairFolder(Frames):
             gains, matrix = clean.white_balance, clean.color_matrix
         elif noisy.color_known:
             gains, matrix = noisy.white_balance, noisy.color_matrix
-        shot_var, read_var = noisy.noise_profile or (None, None)
-        return develop_pair(
-            name,
+        frame = RawFrame(
             clean.mosaic,
-            CFA(clean.cfa),
-            gains,
-            matrix,
-            noisy=noisy.mosaic,
-            shot_var=shot_var,
-            read_var=read_var,
-            color_known=clean.color_known or noisy.color_known,
+            clean.cfa,
+            white_balance=gains,
+            color_matrix=matrix,
             camera=noisy.camera,
             iso=noisy.iso,
+            color_known=clean.color_known or noisy.color_known,
         )
+        capture = replace(frame, mosaic=noisy.mosaic, noise_profile=noisy.noise_profile)
+        return develop_pair(name, frame, capture)
 
 
 def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:

@@ -1,10 +1,10 @@
-"""RAW-sRGB pairs: one shot, RAW and sRGB, with what is known of its camera and its noise."""
+"""RAW-sRGB pairs: one shot as clean RAW, as noisy RAW if it was captured, and as a picture."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, TypeVar
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -15,8 +15,6 @@ from rawaug.data.noise_levels import measure_levels
 from rawaug.io import RawFrame
 from rawaug.io.pictures import decode_srgb, encode_srgb
 from rawaug.registry import Registry
-
-T = TypeVar("T")
 
 DATASETS = Registry("kind of data", "rawaug.datasets", "rawaug.data")
 """The readers of pairs by name, for ``kind:path``: ``reader(path, split)`` returns a sequence of :class:`Pair`.
@@ -30,76 +28,69 @@ PICTURES = Registry("kind of pictures", "rawaug.pictures", "rawaug.data")
 
 @dataclass(frozen=True)
 class Pair:
-    """One shot, RAW and sRGB.
+    """One shot: a clean RAW frame, a noisy one if it was captured, and what they were rendered to.
 
     Attributes:
         name: name of the shot, for reports.
-        srgb: uint8 ``(3, H, W)``, in the sensor's orientation.
-        raw: the clean mosaic, float32 ``(1, H, W)``, black 0, white 1, sides even.
-        cfa: the pattern of ``raw`` and ``noisy``.
-        white_balance: as-shot multipliers of R, G, B, green being 1; all 1 if they are not known.
-        color_matrix: float32 ``(3, 3)``, white-balanced camera colour to linear sRGB, rows summing to 1.
-        noisy: a noisy mosaic of the same scene, like ``raw``, if one was captured.
-        shot_var, read_var: the levels of ``noisy``: its variance is shot_var * raw + read_var.
-        camera: make and model.
-        iso: None if unknown.
-        registered: whether ``srgb`` and ``raw`` agree pixel for pixel. A camera's own JPEG is corrected for its lens:
+        clean: the clean frame, of a Bayer pattern. Its ``noise_profile`` is its own noise, if that was measured.
+            Without ``color_known`` no ISP can be fitted to it.
+        srgb: the picture of ``clean``, uint8 ``(3, H, W)``, in the sensor's orientation.
+        noisy: a noisy frame of the same scene, like ``clean``, if one was captured. Its ``noise_profile`` has
+            (shot_var, read_var): its variance is shot_var * clean + read_var.
+        noisy_srgb: the camera's picture of ``noisy``, like ``srgb``, if there is one.
+        registered: whether ``srgb`` and ``clean`` agree pixel for pixel. A camera's own JPEG is corrected for its lens:
             compare it at a much lower resolution only.
         rendered: whether ``srgb`` is a rendering in the camera's colours. If False, gains and matrix are unknown, and
             ``srgb`` merely displays the RAW, so that no ISP can be fitted to it or scored on it.
-        noisy_srgb: the camera's picture of ``noisy``, like ``srgb``, if there is one.
-        levels_from_clean: whether ``shot_var`` and ``read_var`` were measured against ``raw``. A denoiser under test
-            must not know such levels.
-        own_noise: (shot_var, read_var) of the noise that ``raw`` itself has, if it was measured.
-        color_known: whether ``white_balance`` and ``color_matrix`` are the camera's; without them no ISP can be fitted.
+        levels_from_clean: whether the levels of ``noisy`` were measured against ``clean``. A denoiser under test must
+            not know such levels.
 
     Raises:
-        ValueError: if shapes or dtypes disagree, a side is odd, or levels come without the other or without ``noisy``.
+        ValueError: if the pattern is not Bayer's, shapes or dtypes disagree, or a side is odd.
+
+    Example:
+        >>> picture, mosaic = torch.zeros(3, 4, 6, dtype=torch.uint8), torch.zeros(1, 4, 6)
+        >>> Pair("black", RawFrame(mosaic, "RGGB"), picture).middle(4).clean.mosaic.shape
+        torch.Size([1, 4, 4])
     """
 
     name: str
+    clean: RawFrame
     srgb: Tensor
-    raw: Tensor
-    cfa: CFA
-    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    color_matrix: Tensor = field(default_factory=lambda: torch.eye(3))
-    noisy: Tensor | None = None
-    shot_var: float | None = None
-    read_var: float | None = None
-    camera: str = "unknown"
+    noisy: RawFrame | None = None
+    noisy_srgb: Tensor | None = None
     registered: bool = True
     rendered: bool = True
-    noisy_srgb: Tensor | None = None
     levels_from_clean: bool = False
-    color_known: bool = True
-    iso: float | None = None
-    own_noise: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "cfa", CFA(self.cfa))  # cfa may be the name of a pattern
+        CFA(self.clean.cfa)
+        if self.clean.color_matrix.shape != (3, 3):
+            shape = tuple(self.clean.color_matrix.shape)
+            raise ValueError(f"pair {self.name}: color_matrix must be (3, 3), got {shape}")
 
-        self._require_shape("srgb", self.srgb, 3, torch.uint8)
-        self._require_shape("raw", self.raw, 1, torch.float32)
+        images = {"clean": self.clean.mosaic, "srgb": self.srgb, "noisy_srgb": self.noisy_srgb}
         if self.noisy is not None:
-            self._require_shape("noisy", self.noisy, 1, torch.float32)
-        if self.noisy_srgb is not None:
-            self._require_shape("noisy_srgb", self.noisy_srgb, 3, torch.uint8)
+            images["noisy"] = self.noisy.mosaic
+        size = tuple(self.clean.mosaic.shape[-2:])
+        for key, image in images.items():
+            dtype, shape = torch.float32, (1, *size)
+            if key in ("srgb", "noisy_srgb"):
+                dtype, shape = torch.uint8, (3, *size)
+            if image is not None and (tuple(image.shape) != shape or image.dtype != dtype):
+                got = f"{image.dtype} {tuple(image.shape)}"
+                raise ValueError(f"pair {self.name}: {key} must be {dtype} {shape}, got {got}")
 
-        height, width = self.raw.shape[-2:]
+        height, width = size
         if height % 2 or width % 2 or not height or not width:
-            raise ValueError(f"pair {self.name}: the mosaic must have even sides, got {tuple(self.raw.shape)}")
-        if self.color_matrix.shape != (3, 3):
-            raise ValueError(f"pair {self.name}: color_matrix must be (3, 3), got {tuple(self.color_matrix.shape)}")
-
-        is_incomplete = (self.shot_var is None) != (self.read_var is None)
-        if is_incomplete or (self.noisy is None and self.shot_var is not None):
-            raise ValueError(f"pair {self.name}: shot_var and read_var must be given together, with a noisy mosaic")
+            raise ValueError(f"pair {self.name}: the mosaic must have even sides, got {size}")
 
     @classmethod
-    def of_frame(cls, name: str, frame: RawFrame, srgb: Tensor, **attributes: Any) -> Pair:
-        """Make the pair of a RAW file and its picture, with further ``attributes`` of the pair.
+    def of_frame(cls, name: str, frame: RawFrame, srgb: Tensor, registered: bool = True) -> Pair:
+        """Make the pair of a RAW file and its picture.
 
-        A mosaic with another pattern than Bayer's is converted to RGGB at half its sides.
+        A mosaic with another pattern than Bayer's is converted to RGGB at half its sides. What the file states of its
+        noise is left out: it is that of a whole exposure, and a reference's own noise is measured.
         """
         mosaic = frame.mosaic
         cfa = frame.cfa
@@ -109,36 +100,41 @@ class Pair:
             height, width = mosaic.shape[-2:]
             srgb = _bin_picture(srgb[:, : 2 * height, : 2 * width], 2)
 
-        return cls(
-            name=name,
-            srgb=srgb,
-            raw=mosaic,
-            cfa=CFA(cfa),
+        clean = RawFrame(
+            mosaic,
+            cfa,
             white_balance=frame.white_balance,
             color_matrix=frame.color_matrix,
             camera=frame.camera,
             iso=frame.iso,
-            **attributes,
+            name=name,
         )
+        return cls(name, clean, srgb, registered=registered)
+
+    @property
+    def cfa(self) -> CFA:
+        """The pattern of both frames."""
+        return CFA(self.clean.cfa)
 
     @property
     def balance_known(self) -> bool:
-        return self.white_balance != (1.0, 1.0, 1.0)
+        return self.clean.white_balance != (1.0, 1.0, 1.0)
 
     def with_levels(self) -> Pair:
-        """Return this pair with levels, measured against ``raw`` if the capture states none."""
-        if self.noisy is None or self.shot_var is not None:
+        """Return this pair with levels of ``noisy``, measured against ``clean`` if the capture states none."""
+        if self.noisy is None or self.noisy.noise_profile is not None:
             return self
 
-        shot_var, read_var = measure_levels(self.raw, self.noisy)
-        return replace(self, shot_var=shot_var, read_var=read_var, levels_from_clean=True)
+        levels = measure_levels(self.clean.mosaic, self.noisy.mosaic)
+        return replace(self, noisy=replace(self.noisy, noise_profile=levels), levels_from_clean=True)
 
     def with_own_noise(self, estimate: Callable[[Tensor, CFA], tuple[float, float] | None]) -> Pair:
-        """Return this pair with the noise levels of ``raw`` itself, from ``estimate(raw, cfa)`` if it states none."""
-        if self.own_noise is not None:
+        """Return this pair with the levels of ``clean``, from ``estimate(mosaic, cfa)`` if it states none."""
+        if self.clean.noise_profile is not None:
             return self
 
-        return replace(self, own_noise=estimate(self.raw, self.cfa))
+        levels = estimate(self.clean.mosaic, self.cfa)
+        return replace(self, clean=replace(self.clean, noise_profile=levels))
 
     def require_rendered(self) -> None:
         if not self.rendered:
@@ -148,7 +144,7 @@ class Pair:
             )
 
     def in_pattern(self, cfa: CFA | str) -> Pair:
-        """Crop the outer rows or columns so that the frame has the pattern ``cfa``."""
+        """Crop the outer rows or columns so that the frames have the pattern ``cfa``."""
         target = CFA(cfa)
         if target == self.cfa:
             return self
@@ -159,7 +155,7 @@ class Pair:
         return self._transform(crop, cfa=target)
 
     def middle(self, side: int) -> Pair:
-        """Crop the middle ``side x side`` of the frame, or its full length along a shorter side; the CFA stays."""
+        """Crop the middle ``side x side`` of the frames, or their full length along a shorter side; the CFA stays."""
         even_side = side // 2 * 2
 
         def crop(image: Tensor) -> Tensor:
@@ -168,7 +164,7 @@ class Pair:
         return self._transform(crop)
 
     def binned(self, factor: int, together: bool = False) -> Pair:
-        """Shrink the frame to 1 / ``factor`` of its sides; its noise then has about 1 / ``factor``^2 of the variance.
+        """Shrink the frames to 1 / ``factor`` of their sides; noise then has about 1 / ``factor``^2 of its variance.
 
         :func:`rawaug.bayer.bin_mosaic` bins RAW and explains ``together``; pictures are averaged in linear light.
 
@@ -179,18 +175,11 @@ class Pair:
             return self
 
         cell = 2 * factor
-        height = self.raw.shape[-2] // cell * cell
-        width = self.raw.shape[-1] // cell * cell
+        size = self.clean.mosaic.shape[-2:]
+        height = size[0] // cell * cell
+        width = size[1] // cell * cell
         if not min(height, width):
-            raise ValueError(f"pair {self.name}: {tuple(self.raw.shape[-2:])} is too small to be binned by {factor}")
-
-        levels: dict[str, Any] = {}
-        scale = bin_mosaic_variance(factor, together)
-        if self.shot_var is not None and self.read_var is not None:
-            levels["shot_var"] = self.shot_var * scale
-            levels["read_var"] = self.read_var * scale
-        if self.own_noise is not None:
-            levels["own_noise"] = (self.own_noise[0] * scale, self.own_noise[1] * scale)
+            raise ValueError(f"pair {self.name}: {tuple(size)} is too small to be binned by {factor}")
 
         def bin_image(image: Tensor) -> Tensor:
             whole_cells = image[:, :height, :width]
@@ -198,21 +187,23 @@ class Pair:
                 return bin_mosaic(whole_cells, self.cfa, factor, together)
             return _bin_picture(whole_cells, factor)
 
-        return self._transform(bin_image, **levels)
+        return self._transform(bin_image, variance=bin_mosaic_variance(factor, together))
 
-    def _transform(self, change: Callable[[Tensor], Tensor], **attributes: Any) -> Pair:
-        """Copy the pair with ``change`` applied to every image, and with other ``attributes``."""
-        for key in ("srgb", "raw", "noisy", "noisy_srgb"):
-            image = getattr(self, key)
-            if image is not None:
-                attributes[key] = change(image)
-        return replace(self, **attributes)
+    def _transform(self, change: Callable[[Tensor], Tensor], cfa: CFA | None = None, variance: float = 1.0) -> Pair:
+        """Copy the pair with ``change`` applied to every image, which multiplies the noise by ``variance``."""
 
-    def _require_shape(self, field: str, image: Tensor, channels: int, dtype: torch.dtype) -> None:
-        expected = (channels, *self.raw.shape[-2:])
-        if tuple(image.shape) != expected or image.dtype != dtype:
-            got = f"{image.dtype} {tuple(image.shape)}"
-            raise ValueError(f"pair {self.name}: {field} must be {dtype} {expected}, got {got}")
+        def change_frame(frame: RawFrame) -> RawFrame:
+            levels = frame.noise_profile
+            if levels is not None:
+                levels = levels[0] * variance, levels[1] * variance
+            return replace(frame, mosaic=change(frame.mosaic), cfa=cfa or frame.cfa, noise_profile=levels)
+
+        changed = replace(self, clean=change_frame(self.clean), srgb=change(self.srgb), noisy=None, noisy_srgb=None)
+        if self.noisy is not None:
+            changed = replace(changed, noisy=change_frame(self.noisy))
+        if self.noisy_srgb is not None:
+            changed = replace(changed, noisy_srgb=change(self.noisy_srgb))
+        return changed
 
 
 def centre(image: Tensor, height: int, width: int, step: int = 2) -> Tensor:

@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -36,7 +37,7 @@ from rawaug.data.frames import Frames
 from rawaug.data.pairs import DATASETS, Pair
 from rawaug.data.scenes import camera_in_light, draw_window, scene_files
 from rawaug.data.sidd_scenes import HELD_BACK, PHONES, parse_label
-from rawaug.io import encode_srgb
+from rawaug.io import RawFrame, encode_srgb
 from rawaug.seeding import keyed_generator
 
 _FRAME = (512, 512)
@@ -390,7 +391,7 @@ def take_shot(phone: Phone, scene: Tensor, shot: Shot, generator: torch.Generato
     Example:
         >>> shot = Shot(kelvin=3200, stops=1.0, iso=400, balance_error=0.0, tint_error=(0.0, 0.0), lift_error=0.0)
         >>> pair = take_shot(CAMERAS["IP"], torch.full((3, 64, 96), 0.5), shot, torch.Generator().manual_seed(0))
-        >>> pair.raw.shape, pair.srgb.shape, pair.cfa
+        >>> pair.clean.mosaic.shape, pair.srgb.shape, pair.cfa
         (torch.Size([1, 64, 96]), torch.Size([3, 64, 96]), <CFA.RGGB: 'RGGB'>)
     """
     clean = _expose(phone, scene, shot)
@@ -402,19 +403,20 @@ def take_shot(phone: Phone, scene: Tensor, shot: Shot, generator: torch.Generato
 
     gains = balance(phone, shot)
     lift = digital_gain(phone, clean, gains, shot)
-    return Pair(
-        name=name,
-        srgb=render_shot(phone, clean, gains, lift, shot),
-        raw=clean,
-        cfa=phone.cfa,
+    frame = RawFrame(
+        clean,
+        phone.cfa,
         white_balance=(float(gains[0] / gains[1]), 1.0, float(gains[2] / gains[1])),
         color_matrix=colour_matrix(phone, shot).float(),
-        noisy=noisy,
-        shot_var=shot_var,
-        read_var=read_var,
         camera=phone.name,
-        noisy_srgb=render_shot(phone, noisy, gains, lift, shot),
         iso=float(shot.iso),
+    )
+    return Pair(
+        name,
+        frame,
+        srgb=render_shot(phone, clean, gains, lift, shot),
+        noisy=replace(frame, mosaic=noisy, noise_profile=(shot_var, read_var)),
+        noisy_srgb=render_shot(phone, noisy, gains, lift, shot),
     )
 
 

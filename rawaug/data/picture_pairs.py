@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -36,9 +36,6 @@ EXTENSIONS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 class PicturePair:
     """A shot and its noise-free version, uint8 sRGB ``(3, H, W)`` each."""
 
-    own_noise: ClassVar[None] = None
-    """It is None, as the noise of developed pictures has no levels."""
-
     name: str
     noisy: Tensor
     clean: Tensor
@@ -54,7 +51,7 @@ class PicturePair:
         return self
 
     def with_own_noise(self, estimate: Callable[..., Any]) -> PicturePair:
-        """Return this pair unchanged, see :attr:`own_noise`."""
+        """Return this pair unchanged: the noise of developed pictures has no levels."""
         return self
 
 

@@ -26,13 +26,13 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, unpack
-from rawaug.data.development import develop_mosaic, develop_pair
+from rawaug.data.development import develop_pair
 from rawaug.data.folders import RawFolder
 from rawaug.data.formats import read_npz
 from rawaug.data.frames import Frames
 from rawaug.data.pairs import DATASETS, Pair, require_split
 from rawaug.files import files_below, files_in, require_file
-from rawaug.io import read_picture, read_raw
+from rawaug.io import RawFrame, read_picture, read_raw
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import read_plane
 from rawaug.io.raw import RAW_EXTENSIONS
@@ -130,14 +130,10 @@ class Rawir(Frames):
         file = self.files[index]
         picture = self.pictures[index]
         is_phone = any("p20" in part.lower() for part in file.parts)  # its JPEGs are not registered
-        return Pair(
-            name=self.names[index],
-            srgb=read_picture(picture, self.max_pixels),
-            raw=unpack(read_packed(file, picture, self.white), CFA.RGGB),
-            cfa=CFA.RGGB,
-            camera=self.camera_name(file),
-            registered=not is_phone,
-        )
+        srgb = read_picture(picture, self.max_pixels)
+        raw = unpack(read_packed(file, picture, self.white), CFA.RGGB)
+        clean = RawFrame(raw, CFA.RGGB, camera=self.camera_name(file))
+        return Pair(self.names[index], clean, srgb, registered=not is_phone)
 
 
 def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
@@ -236,14 +232,10 @@ class Zurich(Frames):
             raise ValueError(f"{file}: has value {numbers.max()}, more than {_BITS} bits; give a file of this dataset")
 
         light = (numbers.astype(np.float32) - scale * _BLACK) / (scale * (_ZURICH_WHITE - _BLACK))
-        return Pair(
-            name=self.names[index],
-            srgb=read_picture(self._picture(file), self.max_pixels),
-            raw=torch.from_numpy(np.minimum(light, 1))[None],
-            cfa=CFA.RGGB,
-            camera="Huawei P20 (picture: Canon 5D Mark IV)",
-            registered=False,
-        )
+        srgb = read_picture(self._picture(file), self.max_pixels)
+        raw = torch.from_numpy(np.minimum(light, 1))[None]
+        clean = RawFrame(raw, CFA.RGGB, camera="Huawei P20 (picture: Canon 5D Mark IV)")
+        return Pair(self.names[index], clean, srgb, registered=False)
 
 
 _NOISY_SHOT = re.compile(r"(Scene_\d+)_ISO\d+(?:_\d+)?", re.IGNORECASE)
@@ -296,9 +288,8 @@ class RawBench(Frames):
         exposure = noisy.mosaic[unclipped].mean() / mean[unclipped].mean().clamp_min(1e-6)
         raw = (mean * exposure).clamp(max=1.0)
 
-        srgb = develop_mosaic(raw, CFA(noisy.cfa), noisy.white_balance, noisy.color_matrix)
-        clean = replace(noisy, mosaic=raw)
-        return Pair.of_frame(self.names[index], clean, srgb, noisy=noisy.mosaic, color_known=noisy.color_known)
+        noisy = replace(noisy, noise_profile=None)
+        return develop_pair(self.names[index], replace(noisy, mosaic=raw), noisy)
 
 
 REAL_FRAMES = Path(__file__).with_name("real_frames")
@@ -308,7 +299,7 @@ REAL_BLACK, REAL_WHITE = 512, 16383
 
 @DATASETS.register("real")
 class RealFrames(Frames):
-    """The frames of a split, such as ``real:train``; ``own_noise`` of a pair is the noise of its reference."""
+    """The frames of a split, such as ``real:train``; ``noise_profile`` of a clean frame is its own noise."""
 
     def __init__(self, path: str = "", split: str = "test") -> None:
         split = path or split
@@ -325,16 +316,16 @@ class RealFrames(Frames):
         light = (numbers - REAL_BLACK) / (REAL_WHITE - REAL_BLACK)
         planes = torch.from_numpy(light).reshape(4, -1, numbers.shape[-1])
 
-        return develop_pair(
-            name,
+        clean = RawFrame(
             unpack(planes, cfa),
             cfa,
-            tuple(frame["white_balance"]),
-            torch.tensor(frame["color_matrix"]),
+            white_balance=tuple(frame["white_balance"]),
+            color_matrix=torch.tensor(frame["color_matrix"]),
             camera=frame["camera"],
             iso=frame["iso"],
-            own_noise=tuple(frame["own_noise"]),
+            noise_profile=tuple(frame["own_noise"]),
         )
+        return develop_pair(name, clean)
 
 
 @cache

@@ -9,6 +9,7 @@ Brown, "A high-quality denoising dataset for smartphone cameras", CVPR 2018.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
@@ -29,7 +30,7 @@ from rawaug.data.sidd_scenes import (
     read_sidd_colour,
     read_sidd_mosaic,
 )
-from rawaug.io import read_picture
+from rawaug.io import RawFrame, read_picture
 
 
 class SiddFrames(Frames):
@@ -64,22 +65,12 @@ class SiddFrames(Frames):
             if kind in files:
                 pictures[key] = _turned_back(files[kind], view, self.max_pixels)
 
-        published = self.levels.get(scene)
-        shot_var, read_var = published or measure_levels(clean, noisy)
         camera, cfa = find_phone(scene)
-        return develop_pair(
-            self.names[index],
-            clean,
-            cfa,
-            gains,
-            matrix,
-            noisy=noisy,
-            shot_var=shot_var,
-            read_var=read_var,
-            levels_from_clean=published is None,
-            camera=camera,
-            **pictures,
-        )
+        frame = RawFrame(clean, cfa, white_balance=gains, color_matrix=matrix, camera=camera)
+        published = self.levels.get(scene)
+        levels = published or measure_levels(clean, noisy)
+        capture = replace(frame, mosaic=noisy, noise_profile=levels)
+        return develop_pair(self.names[index], frame, capture, levels_from_clean=published is None, **pictures)
 
 
 def _shots_below(path: Path, left_out: Sequence[str]) -> list[tuple[str, str, dict[str, Path]]]:

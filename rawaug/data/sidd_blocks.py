@@ -11,8 +11,9 @@ from __future__ import annotations
 import csv
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -35,6 +36,7 @@ from rawaug.data.sidd_scenes import (
     read_sidd_colour,
 )
 from rawaug.files import require_file
+from rawaug.io import RawFrame
 
 T = TypeVar("T")
 
@@ -89,23 +91,13 @@ class Once(Generic[T]):
         return self._outcome
 
 
-class _Frame(NamedTuple):
-    """A frame of blocks: its name, phone and pattern, and its published noise levels and colour if there are any."""
-
-    name: str
-    camera: str
-    cfa: CFA
-    levels: tuple[float, float] | None = None
-    colour: tuple[tuple[float, float, float], Tensor, int] | None = None
-
-
 class _Blocks(Frames):
     """Blocks that are all read on the first access; what the blocks of a frame share is cached for the last frame."""
 
     def __init__(self, path: Path, frames: Sequence[str]) -> None:
         self.path = path
         self._all = Once(self._read_all)
-        self._last_frame: tuple[int, dict[str, Tensor], dict[str, Any]] | None = None
+        self._last_frame: tuple[int, RawFrame, dict[str, Tensor], bool] | None = None
         super().__init__(block_names(frames))
 
     @abstractmethod
@@ -113,47 +105,43 @@ class _Blocks(Frames):
         """Read ``raw``, ``noisy`` and any pictures, ``srgb`` and ``noisy_srgb``, as ``(frames, 32, C, H, W)``."""
 
     @abstractmethod
-    def _describe(self, number: int) -> _Frame:
-        """Describe the frame with this number."""
+    def _describe(self, number: int, blocks: Tensor) -> RawFrame:
+        """Describe the frame with this number, whose mosaics are ``(32, 1, H, W)``; its levels are those of noise."""
 
     def read(self, index: int) -> Pair:
         number, block = divmod(index, BLOCKS)
         if self._last_frame is None or self._last_frame[0] != number:
-            images, attributes = self._read_frame(number)
-            self._last_frame = (number, images, attributes)
+            self._last_frame = (number, *self._read_frame(number))
+        _, frame, images, is_measured = self._last_frame
 
-        _, images, attributes = self._last_frame
-        blocks: dict[str, Any] = {}
-        for key, stack in images.items():
-            blocks[key] = stack[block]
-        return develop_pair(self.names[index], **blocks, **attributes)
+        clean = replace(frame, mosaic=images["raw"][block], noise_profile=None)
+        noisy = replace(frame, mosaic=images["noisy"][block])
+        pictures = {key: images[key][block] for key in ("srgb", "noisy_srgb") if key in images}
+        return develop_pair(
+            self.names[index],
+            clean,
+            noisy,
+            levels_from_clean=is_measured,
+            rendered="srgb" in images or frame.color_known,
+            **pictures,
+        )
 
-    def _read_frame(self, number: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Read the images of a frame's blocks, turned alike, and the other attributes of a :class:`Pair` they share."""
-        everything = self._all()
-        frame = self._describe(number)
-
+    def _read_frame(self, number: int) -> tuple[RawFrame, dict[str, Tensor], bool]:
+        """Read a frame, the images of its blocks, turned alike, and whether its levels were measured on them."""
         images = {}
-        for key, stack in everything.items():
+        for key, stack in self._all().items():
             images[key] = stack[number]
+
+        frame = self._describe(number, images["raw"])
         for key in ("srgb", "noisy_srgb"):
             if key in images:
-                images[key] = turn_like(images[key], images["raw"], frame.cfa, f"{self.path}: {frame.name}")
+                images[key] = turn_like(images[key], images["raw"], CFA(frame.cfa), f"{self.path}: {frame.name}")
 
-        shot_var, read_var = frame.levels or measure_noise(images["raw"].numpy(), images["noisy"].numpy())
-        gains, matrix, _ = frame.colour or (*UNKNOWN_COLOUR, 0)
-        attributes = {
-            "cfa": frame.cfa,
-            "camera": frame.camera,
-            "white_balance": gains,
-            "color_matrix": matrix,
-            "shot_var": shot_var,
-            "read_var": read_var,
-            "levels_from_clean": frame.levels is None,
-            "color_known": frame.colour is not None,
-            "rendered": "srgb" in images or frame.colour is not None,
-        }
-        return images, attributes
+        is_measured = frame.noise_profile is None
+        if is_measured:
+            levels = measure_noise(images["raw"].numpy(), images["noisy"].numpy())
+            frame = replace(frame, noise_profile=levels)
+        return frame, images, is_measured
 
 
 def block_names(frames: Sequence[str]) -> list[str]:
@@ -176,10 +164,20 @@ class SiddBlocks(_Blocks):
         self.noisy_file = find_file(Path(path), "ValidationNoisyBlocksRaw.mat")
         super().__init__(Path(path), HELD_BACK)
 
-    def _describe(self, number: int) -> _Frame:
+    def _describe(self, number: int, blocks: Tensor) -> RawFrame:
         name = HELD_BACK[number]
         camera, cfa = find_phone(name)
-        return _Frame(name, camera, cfa, self._levels.get(name), self._colours.get(name))
+        gains, matrix, _ = self._colours.get(name, (*UNKNOWN_COLOUR, 0))
+        return RawFrame(
+            blocks,
+            cfa,
+            white_balance=gains,
+            color_matrix=matrix,
+            camera=camera,
+            noise_profile=self._levels.get(name),
+            name=name,
+            color_known=name in self._colours,
+        )
 
     def _read_all(self) -> dict[str, Tensor]:
         clean = blocks_of_scenes(self.clean_file)
@@ -202,8 +200,8 @@ class SiddPlusBlocks(_Blocks):
         self.cfas = _patterns(find_file(Path(path), "siddplus_*bayer_patterns.csv"))
         super().__init__(Path(path), [f"siddplus_{number:02d}" for number in range(len(self.cfas))])
 
-    def _describe(self, number: int) -> _Frame:
-        return _Frame(f"frame {number}", "SIDD+", self.cfas[number])
+    def _describe(self, number: int, blocks: Tensor) -> RawFrame:
+        return RawFrame(blocks, self.cfas[number], camera="SIDD+", name=f"frame {number}", color_known=False)
 
     def _read_all(self) -> dict[str, Tensor]:
         clean = to_raw(read_array(self.clean_file, self.clean_file.stem), 3, self.clean_file)

@@ -143,7 +143,7 @@ def draw_noisy(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real:
     if strength in STRENGTHS:
         key = "benchmark", strength
 
-    packed = bayer.pack(frame.raw[None], frame.cfa)
+    packed = bayer.pack(frame.clean.mosaic[None], frame.cfa)
     noisy, _, exact = freeze_noise(packed, noise, seed, *key, frame.name)
     assert exact is not None
     return Noisy.of(noisy, exact, frame.cfa)
@@ -155,7 +155,7 @@ def _middle(noisy: Noisy, frame: Pair, crop: int, condition: str, strength: str)
     side = crop // 2
     image = centre(noisy.image, side, side, step=1)
     variance = centre(noisy.variance, side, side, step=1)
-    clean = bayer.pack(frame.raw[None], frame.cfa)
+    clean = bayer.pack(frame.clean.mosaic[None], frame.cfa)
     return raw_trial(frame, image, clean, variance, noisy.levels, frame.cfa, condition=condition, strength=strength)
 
 

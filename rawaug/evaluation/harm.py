@@ -84,7 +84,7 @@ def measure_harm(
 
 def _frame_trial(frame: Pair, column: str, seed: int) -> Trial:
     noise = SensorNoise(**FRAMES[column])
-    packed = bayer.pack(frame.raw[None], frame.cfa)
+    packed = bayer.pack(frame.clean.mosaic[None], frame.cfa)
     noisy, variance, levels = freeze_noise(packed, noise, seed, "harm", column, frame.name)
     return raw_trial(frame, noisy, packed, variance, levels, CFA(frame.cfa), strength=column)
 

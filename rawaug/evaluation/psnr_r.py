@@ -42,7 +42,7 @@ def psnr_r(
     pair.require_rendered()
     as_shot = None
     if white_balance:
-        as_shot = pair.white_balance
+        as_shot = pair.clean.white_balance
 
     def choose(srgb: Tensor) -> ISPParams:
         params = isp.with_white_balance(isp.choose(srgb), as_shot)
@@ -56,7 +56,7 @@ def psnr_r(
 
         return windows_psnr(reverse, pair, patches)
 
-    srgb, raw, clipped, coordinates = block_averages(pair.srgb, pair.raw, pair.cfa)
+    srgb, raw, clipped, coordinates = block_averages(pair.srgb, pair.clean.mosaic, pair.cfa)
     params = choose(srgb[None])
     estimate = isp.reverse_pixels(srgb[None], params, coordinates)[0]
     return block_psnr(estimate, raw, clipped)
@@ -70,7 +70,7 @@ def block_psnr(estimate: Tensor, raw: Tensor, clipped: Tensor) -> float:
 
 def draw_windows(pair: Pair, count: int | None) -> list[tuple[int, int]]:
     """Choose corners of ``count`` random patches of a frame, keyed by its name; None for patches that cover it."""
-    height, width = pair.raw.shape[-2:]
+    height, width = pair.clean.mosaic.shape[-2:]
     every = list(product(patch_starts(height), patch_starts(width)))
     if count is None or count >= len(every):
         return every
@@ -82,12 +82,12 @@ def draw_windows(pair: Pair, count: int | None) -> list[tuple[int, int]]:
 @torch.no_grad()
 def windows_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair, count: int | None) -> float:
     """Average the PSNR over windows; ``make`` maps an sRGB patch ``(1, 3, h, w)`` and its place in the frame to RAW."""
-    height, width = pair.raw.shape[-2:]
+    height, width = pair.clean.mosaic.shape[-2:]
     values = []
     for corner in draw_windows(pair, count):
         y, x = corner
         window = (None, slice(None), slice(y, y + PATCH), slice(x, x + PATCH))
         coordinates = frame_coordinates(min(PATCH, height), min(PATCH, width), corner, (height, width))
-        values.append(patch_psnr(make(pair.srgb[window], coordinates).clamp(0.0, 1.0), pair.raw[window]))
+        values.append(patch_psnr(make(pair.srgb[window], coordinates).clamp(0.0, 1.0), pair.clean.mosaic[window]))
 
     return torch.cat(values).mean().item()

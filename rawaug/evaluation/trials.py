@@ -120,10 +120,10 @@ def make_trial(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed
     """
     pair = pair.with_levels()
     cfa = CFA(cfa or pair.cfa)
-    clean = bayer.pack(crop_to_cfa(pair.raw, pair.cfa, cfa)[None], cfa)
-    if pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None:
-        packed = bayer.pack(crop_to_cfa(pair.noisy, pair.cfa, cfa)[None], cfa)
-        noisy, variance, levels, _ = Noisy.of(packed, (pair.shot_var, pair.read_var), cfa)
+    clean = bayer.pack(crop_to_cfa(pair.clean.mosaic, pair.cfa, cfa)[None], cfa)
+    if pair.noisy is not None and pair.noisy.noise_profile is not None:
+        packed = bayer.pack(crop_to_cfa(pair.noisy.mosaic, pair.cfa, cfa)[None], cfa)
+        noisy, variance, levels, _ = Noisy.of(packed, pair.noisy.noise_profile, cfa)
     else:
         noisy, variance, levels = freeze_noise(clean, noise, seed, TEST_NOISE, pair.name)
     assert variance is not None
@@ -167,8 +167,8 @@ def raw_trial(
     """
     develop = partial(develop_packed, cfa=cfa, pair=pair, exposure=exposure_gain(clean, pair))
     own_variance = None
-    if pair.own_noise is not None:
-        own_variance = noise_variance(clean, *pair.own_noise).mean().item()
+    if pair.clean.noise_profile is not None:
+        own_variance = noise_variance(clean, *pair.clean.noise_profile).mean().item()
 
     return Trial(noisy, clean, variance, pair.name, levels=levels, cfa=cfa, develop=develop, own=own_variance, **about)
 
@@ -273,10 +273,10 @@ def training_noise_note(pairs: Sequence[Pair], noise: NoiseModel, arms: Sequence
     shares = []
     for k in evenly_spaced(len(targets), _MOST_TARGETS):
         pair = targets[k]
-        levels = pair.own_noise or own_noise(pair.raw, pair.cfa)
+        levels = pair.clean.noise_profile or own_noise(pair.clean.mosaic, pair.cfa)
         if levels is None:
             continue
-        clean = bayer.pack(pair.raw[None], pair.cfa)
+        clean = bayer.pack(pair.clean.mosaic[None], pair.cfa)
         params = noise.sample(1, keyed_generator(0, "training noise", pair.name))
         shares.append((noise_variance(clean, *levels).mean() / noise.variance(clean, params).mean()).item())
 

@@ -252,13 +252,13 @@ def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[P
     real = {name: arm for name, arm in recipe.arms.items() if arm.augmented < 1.0}
 
     for pair in pairs:
-        if recipe.isp is None and not pair.color_known:
+        if recipe.isp is None and not pair.clean.color_known:
             raise ValueError(
                 f"{pair.name}: its white balance and colour matrix are unknown, so no ISP can be fitted to it; "
                 "use a shipped one: isp: universal"
             )
-        if real and min(pair.raw.shape[-2:]) < recipe.train.crop + _MARGIN:
-            size = f"{pair.raw.shape[-2]} x {pair.raw.shape[-1]}"
+        if real and min(pair.clean.mosaic.shape[-2:]) < recipe.train.crop + _MARGIN:
+            size = f"{pair.clean.mosaic.shape[-2]} x {pair.clean.mosaic.shape[-1]}"
             raise ValueError(f"{pair.name}: a frame of {size} is too small for train.crop={recipe.train.crop}")
 
     if not recipe.self_supervised:

@@ -62,7 +62,7 @@ _BLACK, _WHITE = 1024, 65535
 
 def full_colour(pair: Pair) -> Tensor:
     """Make the truth of a frame: linear camera RGB ``(1, 3, H/2, W/2)`` with even sides, each pixel from one cell."""
-    red, green, other_green, blue = bayer.pack(pair.raw[None], pair.cfa).unbind(1)
+    red, green, other_green, blue = bayer.pack(pair.clean.mosaic[None], pair.cfa).unbind(1)
     rgb = torch.stack([red, (green + other_green) / 2, blue], dim=1)
     height, width = rgb.shape[-2:]
     return rgb[..., : height // 2 * 2, : width // 2 * 2].contiguous()
@@ -117,7 +117,7 @@ def develop_rgb(image: Tensor, pair: Pair, exposure: float) -> Tensor:
     if image.shape[1] == PACKED:
         rgb = image[0, [0, 1, 3]]
 
-    return render_rgb(rgb, pair.white_balance, pair.color_matrix, exposure, least=None)
+    return render_rgb(rgb, pair.clean.white_balance, pair.clean.color_matrix, exposure, least=None)
 
 
 def demosaic_mosaic(image: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB) -> Tensor:
@@ -154,7 +154,7 @@ def libraw_demosaic(mosaic: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB
     with extra("raw"):
         import rawpy
 
-    gains = torch.tensor(pair.white_balance).reshape(3, 1, 1) / min(pair.white_balance)
+    gains = torch.tensor(pair.clean.white_balance).reshape(3, 1, 1) / min(pair.clean.white_balance)
     headroom = gains.max()
 
     height, width = mosaic.shape[-2:]
@@ -162,8 +162,8 @@ def libraw_demosaic(mosaic: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB
     rows, columns = _repeat_cells(height, period), _repeat_cells(width, period)
     mosaic = (mosaic[0][:, rows][..., columns] / headroom).clamp(-_BLACK / (_WHITE - _BLACK), 1.0)
 
-    colour = pair.white_balance, pair.white_balance, pair.color_matrix
-    frame = RawFrame(mosaic, cfa, (_BLACK,) * 4, _WHITE, *colour, pair.camera, name=pair.name)
+    colour = pair.clean.white_balance, pair.clean.white_balance, pair.clean.color_matrix
+    frame = RawFrame(mosaic, cfa, (_BLACK,) * 4, _WHITE, *colour, pair.clean.camera, name=pair.name)
     settings = {
         "demosaic_algorithm": rawpy.DemosaicAlgorithm[method],
         "output_color": rawpy.ColorSpace.raw,

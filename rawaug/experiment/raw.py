@@ -82,7 +82,7 @@ class RawTask(Task):
         if settings.source == "more":
             return RealCrops(pictures, noise, crop, augment.isp.cfa)
         if settings.source == "noise":
-            clean = [replace(pair, noisy=None, noisy_srgb=None, shot_var=None, read_var=None) for pair in pictures]
+            clean = [replace(pair, noisy=None, noisy_srgb=None) for pair in pictures]
             return RealCrops(clean, noise, crop, augment.isp.cfa)
 
         if isinstance(pictures, PairPictures) and settings.zoom == 1.0:

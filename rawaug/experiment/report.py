@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rawaug.bayer import noise_variance
+from rawaug.data.pairs import Pair
 from rawaug.evaluation.figures import Panels, crops_at_100, plot_curves, save_picture
 from rawaug.evaluation.page import Page
 from rawaug.evaluation.scores import require_numbers
@@ -63,8 +64,9 @@ def write_results(
     if recipe.target == "srgb":  # scores of RAW state the frames' own noise themselves
         content["own_noise"] = {}
         for pair in test:
-            if pair.own_noise is not None:
-                content["own_noise"][pair.name] = noise_variance(pair.raw, *pair.own_noise).mean().item()
+            levels = pair.clean.noise_profile if isinstance(pair, Pair) else None  # developed pictures state none
+            if levels is not None:
+                content["own_noise"][pair.name] = noise_variance(pair.clean.mosaic, *levels).mean().item()
     if unreadable:
         content["unreadable"] = list(unreadable)
 

@@ -170,8 +170,8 @@ def srgb_trials(pairs: Sequence[Any], levels: Sequence[Levels], label: str) -> l
 
 def _drawn_trials(pair: Pair, levels: Sequence[Levels]) -> list[Trial]:
     """Make trials of a RAW frame at every level, as LibRaw develops it, with the RAW before."""
-    clean = developed(pair.raw, pair)
-    packed = bayer.pack(pair.raw[None], pair.cfa)
+    clean = developed(pair.clean.mosaic, pair)
+    packed = bayer.pack(pair.clean.mosaic[None], pair.cfa)
     ways = {"then LibRaw": partial(_unpacked_and_developed, pair=pair)}
 
     trials = []
@@ -195,7 +195,7 @@ def _unpacked_and_developed(packed: Tensor, pair: Pair) -> Tensor:
 def developed(mosaic: Tensor, pair: Pair) -> Tensor:
     """Develop a mosaic ``(1, H, W)`` by LibRaw in the colours of its pair: sRGB ``(1, 3, H, W)`` of 8 bits."""
     mosaic = mosaic.clamp(-BLACK / (WHITE - BLACK), 1.0)
-    colour = pair.white_balance, pair.white_balance, pair.color_matrix
+    colour = pair.clean.white_balance, pair.clean.white_balance, pair.clean.color_matrix
     frame = RawFrame(mosaic, pair.cfa, (BLACK,) * 4, WHITE, *colour, "rawaug", name=pair.name)
 
     with TemporaryDirectory() as folder:

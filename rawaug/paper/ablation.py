@@ -162,7 +162,7 @@ def stage_psnr(isp: DictionaryISP, pair: Pair, white_balance: bool) -> list[list
     srgb, raw, coordinates, unclipped = _comparable_pixels(pair)
     params = isp.choose(pair.srgb[None])
     if white_balance:
-        params = isp.with_white_balance(params, pair.white_balance)
+        params = isp.with_white_balance(params, pair.clean.white_balance)
 
     images: dict[str, Tensor] = {}
     isp.reverse_pixels(srgb, params, coordinates, images)
@@ -180,12 +180,12 @@ def stage_psnr(isp: DictionaryISP, pair: Pair, white_balance: bool) -> list[list
 def _comparable_pixels(pair: Pair) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Give sRGB, RAW of three colours, coordinates and the mask of unclipped pixels, all ``(1, C, h, w)``."""
     if not pair.registered:
-        srgb, raw, clipped, coordinates = block_averages(pair.srgb, pair.raw, pair.cfa)
+        srgb, raw, clipped, coordinates = block_averages(pair.srgb, pair.clean.mosaic, pair.cfa)
         return srgb[None], raw[None], coordinates, (~clipped)[None, None]
 
     every_fourth = (..., slice(None, None, STRIDE), slice(None, None, STRIDE))
-    raw = bayer.demosaic(pair.raw[None], pair.cfa)[every_fourth]
-    coordinates = frame_coordinates(*pair.raw.shape[-2:])[every_fourth]
+    raw = bayer.demosaic(pair.clean.mosaic[None], pair.cfa)[every_fourth]
+    coordinates = frame_coordinates(*pair.clean.mosaic.shape[-2:])[every_fourth]
     srgb = as_float(pair.srgb[None])[every_fourth]
 
     unclipped = (srgb.amax(1, keepdim=True) < CLIPPED) & (raw.amax(1, keepdim=True) < CLIPPED)

@@ -35,14 +35,14 @@ def balanced_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair) -> float
     if not pair.registered:
         raise ValueError(f"{pair.name}: is not registered pixel by pixel, so it has no balanced PSNR")
 
-    height, width = pair.raw.shape[-2:]
+    height, width = pair.clean.mosaic.shape[-2:]
     values = []
     for top, bottom in pairwise(even_edges(height)):
         for begin, end in pairwise(even_edges(width)):
             piece = (None, slice(None), slice(top, bottom), slice(begin, end))
             coordinates = frame_coordinates(bottom - top, end - begin, (top, begin), (height, width))
             raw = make(pair.srgb[piece], coordinates).clamp(0.0, 1.0)
-            values.append(psnr(balanced(raw, pair), balanced(pair.raw[piece], pair)).item())
+            values.append(psnr(balanced(raw, pair), balanced(pair.clean.mosaic[piece], pair)).item())
     return fmean(values)
 
 
@@ -54,7 +54,7 @@ def even_edges(side: int) -> list[int]:
 
 def balanced(raw: Tensor, pair: Pair) -> Tensor:
     """Compute z of a mosaic ``(1, 1, h, w)``, of shape ``(1, 3, h, w)``."""
-    gains = torch.tensor(pair.white_balance)
+    gains = torch.tensor(pair.clean.white_balance)
     gains = gains / gains.max()
     colour = bayer.demosaic(raw, pair.cfa) * gains.reshape(3, 1, 1)
     return colour.clamp_min(0.0) ** (1.0 / GAMMA)

@@ -167,13 +167,13 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None, balanced: bool =
     rows = {row: windows_psnr(make, pair, patches) for row, make in makers.items()}
     seconds = time.perf_counter() - start
 
-    height, width = pair.raw.shape[-2:]
+    height, width = pair.clean.mosaic.shape[-2:]
     area = min(PATCH, height) * min(PATCH, width)
     pixels = len(makers) * len(draw_windows(pair, patches)) * area
 
     rendered = own_rendering(model, pair)
     if rendered is not None:
-        makers["own"] = raw_maker(model, pair.white_balance)
+        makers["own"] = raw_maker(model, pair.clean.white_balance)
         rows["own"] = windows_psnr(makers["own"], rendered, patches)
 
     figures = {}
@@ -206,7 +206,7 @@ def settings(model: Method, pair: Pair) -> dict[str, Any]:
 
     rows: dict[str, Any] = {"blind": None}
     if pair.balance_known:
-        as_shot = model.as_shot_setting(pair.white_balance)
+        as_shot = model.as_shot_setting(pair.clean.white_balance)
         if as_shot is not None:
             rows["as-shot"] = as_shot
     return rows
@@ -220,7 +220,7 @@ def own_rendering(model: Method, pair: Pair) -> Pair | None:
     """
     if not isinstance(model, CompressedISP):
         return None
-    picture = model(pair.raw[None], model.as_shot_setting(pair.white_balance))
+    picture = model(pair.clean.mosaic[None], model.as_shot_setting(pair.clean.white_balance))
     compressed = (255.0 * jpeg(picture, JPEG_QUALITY)[0]).round().to(torch.uint8)
     return replace(pair, srgb=compressed)
 
@@ -232,7 +232,7 @@ def _block_rows(model: Method, pair: Pair) -> dict[str, float]:
             rows["as-shot"] = psnr_r(model, pair, white_balance=True)
         return rows
 
-    srgb, raw, clipped, _ = block_averages(pair.srgb, pair.raw, pair.cfa)
+    srgb, raw, clipped, _ = block_averages(pair.srgb, pair.clean.mosaic, pair.cfa)
     with torch.no_grad():
         colour = model.unprocess(srgb[None])[0]
     return {"blind": block_psnr(colour, raw, clipped)}
@@ -244,14 +244,14 @@ def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
     blind = isp.choose(pair.srgb[None])
     rows = {"blind": blind}
     if pair.balance_known:
-        rows["as-shot"] = isp.with_white_balance(blind, pair.white_balance)
+        rows["as-shot"] = isp.with_white_balance(blind, pair.clean.white_balance)
 
     generator = keyed_generator("raw samples", pair.name)
-    height, width = pair.raw.shape[-2:]
+    height, width = pair.clean.mosaic.shape[-2:]
     row = torch.randint(height, (SAMPLES,), generator=generator)
     column = torch.randint(width, (SAMPLES,), generator=generator)
 
-    readings = torch.stack([row.float(), column.float(), pair.raw[0, row, column]], dim=1)[None]
+    readings = torch.stack([row.float(), column.float(), pair.clean.mosaic[0, row, column]], dim=1)[None]
     x = as_float(pair.srgb[None])
     rows["samples"] = isp.with_raw_samples(blind, x, readings, coordinates_or_full(x, None))
     return rows
@@ -268,19 +268,19 @@ def forward_psnr(model: Method, pair: Pair) -> float | None:
     and if the dictionary's frame does not state its colours.
     """
     if isinstance(model, DictionaryISP):
-        if not pair.color_known:
+        if not pair.clean.color_known:
             return None
         part = sample_pixels([pair], PIXELS, seed=0).pixels
-        error = cycle_error(model, part, model.forward(pair.raw[None]).params, {}, FitConfig())
+        error = cycle_error(model, part, model.forward(pair.clean.mosaic[None]).params, {}, FitConfig())
         return float(-10.0 * error.log10())
 
     if not can_render(model):
         return None
     srgb = as_float(pair.srgb[None])
-    setting = model.as_shot_setting(pair.white_balance)
+    setting = model.as_shot_setting(pair.clean.white_balance)
     if isinstance(model, CycleISP):
         setting = srgb
-    return psnr(model(pair.raw[None], setting), srgb).item()
+    return psnr(model(pair.clean.mosaic[None], setting), srgb).item()
 
 
 def can_render(model: BaselineISP) -> bool:

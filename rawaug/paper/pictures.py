@@ -43,12 +43,12 @@ def draw_frame(family: str, model: Method, pair: Pair, folder: Path) -> None:
         pair: a frame that it has not seen.
         folder: where the pictures go.
     """
-    packed = bayer.pack(pair.raw[None], pair.cfa)
+    packed = bayer.pack(pair.clean.mosaic[None], pair.cfa)
     _, rows, columns = detail_window(packed, SIDE // 2)
     top, left = 2 * rows.start, 2 * columns.start
     patch = pair.srgb[None, :, top : top + SIDE, left : left + SIDE]
-    raw = pair.raw[None, :, top : top + SIDE, left : left + SIDE]
-    (height, width), (frame_height, frame_width) = patch.shape[-2:], pair.raw.shape[-2:]
+    raw = pair.clean.mosaic[None, :, top : top + SIDE, left : left + SIDE]
+    (height, width), (frame_height, frame_width) = patch.shape[-2:], pair.clean.mosaic.shape[-2:]
     place = frame_coordinates(height, width, (top, left), (frame_height, frame_width))
 
     exposure = _BRIGHT / raw.quantile(0.99).clamp_min(1e-4)

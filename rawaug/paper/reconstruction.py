@@ -435,8 +435,8 @@ def _training_frames(settings: Comparison, every: Sequence[Pair]) -> list[Pair]:
     noise = noise_model(settings.noise)  # frozen, keyed by the frame's name, as a noisy capture is
     captured = []
     for pair in pairs:
-        noisy = make_trial(pair, noise).noisy
-        captured.append(replace(pair, noisy=bayer.unpack(noisy, pair.cfa)[0]))
+        mosaic = bayer.unpack(make_trial(pair, noise).noisy, pair.cfa)[0]
+        captured.append(replace(pair, noisy=replace(pair.clean, mosaic=mosaic, noise_profile=None)))
     return captured
 
 

@@ -204,10 +204,9 @@ class RawNoise(PairMaker):
         Raises:
             ValueError: if it is not a frame, is not scaled to white = 1, or does not state its pattern.
         """
+        frame = getattr(frame, "clean", frame)  # of a pair
         if hasattr(frame, "mosaic") and hasattr(frame, "cfa"):
             return _require_raw(frame.mosaic), canonical_cfa(frame.cfa)
-        if hasattr(frame, "raw") and hasattr(frame, "cfa"):
-            return _require_raw(frame.raw), canonical_cfa(frame.cfa)
         if not isinstance(frame, (Tensor, np.ndarray)):
             raise ValueError(f"clean RAW must be a tensor, an array, a RawFrame or a Pair, got {describe(frame)}")
 

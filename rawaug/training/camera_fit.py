@@ -132,7 +132,7 @@ def fit(
         if noise_figure is not None:
             plot_camera_noise(law, estimates, noise_figure)
 
-    blur = measure_blur((pair.raw[0].numpy(), pair.cfa) for pair in islice(iter(frames), _SOFTNESS_FRAMES))
+    blur = measure_blur((pair.clean.mosaic[0].numpy(), pair.cfa) for pair in islice(iter(frames), _SOFTNESS_FRAMES))
     if blur is not None:
         isp.info["blur"] = round(blur, 2)
 

@@ -83,12 +83,14 @@ class RealCrops:
     def draw(self, generator: torch.Generator) -> Sample:
         """Draw a sample of packed RAW ``(4, crop / 2, crop / 2)``."""
         pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
-        if pair.noisy is None:
-            packed = packed_crop(pair.name, [pair.raw], pair.cfa, self.crop, self.cfa, generator)
+        if pair.noisy is None or pair.noisy.noise_profile is None:
+            packed = packed_crop(pair.name, [pair.clean.mosaic], pair.cfa, self.crop, self.cfa, generator)
             return add_noise(packed, self.noise, generator)
 
-        clean, noisy = packed_crop(pair.name, [pair.raw, pair.noisy], pair.cfa, self.crop, self.cfa, generator)
-        variance = bayer.noise_variance(noisy, torch.tensor(pair.shot_var), torch.tensor(pair.read_var))
+        mosaics = [pair.clean.mosaic, pair.noisy.mosaic]
+        clean, noisy = packed_crop(pair.name, mosaics, pair.cfa, self.crop, self.cfa, generator)
+        shot_var, read_var = pair.noisy.noise_profile
+        variance = bayer.noise_variance(noisy, torch.tensor(shot_var), torch.tensor(read_var))
         return Sample(noisy, clean, variance)
 
 

@@ -94,19 +94,19 @@ class NoisyFrame:
 def drop_clean(pair: Pair) -> Pair:
     """Return the pair without anything that was derived from a clean frame.
 
-    A noisy capture, if there is one, replaces ``raw``, and the camera's picture of it replaces ``srgb``; without such a
-    picture, the capture is developed (bilinear demosaic, the camera's white balance and matrix, the sRGB curve). A pair
-    without a capture is a RAW file as shot, which is noisy itself.
+    A noisy capture, if there is one, replaces ``clean``, and the camera's picture of it replaces ``srgb``; without such
+    a picture, the capture is developed (bilinear demosaic, the camera's white balance and matrix, the sRGB curve). A
+    pair without a capture is a RAW file as shot, which is noisy itself.
     """
     if pair.noisy is None:
         return pair
     if pair.noisy_srgb is not None:
-        return replace(pair, raw=pair.noisy, srgb=pair.noisy_srgb)
+        return replace(pair, clean=pair.noisy, srgb=pair.noisy_srgb)
 
-    packed = bayer.pack(pair.noisy[None], pair.cfa)
+    packed = bayer.pack(pair.noisy.mosaic[None], pair.cfa)
     developed = develop_packed(packed, pair.cfa, pair)
     srgb = (developed * 255.0).round().to(torch.uint8)
-    return replace(pair, raw=pair.noisy, srgb=srgb, registered=True)
+    return replace(pair, clean=pair.noisy, srgb=srgb, registered=True)
 
 
 def frame_levels(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float]:
@@ -115,8 +115,8 @@ def frame_levels(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, f
     Raises:
         ValueError: if it has neither.
     """
-    if pair.shot_var is not None and pair.read_var is not None:
-        return pair.shot_var, pair.read_var
+    if pair.noisy is not None and pair.noisy.noise_profile is not None:
+        return pair.noisy.noise_profile
 
     if camera is None:
         raise ValueError(
@@ -125,7 +125,7 @@ def frame_levels(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, f
         )
 
     try:
-        return camera_law(camera).at(pair.iso)
+        return camera_law(camera).at(pair.clean.iso)
     except ValueError as error:
         raise ValueError(f"{pair.name}: {error}") from None
 
@@ -133,7 +133,7 @@ def frame_levels(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, f
 def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
     """Make a real noisy frame with its levels; ``camera`` is a noise law as an ISP's file holds it."""
     shot_var, read_var = frame_levels(pair, camera)
-    return NoisyFrame(pair.name, pair.raw, shot_var, read_var, pair.cfa)
+    return NoisyFrame(pair.name, pair.clean.mosaic, shot_var, read_var, pair.cfa)
 
 
 FAINT = 45.0

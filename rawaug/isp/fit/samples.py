@@ -32,6 +32,26 @@ BLOCK = 16
 """Side in pixels of the blocks over which unregistered pairs are averaged."""
 
 
+class Frame(Protocol):
+    """A mosaic and its colours; :class:`rawaug.io.RawFrame` is one."""
+
+    @property
+    def mosaic(self) -> Tensor:
+        """The readings ``(1, H, W)``, black 0 and white 1."""
+
+    @property
+    def white_balance(self) -> tuple[float, float, float]:
+        """The as-shot multipliers of R, G and B."""
+
+    @property
+    def camera(self) -> str:
+        """Maker and model."""
+
+    @property
+    def color_known(self) -> bool:
+        """Whether the white balance and the colour matrix are the camera's own."""
+
+
 class FramePair(Protocol):
     """A frame that a fit accepts; :class:`rawaug.data.Pair` is one."""
 
@@ -44,32 +64,20 @@ class FramePair(Protocol):
         """The developed picture ``(3, H, W)``, uint8 or float in [0, 1]."""
 
     @property
-    def raw(self) -> Tensor:
-        """The clean mosaic ``(1, H, W)``."""
+    def clean(self) -> Frame:
+        """The clean frame."""
 
     @property
-    def noisy(self) -> Tensor | None:
-        """The captured noisy mosaic ``(1, H, W)``, if there is one."""
+    def noisy(self) -> Frame | None:
+        """The captured noisy frame, if there is one."""
 
     @property
     def cfa(self) -> CFA:
-        """The pattern of the mosaics."""
-
-    @property
-    def white_balance(self) -> tuple[float, float, float]:
-        """The as-shot multipliers of R, G and B."""
-
-    @property
-    def camera(self) -> str:
-        """Maker and model."""
+        """The pattern of both."""
 
     @property
     def registered(self) -> bool:
         """Whether picture and mosaic agree pixel by pixel."""
-
-    @property
-    def color_known(self) -> bool:
-        """Whether the white balance and the colour matrix are the camera's own."""
 
 
 class FrameSummary(NamedTuple):
@@ -172,27 +180,27 @@ def sample_pixels(pairs: Iterable[FramePair], pixels: int, seed: int, noisy: boo
     frames = []
     shots = []
     for pair in pairs:
-        if not pair.color_known:
+        if not pair.clean.color_known:
             unknown = "its white balance and colour matrix are unknown"
             raise ValueError(f"{pair.name}: {unknown}; use an ISP such as universal")
-        raw = pair.noisy if noisy else pair.raw
-        if raw is None:
+        frame = pair.noisy if noisy else pair.clean
+        if frame is None:
             raise ValueError(f"{pair.name}: has no noisy RAW; fit on clean frames or add noise first")
 
         generator = keyed_generator(seed, "pixels", pair.name)
         draw = _draw_sites if pair.registered else _draw_blocks
         try:
-            frames.append(draw(pair.srgb, raw, pair.cfa, pixels, generator))
+            frames.append(draw(pair.srgb, frame.mosaic, pair.cfa, pixels, generator))
         except ValueError as error:
             raise ValueError(f"{pair.name}: {error}") from None
 
         shot = FrameSummary(
             name=pair.name,
-            camera=pair.camera,
-            cfa=CFA(pair.cfa),
-            white_balance=pair.white_balance,
+            camera=pair.clean.camera,
+            cfa=pair.cfa,
+            white_balance=pair.clean.white_balance,
             srgb=thumbnail(as_float(pair.srgb[None])),
-            raw=thumbnail(_colours(raw, pair.cfa)[None]),
+            raw=thumbnail(_colours(frame.mosaic, pair.cfa)[None]),
             registered=pair.registered,
         )
         shots.append(shot)

@@ -209,7 +209,7 @@ def require_crops(pairs: Sequence[FramePair], side: int) -> None:
         if not pair.registered:
             raise ValueError(f"{pair.name}: RAW and sRGB are not registered pixel by pixel, which crops need")
 
-        height, width = pair.raw.shape[-2:]
+        height, width = pair.clean.mosaic.shape[-2:]
         if min(height, width) < side + 2:
             raise ValueError(f"{pair.name}: {height} x {width} is smaller than {side + 2}; use a smaller crop")
 
@@ -234,12 +234,12 @@ def random_crops(
     for index in indices:
         pair = pairs[index]
         srgb = bayer.crop_to_cfa(pair.srgb, CFA(pair.cfa), cfa)
-        raw = bayer.crop_to_cfa(pair.raw, CFA(pair.cfa), cfa)
+        raw = bayer.crop_to_cfa(pair.clean.mosaic, CFA(pair.cfa), cfa)
         corner = random_crop.sample(raw.shape[-2], raw.shape[-1], generator)
 
         srgb_crop = as_float(random_crop.apply(srgb, corner))
         raw_crop = random_crop.apply(raw, corner)
-        crops.append(Crops(srgb_crop, raw_crop, torch.tensor(pair.white_balance)))
+        crops.append(Crops(srgb_crop, raw_crop, torch.tensor(pair.clean.white_balance)))
 
     stacked = (torch.stack(values).to(device) for values in zip(*crops, strict=True))
     return Crops(*stacked)

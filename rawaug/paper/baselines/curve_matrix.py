@@ -66,7 +66,7 @@ class CurveMatrix(BaselineISP):
         linear = undo_bt709(pixels.srgb)
         self.blind.copy_(fit_product(linear, pixels.target, pixels.known))
 
-        factors = torch.stack([inverse_balance(pair.white_balance) for pair in pairs])
+        factors = torch.stack([inverse_balance(pair.clean.white_balance) for pair in pairs])
         balanced = pixels.target / factors[:, :, None, None]
         self.balanced.copy_(fit_product(linear, balanced, pixels.known))
         return [math.nan]

@@ -59,7 +59,7 @@ class CompressedISP(CropTrainedISP):
 
     def prepare(self, pairs: Sequence[FramePair]) -> None:
         """Take the pairs' mean multipliers for shots that state none."""
-        multipliers = torch.tensor([pair.white_balance for pair in pairs])
+        multipliers = torch.tensor([pair.clean.white_balance for pair in pairs])
         self.balance.copy_(multipliers.log().mean(0, keepdim=True).exp())
 
     def as_shot_setting(self, white_balance: tuple[float, float, float]) -> Balance:

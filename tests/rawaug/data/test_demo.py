@@ -42,25 +42,29 @@ def test_capture_is_sample_and_apply_and_replays_bit_for_bit() -> None:
     camera = DemoCamera()
     captured = camera.capture(picture, generator(3), "shot")
     again = camera.apply(picture, camera.sample(generator(3)), "shot")
-    for field in ("srgb", "raw", "noisy", "color_matrix"):
-        assert torch.equal(getattr(captured, field), getattr(again, field))
-    assert captured.white_balance == again.white_balance and captured.cfa == CFA.GRBG
+    assert torch.equal(captured.srgb, again.srgb)
+    for first, second in ((captured.clean, again.clean), (captured.noisy, again.noisy)):
+        assert first is not None and second is not None and torch.equal(first.mosaic, second.mosaic)
+        assert torch.equal(first.color_matrix, second.color_matrix)
+    assert captured.clean.white_balance == again.clean.white_balance and captured.cfa == CFA.GRBG
 
 
 @pytest.mark.parametrize("iso", NOISE_LEVELS)
 @pytest.mark.parametrize("level", [0, 60, 255])
 def test_noise_has_the_variance_of_its_levels_and_no_bias(iso: int, level: int) -> None:
     pair = DemoCamera().apply(flat(level), DAYLIGHT._replace(iso=iso))
-    assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
-    noise = (pair.noisy - pair.raw).double()
+    assert pair.noisy is not None and pair.noisy.noise_profile is not None
+    noise = (pair.noisy.mosaic - pair.clean.mosaic).double()
     step = 1 / (WHITE - BLACK)
-    expected = pair.shot_var * pair.raw.double().mean() + pair.read_var + step**2 / 12
+    expected = (
+        pair.noisy.noise_profile[0] * pair.clean.mosaic.double().mean() + pair.noisy.noise_profile[1] + step**2 / 12
+    )
     spread = math.sqrt(2 / noise.numel())
     assert noise.square().mean() / expected == pytest.approx(1, abs=6 * spread + 0.02)
     assert abs(noise.mean()) < 5 * (expected / noise.numel()) ** 0.5 + 0.01 * expected**0.5
     if level == 0:
-        assert (pair.noisy < 0).float().mean() > 0.3, "clipped at black"
-    assert pair.noisy.max() <= 1
+        assert (pair.noisy.mosaic < 0).float().mean() > 0.3, "clipped at black"
+    assert pair.noisy.mosaic.max() <= 1
 
 
 def test_raw_holds_digital_numbers() -> None:
@@ -68,7 +72,7 @@ def test_raw_holds_digital_numbers() -> None:
         torch.randint(0, 256, (3, 32, 48), dtype=torch.uint8, generator=generator()), generator()
     )
     assert pair.noisy is not None
-    for raw in (pair.raw, pair.noisy):
+    for raw in (pair.clean.mosaic, pair.noisy.mosaic):
         numbers = raw.double() * (WHITE - BLACK) + BLACK
         assert (numbers - numbers.round()).abs().max() < 1e-3
         assert numbers.min() > -1e-3 and numbers.max() < WHITE + 1e-3
@@ -78,10 +82,10 @@ def test_raw_holds_digital_numbers() -> None:
 def test_grey_stays_grey_and_flat_in_any_light(seed: int) -> None:
     pair = DemoCamera().capture(flat(128, 64), generator(seed), iso=100)
     assert pair.srgb.float().std() < 1.0
-    sites = pack(pair.raw, pair.cfa).mean((-2, -1))
+    sites = pack(pair.clean.mosaic, pair.cfa).mean((-2, -1))
     red, green, blue = sites[0], (sites[1] + sites[2]) / 2, sites[3]
-    assert (green / red).item() == pytest.approx(pair.white_balance[0], rel=0.01)
-    assert (green / blue).item() == pytest.approx(pair.white_balance[2], rel=0.01)
+    assert (green / red).item() == pytest.approx(pair.clean.white_balance[0], rel=0.01)
+    assert (green / blue).item() == pytest.approx(pair.clean.white_balance[2], rel=0.01)
 
 
 def test_raw_falls_off_towards_the_corners_around_a_point_off_centre() -> None:
@@ -90,7 +94,7 @@ def test_raw_falls_off_towards_the_corners_around_a_point_off_centre() -> None:
     assert (row, column) != (128, 192) and abs(row - 128) < 30 and abs(column - 192) < 30
     corners = shading[[0, 0, -1, -1], [0, -1, 0, -1]]
     assert 0.5 < corners.min() < corners.max() < 0.7
-    raw = DemoCamera().apply(flat(255), DAYLIGHT).raw
+    raw = DemoCamera().apply(flat(255), DAYLIGHT).clean.mosaic
     green = pack(raw, CFA.GRBG)[1]
     expected = _shading(192, 192)[0::2, 0::2] * DAYLIGHT.exposure  # Gr comes first in GRBG
     assert torch.allclose(green, expected, atol=1e-3)
@@ -103,7 +107,7 @@ def test_a_saturated_primary_lights_its_own_sites_most(cfa: CFA) -> None:
         picture[channel] = 255
         shot = DAYLIGHT._replace(white_balance=(1.0, 1.0, 1.0))
         pair = DemoCamera(cfa).apply(picture, shot)
-        means = pack(pair.raw, cfa).mean((-2, -1))
+        means = pack(pair.clean.mosaic, cfa).mean((-2, -1))
         assert set(means.topk(len(sites)).indices.tolist()) == set(sites)
         assert pair.srgb.float().mean((1, 2)).argmax() == channel
 
@@ -175,10 +179,10 @@ def test_pairs_of_every_split() -> None:
         pairs = demo_pairs(split)
         assert len(pairs) == len({pair.name for pair in pairs}) == count
         for pair in pairs:
-            assert pair.raw.shape == (1, *FRAME) and pair.cfa == CFA.GRBG and pair.registered
+            assert pair.clean.mosaic.shape == (1, *FRAME) and pair.cfa == CFA.GRBG and pair.registered
             assert pair.noisy is not None and pair.name.startswith(f"{split}_")
-            assert (pair.raw >= 1).float().mean() < 0.01, "clipped"
-    assert len({pair.shot_var for pair in demo_pairs("test")}) == 6
+            assert (pair.clean.mosaic >= 1).float().mean() < 0.01, "clipped"
+    assert len({pair.noisy.noise_profile for pair in demo_pairs("test") if pair.noisy is not None}) == 6
 
 
 def test_a_pair_depends_on_its_key_alone() -> None:
@@ -188,8 +192,8 @@ def test_a_pair_depends_on_its_key_alone() -> None:
     assert first[0] is not longer[0] and longer[0] is demo_pairs("train", 1)[0]
     assert torch.equal(first[0].srgb, longer[0].srgb)
     assert first[0].noisy is not None and longer[0].noisy is not None
-    assert torch.equal(first[0].noisy, longer[0].noisy)
-    assert not torch.equal(longer[0].raw, longer[1].raw)
+    assert torch.equal(first[0].noisy.mosaic, longer[0].noisy.mosaic)
+    assert not torch.equal(longer[0].clean.mosaic, longer[1].clean.mosaic)
 
 
 def test_pictures_are_many_and_differ() -> None:

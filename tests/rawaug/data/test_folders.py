@@ -261,8 +261,8 @@ def test_a_link_to_itself_is_one_unreadable_frame_of_a_folder(shots: Path) -> No
 
 def test_a_pair_is_the_mosaic_and_libraws_rendering(shots: Path) -> None:
     pair, frame = RawFolder(shots)[0], read_raw(shots / "b.dng")
-    assert torch.equal(pair.raw, frame.mosaic) and torch.equal(pair.srgb, develop(shots / "b.dng"))
-    assert (pair.camera, pair.white_balance, pair.registered) == (frame.camera, frame.white_balance, True)
+    assert torch.equal(pair.clean.mosaic, frame.mosaic) and torch.equal(pair.srgb, develop(shots / "b.dng"))
+    assert (pair.clean.camera, pair.clean.white_balance, pair.registered) == (frame.camera, frame.white_balance, True)
     assert pair.noisy is None
 
 
@@ -293,7 +293,7 @@ def test_a_jpeg_that_lacks_a_few_lines_is_taken_and_the_mosaic_is_cut(tmp_path: 
     (tmp_path / "a.png").rename(tmp_path / "a.jpg")
     pair = RawFolder(tmp_path)[0]
     assert not pair.registered and pair.cfa == CFA.GRBG
-    assert torch.equal(pair.raw, read_raw(path).mosaic[:, 2:158, 2:238])
+    assert torch.equal(pair.clean.mosaic, read_raw(path).mosaic[:, 2:158, 2:238])
     assert torch.equal(pair.srgb, develop(path)[:, 2:158, 2:238])
 
 

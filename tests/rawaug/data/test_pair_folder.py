@@ -18,6 +18,7 @@ from scipy.io import savemat
 from rawaug.bayer import CFA, pack
 from rawaug.cli import main
 from rawaug.data import Pair, PairFolder, check, open_pairs
+from rawaug.io import RawFrame
 
 Dng = Callable[..., Path]
 BLACK, WHITE = 64, 1023
@@ -62,9 +63,12 @@ def refused(folder: Path, **settings: Any) -> str:
 def test_numbers_of_every_format_become_signal_by_the_given_levels(tmp_path: Path, suffix: str) -> None:
     write_pair(tmp_path / "sub", "a", suffix)
     (pair,) = open_pairs(f"pairs:{tmp_path}", **GIVEN)
-    assert (pair.name, pair.cfa, pair.color_known, pair.shot_var) == ("sub/a", CFA.GRBG, False, None)
-    assert pair.noisy is not None and torch.allclose(pair.raw, signal(CLEAN), atol=1e-6)
-    assert torch.allclose(pair.noisy, signal(NOISY), atol=1e-6) and pair.noisy.min() < 0  # not clipped at black
+    assert pair.noisy is not None and pair.noisy.noise_profile is None
+    assert (pair.name, pair.cfa, pair.clean.color_known) == ("sub/a", CFA.GRBG, False)
+    assert torch.allclose(pair.clean.mosaic, signal(CLEAN), atol=1e-6)
+    assert (
+        torch.allclose(pair.noisy.mosaic, signal(NOISY), atol=1e-6) and pair.noisy.mosaic.min() < 0
+    )  # not clipped at black
     missing = dict(GIVEN)
     for key in ("white", "black", "cfa"):  # what is not stated must be given
         del missing[key]
@@ -75,9 +79,10 @@ def test_a_camera_file_states_it_all_and_cannot_be_contradicted(tmp_path: Path, 
     for kind, numbers in (("noisy", NOISY), ("clean", CLEAN)):
         bayer_dng(tmp_path / f"a_{kind}.dng", numbers, "BGGR", (BLACK,), WHITE, noise_profile=(1e-3, 1e-5))
     pair = PairFolder(tmp_path)[0]
-    assert (pair.cfa, pair.color_known, pair.camera) == (CFA.BGGR, True, "Maker Model 1")
-    assert (pair.shot_var, pair.read_var) == (1e-3, 1e-5) and pair.white_balance == pytest.approx((2.0, 1.0, 1.6))
-    assert pair.noisy is not None and torch.allclose(pair.noisy, signal(NOISY), atol=1e-6)
+    assert (pair.cfa, pair.clean.color_known, pair.clean.camera) == (CFA.BGGR, True, "Maker Model 1")
+    assert pair.noisy is not None and pair.noisy.noise_profile == (1e-3, 1e-5)
+    assert pair.clean.white_balance == pytest.approx((2.0, 1.0, 1.6))
+    assert pair.noisy is not None and torch.allclose(pair.noisy.mosaic, signal(NOISY), atol=1e-6)
     assert "states cfa BGGR, not RGGB as given" in refused(tmp_path, cfa="RGGB")
     assert "states black 64, not 0 as given" in refused(tmp_path, black=0)
     assert len(open_pairs(f"pairs:{tmp_path}", cfa="BGGR", black=[BLACK] * 4, white=WHITE)[:]) == 1
@@ -97,10 +102,13 @@ def test_statements_of_a_file_are_taken(tmp_path: Path, suffix: str) -> None:
     else:
         savemat(tmp_path / "a.mat", {**both(), **stated})
     pair = PairFolder(tmp_path)[0]
-    assert (pair.name, pair.cfa, pair.white_balance, pair.color_known) == ("a", CFA.GRBG, (2.0, 1.0, 1.5), True)
-    assert pair.shot_var == pytest.approx(1e-3) and torch.allclose(pair.color_matrix, torch.tensor(MATRIX).float())
-    assert pair.noisy is not None and torch.allclose(pair.noisy, signal(NOISY), atol=1e-6)
-    assert torch.allclose(pair.raw, signal(CLEAN), atol=1e-6)
+    assert (pair.name, pair.cfa) == ("a", CFA.GRBG)
+    assert (pair.clean.white_balance, pair.clean.color_known) == ((2.0, 1.0, 1.5), True)
+    assert pair.noisy is not None and pair.noisy.noise_profile is not None
+    assert pair.noisy.noise_profile[0] == pytest.approx(1e-3)
+    assert torch.allclose(pair.clean.color_matrix, torch.tensor(MATRIX).float())
+    assert pair.noisy is not None and torch.allclose(pair.noisy.mosaic, signal(NOISY), atol=1e-6)
+    assert torch.allclose(pair.clean.mosaic, signal(CLEAN), atol=1e-6)
 
 
 def both() -> dict[str, np.ndarray]:
@@ -109,7 +117,7 @@ def both() -> dict[str, np.ndarray]:
 
 def test_four_black_levels_are_those_of_r_gr_gb_b(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", noisy=CLEAN, clean=CLEAN, black=np.array([60, 61, 62, 63]), white=WHITE)
-    packed = pack(PairFolder(tmp_path, cfa="GRBG")[0].raw, "GRBG")
+    packed = pack(PairFolder(tmp_path, cfa="GRBG")[0].clean.mosaic, "GRBG")
     numbers = pack(torch.from_numpy(CLEAN.astype(np.float32))[None], "GRBG")
     for plane, black in enumerate((60, 61, 62, 63)):
         assert torch.allclose(packed[plane], (numbers[plane] - black) / (WHITE - black))
@@ -118,7 +126,7 @@ def test_four_black_levels_are_those_of_r_gr_gb_b(tmp_path: Path) -> None:
 def test_floating_point_holds_the_signal_itself_and_must_stay_within_it(tmp_path: Path) -> None:
     write(tmp_path / "a_clean.tif", signal(CLEAN)[0].numpy())
     write(tmp_path / "a_noisy.tif", signal(NOISY)[0].numpy())
-    assert torch.equal(PairFolder(tmp_path, cfa="RGGB")[0].raw, signal(CLEAN))
+    assert torch.equal(PairFolder(tmp_path, cfa="RGGB")[0].clean.mosaic, signal(CLEAN))
     write(tmp_path / "a_clean.tif", CLEAN.astype(np.float32))
     assert "a_clean.tif: has values from" in refused(tmp_path, cfa="RGGB")
     write(tmp_path / "a_clean.tif", np.full((32, 48), np.nan, np.float32))
@@ -131,7 +139,7 @@ def test_other_names_go_by_a_pattern(tmp_path: Path) -> None:
         write(tmp_path / "s1" / f"x_CLEAN_{index}.png", CLEAN)
     write(tmp_path / "preview.png", CLEAN)
     pairs = PairFolder(tmp_path, noisy="*_NOISY_*.png", **GIVEN)
-    assert pairs.names == ["s1/x_NOISY_010", "s1/x_NOISY_011"] and torch.equal(pairs[1].raw, signal(CLEAN))
+    assert pairs.names == ["s1/x_NOISY_010", "s1/x_NOISY_011"] and torch.equal(pairs[1].clean.mosaic, signal(CLEAN))
     assert "preview.png (and 4 others): is neither" in refused(tmp_path)
     assert "same number of * and ?" in refused(tmp_path, noisy="*_NOISY_*.png", clean="*.png")
     assert "does not contain the word noisy" in refused(tmp_path, noisy="*_01?.png")
@@ -198,7 +206,7 @@ def test_settings_are_for_pairs_alone(tmp_path: Path, bayer_dng: Dng) -> None:
 
 
 def test_a_sequence_of_pairs_is_taken_as_it_is() -> None:
-    pairs = [Pair("a", torch.zeros(3, 4, 4, dtype=torch.uint8), torch.zeros(1, 4, 4), CFA.RGGB)]
+    pairs = [Pair("a", RawFrame(torch.zeros(1, 4, 4), CFA.RGGB), torch.zeros(3, 4, 4, dtype=torch.uint8))]
     assert open_pairs(pairs) is pairs
     for wrong in ([], [1], 5):
         with pytest.raises(ValueError, match=r"list of Pair"):
@@ -243,9 +251,9 @@ def test_packed_numbers_have_their_planes_first_or_last(tmp_path: Path, kind: st
             np.save(file, planes) if kind == "npy" else np.savez(file, planes)
     given: dict[str, Any] = {"cfa": "GRBG", "black": 64, "white": 1023}
     first, last = (open_pairs(f"pairs:{tmp_path / name}", **given)[0] for name in ("first", "last"))
-    assert torch.equal(first.raw, last.raw)
+    assert torch.equal(first.clean.mosaic, last.clean.mosaic)
     packed = torch.from_numpy((numbers.astype(np.float32) - 64) / (1023 - 64))
-    assert torch.allclose(pack(first.raw, CFA.GRBG), packed)
+    assert torch.allclose(pack(first.clean.mosaic, CFA.GRBG), packed)
     if kind == "npy":
         (part,) = check(tmp_path / "last").parts
         assert part.what == "noisy/clean pairs", "not an unknown dataset of crops"
@@ -276,4 +284,4 @@ def test_one_plane_may_have_an_axis_of_its_own_and_a_pattern_may_be_bytes(tmp_pa
     noisy = np.expand_dims(numbers, axis)
     np.savez(tmp_path / "a.npz", noisy=noisy, clean=numbers, cfa=b"GRBG", black=64, white=1023)
     pair = open_pairs(f"pairs:{tmp_path}")[0]
-    assert pair.cfa == CFA.GRBG and pair.noisy is not None and torch.equal(pair.noisy, pair.raw)
+    assert pair.cfa == CFA.GRBG and pair.noisy is not None and torch.equal(pair.noisy.mosaic, pair.clean.mosaic)

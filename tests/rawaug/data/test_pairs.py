@@ -17,16 +17,14 @@ from rawaug.data.pairs import Pair
 from rawaug.data.selection import one_a_phone, select_pairs, whole_scenes
 from rawaug.experiment.data import open_frames
 from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
+from rawaug.io import RawFrame
 
 
 def pair(**changes: Any) -> Pair:
     fields: dict[str, Any] = {
         "name": "shot",
+        "clean": RawFrame(torch.zeros(1, 6, 8), CFA.RGGB, white_balance=(2.0, 1.0, 1.5)),
         "srgb": torch.zeros(3, 6, 8, dtype=torch.uint8),
-        "raw": torch.zeros(1, 6, 8),
-        "cfa": CFA.RGGB,
-        "white_balance": (2.0, 1.0, 1.5),
-        "color_matrix": torch.eye(3),
     }
     return Pair(**{**fields, **changes})
 
@@ -39,12 +37,17 @@ def pair(**changes: Any) -> Pair:
             r"shot: srgb .*uint8",
         ),
         ({"srgb": torch.zeros(3, 6, 6, dtype=torch.uint8)}, r"srgb .*\(3, 6, 6\)"),
-        ({"raw": torch.zeros(6, 8)}, r"raw .*float32"),
-        ({"noisy": torch.zeros(1, 6, 6)}, r"noisy .*\(1, 6, 8\)"),
-        ({"srgb": torch.zeros(3, 5, 8, dtype=torch.uint8), "raw": torch.zeros(1, 5, 8)}, "even sides"),
-        ({"color_matrix": torch.eye(4)}, r"color_matrix .*\(3, 3\)"),
-        ({"shot_var": 1e-3, "read_var": 1e-6}, r"together.*noisy"),
-        ({"shot_var": 1e-3, "noisy": torch.zeros(1, 6, 8)}, "together"),
+        ({"clean": RawFrame(torch.zeros(6, 8), "RGGB")}, r"clean .*float32"),
+        ({"clean": RawFrame(torch.zeros(1, 6, 8), "XTRANS")}, "XTRANS"),
+        ({"noisy": RawFrame(torch.zeros(1, 6, 6), "RGGB")}, r"noisy .*\(1, 6, 8\)"),
+        (
+            {"srgb": torch.zeros(3, 5, 8, dtype=torch.uint8), "clean": RawFrame(torch.zeros(1, 5, 8), "RGGB")},
+            "even sides",
+        ),
+        (
+            {"clean": RawFrame(torch.zeros(1, 6, 8), "RGGB", color_matrix=torch.eye(4))},
+            r"color_matrix .*\(3, 3\)",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(changes: dict[str, Any], message: str) -> None:
@@ -79,7 +82,7 @@ class Shots(Frames):
 
     def read(self, index: int) -> Pair:
         self.seen.append(index)
-        return Pair(self.names[index], torch.zeros(3, 2, 2, dtype=torch.uint8), torch.zeros(1, 2, 2), CFA.RGGB)
+        return Pair(self.names[index], RawFrame(torch.zeros(1, 2, 2), "RGGB"), torch.zeros(3, 2, 2, dtype=torch.uint8))
 
 
 def test_the_first_ones_are_of_one_phone_and_others_are_not() -> None:
@@ -180,10 +183,11 @@ def test_noise_falls_by_the_number_of_sites() -> None:
     raw = torch.rand(1, 1, 48, generator=generator).repeat_interleave(16, 2).expand(1, 768, 768)
     noisy = raw + torch.randn(raw.shape, generator=generator) * (4e-3 * raw + 1e-4) ** 0.5
     srgb = torch.zeros(3, 768, 768, dtype=torch.uint8)
-    pair = Pair("a", srgb, raw.contiguous(), CFA.RGGB, noisy=noisy, shot_var=4e-3, read_var=1e-4).binned(4)
+    clean = RawFrame(raw.contiguous(), CFA.RGGB)
+    pair = Pair("a", clean, srgb, replace(clean, mosaic=noisy, noise_profile=(4e-3, 1e-4))).binned(4)
     left = bin_mosaic_variance(4)
-    assert pair.noisy is not None and (pair.shot_var, pair.read_var) == pytest.approx((4e-3 * left, 1e-4 * left))
-    measured = measure_noise(pair.raw.numpy(), pair.noisy.numpy())
+    assert pair.noisy is not None and pair.noisy.noise_profile == pytest.approx((4e-3 * left, 1e-4 * left))
+    measured = measure_noise(pair.clean.mosaic.numpy(), pair.noisy.mosaic.numpy())
     assert measured[0] * 0.5 + measured[1] == pytest.approx((4e-3 * 0.5 + 1e-4) * left, rel=0.05)
 
 
@@ -191,12 +195,12 @@ def test_pairs_are_opened_binned() -> None:
     whole, binned = open_pairs("demo:test"), open_pairs("demo:test", bin=4)
     assert as_frames(binned).names == [pair.name for pair in whole]
     pair = binned[0]
-    assert pair.raw.shape == (1, 72, 112) and pair.srgb.shape == (3, 72, 112) and pair.cfa == whole[0].cfa
-    assert pair.raw.mean().item() == pytest.approx(whole[0].raw.mean().item(), rel=1e-3)
+    assert pair.clean.mosaic.shape == (1, 72, 112) and pair.srgb.shape == (3, 72, 112) and pair.cfa == whole[0].cfa
+    assert pair.clean.mosaic.mean().item() == pytest.approx(whole[0].clean.mosaic.mean().item(), rel=1e-3)
     assert shared_frame(whole, binned) is not None and as_frames(whole).stamps() != as_frames(binned).stamps()
     readable = Readable(binned)
     readable.broken[0] = "damaged"
-    assert readable.readable()[0].raw.shape == (1, 72, 112)
+    assert readable.readable()[0].clean.mosaic.shape == (1, 72, 112)
     with pytest.raises(ValueError, match=r"^bin"):
         open_pairs("demo:test", bin=0)
     with pytest.raises(ValueError, match="binned"):

@@ -57,10 +57,12 @@ def folder(tmp_path: Path) -> Path:
 def test_noise_has_the_published_levels_and_no_bias(code: str, iso: int) -> None:
     phone = CAMERAS[code]
     pair = take_shot(phone, grey(), PLAIN._replace(iso=iso), generator())
-    assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
-    noise = (pair.noisy - pair.raw).double()
+    assert pair.noisy is not None and pair.noisy.noise_profile is not None
+    noise = (pair.noisy.mosaic - pair.clean.mosaic).double()
     step = 1 / (WHITE - phone.black)
-    expected = pair.shot_var * pair.raw.double().mean() + pair.read_var + step**2 / 12
+    expected = (
+        pair.noisy.noise_profile[0] * pair.clean.mosaic.double().mean() + pair.noisy.noise_profile[1] + step**2 / 12
+    )
     assert noise.square().mean() / expected == pytest.approx(1, abs=0.06)
     assert abs(noise.mean()) < 5 * (expected / noise.numel()) ** 0.5
 
@@ -68,7 +70,7 @@ def test_noise_has_the_published_levels_and_no_bias(code: str, iso: int) -> None
 def test_noise_of_black_is_not_clipped() -> None:
     pair = take_shot(CAMERAS["N6"], grey(0.0), PLAIN._replace(iso=3200), generator())
     assert pair.noisy is not None
-    assert (pair.noisy < 0).float().mean() > 0.3
+    assert (pair.noisy.mosaic < 0).float().mean() > 0.3
 
 
 def test_levels_between_published_isos_lie_between_them_and_are_held_beyond() -> None:
@@ -84,11 +86,11 @@ def test_levels_between_published_isos_lie_between_them_and_are_held_beyond() ->
 def test_noisy_raw_has_ten_bits_and_the_pattern_of_the_phone(code: str) -> None:
     phone = CAMERAS[code]
     pair = take_shot(phone, torch.rand(3, 32, 48, generator=generator()), PLAIN, generator())
-    assert pair.noisy is not None and pair.cfa == phone.cfa and pair.camera == phone.name
-    numbers = pair.noisy.double() * (WHITE - phone.black) + phone.black
+    assert pair.noisy is not None and pair.cfa == phone.cfa and pair.clean.camera == phone.name
+    numbers = pair.noisy.mosaic.double() * (WHITE - phone.black) + phone.black
     assert (numbers - numbers.round()).abs().max() < 1e-3
     assert numbers.min() > -1e-3 and numbers.max() < WHITE + 1e-3
-    assert pair.raw.min() >= 0 and pair.raw.max() <= 1
+    assert pair.clean.mosaic.min() >= 0 and pair.clean.mosaic.max() <= 1
 
 
 @pytest.mark.parametrize("code", CODES)
@@ -96,7 +98,7 @@ def test_noisy_raw_has_ten_bits_and_the_pattern_of_the_phone(code: str) -> None:
 def test_raw_of_grey_has_the_colour_of_the_light_to_the_camera(code: str, kelvin: int) -> None:
     phone = CAMERAS[code]
     pair = take_shot(phone, grey(), PLAIN._replace(kelvin=kelvin), generator())
-    middle = pack(pair.raw, phone.cfa)[:, 31:33, 31:33].mean((1, 2))
+    middle = pack(pair.clean.mosaic, phone.cfa)[:, 31:33, 31:33].mean((1, 2))
     response = camera_in_light(phone.xyz_to_camera, kelvin).sum(1)
     assert float(middle[0] / middle[1]) == pytest.approx(float(response[0] / response[1]), rel=0.01)
     assert float(middle[3] / middle[2]) == pytest.approx(float(response[2] / response[1]), rel=0.01)
@@ -124,7 +126,7 @@ def test_a_warmer_picture_is_of_smaller_red_gains() -> None:
 def test_a_dark_frame_is_lifted_by_parts() -> None:
     phone = CAMERAS["GP"]
     bright, dark = (take_shot(phone, grey(0.5), PLAIN._replace(stops=stops), generator()) for stops in (0.0, 2.0))
-    ratio = float(dark.raw.mean() / bright.raw.mean())
+    ratio = float(dark.clean.mosaic.mean() / bright.clean.mosaic.mean())
     assert ratio == pytest.approx(0.25, rel=0.01)
     careless = phone._replace(rendering=phone.rendering._replace(lift=0.0))
     unlifted = take_shot(careless, grey(0.5), PLAIN._replace(stops=2.0), generator())
@@ -136,9 +138,9 @@ def test_the_white_balance_of_a_pair_is_the_renderers() -> None:
     shot = PLAIN._replace(tint_error=(0.2, -0.1))
     pair = take_shot(CAMERAS["G4"], grey(), shot, generator())
     gains = balance(CAMERAS["G4"], shot)
-    assert pair.white_balance == pytest.approx((float(gains[0] / gains[1]), 1.0, float(gains[2] / gains[1])))
-    assert torch.allclose(pair.color_matrix.sum(1), torch.ones(3), atol=1e-5)
-    assert torch.allclose(pair.color_matrix, colour_matrix(CAMERAS["G4"], shot).float())
+    assert pair.clean.white_balance == pytest.approx((float(gains[0] / gains[1]), 1.0, float(gains[2] / gains[1])))
+    assert torch.allclose(pair.clean.color_matrix.sum(1), torch.ones(3), atol=1e-5)
+    assert torch.allclose(pair.clean.color_matrix, colour_matrix(CAMERAS["G4"], shot).float())
 
 
 @pytest.mark.parametrize("code", CODES)
@@ -208,17 +210,17 @@ def test_a_frame_depends_on_seed_split_and_instance_alone(folder: Path) -> None:
     last, first = frames[5], PhoneFrames(folder, "train")[0]
     assert torch.equal(PhoneFrames(folder, "train")[5].srgb, last.srgb)
     assert first.noisy is not None and frames[0].noisy is not None
-    assert torch.equal(first.noisy, frames[0].noisy)
+    assert torch.equal(first.noisy.mosaic, frames[0].noisy.mosaic)
     other = open_pairs(f"phones:{folder}", split="train", seed=1)
-    assert not torch.equal(other[0].raw, first.raw)
+    assert not torch.equal(other[0].clean.mosaic, first.clean.mosaic)
 
 
 def test_two_frames_of_an_instance_differ_by_their_noise(folder: Path) -> None:
     frames = PhoneFrames(folder, "train")
     first, second = frames[0], frames[1]
-    assert torch.equal(first.raw, second.raw) and torch.equal(first.srgb, second.srgb)
+    assert torch.equal(first.clean.mosaic, second.clean.mosaic) and torch.equal(first.srgb, second.srgb)
     assert first.noisy is not None and second.noisy is not None
-    assert not torch.equal(first.noisy, second.noisy)
+    assert not torch.equal(first.noisy.mosaic, second.noisy.mosaic)
 
 
 def test_splits_share_no_photograph(folder: Path) -> None:
@@ -250,19 +252,20 @@ def test_a_folder_with_too_few_pictures_says_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize("camera", ["canon", "nikon"])
 def test_a_dslr_frame_is_what_libraw_reads_and_renders(folder: Path, camera: str) -> None:
     pair = open_pairs(f"dslr_{camera}:{folder}")[0]
-    assert pair.raw.shape == (1, 512, 768) and pair.cfa == CFA.RGGB and pair.camera.endswith(("5D", "D700"))
-    assert 1.2 < pair.white_balance[0] < 3.5 and 0.8 < pair.white_balance[2] < 2.5
-    balanced = pack(pair.raw, pair.cfa).mean((1, 2)) * torch.tensor(
-        [pair.white_balance[0], 1, 1, pair.white_balance[2]]
+    assert pair.clean.mosaic.shape == (1, 512, 768) and pair.cfa == CFA.RGGB
+    assert pair.clean.camera.endswith(("5D", "D700"))
+    assert 1.2 < pair.clean.white_balance[0] < 3.5 and 0.8 < pair.clean.white_balance[2] < 2.5
+    balanced = pack(pair.clean.mosaic, pair.cfa).mean((1, 2)) * torch.tensor(
+        [pair.clean.white_balance[0], 1, 1, pair.clean.white_balance[2]]
     )
     assert float(balanced.max() / balanced.min()) < 1.6
-    assert torch.equal(open_pairs(f"dslr_{camera}:{folder}")[0].raw, pair.raw)
+    assert torch.equal(open_pairs(f"dslr_{camera}:{folder}")[0].clean.mosaic, pair.clean.mosaic)
 
 
 def test_a_dslrs_jpeg_is_near_its_rendering(folder: Path) -> None:
     plain = open_pairs(f"dslr_nikon:{folder}")[0]
     jpeg = open_pairs(f"dslr_nikon_jpeg:{folder}")[0]
-    assert torch.equal(plain.raw, jpeg.raw) and not torch.equal(plain.srgb, jpeg.srgb)
+    assert torch.equal(plain.clean.mosaic, jpeg.clean.mosaic) and not torch.equal(plain.srgb, jpeg.srgb)
     assert (plain.srgb.float() - jpeg.srgb.float()).abs().mean() < 6
 
 

@@ -47,8 +47,8 @@ def test_a_split_is_found_by_number_and_developed(fivek: Path) -> None:
     for place in (0, 40, 72):
         pair = pairs[place]
         assert pair.name.startswith(f"a{fivek_numbers('nikon', 'test')[place]}-") and pair.registered
-        assert pair.raw[0, 0, 0].item() == pytest.approx((500 + 10 * place) / 4095)
-        assert str(pair.cfa) == "RGGB" and pair.white_balance == pytest.approx((2, 1, 1.6), rel=1e-4)
+        assert pair.clean.mosaic[0, 0, 0].item() == pytest.approx((500 + 10 * place) / 4095)
+        assert str(pair.cfa) == "RGGB" and pair.clean.white_balance == pytest.approx((2, 1, 1.6), rel=1e-4)
         assert pair.srgb.shape == (3, 32, 48)
 
 
@@ -61,7 +61,7 @@ def test_invisps_pictures_are_scaled_by_the_frames_maximum_and_stored_as_jpegs(
     cell[:, 24:] //= 3
     bayer_dng(file, cell)
     pair, plain = (open_pairs(f"{kind}_nikon:{fivek}", split="test")[72] for kind in ("invisp", "fivek"))
-    assert torch.equal(pair.raw, plain.raw) and pair.name == plain.name == file.stem
+    assert torch.equal(pair.clean.mosaic, plain.clean.mosaic) and pair.name == plain.name == file.stem
     assert torch.equal(plain.srgb, develop(file))
     assert torch.equal(pair.srgb, recode_jpeg(develop(file, 0.75), 90))
     assert pair.srgb.float().mean() > plain.srgb.float().mean() + 2, "the brightest becomes white"
@@ -102,13 +102,13 @@ def write_pair(folder: Path, stem: str, picture: str, scale: int = 1) -> None:
 def test_planes_rows_and_white_are_the_published_ones(tmp_path: Path, picture: str, white: int) -> None:
     write_pair(tmp_path, "12_3", picture)
     (pair,) = Rawir(tmp_path)
-    assert pair.name == "12_3" and pair.cfa == CFA.RGGB and pair.registered and pair.raw.shape == (1, 12, 16)
-    packed = pack(pair.raw, pair.cfa) * white
+    assert pair.name == "12_3" and pair.cfa == CFA.RGGB and pair.registered and pair.clean.mosaic.shape == (1, 12, 16)
+    packed = pack(pair.clean.mosaic, pair.cfa) * white
     assert torch.allclose(packed[:, 0, 1], torch.tensor(PLANES, dtype=torch.float32), atol=1e-3)
     assert torch.allclose(packed[:, 2, 0] - packed[:, 0, 1], torch.full((4,), 7.0), atol=1e-3)
-    assert pair.raw[0, 0, 3].item() == pytest.approx(200 / white) and pair.raw[0, 1, 2].item() == pytest.approx(
-        300 / white
-    )
+    assert pair.clean.mosaic[0, 0, 3].item() == pytest.approx(200 / white) and pair.clean.mosaic[
+        0, 1, 2
+    ].item() == pytest.approx(300 / white)
 
 
 def test_splits_are_folders_and_the_p20_is_not_registered(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_an_archive_states_its_white_level(tmp_path: Path) -> None:
     (tmp_path / "a.npy").unlink()
     np.savez(tmp_path / "a.npz", raw=packed, max_val=2**14 - 1)
     (pair,) = Rawir(tmp_path)
-    assert pair.raw[0, 0, 3].item() == pytest.approx(200 / (2**14 - 1))
+    assert pair.clean.mosaic[0, 0, 3].item() == pytest.approx(200 / (2**14 - 1))
     np.savez(tmp_path / "a.npz", raw=packed)
     with pytest.raises(OSError, match=r"a\.npz: .*packed"):
         Rawir(tmp_path)[0]
@@ -145,8 +145,8 @@ def test_rgb2raw_keeps_whole_raws_of_every_phone_aside(tmp_path: Path) -> None:
     assert shots["test"] == {f"{phone}/{shot}" for phone in ("iphone-x", "samsung-s9") for shot in (10, 20)}
     assert not (shots["train"] & shots["test"] or shots["train"] & shots["validation"])
     pair = open_pairs(f"rgb2raw:{tmp_path}", "test")[2]
-    assert (pair.name, pair.camera, pair.balance_known) == ("iphone-x/20_0", "iphone-x", False)
-    assert pair.raw[0, 0, 3].item() == pytest.approx(200 / 4095)
+    assert (pair.name, pair.clean.camera, pair.balance_known) == ("iphone-x/20_0", "iphone-x", False)
+    assert pair.clean.mosaic[0, 0, 3].item() == pytest.approx(200 / 4095)
     with pytest.raises(ValueError, match="train"):
         write_pair(tmp_path / "one", "1_0", "png")
         Rgb2Raw(tmp_path / "one", "train")
@@ -156,7 +156,7 @@ def test_what_is_wrong_is_reported(tmp_path: Path) -> None:
     write_pair(tmp_path, "a", "jpg", scale=3)
     with pytest.raises(ValueError, match=r"a\.npy: .*white"):
         Rawir(tmp_path)[0]
-    assert Rawir(tmp_path, white=4095)[0].raw.max().item() == pytest.approx(1207 / 4095)
+    assert Rawir(tmp_path, white=4095)[0].clean.mosaic.max().item() == pytest.approx(1207 / 4095)
     np.save(tmp_path / "a.npy", np.zeros((4, 6, 8), np.uint16))
     with pytest.raises(ValueError, match="unsigned"):
         Rawir(tmp_path)[0]
@@ -220,21 +220,21 @@ def test_pattern_levels_and_order_are_the_published_ones(zurich: Path) -> None:
     pairs = open_pairs(f"zurich:{zurich}", "test")
     assert [pair.name for pair in pairs] == ["test_0", "test_2", "test_10"]
     pair = pairs[2]
-    assert pair.cfa == CFA.RGGB and not pair.registered and pair.raw.shape == (1, 8, 12)
-    planes = pack(pair.raw, pair.cfa)[:, 1, 1] * (1020 - 63)
+    assert pair.cfa == CFA.RGGB and not pair.registered and pair.clean.mosaic.shape == (1, 8, 12)
+    planes = pack(pair.clean.mosaic, pair.cfa)[:, 1, 1] * (1020 - 63)
     assert planes.tolist() == pytest.approx([110, 210, 310, 410], abs=1e-3)
-    assert pair.raw[0, 0, 0].item() == pytest.approx(-43 / 957), "not clipped at black"
-    assert pair.raw[0, 7, 11].item() == 1 and pair.srgb[0, 3, 3].item() == pytest.approx(90, abs=2)
+    assert pair.clean.mosaic[0, 0, 0].item() == pytest.approx(-43 / 957), "not clipped at black"
+    assert pair.clean.mosaic[0, 7, 11].item() == 1 and pair.srgb[0, 3, 3].item() == pytest.approx(90, abs=2)
 
 
 def test_8_bits_are_a_quarter(tmp_path: Path) -> None:
     write_zurich(tmp_path / "train", 0, (np.tile(CELL, (4, 6)) // 4).astype(np.uint8))
-    planes = pack(Zurich(tmp_path)[0].raw, "RGGB")[:, 0, 0] * 957
+    planes = pack(Zurich(tmp_path)[0].clean.mosaic, "RGGB")[:, 0, 0] * 957
     assert planes.tolist() == pytest.approx([100, 200, 300, 400], abs=4)
 
 
 def test_larger_pictures_and_mosaics_are_refused(zurich: Path) -> None:
-    assert open_pairs(f"zurich:{zurich}", "test", max_pixels=96)[0].raw.shape == (1, 8, 12)
+    assert open_pairs(f"zurich:{zurich}", "test", max_pixels=96)[0].clean.mosaic.shape == (1, 8, 12)
     with pytest.raises(ValueError, match=r"huawei_raw/0\.png: .*declares"):
         open_pairs(f"zurich:{zurich}", "test", max_pixels=95)[0]
     write_picture(zurich / "test" / "canon" / "0.jpg", torch.zeros(3, 16, 24, dtype=torch.uint8))
@@ -272,10 +272,10 @@ def test_the_clean_frame_is_the_mean_at_iso_100_at_the_noisy_exposure(
     bayer_dng(folder / "Scene_0001_ISO800_1.ARW", noisy, black=(64,))
     pairs = open_pairs(f"rawbench:{tmp_path}")
     (pair,) = pairs
-    assert pair.name == "Scene_0001_ISO800_1" and pair.noisy is not None and pair.color_known
+    assert pair.name == "Scene_0001_ISO800_1" and pair.noisy is not None and pair.clean.color_known
     truth = torch.from_numpy(GAIN * light / (4095 - 64)).float()
-    assert (pair.raw[0] - truth).abs().mean() < 4e-3 < (pair.noisy[0] - truth).abs().mean()
-    assert (pair.raw.mean() - truth.clamp(max=1).mean()).abs() < 1e-3
+    assert (pair.clean.mosaic[0] - truth).abs().mean() < 4e-3 < (pair.noisy.mosaic[0] - truth).abs().mean()
+    assert (pair.clean.mosaic.mean() - truth.clamp(max=1).mean()).abs() < 1e-3
 
 
 def test_what_is_missing_is_named(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:

@@ -18,12 +18,16 @@ def test_every_split_is_read_and_states_what_is_known() -> None:
     splits = {split: open_pairs(f"real:{split}") for split in ("train", "validation", "test")}
     assert [len(pairs) for pairs in splits.values()] == [3, 2, 4]
     assert len({name for pairs in splits.values() for name in pairs.names}) == 9  # type: ignore[attr-defined]
-    cameras = {split: {pair.camera for pair in pairs} for split, pairs in splits.items()}
+    cameras = {split: {pair.clean.camera for pair in pairs} for split, pairs in splits.items()}
     assert not cameras["validation"] & (cameras["train"] | cameras["test"])
     for pair in (pair for pairs in splits.values() for pair in pairs):
-        assert pair.color_known and pair.balance_known and pair.iso and pair.noisy is None
-        assert -0.01 < pair.raw.min() < 0.02 and pair.raw.max() <= 1.0 and pair.srgb.float().std() > 10
-        assert pair.own_noise is not None and 1e-7 < pair.own_noise[0] * pair.raw.mean() + pair.own_noise[1] < 3e-6
+        assert pair.clean.color_known and pair.balance_known and pair.clean.iso and pair.noisy is None
+        assert (
+            -0.01 < pair.clean.mosaic.min() < 0.02 and pair.clean.mosaic.max() <= 1.0 and pair.srgb.float().std() > 10
+        )
+        assert pair.clean.noise_profile is not None
+        shot_var, read_var = pair.clean.noise_profile
+        assert 1e-7 < shot_var * pair.clean.mosaic.mean() + read_var < 3e-6
     with pytest.raises(ValueError, match=r"real: .*validation"):
         open_pairs("real:all")
 

@@ -81,10 +81,10 @@ def test_frames_have_their_phones_pattern_and_axes(tmp_path: Path, mat73: Writer
     frames = SiddFrames(tmp_path)
     assert frames.names == [f"0001_001_{phone}_00100_00060_3200_L_{k}" for k in ("010", "011")]
     pair = frames[0]
-    assert pair.cfa == PHONES[phone][1] and pair.camera == PHONES[phone][0]
-    assert torch.equal(pair.raw, clean_frame(pair.cfa)), "rows are rows"
-    assert pair.noisy is not None and torch.equal(pair.noisy, noisy_frame(pair.raw, 10))
-    red, green_r, green_b, blue = pack(pair.raw, pair.cfa).mean(dim=(1, 2)).tolist()
+    assert pair.cfa == PHONES[phone][1] and pair.clean.camera == PHONES[phone][0]
+    assert torch.equal(pair.clean.mosaic, clean_frame(pair.cfa)), "rows are rows"
+    assert pair.noisy is not None and torch.equal(pair.noisy.mosaic, noisy_frame(pair.clean.mosaic, 10))
+    red, green_r, green_b, blue = pack(pair.clean.mosaic, pair.cfa).mean(dim=(1, 2)).tolist()
     assert red / green_r == pytest.approx(0.5, rel=0.02) and blue / green_b == pytest.approx(0.8, rel=0.02)
 
 
@@ -97,14 +97,14 @@ def test_the_patterns_are_the_published_ones() -> None:
 def test_colour_is_that_of_the_metadata_and_renders_grey_as_grey(tmp_path: Path, mat73: Writer) -> None:
     write_scene(tmp_path, mat73, "0001_001_S6_00100_00060_3200_L")
     pair = SiddFrames(tmp_path)[0]
-    assert pair.white_balance == pytest.approx((2.0, 1.0, 1.25))
-    assert torch.allclose(pair.color_matrix.sum(dim=1), torch.ones(3), atol=1e-5)
+    assert pair.clean.white_balance == pytest.approx((2.0, 1.0, 1.25))
+    assert torch.allclose(pair.clean.color_matrix.sum(dim=1), torch.ones(3), atol=1e-5)
     inside = pair.srgb[:, 8:-8, 8:-8].float()
     assert (inside - inside.mean(dim=0)).abs().max() <= 2 and inside.std() > 20
     to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
     for rgb in np.eye(3):
         camera = COLOUR @ to_xyz @ rgb / (COLOUR @ to_xyz @ np.ones(3))
-        assert np.allclose(pair.color_matrix.numpy() @ camera, rgb, atol=1e-5)
+        assert np.allclose(pair.clean.color_matrix.numpy() @ camera, rgb, atol=1e-5)
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
@@ -124,10 +124,13 @@ def test_noise_levels_are_measured_or_read_from_the_table(tmp_path: Path, mat73:
     name = "0001_001_IP_00100_00060_3200_L"
     write_scene(tmp_path, mat73, name, ("010",))
     pair = SiddFrames(tmp_path)[0]
-    assert pair.shot_var == pytest.approx(SHOT_VAR, rel=0.1) and pair.read_var == pytest.approx(READ_VAR, rel=0.6)
+    assert pair.noisy is not None and pair.noisy.noise_profile is not None
+    shot_var, read_var = pair.noisy.noise_profile
+    assert shot_var == pytest.approx(SHOT_VAR, rel=0.1) and read_var == pytest.approx(READ_VAR, rel=0.6)
     write_levels(tmp_path, [f"{name}, 0.01, 1e-4, 0.02, 2e-4, 0.07, 3e-4"])
     pair = SiddFrames(tmp_path)[0]
-    assert (pair.shot_var, pair.read_var) == pytest.approx((0.03, 2e-4)), "green counts twice"
+    assert pair.noisy is not None
+    assert pair.noisy.noise_profile == pytest.approx((0.03, 2e-4)), "green counts twice"
 
 
 def test_small_has_no_number_in_its_names_and_what_is_held_back_is_left_out(tmp_path: Path, mat73: Writer) -> None:
@@ -204,17 +207,19 @@ def test_blocks_have_the_pattern_of_their_scene(blocks: Path) -> None:
         pair = pairs[k]
         bright = torch.linspace(0.2, 1, 32)[k % 32]
         expected = flat_frame(pair.cfa) * bright
-        assert torch.allclose(pair.raw, expected) and pair.noisy is not None
-        packed = pack(pair.raw, pair.cfa).mean(dim=(1, 2))
+        assert torch.allclose(pair.clean.mosaic, expected) and pair.noisy is not None
+        packed = pack(pair.clean.mosaic, pair.cfa).mean(dim=(1, 2))
         assert packed[0] < packed[3] < packed[1], "red is darker than blue, blue than green"
-        assert pair.shot_var == pytest.approx(SHOT_VAR, rel=0.5) and pair.white_balance == (1, 1, 1)
+        assert pair.noisy.noise_profile is not None
+        assert pair.noisy.noise_profile[0] == pytest.approx(SHOT_VAR, rel=0.5) and pair.clean.white_balance == (1, 1, 1)
 
 
 def test_the_benchmark_and_its_submission(blocks: Path, tmp_path: Path) -> None:
     benchmark = SiddBenchmark(blocks)
     noisy = list(benchmark)
     assert len(noisy) == 1280 and noisy[0].name == f"{HELD_BACK[0]}_00" and noisy[0].cfa == CFA.GRBG
-    assert torch.equal(noisy[0].mosaic, SiddBlocks(blocks)[31].noisy)  # type: ignore[arg-type]
+    block = SiddBlocks(blocks)[31].noisy
+    assert block is not None and torch.equal(noisy[0].mosaic, block.mosaic)
     path = tmp_path / "SubmitRaw.csv"
     write_submission(path, (block.mosaic / 2 for block in benchmark), SIDE)
     assert torch.equal(read_submission(path), torch.stack([block.mosaic / 2 for block in noisy]))
@@ -275,7 +280,7 @@ def test_sidd_plus_has_a_pattern_for_each_frame(tmp_path: Path) -> None:
     (tmp_path / "siddplus_valid_bayer_patterns.csv").write_text("rggb\nbggr\n")
     pairs = open_pairs(f"siddplus:{tmp_path}")
     assert [pairs[k].cfa for k in (0, 31, 32, 63)] == [CFA.RGGB, CFA.RGGB, CFA.BGGR, CFA.BGGR] and len(pairs) == 64
-    assert torch.equal(pairs[40].raw, clean_frame(CFA.BGGR, SIDE, SIDE))
+    assert torch.equal(pairs[40].clean.mosaic, clean_frame(CFA.BGGR, SIDE, SIDE))
     (tmp_path / "siddplus_valid_bayer_patterns.csv").write_text("rggb\n")
     with pytest.raises(ValueError, match="patterns"):
         SiddPlusBlocks(tmp_path)[0]
@@ -376,8 +381,8 @@ def test_without_pictures_or_metadata_psnr_r_is_refused(
     savemat(shot / "0009_METADATA_RAW_010.MAT", {"metadata": tags})
     write_levels(tmp_path, [f"{SCENES[0]}, 0.01, 1e-4, 0.01, 1e-4, 0.01, 1e-4"])
     pairs = SiddBlocks(tmp_path)
-    assert pairs[0].rendered and psnr_r(camera, pairs[0]) < 60.0 and pairs[0].white_balance == (2.0, 1.0, 1.25)
-    assert not pairs[0].levels_from_clean and pairs[32].levels_from_clean and pairs[32].white_balance == (1, 1, 1)
+    assert pairs[0].rendered and psnr_r(camera, pairs[0]) < 60.0 and pairs[0].clean.white_balance == (2.0, 1.0, 1.25)
+    assert not pairs[0].levels_from_clean and pairs[32].levels_from_clean and pairs[32].clean.white_balance == (1, 1, 1)
     with pytest.raises(ValueError, match=f"{SCENES[1]}_00.*picture"):
         psnr_r(camera, pairs[32])
 

@@ -91,7 +91,7 @@ def test_estimated_levels_do_not_depend_on_the_clean_frame(monkeypatch: pytest.M
 
 
 def test_noise_of_the_callers_is_that_of_evaluate() -> None:
-    frame = replace(open_pairs("demo:test")[0], noisy=None, shot_var=None, read_var=None)
+    frame = replace(open_pairs("demo:test")[0], noisy=None)
     found = trials([frame], crop=10_000, strengths=choose_strengths("SonyA7S2", [1600, 6400]))
     assert {trial.strength for trial in found} == {"ISO 1600", "ISO 6400"}
     (told,) = (trial for trial in found if (trial.condition, trial.strength) == (TOLD, "ISO 6400"))

@@ -26,6 +26,7 @@ from rawaug.evaluation.trials import (
     own_noise_note,
     training_noise_note,
 )
+from rawaug.io import RawFrame
 from rawaug.noise import noise_model
 
 SHOT, READ = 1e-4, 2e-6
@@ -42,19 +43,19 @@ def reference() -> Pair:
     clean = scene()
     noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(1))
     raw = clean + noise * bayer.noise_variance(clean, SHOT, READ).sqrt()
-    return Pair("reference", torch.zeros(3, *clean.shape[1:], dtype=torch.uint8), raw, CFA.GRBG)
+    return Pair("reference", RawFrame(raw, CFA.GRBG), torch.zeros(3, *clean.shape[1:], dtype=torch.uint8))
 
 
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_a_perfect_denoiser_is_left_with_the_references_own_noise(reference: Pair, factor: int) -> None:
     noise = noise_model((1e-2, 1e-4))
     trial = make_trial(measure_own_noise([reference]).binned(factor).middles(256)[0], noise)
-    middle = as_frames([replace(reference, raw=scene())]).binned(factor).middles(256)[0]
-    truth = bayer.pack(middle.raw[None], CFA.GRBG)
+    middle = as_frames([replace(reference, clean=RawFrame(scene(), CFA.GRBG))]).binned(factor).middles(256)[0]
+    truth = bayer.pack(middle.clean.mosaic[None], CFA.GRBG)
     result = summary(score([RawDenoiser.of(lambda noisy: truth)], [trial]))
     assert result["own_noise"] == result["images"][0]["own_noise"] == pytest.approx(1.0, rel=0.1)
     assert own_noise_note({"perfect": result}).startswith("own noise of the references as a share of")
-    added = bayer.noise_variance(middle.raw, 1e-2, 1e-4).mean().item()
+    added = bayer.noise_variance(middle.clean.mosaic, 1e-2, 1e-4).mean().item()
     assert trial.variance is not None and trial.variance.mean().item() == pytest.approx(added, rel=0.1)
 
 
@@ -85,8 +86,8 @@ def test_the_clean_picture_states_its_own_noise(reference: Pair) -> None:
 
 def test_noise_as_weak_as_the_references_own_is_said() -> None:
     raw = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(0))
-    texture = Pair("texture", torch.zeros(3, 128, 128, dtype=torch.uint8), raw, CFA.RGGB)
-    assert measure_own_noise([texture])[0].own_noise is None, "no flat regions, no figure"
+    texture = Pair("texture", RawFrame(raw, CFA.RGGB), torch.zeros(3, 128, 128, dtype=torch.uint8))
+    assert measure_own_noise([texture])[0].clean.noise_profile is None, "no flat regions, no figure"
 
     def trial(own: float, added: float) -> Trial:
         return Trial(torch.zeros(1), torch.zeros(1), torch.full((1,), added), own=own)
@@ -101,4 +102,4 @@ def test_training_on_noisy_references_is_said_to_teach_their_noise(reference: Pa
     assert "real" in training_noise_note([reference], as_strong, ["real"])
     assert training_noise_note([reference], stronger, ["real"]) == ""
     assert training_noise_note([reference], as_strong, []) == training_noise_note([], as_strong, ["real"]) == ""
-    assert training_noise_note([replace(reference, noisy=reference.raw)], as_strong, ["real"]) == ""
+    assert training_noise_note([replace(reference, noisy=reference.clean)], as_strong, ["real"]) == ""

@@ -22,6 +22,7 @@ from rawaug.evaluation.figures import WINDOW, Panels, find_detail, plot_curves
 from rawaug.evaluation.page import Page, name_part
 from rawaug.evaluation.table_files import latex_table
 from rawaug.evaluation.trials import raw_trial
+from rawaug.io import RawFrame
 
 
 def scores(psnr: float) -> dict[str, Any]:
@@ -41,7 +42,8 @@ def page(tmp_path: Path) -> str:
     made.add_curves(plot_curves({"real": [log]}))
     generator = torch.Generator().manual_seed(0)
     raw = torch.rand(1, 200, 800, generator=generator)
-    pair = Pair("a <frame>", torch.zeros(3, 200, 800, dtype=torch.uint8), raw, CFA.GRBG, (2, 1, 1.6), torch.eye(3))
+    frame = RawFrame(raw, CFA.GRBG, white_balance=(2, 1, 1.6))
+    pair = Pair("a <frame>", frame, torch.zeros(3, 200, 800, dtype=torch.uint8))
     packed = bayer.pack(raw[None], CFA.GRBG)
     trial = raw_trial(pair, packed, packed, packed, None, CFA.GRBG)
     made.add_frame(Panels(trial, {"noisy": packed, "real": packed, "clean": packed}, {"real": "40.12 dB"}))

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from rawaug.data import demo_pairs
+from rawaug.data.pairs import Pair
 from rawaug.evaluation.psnr_r import block_psnr, psnr_r
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
@@ -19,11 +20,11 @@ def test_patch_by_patch_it_is_that_of_the_whole_mosaic() -> None:
     pair = demo_pairs("validation", count=1)[0]
     isp = DictionaryISP(ISPConfig(cfa="GRBG"))
     cast(Any, isp.stages["shading"]).mask.set(torch.zeros(2), torch.eye(2))
-    twice: dict[str, Any] = {key: torch.cat([getattr(pair, key)] * 2, 1) for key in ("srgb", "raw", "noisy")}
-    tall = replace(pair, **twice)
+    mosaic = torch.cat([pair.clean.mosaic] * 2, 1)
+    tall = Pair("tall", replace(pair.clean, mosaic=mosaic), torch.cat([pair.srgb] * 2, 1))
     with torch.no_grad():
         whole = isp.reverse(tall.srgb[None]).raw.clamp(0.0, 1.0)
-    assert psnr_r(isp, tall) == pytest.approx(patch_psnr(whole, tall.raw[None]).item(), abs=1e-5)
+    assert psnr_r(isp, tall) == pytest.approx(patch_psnr(whole, tall.clean.mosaic[None]).item(), abs=1e-5)
 
 
 def test_a_clipped_block_is_left_out() -> None:

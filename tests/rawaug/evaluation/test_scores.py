@@ -40,9 +40,9 @@ def middles(given: list[Pair]) -> list[Pair]:
 def test_the_noise_map_of_a_test_is_that_of_the_noisy_frame() -> None:
     """A test must not know the clean frame, not even through its noise map."""
     captured = demo_pairs("test", count=1)[0]
-    assert captured.shot_var is not None and captured.read_var is not None
-    drawn = replace(captured, noisy=None, shot_var=None, read_var=None)
-    for pair, levels in ((captured, (captured.shot_var, captured.read_var)), (drawn, (1e-2, 1e-4))):
+    assert captured.noisy is not None and captured.noisy.noise_profile is not None
+    drawn = replace(captured, noisy=None)
+    for pair, levels in ((captured, captured.noisy.noise_profile), (drawn, (1e-2, 1e-4))):
         sample = make_trial(pair, noise_model((1e-2, 1e-4)))
         assert not torch.equal(sample.noisy, sample.clean) and sample.noisy.min() < 0
         expected = levels[0] * sample.noisy.clamp_min(0.0) + levels[1]
@@ -53,7 +53,9 @@ def test_the_noise_map_of_a_test_is_that_of_the_noisy_frame() -> None:
 
 def test_scores_whose_levels_came_from_the_clean_frame_are_marked(capsys: pytest.CaptureFixture[str]) -> None:
     pair = demo_pairs("test", count=1)[0].middle(64)
-    measured = replace(pair, name="measured", shot_var=None, read_var=None)  # so that they are measured
+    assert pair.noisy is not None
+    bare = replace(pair.noisy, noise_profile=None)
+    measured = replace(pair, name="measured", noisy=bare)  # so that they are measured
     noise = noise_model((1e-2, 1e-4))
     trials = [make_trial(frame, noise) for frame in (pair, measured)]
     result = summary(score([RawDenoiser.of(lambda noisy: noisy * 0.99)], trials))
@@ -115,16 +117,18 @@ def test_the_first_result_that_is_not_finite_ends_it(kind: str, tmp_path: Path, 
 
 def test_a_capture_without_levels_is_the_test_case_and_its_levels_are_measured() -> None:
     pair = demo_pairs("test", count=1)[0]
-    assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
-    bare, noise = replace(pair, shot_var=None, read_var=None), noise_model("cycleisp_sidd")
+    assert pair.noisy is not None and pair.noisy.noise_profile is not None
+    bare = replace(pair, noisy=replace(pair.noisy, noise_profile=None))
+    noise = noise_model("cycleisp_sidd")
     with_levels, measured = (make_trial(p, noise) for p in (pair, bare))
     assert measured.variance is not None and with_levels.variance is not None
     assert torch.equal(measured.noisy, with_levels.noisy)
     assert (measured.variance / with_levels.variance).mean() == pytest.approx(1.0, abs=0.1)
     levels = measured.levels
     assert levels is not None
-    y = pair.raw.mean().item()
-    assert levels[0] * y + levels[1] == pytest.approx(pair.shot_var * y + pair.read_var, rel=0.1)
+    y = pair.clean.mosaic.mean().item()
+    shot_var, read_var = pair.noisy.noise_profile
+    assert levels[0] * y + levels[1] == pytest.approx(shot_var * y + read_var, rel=0.1)
 
 
 def test_classical_denoisers_stand_beside_it(identity: Path, given: list[Pair]) -> None:
@@ -138,7 +142,7 @@ def test_classical_denoisers_stand_beside_it(identity: Path, given: list[Pair]) 
 
 
 def test_noise_of_another_kind_is_scored_without_stabilisation() -> None:
-    pair = replace(demo_pairs("test", count=1)[0], noisy=None, shot_var=None, read_var=None)
+    pair = replace(demo_pairs("test", count=1)[0], noisy=None)
     noise = noise_model((0.0, 1e-3))
     noisy, denoised = score([NOISY, RawDenoiser.of("Wavelet")], [make_trial(pair, noise)])
     assert denoised.psnr > noisy.psnr + 3.0
@@ -149,7 +153,8 @@ def test_the_development_is_the_same_for_both() -> None:
     pair = demo_pairs("test", count=1)[0]
     trial = make_trial(pair, noise_model("cycleisp_sidd"))
     whole = compare_images(trial.noisy, trial)
-    dark = replace(make_trial(replace(pair, raw=pair.raw / 2), noise_model((0.0, 0.0))), noisy=trial.noisy / 2)
+    halved = replace(pair, clean=replace(pair.clean, mosaic=pair.clean.mosaic / 2))
+    dark = replace(make_trial(halved, noise_model((0.0, 0.0))), noisy=trial.noisy / 2)
     half = compare_images(dark.noisy, dark)
     assert half[2:] == pytest.approx(whole[2:], rel=1e-4) and half[0] == pytest.approx(whole[0] + 6.02, abs=0.01)
 

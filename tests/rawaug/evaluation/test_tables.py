@@ -17,6 +17,7 @@ from rawaug.evaluation.figures import Panels, save_picture
 from rawaug.evaluation.tables import mean_and_spread, print_table
 from rawaug.evaluation.trials import raw_trial
 from rawaug.evaluation.verdict import verdict
+from rawaug.io import RawFrame
 
 
 @pytest.fixture
@@ -26,20 +27,23 @@ def grey_pair() -> Pair:
     raw = bayer.mosaic(light[:, None, None].expand(3, 32, 32), "GBRG")
     srgb = torch.zeros(3, 32, 32, dtype=torch.uint8)
     matrix = torch.tensor([[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.0, -0.5, 1.5]])
-    return Pair("grey", srgb, raw, CFA.GBRG, (2.0, 1.0, 1.6), matrix)
+    return Pair("grey", RawFrame(raw, CFA.GBRG, white_balance=(2.0, 1.0, 1.6), color_matrix=matrix), srgb)
 
 
 def test_grey_is_developed_to_grey_and_the_brightest_near_white(grey_pair: Pair) -> None:
-    packed = bayer.pack(grey_pair.raw[None], "GBRG")
+    packed = bayer.pack(grey_pair.clean.mosaic[None], "GBRG")
     panel = develop_packed(packed, CFA.GBRG, grey_pair)
     torch.testing.assert_close(panel, panel[:1].expand(3, 32, 32), atol=1e-5, rtol=0)
     assert panel.mean().item() == pytest.approx(0.665, abs=0.002)  # the sRGB value of linear 0.4
     assert exposure_gain(packed, grey_pair) * 0.4 == pytest.approx(0.9, abs=1e-4)
-    assert exposure_gain(packed * 0, replace(grey_pair, raw=grey_pair.raw * 0)) < 1e4
+    assert (
+        exposure_gain(packed * 0, replace(grey_pair, clean=replace(grey_pair.clean, mosaic=0 * grey_pair.clean.mosaic)))
+        < 1e4
+    )
 
 
 def test_the_figure_is_written(grey_pair: Pair, tmp_path: Path) -> None:
-    packed = bayer.pack(grey_pair.raw[None], "GBRG")
+    packed = bayer.pack(grey_pair.clean.mosaic[None], "GBRG")
     trial = raw_trial(grey_pair, packed, packed, packed, None, CFA.GBRG)
     row = Panels(trial, {"noisy": packed, "clean": packed}, {"noisy": "20.00 dB", "clean": "grey"})
     assert save_picture([row], tmp_path / "new" / "figure.png").stat().st_size > 1000

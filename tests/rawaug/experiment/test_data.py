@@ -17,7 +17,7 @@ from rawaug.data.frames import as_frames
 from rawaug.experiment.data import name_given_pairs, open_frames, read_frames, require_usable, use_all_pairs
 from rawaug.experiment.recipe import find_recipe, read_recipe, recipe_list, shipped_recipes
 from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
-from rawaug.io import write_picture
+from rawaug.io import RawFrame, write_picture
 from rawaug.training.config import TrainConfig
 
 ARMS = {"real": ArmConfig()}
@@ -114,7 +114,7 @@ def test_pairs_from_python_are_divided_and_seen_by_their_content(data: DataConfi
     frames = opened(recipe, pairs=pairs, test=test)
     assert list(frames["pairs"]) == pairs[:4] and list(frames["validation"]) == pairs[4:]
     assert list(frames["test"]) == test[:1]
-    other = replace(pairs[4], raw=pairs[4].raw * 0.5)
+    other = replace(pairs[4], clean=replace(pairs[4].clean, mosaic=pairs[4].clean.mosaic * 0.5))
     changed = opened(recipe, pairs=[*pairs[:4], other], test=test)
     assert as_frames(frames["validation"]).stamps() != as_frames(changed["validation"]).stamps()
     assert as_frames(frames["pairs"]).stamps() == as_frames(changed["pairs"]).stamps()
@@ -136,8 +136,8 @@ def test_validation_and_test_frames_are_binned_and_cropped_and_training_frames_a
     recipe = Recipe(arms=ARMS, data=replace(data, bin=4, validation_crop=None, test_crop=32))
     frames = opened(recipe, **given)
     (watched,) = shots["validation"]
-    assert torch.equal(frames["validation"][0].raw, bin_mosaic(watched.raw, watched.cfa, 4))
-    assert frames["test"][0].raw.shape == (1, 32, 32) and frames["pairs"][0] is shots["train"][0]
+    assert torch.equal(frames["validation"][0].clean.mosaic, bin_mosaic(watched.clean.mosaic, watched.cfa, 4))
+    assert frames["test"][0].clean.mosaic.shape == (1, 32, 32) and frames["pairs"][0] is shots["train"][0]
 
 
 def test_two_folders_may_use_the_same_names(own: Path, data: DataConfig, tmp_path: Path) -> None:
@@ -149,8 +149,8 @@ def test_two_folders_may_use_the_same_names(own: Path, data: DataConfig, tmp_pat
 
 
 def test_what_frames_lack_is_found_before_anything_is_fitted() -> None:
-    flat = torch.zeros(1, 72, 72)
-    pair = Pair("a", torch.zeros(3, 72, 72, dtype=torch.uint8), flat, "RGGB", noisy=flat)  # type: ignore[arg-type]
+    flat = RawFrame(torch.zeros(1, 72, 72), "RGGB")
+    pair = Pair("a", flat, torch.zeros(3, 72, 72, dtype=torch.uint8), flat)
     recipe = Recipe(arms={"r2r": ArmConfig(estimator="r2r")}, data=DataConfig())
     with pytest.raises(ValueError, match="levels"):
         require_usable(recipe, [pair], [])
@@ -163,7 +163,7 @@ def test_what_frames_lack_is_found_before_anything_is_fitted() -> None:
         require_usable(replace(supervised, train=replace(supervised.train, crop=68)), [pair], [])
     require_usable(replace(supervised, train=replace(supervised.train, crop=66)), [pair], [])
     with pytest.raises(ValueError, match="white balance"):
-        require_usable(supervised, [replace(pair, color_known=False)], [])
+        require_usable(supervised, [replace(pair, clean=replace(pair.clean, color_known=False))], [])
     require_usable(replace(supervised, isp="universal", train=replace(supervised.train, crop=66)), [pair], [])
 
 

@@ -54,7 +54,7 @@ class BurstTask(RawTask):
 
     def test(self, frames, isp, noise):
         def make(pair):
-            clean = replace(pair, noisy=None, shot_var=None, read_var=None)
+            clean = replace(pair, noisy=None)
             return make_trial(clean, self.noise, isp.cfa, condition=f"{self.recipe.shots} shots")
 
         return make_trials(frames, make)

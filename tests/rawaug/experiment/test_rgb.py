@@ -22,6 +22,7 @@ from rawaug.experiment.full_colour import RgbRecipe, demosaic_mosaic, full_colou
 from rawaug.experiment.run import run
 from rawaug.experiment.run import run as train_denoiser
 from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
+from rawaug.io import RawFrame
 from rawaug.io.pictures import decode_srgb
 from rawaug.metrics import psnr
 from rawaug.noise import noise_model
@@ -35,7 +36,7 @@ def a_pair(cfa: CFA = CFA.RGGB, name: str = "scene") -> Pair:
     y, x = torch.meshgrid(torch.linspace(0, 3, 192), torch.linspace(0, 4, 256), indexing="ij")
     rgb = torch.stack([0.2 + 0.1 * x.sin(), 0.5 + 0.2 * y.cos(), 0.3 + 0.1 * (x + y).sin()])
     srgb = torch.zeros(3, 192, 256, dtype=torch.uint8)
-    return Pair(name, srgb, bayer.mosaic(rgb, cfa), cfa, white_balance=(2.0, 1.0, 1.5))
+    return Pair(name, RawFrame(bayer.mosaic(rgb, cfa), cfa, white_balance=(2.0, 1.0, 1.5)), srgb)
 
 
 @pytest.mark.parametrize("cfa", list(CFA))
@@ -43,7 +44,7 @@ def test_a_pixel_of_the_truth_is_a_cell_of_the_frame(cfa: CFA) -> None:
     pair = a_pair(cfa)
     truth = full_colour(pair)
     assert truth.shape == (1, 3, 96, 128)
-    cell = pair.raw[0, 20:22, 30:32].flatten().tolist()
+    cell = pair.clean.mosaic[0, 20:22, 30:32].flatten().tolist()
     by_colour = {c: [v for v, colour in zip(cell, cfa.value, strict=True) if colour == c] for c in "RGB"}
     expected = [sum(values) / len(values) for values in by_colour.values()]
     assert truth[0, :, 10, 15].tolist() == pytest.approx(expected)
@@ -55,7 +56,7 @@ def test_the_truth_of_a_grey_scene_is_grey(cfa: CFA, factor: int) -> None:
     """The colours of a cell are means around one centre: of a photograph as soft as lenses make them."""
     light = decode_srgb(demo_pictures(2)[1][:, :320, :448].float() / 255.0).mean(0)[None, None]
     grey = F.avg_pool2d(F.interpolate(light, size=(642, 898), mode="bicubic"), 3, stride=1)[0]
-    pair = Pair("grey", torch.zeros(3, 640, 896, dtype=torch.uint8), grey, cfa)
+    pair = Pair("grey", RawFrame(grey, cfa), torch.zeros(3, 640, 896, dtype=torch.uint8))
     recipe = small(Path(), data=DataConfig(pairs=None, validation=None, test_crop=None, bin=factor))
     frames, _ = open_frames(recipe, {"test": [pair]})
     truth = full_colour(frames["test"][0])

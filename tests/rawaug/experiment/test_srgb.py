@@ -64,8 +64,8 @@ def trials(pairs: list[Pair]) -> list[Trial]:
 
 def test_libraw_develops_grey_to_grey_by_its_own_curve(pairs: list[Pair]) -> None:
     pair, light = pairs[0], 0.2
-    mosaic = torch.empty_like(pair.raw)
-    for (i, j), gain in zip(pair.cfa.sites, [pair.white_balance[c] for c in (0, 1, 1, 2)], strict=True):
+    mosaic = torch.empty_like(pair.clean.mosaic)
+    for (i, j), gain in zip(pair.cfa.sites, [pair.clean.white_balance[c] for c in (0, 1, 1, 2)], strict=True):
         mosaic[:, i::2, j::2] = light / gain
     srgb = developed(mosaic, pair)[0, :, 8:-8, 8:-8]
     expected = 1.099 * light**0.45 - 0.099  # BT.709
@@ -78,7 +78,7 @@ def test_noise_is_that_of_the_level_the_same_for_all(trials: list[Trial], pairs:
     assert psnr(weak.noisy, weak.clean) > 55 and torch.equal(weak.clean, strong.clean)
     raw = strong.inputs["raw"]
     assert raw.variance is not None
-    clean = pack(pairs[0].raw[None], pairs[0].cfa)
+    clean = pack(pairs[0].clean.mosaic[None], pairs[0].cfa)
     noise, told = raw.image - clean, raw.variance.mean().item()
     assert noise[clean < 0.9].var().item() == pytest.approx(told, rel=0.05)
     (again,) = srgb_trials(pairs[:1], LEVELS[1:], "again")
@@ -174,8 +174,8 @@ def test_the_strength_of_a_filter_is_chosen_on_validation_whatever_the_test_fram
 ) -> None:
     """Flat validation frames choose a strong filter, which test frames with detail would not have chosen."""
     test = pairs[0]
-    flat = replace(test, name="flat", raw=torch.full_like(test.raw, 0.2))
-    detailed = replace(test, name="detailed", raw=test.raw.clone())
+    flat = replace(test, name="flat", clean=replace(test.clean, mosaic=torch.full_like(test.clean.mosaic, 0.2)))
+    detailed = replace(test, name="detailed", clean=replace(test.clean, mosaic=test.clean.mosaic.clone()))
     recipe = replace(RECIPE, classical=["NonLocalMeans"], out=str(tmp_path))
     found = {}
     for frame in (flat, detailed):

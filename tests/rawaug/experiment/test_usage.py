@@ -99,8 +99,9 @@ def test_the_help_lists_the_networks_of_the_registry(capsys: pytest.CaptureFixtu
 
 
 def test_frames_without_known_noise_ask_for_the_command_to_type() -> None:
+    pair = replace(demo_pairs("train", count=1)[0], noisy=None)
     with pytest.raises(ValueError, match="noise: camera"):
-        frame_levels(replace(demo_pairs("train", count=1)[0], shot_var=None, read_var=None), None)
+        frame_levels(pair, None)
 
 
 def test_frames_with_next_to_no_noise_are_named_before_training() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ import torch
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
+from rawaug.io import RawFrame
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 
@@ -49,10 +51,11 @@ def make_pair(
     raw = linear / torch.tensor(white_balance)[:, None, None] * torch.exp(-0.5 * fall_off * (x**2 + y**2))
     mosaic = bayer.mosaic(raw, "GRBG")
     inverse = torch.linalg.inv(matrix)
+    clean = RawFrame(mosaic, CFA.GRBG, white_balance=white_balance, color_matrix=inverse, camera=camera)
     if shot_var is None:
-        return Pair(name, srgb, mosaic, CFA.GRBG, white_balance, inverse, camera=camera)
+        return Pair(name, clean, srgb)
     noisy = mosaic + (shot_var * mosaic).sqrt() * torch.randn(mosaic.shape, generator=generator)
-    return Pair(name, srgb, mosaic, CFA.GRBG, white_balance, inverse, noisy, shot_var, 0.0, camera)
+    return Pair(name, clean, srgb, replace(clean, mosaic=noisy, noise_profile=(shot_var, 0.0)))
 
 
 @pytest.fixture(scope="session")

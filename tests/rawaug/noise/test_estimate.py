@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from torch.nn.functional import interpolate
 from rawaug.bayer import CFA, bin_mosaic_variance, unpack
 from rawaug.data import Pair
 from rawaug.evaluation.trials import measure_own_noise
+from rawaug.io import RawFrame
 from rawaug.noise import (
     DefectPixels,
     FixedLevels,
@@ -236,28 +238,31 @@ def patches(height: int = 1024, width: int = 1280) -> Tensor:
 def reference(truth: Tensor) -> Pair:
     noise = torch.randn(truth.shape, generator=torch.Generator().manual_seed(1))
     raw = truth + noise * (OWN[0] * truth + OWN[1]) ** 0.5
-    return Pair("frame", torch.zeros(3, *truth.shape[1:], dtype=torch.uint8), raw, CFA.GRBG)
+    return Pair("frame", RawFrame(raw, CFA.GRBG), torch.zeros(3, *truth.shape[1:], dtype=torch.uint8))
 
 
 @pytest.mark.parametrize(("factor", "together"), [(1, False), (4, False), (4, True)])
 def test_the_share_of_a_known_own_noise_is_found(factor: int, together: bool) -> None:
     truth = patches()
     pairs = measure_own_noise([reference(truth)]).binned(factor, together)
-    clean = Pair("truth", reference(truth).srgb, truth, CFA.GRBG).binned(factor, together).raw
+    whole = Pair("truth", RawFrame(truth, CFA.GRBG), reference(truth).srgb)
+    clean = whole.binned(factor, together).clean.mosaic
     denoised = clean + 3e-3 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(2))
-    error = (denoised - pairs[0].raw).square().mean().item()
-    levels = pairs[0].own_noise
+    error = (denoised - pairs[0].clean.mosaic).square().mean().item()
+    levels = pairs[0].clean.noise_profile
     assert levels is not None
-    known = (clean - pairs[0].raw).square().mean().item() / error
-    assert 0.05 < known < 0.95 and own_noise_share(levels, pairs[0].raw, error) == pytest.approx(known, rel=0.1)
+    known = (clean - pairs[0].clean.mosaic).square().mean().item() / error
+    assert 0.05 < known < 0.95 and own_noise_share(levels, pairs[0].clean.mosaic, error) == pytest.approx(
+        known, rel=0.1
+    )
 
 
 def test_what_cannot_be_measured_is_unknown_and_what_is_stated_is_taken() -> None:
     small = reference(patches(64, 64))
-    assert own_noise(small.raw, small.cfa) is None
-    stated = Pair("a", small.srgb, small.raw, small.cfa, own_noise=(3.2e-5, 1.6e-7))
+    assert own_noise(small.clean.mosaic, small.cfa) is None
+    stated = replace(small, clean=replace(small.clean, noise_profile=(3.2e-5, 1.6e-7)))
     for together, left in ((False, bin_mosaic_variance(4)), (True, bin_mosaic_variance(4, together=True))):
-        assert measure_own_noise([stated]).binned(4, together)[0].own_noise == pytest.approx(
+        assert measure_own_noise([stated]).binned(4, together)[0].clean.noise_profile == pytest.approx(
             (3.2e-5 * left, 1.6e-7 * left)
         )
 

@@ -10,6 +10,7 @@ import torch
 
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
+from rawaug.io import RawFrame
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 
@@ -45,7 +46,9 @@ def frame_of(known_camera: DictionaryISP) -> FrameOf:
         with torch.no_grad():
             raw = known_camera.reverse(srgb[None], white_balance=light).raw[0]
         raw = (raw * LEVELS).round() / LEVELS
-        return Pair(name, srgb, raw, CFA.GRBG, light, torch.linalg.inv(torch.tensor(MATRIX)), camera="known")
+        matrix = torch.linalg.inv(torch.tensor(MATRIX))
+        clean = RawFrame(raw, CFA.GRBG, white_balance=light, color_matrix=matrix, camera="known")
+        return Pair(name, clean, srgb)
 
     return make
 

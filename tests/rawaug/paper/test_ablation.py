@@ -44,7 +44,7 @@ def test_the_figures_are_psnr_in_rgb_y_and_uv(known_camera: DictionaryISP, frame
     pair = frame_of("daylight")
     picked = (slice(None), slice(None, None, 4), slice(None, None, 4))
     x = (pair.srgb / 255.0)[picked].double()
-    raw = bayer.demosaic(pair.raw[None], pair.cfa)[0][picked].double()
+    raw = bayer.demosaic(pair.clean.mosaic[None], pair.cfa)[0][picked].double()
     yuv = torch.from_numpy(rgb2yuv((x - raw).numpy(), channel_axis=0))
     expected = [-10 * (part**2).mean().log10().item() for part in (x - raw, yuv[:1], yuv[1:])]
     assert stage_psnr(known_camera, pair, white_balance=False)[0] == pytest.approx(expected, abs=0.02)

@@ -16,7 +16,8 @@ from rawaug.paper.balanced import balanced_psnr, even_edges
 def test_a_flat_error_has_the_figure_of_the_formula(frame_of: Callable[..., Pair]) -> None:
     """RAW of 0.25 taken for 0.36: z is w^(1/2.2) times 0.5325 and 0.6285, by channel."""
     raw = torch.full((1, 64, 96), 0.25)
-    pair = replace(frame_of("flat", size=(64, 96)), raw=raw, white_balance=(2.0, 1.0, 1.6))
+    pair = frame_of("flat", size=(64, 96))
+    pair = replace(pair, clean=replace(pair.clean, mosaic=raw, white_balance=(2.0, 1.0, 1.6)))
     gains = [1.0, 0.5, 0.8]
     difference = 0.36 ** (1 / 2.2) - 0.25 ** (1 / 2.2)
     error = sum((gain ** (1 / 2.2) * difference) ** 2 for gain in gains) / 3

@@ -92,6 +92,11 @@ def test_the_piece_at_the_centre_is_scored_in_its_pattern(scored: list[Pair], tm
     for side in (None, 66):
         psnr_d(MODELS["upi"](), PICTURES, replace(TINY, test_crop=side), tmp_path, 0)
     small, large, same, piece = scored
-    assert torch.equal(same.raw, small.raw) and piece.raw.shape == (1, 66, 66) and piece.srgb.shape == (3, 66, 66)
+    assert (
+        torch.equal(same.clean.mosaic, small.clean.mosaic)
+        and piece.clean.mosaic.shape == (1, 66, 66)
+        and piece.srgb.shape == (3, 66, 66)
+    )
     assert piece.cfa == large.cfa
-    assert torch.equal(piece.raw, large.raw[:, 14:80, 32:98]) and torch.equal(piece.srgb, large.srgb[:, 14:80, 32:98])
+    assert torch.equal(piece.clean.mosaic, large.clean.mosaic[:, 14:80, 32:98])
+    assert torch.equal(piece.srgb, large.srgb[:, 14:80, 32:98])

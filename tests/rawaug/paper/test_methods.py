@@ -34,15 +34,16 @@ DAYLIGHT, LAMPS = (2.0, 1.0, 1.5), (1.2, 1.0, 2.6)
 
 def test_a_shipped_isp_is_a_method_and_is_not_fitted(frame_of: FrameOf, tmp_path: Path) -> None:
     frame = frame_of("one", size=(64, 96))
+    relabelled = replace(frame, clean=replace(frame.clean, cfa=CFA.RGGB))
     universal = DictionaryISP.from_pretrained("universal-small")
     universal.save(tmp_path / "own.safetensors")
     for name in ("universal-small", str(tmp_path / "own.safetensors")):
         assert is_method(name)
-        fitted = fit_family(name, [replace(frame, cfa=CFA.RGGB)], FitConfig(), TRAINING)
+        fitted = fit_family(name, [relabelled], FitConfig(), TRAINING)
         assert isinstance(fitted.model, DictionaryISP) and fitted.seconds == 0.0
         assert torch.equal(fitted.model.colour.atoms(), universal.colour.atoms())
     assert not is_method("universal-tiny")
-    rows = rows_of(fitted.model, replace(frame, cfa=CFA.RGGB), 1)
+    rows = rows_of(fitted.model, relabelled, 1)
     assert rows["samples"] > rows["blind"], "readings weigh tone curves as well"
     with pytest.raises(ValueError, match="RGGB"):
         fit_family("universal-small", [frame], FitConfig(), TRAINING)
@@ -73,7 +74,8 @@ def test_the_shots_gains_take_the_place_of_the_methods_own(method: Any, frame_of
     red, blue = ((daylight[0, k] / daylight[0, 1]).median() / (lamps[0, k] / lamps[0, 1]).median() for k in (0, 3))
     assert red.item() == pytest.approx(LAMPS[0] / DAYLIGHT[0], rel=0.02)
     assert blue.item() == pytest.approx(LAMPS[2] / DAYLIGHT[2], rel=0.02)
-    unknown = replace(frame_of("a"), white_balance=(1.0, 1.0, 1.0))
+    frame = frame_of("a")
+    unknown = replace(frame, clean=replace(frame.clean, white_balance=(1.0, 1.0, 1.0)))
     assert "as-shot" not in rows_of(model, unknown, 1), "no gains are known"
 
 
@@ -99,7 +101,9 @@ def test_the_forward_pass_is_scored_under_its_own_choice_of_light(
     right, wrong = (forward_psnr(known_camera, frame_of("a", light)) for light in (DAYLIGHT, LAMPS))
     assert right is not None and wrong is not None and wrong < right - 3.0
     assert forward_psnr(UPI(), frame_of("a")) is None
-    assert forward_psnr(known_camera, replace(frame_of("a"), color_known=False)) is None
+    frame = frame_of("a")
+    unknown = replace(frame, clean=replace(frame.clean, color_known=False))
+    assert forward_psnr(known_camera, unknown) is None
 
 
 FINE = torch.randint(30, 200, (3, 64, 96), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)

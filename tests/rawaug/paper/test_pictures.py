@@ -10,15 +10,14 @@ import torch
 
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.io import read_picture
+from rawaug.io import RawFrame, read_picture
 from rawaug.isp.model import DictionaryISP
 from rawaug.paper.pictures import SAMPLES, draw_frame
 
 PAIR = Pair(
     "frame",
+    RawFrame(0.2 * torch.rand(1, 300, 280, generator=torch.Generator().manual_seed(1)), CFA.RGGB),
     torch.randint(256, (3, 300, 280), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)),
-    0.2 * torch.rand(1, 300, 280, generator=torch.Generator().manual_seed(1)),
-    CFA.RGGB,
 )
 
 
@@ -27,7 +26,7 @@ def test_a_method_without_error_looks_as_the_raw_and_a_darker_one_darker(tmp_pat
         for top in range(0, 45, 2):
             for left in range(0, 25, 2):
                 if torch.equal(PAIR.srgb[:, top : top + 256, left : left + 256], patch[0]):
-                    return share * PAIR.raw[None, :, top : top + 256, left : left + 256]
+                    return share * PAIR.clean.mosaic[None, :, top : top + 256, left : left + 256]
         raise AssertionError("the patch is no part of the frame at a site of its pattern")
 
     for name, share in (("exact", 1.0), ("dark", 0.5)):

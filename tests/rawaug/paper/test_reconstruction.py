@@ -14,6 +14,7 @@ import torch
 
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
+from rawaug.io import RawFrame
 from rawaug.isp.fit import FitConfig
 from rawaug.paper import reconstruction
 from rawaug.paper.baselines import Training
@@ -44,7 +45,7 @@ class Laboratory:
         if self.pairs:
             return self.pairs
         srgb, raw = torch.zeros(3, 2, 2, dtype=torch.uint8), torch.zeros(1, 2, 2)
-        return [Pair(f"f{k}", srgb, raw, CFA.RGGB, (1.0, 1.0, 1.0), torch.eye(3)) for k in range(self.frames)]
+        return [Pair(f"f{k}", RawFrame(raw, CFA.RGGB), srgb) for k in range(self.frames)]
 
     def open_pictures(self, spec: str, min_side: int) -> list[torch.Tensor]:
         self.min_side = min_side
@@ -112,7 +113,7 @@ def test_a_published_split_is_fitted_once_and_scored_on_every_test_frame(
 ) -> None:
     scored: list[Pair] = []
     test = [
-        Pair(f"t{k}", torch.zeros(3, 6, 6, dtype=torch.uint8), torch.zeros(1, 6, 6), cfa)
+        Pair(f"t{k}", RawFrame(torch.zeros(1, 6, 6), cfa), torch.zeros(3, 6, 6, dtype=torch.uint8))
         for k, cfa in enumerate((CFA.RGGB, CFA.BGGR, CFA.GRBG))
     ]
 
@@ -128,7 +129,7 @@ def test_a_published_split_is_fitted_once_and_scored_on_every_test_frame(
     rows = compare(settings(tmp_path, test="blocks", methods=["dictionary"], seeds=1))
     assert laboratory.folds == [] and laboratory.wholes == [("dictionary", 0)], "one fit for all that is measured"
     assert rows["dictionary"]["frames"] == {"t0": [40.0], "t1": [41.0], "t2": [42.0]}
-    assert {pair.cfa for pair in scored} == {CFA.RGGB} and scored[1].raw.shape == (1, 4, 4)
+    assert {pair.cfa for pair in scored} == {CFA.RGGB} and scored[1].clean.mosaic.shape == (1, 4, 4)
     assert "3 frames of blocks" in capsys.readouterr().out
     with pytest.raises(ValueError, match=r"test: .*unseen"):
         compare(settings(tmp_path, test="known", name="other"))
@@ -195,7 +196,7 @@ def test_frames_that_cannot_make_a_table_are_refused(laboratory: Laboratory, tmp
     pairs = laboratory.open_pairs("", "")
     for odd, message in (
         (replace(pairs[1], registered=False), "f1 is not registered pixel by pixel; unet cannot share"),
-        (replace(pairs[1], cfa=CFA.BGGR), "f1 has a different CFA"),
+        (replace(pairs[1], clean=replace(pairs[1].clean, cfa=CFA.BGGR)), "f1 has a different CFA"),
         (replace(pairs[1], name="f0"), "several frames are named f0"),
     ):
         laboratory.pairs = [pairs[0], odd, pairs[2]]

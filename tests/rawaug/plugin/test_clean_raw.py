@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 import rawaug
-from rawaug.bayer import CFA, pack, pattern
+from rawaug.bayer import pack, pattern
 from rawaug.data.pairs import Pair
 from rawaug.io import RawFrame
 from rawaug.noise import RowNoise
@@ -77,7 +77,7 @@ def test_every_form_of_a_frame_is_the_same_raw(sites: Tensor) -> None:
         sites,
         sites[0].numpy(),
         RawFrame(sites, "GBRG"),
-        Pair("shot", srgb, sites, CFA.GBRG, (1.0, 1.0, 1.0), torch.eye(3)),
+        Pair("shot", RawFrame(sites, "GBRG"), srgb),
     ]
     noise = RawNoise(LEVELS, cfa="GBRG")
     expected = noise.apply(packed, noise.sample(packed, torch.Generator().manual_seed(0)))

@@ -152,7 +152,7 @@ def test_the_cameras_jpeg_is_taken_unless_it_is_refused(tmp_path: Path, shoot: S
 
 def test_pairs_are_fitted_as_they_are() -> None:
     pairs, other = rawaug.data.demo_pairs("train", count=2), rawaug.data.demo_pairs("validation", count=1)
-    unknown = replace(pairs[0], color_known=False)
+    unknown = replace(pairs[0], clean=replace(pairs[0].clean, color_known=False))
     with pytest.raises(ValueError, match=r"train_00_astronaut: .*balance"):
         rawaug.fit([unknown], progress=False, noise="off", **SETTINGS)
     isp = rawaug.fit(pairs, progress=False, noise="off", held_out=other, **SETTINGS)

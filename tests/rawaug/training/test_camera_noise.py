@@ -39,7 +39,7 @@ def noisy_pair() -> Pair:
     packed = bayer.pack(raw[None], "GRBG")
     noisy = bayer.unpack(noise.apply(packed, noise.sample(1, generator)), "GRBG")[0]
     srgb = (scene ** (1 / 2.2) * 255).round().to(torch.uint8)
-    return Pair("chart", srgb, raw, CFA.GRBG, (1.0, 1.0, 1.0), torch.eye(3), noisy=noisy)
+    return Pair("chart", RawFrame(raw, CFA.GRBG), srgb, RawFrame(noisy, CFA.GRBG))
 
 
 def test_the_capture_is_measured_and_stored(noisy_pair: Pair, tmp_path: Path) -> None:
@@ -62,8 +62,8 @@ def test_dark_frames_set_the_read_variance(noisy_pair: Pair, tmp_path: Path, bay
 def with_variance(pair: Pair, shot_var: float, read_var: float, seed: int = 1) -> Pair:
     """The pair with noise of the variance ``shot_var y + read_var``, which no sensor need have."""
     generator = torch.Generator().manual_seed(seed)
-    noise = torch.randn(pair.raw.shape, generator=generator) * (shot_var * pair.raw + read_var).sqrt()
-    return replace(pair, noisy=pair.raw + noise)
+    noise = torch.randn(pair.clean.mosaic.shape, generator=generator) * (shot_var * pair.clean.mosaic + read_var).sqrt()
+    return replace(pair, noisy=replace(pair.clean, mosaic=pair.clean.mosaic + noise))
 
 
 def test_what_is_refused_is_reported_or_raised_as_is_asked(noisy_pair: Pair) -> None:
@@ -89,7 +89,7 @@ def test_the_limits_are_a_slope_above_0_and_half_the_variance_explained(
         return replace(found, shot_var=shot_var, r2=r2)
 
     assert noisy_pair.noisy is not None
-    found = estimate_noise(noisy_pair.noisy, noisy_pair.cfa)
+    found = estimate_noise(noisy_pair.noisy.mosaic, noisy_pair.cfa)
     monkeypatch.setattr("rawaug.training.camera_noise.estimate_noise", estimate)
     if accepted:
         assert measure_camera_noise([noisy_pair])[0].at(None)[0] == shot_var
@@ -99,7 +99,8 @@ def test_the_limits_are_a_slope_above_0_and_half_the_variance_explained(
 
 
 def at_iso(pair: Pair, iso: float | None, shot_var: float, camera: str = "Maker Model") -> Pair:
-    return replace(with_variance(pair, shot_var, shot_var / 25), iso=iso, camera=camera)
+    pair = replace(pair, clean=replace(pair.clean, iso=iso, camera=camera))
+    return with_variance(pair, shot_var, shot_var / 25)
 
 
 def test_a_law_over_iso_is_measured_stored_and_drawn_from(noisy_pair: Pair, tmp_path: Path) -> None:
@@ -144,7 +145,7 @@ def test_denoise_takes_the_law_at_the_files_iso(noisy_pair: Pair, tmp_path: Path
     save(build("PMRID", width=4, variance_map=True), weights, {"cfa": "RGGB", "noise": law.spec()})
     stored = load_noise("camera", RawDenoiser.of(weights))
     frame = RawFrame(
-        noisy_pair.raw, CFA.GRBG, (0.0, 0.0, 0.0, 0.0), 4095.0, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0), torch.eye(3),
+        noisy_pair.clean.mosaic, CFA.GRBG, (0.0, 0.0, 0.0, 0.0), 4095.0, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0), torch.eye(3),
         camera="Maker Model", iso=400, noise_profile=None, orientation=0, name="a",
     )  # fmt: skip
     assert find_levels(frame, stored) == (8e-4, 1e-5, "camera")

@@ -95,7 +95,10 @@ def test_noise_of_unknown_levels_is_refused(pictures: list[torch.Tensor]) -> Non
 def test_a_self_supervised_recipe_never_meets_a_clean_frame(pictures: list[torch.Tensor]) -> None:
     """Its samples and its validation are the same whatever the clean frames are."""
     pairs = demo_pairs("train", count=2)
-    spoilt = [replace(pair, raw=torch.zeros_like(pair.raw), srgb=0 * pair.srgb) for pair in pairs]
+    spoilt = []
+    for pair in pairs:
+        black = replace(pair.clean, mosaic=0 * pair.clean.mosaic)
+        spoilt.append(replace(pair, clean=black, srgb=0 * pair.srgb))
     recipe = Recipe(arms={"r2r": ArmConfig(0.5, estimator="r2r")}, train=TrainConfig(batch=2, crop=32))
     isp, noise = DictionaryISP(), noise_model("cycleisp_sidd")
 
@@ -112,7 +115,7 @@ def test_a_self_supervised_recipe_never_meets_a_clean_frame(pictures: list[torch
 
 
 def test_frames_as_shot_need_measured_levels() -> None:
-    pair = replace(demo_pairs("train", count=1)[0], noisy=None, shot_var=None, read_var=None)
+    pair = replace(demo_pairs("train", count=1)[0], noisy=None)
     assert drop_clean(pair) is pair
     with pytest.raises(ValueError, match=r"train_00_astronaut: .*levels"):
         noisy_frame(pair, None)
@@ -176,7 +179,7 @@ def test_the_held_out_score_ranks_as_clean_frames_do() -> None:
     pair = demo_pairs("validation", count=1)[0]
     frame = noisy_frame(drop_clean(pair), None)
     (sample,) = r2r_trials([frame], pair.cfa)
-    clean = bayer.pack(pair.raw[None], pair.cfa)
+    clean = bayer.pack(pair.clean.mosaic[None], pair.cfa)
     errors = [float(((1 - t) * clean + t * sample.noisy - sample.clean).square().mean()) for t in (0.0, 0.1, 0.3, 1.0)]
     assert errors == sorted(errors)
     (again,) = r2r_trials([frame], pair.cfa)
@@ -217,9 +220,11 @@ def test_each_estimator_learns_to_denoise_from_one_noisy_frame(estimator: SelfSu
 def test_r2rs_target_hardly_depends_on_the_noise_of_its_input() -> None:
     """What of the target a cubic in the input's noise explains, in standard deviations of the noise."""
     pair = demo_pairs("validation", count=1)[0]
-    deviation = (8e-3 * pair.raw + 3e-4).sqrt()
-    noisy = pair.raw + deviation * torch.randn(pair.raw.shape, generator=torch.Generator().manual_seed(0))
-    clean, shot, sd = (bayer.pack(mosaic[None], pair.cfa)[0] for mosaic in (pair.raw, noisy, deviation))
+    deviation = (8e-3 * pair.clean.mosaic + 3e-4).sqrt()
+    noisy = pair.clean.mosaic + deviation * torch.randn(
+        pair.clean.mosaic.shape, generator=torch.Generator().manual_seed(0)
+    )
+    clean, shot, sd = (bayer.pack(mosaic[None], pair.cfa)[0] for mosaic in (pair.clean.mosaic, noisy, deviation))
 
     def explained(signal: torch.Tensor) -> float:
         crop = NoisyCrop(shot[None], bayer.pack(signal[None], pair.cfa)[0], 8e-3, 3e-4)
@@ -229,16 +234,16 @@ def test_r2rs_target_hardly_depends_on_the_noise_of_its_input() -> None:
         powers = noise[:, None] ** torch.arange(4)
         return float((powers @ torch.linalg.lstsq(powers, error[:, None]).solution).square().mean().sqrt())
 
-    assert explained(pair.raw) < 0.05, "the true signal"
+    assert explained(pair.clean.mosaic) < 0.05, "the true signal"
     assert explained(signal_estimate(noisy, 8e-3, 3e-4, pair.cfa)) < 0.1
     assert explained(noisy) > 0.2, "the noisy signal"
 
 
 def test_the_estimate_is_nearer_to_the_scene_than_the_frame_finite_and_left_out_without_shot_noise() -> None:
     pair = demo_pairs("validation", count=1)[0]
-    assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
-    estimate = signal_estimate(pair.noisy, pair.shot_var, pair.read_var, pair.cfa)
-    before, after = ((x - pair.raw).square().mean() for x in (pair.noisy, estimate))
+    assert pair.noisy is not None and pair.noisy.noise_profile is not None
+    estimate = signal_estimate(pair.noisy.mosaic, *pair.noisy.noise_profile, pair.cfa)
+    before, after = ((x - pair.clean.mosaic).square().mean() for x in (pair.noisy.mosaic, estimate))
     assert after < 0.7 * before
     dark = 1e-2 * torch.randn(1, 64, 64, generator=torch.Generator().manual_seed(0))
     for frame in (dark, 0 * dark):

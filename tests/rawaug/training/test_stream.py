@@ -11,6 +11,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA, noise_variance
 from rawaug.data import demo_pairs, demo_photographs, demo_pictures
 from rawaug.data.pairs import Pair
+from rawaug.io import RawFrame
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.plugin.augment import RawAugment
@@ -25,7 +26,7 @@ def colour_pair(cfa: CFA) -> Pair:
     """A frame that is 0.2 at red, 0.5 at green and 0.8 at blue sites."""
     rgb = torch.tensor([0.2, 0.5, 0.8])[:, None, None].expand(3, 40, 48)
     srgb = torch.zeros(3, 40, 48, dtype=torch.uint8)
-    return Pair("colours", srgb, bayer.mosaic(rgb, cfa), cfa, (1, 1, 1), torch.eye(3))
+    return Pair("colours", RawFrame(bayer.mosaic(rgb, cfa), cfa), srgb)
 
 
 @pytest.mark.parametrize("cfa", list(CFA))
@@ -42,7 +43,7 @@ def test_crops_of_any_sensor_come_in_the_networks_pattern(cfa: CFA) -> None:
 def test_own_pictures_become_raw_at_the_sites_that_were_read(cfa: CFA) -> None:
     channels = bayer.mosaic(torch.arange(3)[:, None, None].expand(3, 24, 30), cfa)
     read = torch.nn.functional.one_hot(channels[0].long(), 3).movedim(2, 0)
-    pair = replace(colour_pair(cfa), srgb=(255 * read).to(torch.uint8), raw=torch.zeros(1, 24, 30))
+    pair = Pair("sites", RawFrame(torch.zeros(1, 24, 30), cfa), (255 * read).to(torch.uint8))
     crops = OwnPictureCrops([pair], RawAugment(DictionaryISP()), crop=16)
     for seed in range(16):
         patch, place = crops.draw_patch(pair, torch.Generator().manual_seed(seed))
@@ -54,9 +55,11 @@ def test_own_pictures_become_raw_at_the_sites_that_were_read(cfa: CFA) -> None:
 @pytest.mark.parametrize("source", ["captured", "drawn", "made of pictures"])
 def test_the_noise_map_of_a_sample_is_that_of_its_noisy_frame(source: str) -> None:
     """No network is told of the clean frame, not even through its noise map, wherever a sample comes from."""
-    pair = replace(demo_pairs("train", count=1)[0], shot_var=1e-2, read_var=1e-4)
+    pair = demo_pairs("train", count=1)[0]
+    assert pair.noisy is not None
+    pair = replace(pair, noisy=replace(pair.noisy, noise_profile=(1e-2, 1e-4)))
     if source == "drawn":
-        pair = replace(pair, noisy=None, shot_var=None, read_var=None)
+        pair = replace(pair, noisy=None)
     real = RealCrops([pair], noise_model((1e-2, 1e-4)), crop=32, cfa=pair.cfa)
     pictures = RawPairs(demo_pictures(1), RawAugment(DictionaryISP(), noise=(1e-2, 1e-4)), crop=32)
     stream = TrainingStream(real, pictures, batch=1, augmented=float("pictures" in source), seed=0)
@@ -69,8 +72,8 @@ def test_the_noise_map_of_a_sample_is_that_of_its_noisy_frame(source: str) -> No
 def test_a_captures_noise_is_never_renewed(levels: bool) -> None:
     pair = demo_pairs("train", count=1)[0]
     assert pair.noisy is not None
-    known = set(pair.noisy.flatten().tolist())
-    pair = pair if levels else replace(pair, shot_var=None, read_var=None)
+    known = set(pair.noisy.mosaic.flatten().tolist())
+    pair = pair if levels else replace(pair, noisy=replace(pair.noisy, noise_profile=None))
     crops = RealCrops([pair], noise_model("cycleisp_sidd"), crop=32, cfa=pair.cfa)
     for seed in range(4):
         assert set(crops.draw(torch.Generator().manual_seed(seed)).noisy.flatten().tolist()) <= known

@@ -89,7 +89,10 @@ def test_a_stopped_fit_goes_on_bit_for_bit(
     assert all(torch.equal(resumed[key], whole[key]) for key in whole)
 
     # of other settings, or of frames about which the files say something else, it is not used
-    liar, known = replace(exact_pairs[0], white_balance=(1.0, 1.0, 1.0)), list[bool]()
+    liar, known = (
+        replace(exact_pairs[0], clean=replace(exact_pairs[0].clean, white_balance=(1.0, 1.0, 1.0))),
+        list[bool](),
+    )
 
     class Noted(Descent):
         def __init__(self, *args: Any) -> None:
@@ -167,7 +170,8 @@ def test_a_fit_shows_the_forward_encoders_what_the_forward_pass_does(
     with torch.no_grad():
         cast(Any, isp.stages["shading"]).mask.set(torch.zeros(2), 3.0 * torch.eye(2))
     flat = isp.reverse(torch.full((1, 3, 32, 40), 0.5)).raw[0]
-    part, shots = sample_pixels([replace(exact_pair("shot", (1.6, 1.0, 1.7), 0, size=(32, 40)), raw=flat)], 64, 0)
+    pair = exact_pair("shot", (1.6, 1.0, 1.7), 0, size=(32, 40))
+    part, shots = sample_pixels([replace(pair, clean=replace(pair.clean, mosaic=flat))], 64, 0)
     seen: list[Tensor] = []
     isp.forward_encoders.colour.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
     if stage == "encoders":

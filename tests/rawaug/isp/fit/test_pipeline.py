@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from rawaug.data.pairs import Pair
+from rawaug.io import RawFrame
 from rawaug.isp.description import tone_table
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.fit import FitConfig, fit_isp
@@ -25,27 +26,27 @@ TINY = FitConfig(steps=3, curve_steps=30, pixels=512, batch=128, shading="off", 
 
 def error_db(isp: DictionaryISP, pair: Pair, white_balance: tuple[float, ...] | None = None) -> float:
     raw = isp.reverse(pair.srgb[None], white_balance=white_balance).raw
-    return psnr(raw, pair.raw[None]).item()
+    return psnr(raw, pair.clean.mosaic[None]).item()
 
 
 def test_it_recovers_matrix_and_gains(
     fitted: DictionaryISP, exact_pairs: list[Pair], camera_matrix: torch.Tensor
 ) -> None:
     torch.testing.assert_close(fitted.colour.atoms(), camera_matrix.expand(3, 3, 3), atol=0.02, rtol=0)
-    ratios = fitted.gain.atoms()[:3, 1:] / torch.tensor([p.white_balance for p in exact_pairs])[:, [0, 2]]
+    ratios = fitted.gain.atoms()[:3, 1:] / torch.tensor([p.clean.white_balance for p in exact_pairs])[:, [0, 2]]
     torch.testing.assert_close(ratios, torch.ones(3, 2), atol=0.02, rtol=0)
 
 
 def test_known_gains_give_an_unseen_shot(fitted: DictionaryISP, exact_pair: Callable[..., Pair]) -> None:
     unseen = exact_pair("unseen", (1.3, 1.0, 2.2), seed=9)
-    assert error_db(fitted, unseen, unseen.white_balance) > 55.0
+    assert error_db(fitted, unseen, unseen.clean.white_balance) > 55.0
     assert error_db(fitted, unseen) < 40.0  # blind, the gains cannot be guessed
 
 
 def test_the_forward_pass_renders_the_picture(exact_pair: Callable[..., Pair]) -> None:
     pair = exact_pair("shot", (1.6, 1.0, 1.5), 0, curve=lambda x: (3 * x**2 - 2 * x**3) ** 1.8)
     isp = fit_isp([pair], replace(QUICK, batch=512, shading="off"), progress=False)
-    rendered = isp.forward(pair.raw[None], white_balance=pair.white_balance).srgb
+    rendered = isp.forward(pair.clean.mosaic[None], white_balance=pair.clean.white_balance).srgb
     assert psnr(rendered, pair.srgb[None] / 255.0).item() > 33.0  # gamma alone: 25
 
 
@@ -54,7 +55,10 @@ def test_noisy_frames_give_the_constants_of_clean_ones(exact_pair: Callable[...,
     pairs = [exact_pair(f"shot{k}", balance, k, shot_var=5e-3) for k, balance in enumerate(balances)]
     config = replace(QUICK, steps=10, curve_steps=50, prior_steps=100, pixels=8192, shading="off")
     clean = fit_isp(pairs, config, progress=False)
-    unread = [replace(pair, raw=torch.full_like(pair.raw, torch.nan)) for pair in pairs]  # the clean RAW is not seen
+    unread = []  # the clean RAW is not seen
+    for pair in pairs:
+        unknown = replace(pair.clean, mosaic=torch.full_like(pair.clean.mosaic, torch.nan))
+        unread.append(replace(pair, clean=unknown))
     noisy = fit_isp(unread, replace(config, noisy=True), progress=False)
     srgb = pairs[0].srgb[None]
     torch.testing.assert_close(noisy.choose(srgb).gains, clean.choose(srgb).gains, rtol=0.03, atol=0)
@@ -65,8 +69,8 @@ def test_an_unregistered_pair_is_fitted_over_blocks(
     exact_pair: Callable[..., Pair], camera_matrix: torch.Tensor
 ) -> None:
     wide = exact_pair("jpeg", (1.6, 1.0, 1.5), 0, size=(192, 256))
-    raw, srgb = wide.raw[:, 8:-8, 8:-8], wide.srgb[:, 4:-12, 14:-2]  # 4 pixels down, 6 to the left
-    jpeg = replace(wide, raw=raw, srgb=srgb, registered=False)
+    raw, srgb = wide.clean.mosaic[:, 8:-8, 8:-8], wide.srgb[:, 4:-12, 14:-2]  # 4 pixels down, 6 to the left
+    jpeg = replace(wide, clean=replace(wide.clean, mosaic=raw), srgb=srgb, registered=False)
     isp = fit_isp([jpeg], replace(QUICK, batch=256, shading="off"), progress=False)
     torch.testing.assert_close(isp.colour.atoms()[0], camera_matrix, atol=0.05, rtol=0)
     assert error_db(isp, exact_pair("unseen", (1.6, 1.0, 1.5), 9)) > 40.0
@@ -79,11 +83,11 @@ def test_a_report_sees_the_isp_as_it_would_be_and_changes_nothing(
     scores = []
 
     def report(isp: DictionaryISP) -> str:
-        scores.append(error_db(isp, exact_pairs[0], exact_pairs[0].white_balance))
+        scores.append(error_db(isp, exact_pairs[0], exact_pairs[0].clean.white_balance))
         return f"{scores[-1]:.1f} dB"
 
     last = fit_isp(exact_pairs[:1], TINY, progress=False, report=report)
-    assert scores[-1] == pytest.approx(error_db(last, exact_pairs[0], exact_pairs[0].white_balance), abs=0.02)
+    assert scores[-1] == pytest.approx(error_db(last, exact_pairs[0], exact_pairs[0].clean.white_balance), abs=0.02)
     seen = last.state_dict()
     unseen = fit_isp(exact_pairs[:1], TINY, progress=False).state_dict()
     assert len(scores) == 2 and min(scores) > 45.0  # after 2 and 3 steps
@@ -94,9 +98,9 @@ def test_no_frame_and_a_white_frame_are_refused(exact_pairs: list[Pair], camera_
     with pytest.raises(ValueError, match="pair"):
         fit_isp([], TINY, progress=False)
     first = exact_pairs[0]
-    white = Pair(
-        "white", torch.full_like(first.srgb, 255), torch.ones_like(first.raw), first.cfa, (1, 1, 1), camera_matrix
-    )
+    saturated = torch.ones_like(first.clean.mosaic)
+    clean = RawFrame(saturated, first.cfa, white_balance=(1, 1, 1), color_matrix=camera_matrix)
+    white = Pair("white", clean, torch.full_like(first.srgb, 255))
     with pytest.raises(ValueError, match="unclipped"):
         fit_isp([white], TINY, progress=False)
 
@@ -105,7 +109,8 @@ def test_one_white_frame_of_ten_is_left_out_with_a_note(
     exact_pairs: list[Pair], capsys: pytest.CaptureFixture[str]
 ) -> None:
     first = exact_pairs[0]
-    white = replace(first, name="white", srgb=torch.full_like(first.srgb, 255), raw=torch.ones_like(first.raw))
+    saturated = replace(first.clean, mosaic=torch.ones_like(first.clean.mosaic))
+    white = replace(first, name="white", srgb=torch.full_like(first.srgb, 255), clean=saturated)
     others = [replace(first, name=f"copy {k}") for k in range(9)]
     isp = fit_isp([*others, white], TINY, progress=False)
     assert len(isp.info["frames"]) == 9 and "white" not in isp.info["frames"]
@@ -138,13 +143,13 @@ def test_a_curve_that_no_standard_has_is_found_and_serves_every_pass(exact_pair:
     assert isp.config.stages == ("curve", "colour", "gains") and isp.tone is not None
     assert (isp.tone.curves.diff(dim=1) >= 0).all() and isp.tone.curves[0, 0] == 0 and isp.tone.curves[0, -1] == 1
     unseen = exact_pair("unseen", (1.3, 1.0, 2.2), 9, curve=bent)
-    back = isp.reverse(unseen.srgb[None], white_balance=unseen.white_balance)
-    assert psnr(back.raw, unseen.raw[None]).item() > 52.0
+    back = isp.reverse(unseen.srgb[None], white_balance=unseen.clean.white_balance)
+    assert psnr(back.raw, unseen.clean.mosaic[None]).item() > 52.0
     baked = BakedISP(isp)(unseen.srgb[None], back.params)
     torch.testing.assert_close(
         baked, torch.nn.functional.pixel_unshuffle(back.raw, 2)[:, [1, 0, 3, 2]], atol=2e-4, rtol=0
     )
-    ahead = isp.forward(unseen.raw[None], white_balance=unseen.white_balance).srgb
+    ahead = isp.forward(unseen.clean.mosaic[None], white_balance=unseen.clean.white_balance).srgb
     assert psnr(ahead, unseen.srgb[None] / 255.0).item() > 38.0
 
 

@@ -12,6 +12,7 @@ from scipy.optimize import nnls
 
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
+from rawaug.io import RawFrame
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import sample_pixels
@@ -78,7 +79,7 @@ def test_two_cameras_in_one_fit_are_reported_apart_by_their_light(
         isp.colour.spread.fill_(torch.inf)
         alike = isp.reverse(unseen.srgb[None], isp.with_white_balance(isp.choose(unseen.srgb[None]), light))
         isp.colour.spread.copy_(isp_of_all)
-        scores = [psnr(result.raw, unseen.raw[None]).item() for result in (known, alike)]
+        scores = [psnr(result.raw, unseen.clean.mosaic[None]).item() for result in (known, alike)]
         assert scores[0] > 48.0 and scores[0] > scores[1] + 10.0
 
 
@@ -102,13 +103,15 @@ def test_clipped_readings_say_nothing_of_the_gains(
 ) -> None:
     gains = (2.0, 1.0, 1.5)
     pair = exact_pair("shot", gains, 0)
-    clipped = (torch.arange(pair.raw.shape[-1]) % 8 < 4).expand_as(pair.raw)
-    srgb, raw = torch.where(clipped, 255, pair.srgb), torch.where(clipped, 1.0, pair.raw)
+    clipped = (torch.arange(pair.clean.mosaic.shape[-1]) % 8 < 4).expand_as(pair.clean.mosaic)
+    srgb, raw = torch.where(clipped, 255, pair.srgb), torch.where(clipped, 1.0, pair.clean.mosaic)
     isp = DictionaryISP(ISPConfig(colour_atoms=1, gain_atoms=2, attention=False))
     with torch.no_grad():
         isp.colour.matrices.copy_(camera_matrix[None])
         isp.gain.log_gains.copy_(torch.tensor([[1.0, 2.0, 1.5], [1.0, 1.0, 1.0]]).log())
-    samples, _ = sample_pixels([replace(pair, srgb=srgb.to(torch.uint8), raw=raw)], 4096, seed=0)
+    samples, _ = sample_pixels(
+        [replace(pair, clean=replace(pair.clean, mosaic=raw), srgb=srgb.to(torch.uint8))], 4096, seed=0
+    )
     set_priors(isp, samples, FitConfig())
     torch.testing.assert_close(isp.choose(pair.srgb[None]).gains, torch.tensor([gains]), atol=0.02, rtol=0)
 
@@ -120,9 +123,9 @@ def test_the_knee_spares_highlights_only_where_the_camera_did(exact_pairs: list[
         for pair in exact_pairs[:2]:
             mean = pair.srgb.float().mean(0) / 255
             bright = (mean > 0.6).expand_as(pair.srgb)
-            raw = torch.where(bright[:1], 1.0, pair.raw) if spared else pair.raw
-            pairs.append(Pair(pair.name, torch.where(bright, 255, pair.srgb).to(torch.uint8), raw, pair.cfa,
-                              pair.white_balance, pair.color_matrix))  # fmt: skip
+            raw = torch.where(bright[:1], 1.0, pair.clean.mosaic) if spared else pair.clean.mosaic
+            srgb = torch.where(bright, 255, pair.srgb).to(torch.uint8)
+            pairs.append(replace(pair, clean=replace(pair.clean, mosaic=raw), srgb=srgb))
         knees.append(fit_isp(pairs, QUICK, progress=False).config.knee or 1.0)
     assert knees[0] > knees[1]
 
@@ -168,7 +171,9 @@ def s_curve(x: torch.Tensor) -> torch.Tensor:
 
 
 def error_db(isp: DictionaryISP, pair: Pair) -> float:
-    return psnr(isp.reverse(pair.srgb[None], white_balance=pair.white_balance).raw, pair.raw[None]).item()
+    return psnr(
+        isp.reverse(pair.srgb[None], white_balance=pair.clean.white_balance).raw, pair.clean.mosaic[None]
+    ).item()
 
 
 @pytest.mark.parametrize(
@@ -242,7 +247,8 @@ def test_a_tie_is_within_a_camera_and_bounded(exact_pairs: list[Pair], camera_ma
 def test_one_frame_whose_metadata_lie_does_not_spoil_the_others(
     exact_pairs: list[Pair], exact_pair: Callable[..., Pair], camera_matrix: torch.Tensor
 ) -> None:
-    liar = replace(exact_pair("liar", (1.9, 1.0, 1.4), 5), white_balance=(1.0, 1.0, 1.0))
+    liar = exact_pair("liar", (1.9, 1.0, 1.4), 5)
+    liar = replace(liar, clean=replace(liar.clean, white_balance=(1.0, 1.0, 1.0)))
     isp = fit_isp([*exact_pairs, liar], replace(SHORT, steps=40), progress=False)
     torch.testing.assert_close(isp.colour.atoms(), camera_matrix.expand(4, 3, 3), atol=0.02, rtol=0)
     assert error_db(isp, exact_pair("unseen", (1.7, 1.0, 1.6), 9)) > 60.0
@@ -250,13 +256,6 @@ def test_one_frame_whose_metadata_lie_does_not_spoil_the_others(
 
 def test_a_frame_without_unclipped_pixels_is_named() -> None:
     white = torch.full((3, 64, 64), 255, dtype=torch.uint8)
-    blown = Pair(
-        name="IMG_1",
-        srgb=white,
-        raw=torch.ones(1, 64, 64),
-        cfa=CFA.RGGB,
-        white_balance=(2.0, 1.0, 1.5),
-        color_matrix=torch.eye(3),
-    )
+    blown = Pair("IMG_1", RawFrame(torch.ones(1, 64, 64), CFA.RGGB, white_balance=(2.0, 1.0, 1.5)), white)
     with pytest.raises(ValueError, match=r"IMG_1: .*unclipped"):
         fit_isp([blown], FitConfig(pixels=256), progress=False)

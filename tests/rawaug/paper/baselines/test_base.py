@@ -110,18 +110,24 @@ def test_seconds_end_it_and_steps_are_counted(exact_pairs: list[Pair]) -> None:
 
 def test_upi_comes_back_as_it_is_and_tuned_upi_is_solved(exact_pairs: list[Pair]) -> None:
     assert fit_baseline(UPI(), exact_pairs, Training()).info["steps"] == 0
-    alike = [replace(pair, raw=exact_pairs[0].raw, srgb=exact_pairs[0].srgb) for pair in exact_pairs]
+    alike = []
+    for pair in exact_pairs:
+        clean = replace(pair.clean, mosaic=exact_pairs[0].clean.mosaic)
+        alike.append(replace(pair, clean=clean, srgb=exact_pairs[0].srgb))
     tuned = fit_baseline(TunedUPI("GRBG"), alike, Training(seconds=1.0))
     assert tuned.info["steps"] == 1
     pair = exact_pairs[0]
-    published = psnr(UPI("GRBG").reverse(pair.srgb[None]), pair.raw[None])
-    assert psnr(tuned.reverse(pair.srgb[None]), pair.raw[None]) > published + 3.0
+    published = psnr(UPI("GRBG").reverse(pair.srgb[None]), pair.clean.mosaic[None])
+    assert psnr(tuned.reverse(pair.srgb[None]), pair.clean.mosaic[None]) > published + 3.0
 
 
 @pytest.mark.parametrize("cfa", list(CFA))
 def test_crops_of_any_pattern_arrive_in_that_of_the_model(cfa: CFA, exact_pairs: list[Pair]) -> None:
     first = exact_pairs[0]
-    mirrors = [replace(first, raw=bayer.mosaic(first.srgb / 255.0, own), cfa=own) for own in CFA]
+    mirrors = []
+    for own in CFA:
+        clean = replace(first.clean, mosaic=bayer.mosaic(first.srgb / 255.0, own), cfa=own)
+        mirrors.append(replace(first, clean=clean))
     for step in range(4):
         crops = random_crops(mirrors, cfa, Training(crop=94), step)
         assert torch.equal(bayer.mosaic(crops.srgb, cfa), crops.raw)
@@ -129,7 +135,7 @@ def test_crops_of_any_pattern_arrive_in_that_of_the_model(cfa: CFA, exact_pairs:
 
 
 def test_methods_that_cannot_render_say_so(exact_pairs: list[Pair]) -> None:
-    raw = exact_pairs[0].raw[None]
+    raw = exact_pairs[0].clean.mosaic[None]
     for name in SMALL:
         model = small(name, "GRBG")
         if model.renders:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
+from rawaug.io import RawFrame
 from rawaug.paper.baselines import Training, fit_baseline
 from rawaug.paper.baselines.curve_matrix import CurveMatrix, inverse_balance, undo_bt709
 
@@ -24,7 +25,7 @@ def shot(seed: int, white_balance: tuple[float, float, float]) -> Pair:
     srgb = torch.randint(0, 220, (3, 64, 64), dtype=torch.uint8, generator=generator)
     model = CurveMatrix("GBRG")
     raw = model.reverse(srgb[None], inverse_balance(white_balance)[:, None] * MATRIX)[0]
-    return Pair(f"shot{seed}", srgb, raw, CFA.GBRG, white_balance, torch.eye(3))
+    return Pair(f"shot{seed}", RawFrame(raw, CFA.GBRG, white_balance=white_balance), srgb)
 
 
 def test_the_curve_is_that_of_bt_709() -> None:
@@ -38,9 +39,9 @@ def test_the_matrix_is_found_and_the_gains_change_it_from_shot_to_shot() -> None
     torch.testing.assert_close(model.balanced, MATRIX, atol=1e-3, rtol=0)
 
     pair = shot(2, (1.2, 1.0, 2.6))
-    as_shot = model.reverse(pair.srgb[None], model.as_shot_setting(pair.white_balance))
-    torch.testing.assert_close(as_shot[0], pair.raw, atol=1e-3, rtol=0)
+    as_shot = model.reverse(pair.srgb[None], model.as_shot_setting(pair.clean.white_balance))
+    torch.testing.assert_close(as_shot[0], pair.clean.mosaic, atol=1e-3, rtol=0)
     blind = model.reverse(pair.srgb[None])[0]
-    assert (blind - pair.raw).abs().mean() > 0.01
+    assert (blind - pair.clean.mosaic).abs().mean() > 0.01
     with pytest.raises(ValueError, match="converts"):
-        model.render(pair.raw[None])
+        model.render(pair.clean.mosaic[None])

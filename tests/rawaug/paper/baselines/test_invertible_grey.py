@@ -22,8 +22,8 @@ def test_what_the_encoder_renders_holds_what_the_decoder_needs(exact_pairs: list
 
     def restored(model: InvertibleGrey) -> float:
         with torch.no_grad():
-            picture = model(pair.raw[None], pair.white_balance)
-            return psnr(model.reverse(picture, pair.white_balance), pair.raw[None]).item()
+            picture = model(pair.clean.mosaic[None], pair.clean.white_balance)
+            return psnr(model.reverse(picture, pair.clean.white_balance), pair.clean.mosaic[None]).item()
 
     before = restored(InvertibleGrey("GRBG", features=8, blocks=1))
     model = InvertibleGrey("GRBG", features=8, blocks=1)
@@ -33,7 +33,7 @@ def test_what_the_encoder_renders_holds_what_the_decoder_needs(exact_pairs: list
 
 def test_the_hidden_error_trains_the_encoder(exact_pairs: list[Pair]) -> None:
     model = InvertibleGrey("GRBG", features=4, blocks=1)
-    compressed = model.compress(exact_pairs[0].raw[None])
+    compressed = model.compress(exact_pairs[0].clean.mosaic[None])
     error = (model.from_picture(model.to_picture(compressed)) - compressed).abs().mean()
     error.backward()
     gradients = [parameter.grad for parameter in model.encoder.parameters()]

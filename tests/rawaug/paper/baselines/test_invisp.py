@@ -42,7 +42,7 @@ def test_untrained_it_is_a_plain_gamma_camera(blocks: int) -> None:
 def test_blind_it_uses_the_mean_balance_of_the_pairs(exact_pairs: list[Pair]) -> None:
     model = InvISP(blocks=1, growth=4)
     model.prepare(exact_pairs)
-    mean = torch.tensor([pair.white_balance for pair in exact_pairs]).log().mean(0).exp()
+    mean = torch.tensor([pair.clean.white_balance for pair in exact_pairs]).log().mean(0).exp()
     srgb = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(3))
     torch.testing.assert_close(model.reverse(srgb), model.reverse(srgb, mean))
 

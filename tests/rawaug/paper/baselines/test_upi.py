@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
+from rawaug.io import RawFrame
 from rawaug.isp.config import HIGHLIGHT_KNEE
 from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.functional import gamma_expand
@@ -99,7 +100,7 @@ def shot(seed: int, digital: float = 1.0) -> Pair:
     generator = torch.Generator().manual_seed(seed)
     srgb = torch.randint(30, 200, (3, 64, 64), dtype=torch.uint8, generator=generator)
     raw = Known(digital * GAINS).reverse(srgb[None])[0]
-    return Pair(f"shot{seed}", srgb, raw, CFA.GBRG, (1.7, 1.0, 1.3), torch.eye(3))
+    return Pair(f"shot{seed}", RawFrame(raw, CFA.GBRG, white_balance=(1.7, 1.0, 1.3)), srgb)
 
 
 def test_alike_frames_give_the_camera() -> None:
@@ -107,7 +108,7 @@ def test_alike_frames_give_the_camera() -> None:
     torch.testing.assert_close(tuned.matrix.data, MATRIX, atol=1e-3, rtol=0)
     torch.testing.assert_close(tuned.gains.data, GAINS, atol=1e-2, rtol=0)
     pair = shot(2)
-    torch.testing.assert_close(tuned.reverse(pair.srgb[None]), pair.raw[None], atol=1e-3, rtol=0)
+    torch.testing.assert_close(tuned.reverse(pair.srgb[None]), pair.clean.mosaic[None], atol=1e-3, rtol=0)
 
 
 def test_of_three_frames_the_two_that_agree_are_followed_and_not_the_bright_one() -> None:
