@@ -61,7 +61,7 @@ def estimate_level(network: Any, srgb: Tensor) -> tuple[float, float]:
     # What it removes at an unknown level: its power, and products of pixels one and two apart, by squares ``(N,)``.
     side = min(_SQUARE, *srgb.shape[-2:])
     squares = []
-    for part in _spread_parts(srgb):
+    for part in spread_parts(srgb):
         removed = (part - network(part, torch.zeros_like(part))).float()
         power = removed.square().mean(1, keepdim=True)
         products = [power, _times_shifted(removed, 1), _times_shifted(removed, 2)]
@@ -99,7 +99,7 @@ def _times_shifted(removed: Tensor, distance: int) -> Tensor:
     return (removed * (below + beside) / 2).mean(1, keepdim=True)
 
 
-def _spread_parts(srgb: Tensor) -> Iterator[Tensor]:
+def spread_parts(srgb: Tensor) -> Iterator[Tensor]:
     """Cut squares that are spread over a picture ``(1, 3, H, W)``, or take the whole of a small one."""
     height, width = srgb.shape[-2:]
     for top in _spread_places(height):

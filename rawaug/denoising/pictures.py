@@ -27,13 +27,15 @@ from torch import Tensor, nn
 
 import denoisers
 from denoisers.classical import FILTERS
+from denoisers.ffdnet import Refilled
 from denoisers.published import Image
 from rawaug import bayer
 from rawaug.denoising.denoiser import ImageDenoiser, Noisy, each_with_progress, read_named
+from rawaug.denoising.drawn import explain_drawn
 from rawaug.denoising.folder import Files
 from rawaug.denoising.picture_levels import estimate_level, white_level
 from rawaug.errors import escape
-from rawaug.files import files_below
+from rawaug.files import files_below, write_bytes
 from rawaug.io import RawFrame
 from rawaug.io.content import RAW_EXTENSIONS, Listing, list_files, picture_extensions
 from rawaug.io.isolated import isolated
@@ -44,6 +46,8 @@ _TILE = 1024
 """Side of a tile; without tiles, the default denoiser needs more than 2 GB for 12 megapixels."""
 _LOWEST_OF_FILTERS = 1e-4
 """The lowest level that a filter is told, since it divides by it."""
+_REFILL = "+refill"
+"""Behind a network's name: its pixels are denoised apart and refilled."""
 VIEWS = {1: (0,), 2: (0, 5), 4: range(4), 8: range(bayer.N_VIEWS)}
 """The views that are averaged, by the number of views."""
 LINEAR = (".exr",)
@@ -58,7 +62,10 @@ class PictureDenoiser(ImageDenoiser):
 
     :meth:`of` takes the name of a shipped denoiser of pictures or of a classical filter, ``{"name": ..., "settings":
     {...}}``, a ``.safetensors`` of rawaug or of FFDNet's authors, or a network of sRGB; with ``@15`` behind a name, it
-    is told this level, in units of 1/255, every time.
+    is told this level, in units of 1/255, every time. With ``+refill`` before it, a network for white noise works as
+    :class:`denoisers.ffdnet.Refilled`, such as ``ffdnet_color.safetensors+refill@50``.
+
+    A picture whose level is estimated stays as it is if it was drawn, see :mod:`rawaug.denoising.drawn`.
 
     Attributes:
         run: ``run(srgb, level) -> srgb``, called on ``device`` with the level that is told or estimated.
@@ -104,8 +111,10 @@ class PictureDenoiser(ImageDenoiser):
         if stem in FILTERS:
             denoiser = _of_filter(stem)
         else:
-            file = read_named(stem, cls)
+            file = read_named(stem.removesuffix(_REFILL), cls)
             denoiser = _of_network(file.name, file.network, file.info)
+            if stem.endswith(_REFILL):
+                denoiser = _of_network(f"{file.name}, refilled", Refilled(file.network), file.info)
 
         if level is None:
             return denoiser
@@ -114,8 +123,17 @@ class PictureDenoiser(ImageDenoiser):
     @torch.inference_mode()
     def __call__(self, noisy: Noisy) -> Tensor:
         """sRGB ``(1, 3, H, W)`` denoised, on the CPU, cut to [0, 1]."""
+        if self.explain_kept(noisy.image) is not None:
+            return noisy.image.clone()
+
         mean = self._compute(self._average_views, noisy.image).clamp_(0.0, 1.0)
         return self._require_sound(mean, noisy.image, noisy.image.shape)
+
+    def explain_kept(self, srgb: Tensor) -> str | None:
+        """Explain why a picture ``(1, 3, H, W)`` stays as it is: it was drawn, not taken; None if it is denoised."""
+        if not self.reads_levels or self.level is not None:
+            return None
+        return explain_drawn(srgb)
 
     def _average_views(self, srgb: Tensor) -> Tensor:
         total = torch.zeros_like(srgb)
@@ -194,14 +212,25 @@ def _split_level(spec: str) -> tuple[str, float | None]:
 
 @dataclass(frozen=True)
 class DenoisedPicture:
-    """What was done to a picture; ``deviation`` is the removed noise's, in units of 1/255."""
+    """What was done to a picture.
+
+    Attributes:
+        source, out: the files.
+        deviation: that of the noise that was removed, in units of 1/255.
+        seconds: how long it took.
+        kept: why the picture was left as it is; None if it was denoised.
+    """
 
     source: Path
     out: Path | None
     deviation: float
     seconds: float
+    kept: str | None = None
 
     def __str__(self) -> str:
+        if self.kept is not None:
+            advice = "name a level, as in --denoiser rawaug-srgb@10, to denoise it"
+            return f"{escape(self.out)}: left as it is, since {self.kept}; {advice}"
         return f"{escape(self.out)}: noise of {self.deviation:.1f} in 255 removed, {self.seconds:.1f} s"
 
 
@@ -269,9 +298,12 @@ class PictureFiles(Files[DenoisedPicture]):
         if min(height, width) < 2:
             raise ValueError(f"{source}: is {width} x {height} pixels; at least 2 x 2 needed")
 
+        kept = self.denoiser.explain_kept(srgb[None])
         denoised = self.denoiser(Noisy(srgb[None]))[0]
         deviation = 255.0 * (denoised - srgb).square().mean().sqrt().item()
 
-        if out is not None:
+        if out is not None and kept is not None and out.suffix.lower() == source.suffix.lower():
+            write_bytes(source.read_bytes(), out)  # a JPEG that is written again has other pixels
+        elif out is not None:
             write_stored(out, denoised, picture)
-        return denoised, DenoisedPicture(source, out, deviation, time.perf_counter() - start)
+        return denoised, DenoisedPicture(source, out, deviation, time.perf_counter() - start, kept)

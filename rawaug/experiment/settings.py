@@ -59,7 +59,9 @@ Share = Annotated[float, Interval(ge=0.0, le=1.0)]
 Side = Annotated[int, Interval(ge=32, le=MOST)]
 """The side of the middle of a frame, in pixels."""
 
-NoiseSetting = Annotated[tuple[float, float] | str | list[str] | dict[str, Any], BeforeValidator(_require_noise_form)]
+NoiseSetting = Annotated[
+    tuple[float, float] | str | Sequence[str | dict[str, Any]] | dict[str, Any], BeforeValidator(_require_noise_form)
+]
 """This is the noise of a recipe, as :func:`rawaug.noise.noise_model` takes it."""
 
 

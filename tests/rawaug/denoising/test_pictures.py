@@ -9,10 +9,12 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import save_file as save_weights
 from torch import Tensor
 
 import denoisers
 import rawaug
+from denoisers.ffdnet import Refilled
 from rawaug import bayer
 from rawaug.cli import main
 from rawaug.commands.benchmark import run as benchmark
@@ -144,6 +146,30 @@ def test_ffdnet_is_told_the_deviation_of_its_noise() -> None:
     network(torch.rand(1, 3, 16, 16), torch.full((1, 3, 16, 16), 0.01))
     assert seen[0].shape == (1, 15, 8, 8)
     assert torch.allclose(seen[0][:, :3], torch.tensor(0.1))
+
+
+def test_a_refilled_network_sees_each_quarter_of_the_pixels_and_then_a_quarter_of_the_noisy_ones() -> None:
+    class _Black(torch.nn.Module):
+        def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
+            seen.append(noisy.clone())
+            return torch.zeros_like(noisy) if noisy.shape[0] == 4 else noisy
+
+    seen: list[Tensor] = []
+    picture = torch.rand(1, 3, 6, 8)
+    result = Refilled(_Black())(picture, torch.zeros_like(picture))
+    quarters = [picture[..., row::2, column::2] for row in (0, 1) for column in (0, 1)]
+    assert torch.equal(seen[0], torch.cat(quarters))
+    assert torch.allclose(result, picture / 4)
+
+
+def test_a_refilled_network_is_named_in_the_benchmark(tmp_path: Path) -> None:
+    save_weights(denoisers.build("FFDNet").state_dict(), tmp_path / "ffdnet.safetensors")
+    refilled = PictureDenoiser.of(f"{tmp_path / 'ffdnet.safetensors'}+refill@50")
+    assert "refilled" in refilled.name
+    assert isinstance(refilled.network, Refilled)
+    assert refilled.level == pytest.approx(50 / 255)
+    with pytest.raises(ValueError, match="RAW"):
+        PictureDenoiser.of("rawaug-small+refill")
 
 
 def test_files_and_folders_of_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,14 +9,17 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+import torch
+from pydantic import TypeAdapter
 
 from rawaug.cli import main
 from rawaug.commands.run import with_values
 from rawaug.experiment import run as experiment
 from rawaug.experiment.recipe import EXPERIMENTS, find_kind, find_recipe, find_settings, kinds, read_recipe
-from rawaug.experiment.settings import ArmConfig, DataConfig, ISPSource, Recipe
+from rawaug.experiment.settings import ArmConfig, DataConfig, ISPSource, NoiseSetting, Recipe
 from rawaug.experiment.task import TASKS
 from rawaug.isp.fit.samples import BLOCK
+from rawaug.noise import noise_model
 from rawaug.paper.baselines import BASELINES
 from rawaug.paper.methods import FAMILIES, ROWS
 from rawaug.paper.reconstruction import Comparison
@@ -202,3 +205,10 @@ def test_the_noise_of_a_camera_is_at_the_iso_of_the_isp() -> None:
     assert camera.load().info["cameras"] == ["Nikon D750"]
     assert camera.load().info["key"] != ISPSource().load().info["key"]
     assert Recipe(arms=arms, data=data, isp="universal").noise_at_iso == "cycleisp_sidd"
+
+
+def test_the_noise_of_a_recipe_may_be_several_cameras_at_an_iso_of_their_own() -> None:
+    phone = {"name": "Motorola Nexus 6", "iso": 3200}
+    noise = TypeAdapter(NoiseSetting).validate_python(["any camera", phone])
+    drawn = noise_model(noise).sample(64, torch.Generator().manual_seed(0))["shot_var"]
+    assert torch.isclose(drawn, torch.tensor(0.013773)).sum() in range(16, 49)
