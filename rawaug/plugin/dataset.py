@@ -338,11 +338,14 @@ class RawPairs(_Pairs[Sample]):
             indices: B indices of a dataset whose samples are pictures alone; ``crop`` must be set.
             generators: one generator for each index.
         """
+        pair: RawPair = self.augment.apply(*self.cut_batch(indices, generators))
+        return pair
+
+    def cut_batch(self, indices: Sequence[int], generators: Sequence[torch.Generator]) -> tuple[Tensor, AugmentParams]:
+        """Draw the crops ``(B, 3, h, w)`` and the parameters of :meth:`draw_batch`, whose pairs any device can make."""
         _, patches, places, chosen = self._cut(indices, generators)
         batch = torch.stack(patches)
-        params = self.augment.sample_each(batch, generators, torch.stack(places), chosen)
-        pair: RawPair = self.augment.apply(batch, params)
-        return pair
+        return batch, self.augment.sample_each(batch, generators, torch.stack(places), chosen)
 
     def _draw_samples(self, indices: Sequence[int], generators: Sequence[torch.Generator]) -> list[Sample]:
         samples, patches, places, chosen = self._cut(indices, generators)

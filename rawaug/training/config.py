@@ -74,10 +74,11 @@ class TrainConfig:
         validate_every: steps between validations; the best weights are kept. A training with no more steps than that is
             validated five times.
         checkpoint_every: steps between checkpoints, from which a killed run resumes.
-        workers: processes that prepare samples; 0 prepares them in the training process.
+        workers: processes that prepare samples; 0 prepares them in the training process. On CUDA they read and cut
+            pictures, and the GPU makes RAW of them, if ``augmented`` is 1.
         precision: Fabric's precision, such as 32-true or bf16-mixed.
         channels_last: memory format of the network.
-        compile: torch.compile the network.
+        compile: torch.compile the network; on CUDA its steps are launched as graphs.
         logger: where loss and validation are logged besides ``log.csv``: tensorboard, wandb or csv; null for nowhere.
     """
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from copy import copy
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy, deepcopy
+from functools import partial
+from operator import itemgetter
 from statistics import fmean
 from typing import Any, Protocol
 
@@ -19,6 +21,7 @@ from rawaug.metrics import psnr
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.maker import PairMaker
 from rawaug.plugin.params import AugmentParams
 from rawaug.seeding import keyed_generator
 
@@ -95,24 +98,48 @@ class RealCrops:
 
 
 class PictureCrops:
-    """Samples of :class:`rawaug.RawPairs` in any target; zeros stand for the noise map if there is none."""
+    """Samples of :class:`rawaug.RawPairs` in any target; zeros stand for the noise map if there is none.
+
+    After :meth:`leave_pairs_to` a sample is a crop of a picture and the parameters of its pair, which are a quarter of
+    the pair's bytes.
+    """
 
     def __init__(self, pairs: RawPairs) -> None:
         self.pairs = pairs
+        self._cuts_only = False
 
-    def draw(self, generator: torch.Generator) -> Sample:
+    def draw(self, generator: torch.Generator) -> Any:
         """Draw a sample of one crop, ``(C, h, w)`` as the target has it."""
         return self.draw_batch([generator])[0]
 
-    def draw_batch(self, generators: Sequence[torch.Generator]) -> list[Sample]:
+    def draw_batch(self, generators: Sequence[torch.Generator]) -> list[Any]:
         """Draw one crop for each generator, all made together."""
         indices = [int(torch.randint(len(self.pairs), (), generator=generator)) for generator in generators]
-        pair = self.pairs.draw_batch(indices, generators)
+        crops, params = self.pairs.cut_batch(indices, generators)
+        if not self._cuts_only:
+            return list(map(Sample, *_make_pairs(self.pairs.augment, crops, params)))
 
-        variance = pair.variance
-        if not variance.numel():
-            variance = torch.zeros_like(pair.noisy)
-        return list(map(Sample, pair.noisy, pair.clean, variance))
+        samples = []
+        for number, crop in enumerate(crops):
+            samples.append((crop, params.map(itemgetter(number))))
+        return samples
+
+    def leave_pairs_to(self, device: torch.device) -> Callable[[Tensor, AugmentParams], Sample]:
+        """Draw no more than crops and parameters from now on; return what makes a batch of pairs of them on a device.
+
+        The pairs are those that were drawn before, up to the last bits in which two kinds of device differ.
+        """
+        self._cuts_only = True
+        return partial(_make_pairs, deepcopy(self.pairs.augment).to(device))
+
+
+def _make_pairs(augment: PairMaker, crops: Tensor, params: AugmentParams) -> Sample:
+    """Make the pairs of crops ``(B, 3, h, w)``, on their device; zeros stand for the noise map if there is none."""
+    pair = augment.apply(crops, params)
+    variance = pair.variance
+    if not variance.numel():
+        variance = torch.zeros_like(pair.noisy)
+    return Sample(pair.noisy, pair.clean, variance)
 
 
 class OwnPictureCrops:

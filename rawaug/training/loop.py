@@ -34,6 +34,9 @@ from rawaug.training.state import TrainingState, first_network
 from rawaug.training.stream import StepSampler, TrainingStream
 from rawaug.training.weighing import weigh_loss
 
+MAKE_PAIRS = {"cuda"}
+"""Devices of these kinds make the pairs of pictures themselves, of crops in bytes; for others the workers make them."""
+
 
 def train(
     stream: TrainingStream,
@@ -86,11 +89,15 @@ def train(
     if start and is_first:
         print(f"{label}: resumed after step {start} of {config.steps}")
     journal = Journal(folder, start) if is_first else None
+    make_pairs = stream.leave_pairs_to(fabric.device) if fabric.device.type in MAKE_PAIRS else None
     loader = _load_batches(stream, start, config, fabric)
     bar = progress(loader, label=label, unit="step", total=config.steps, initial=start, leave=True, shown=is_first)
 
     begin = time.perf_counter()
     for step, batch in enumerate(bar, start=start + 1):
+        if make_pairs is not None:
+            crops, params = batch
+            batch = make_pairs(crops.to(fabric.device, non_blocking=True), params)
         sample = _place(batch, fabric.device, state.layout)
         loss = estimator.loss(model, sample, weigh_loss(criterion, config.weigh, sample), step / config.steps)
         learning_rate = state.update(loss)
@@ -129,7 +136,7 @@ def _load_batches(stream: TrainingStream, start: int, config: TrainConfig, fabri
 
 def _place(batch: Any, device: torch.device, layout: torch.memory_format) -> Any:
     """Put a batch, a named tuple of tensors, on a device and in a memory format."""
-    tensors = [tensor.to(device, memory_format=layout) for tensor in batch]
+    tensors = [tensor.to(device, memory_format=layout, non_blocking=True) for tensor in batch]
     return type(batch)(*tensors)
 
 

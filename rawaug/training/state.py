@@ -143,7 +143,8 @@ class TrainingState:
         self.losses = self.losses.to(fabric.device)
 
         if self.config.compile:
-            return torch.compile(self.model)
+            mode = "reduce-overhead" if fabric.device.type == "cuda" else None  # steps are launched as CUDA graphs
+            return torch.compile(self.model, mode=mode)
         return self.model
 
     def update(self, loss: Tensor) -> float:

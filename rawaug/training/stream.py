@@ -6,13 +6,16 @@ captured; or crops of frames without a clean RAW). The other part is RAW made fr
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
+from rawaug.data.pairs import Sample
 from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.params import AugmentParams
 from rawaug.seeding import keyed_generator
 from rawaug.training.crops import PictureCrops, Source
 
@@ -43,6 +46,12 @@ class TrainingStream(Dataset[Any]):
             raise ValueError("an augmented arm needs sRGB pictures; set data.pictures")
         if self.from_pictures < batch and real is None:
             raise ValueError("this arm needs real pairs; set data.pairs")
+
+    def leave_pairs_to(self, device: torch.device) -> Callable[[Tensor, AugmentParams], Sample] | None:
+        """Leave the pairs to a device, see :class:`PictureCrops`; None if not all samples are pairs of pictures."""
+        if self.from_pictures < self.batch or not isinstance(self.pictures, PictureCrops):
+            return None
+        return self.pictures.leave_pairs_to(device)
 
     def __getitem__(self, index: int) -> Any:
         source = self.real

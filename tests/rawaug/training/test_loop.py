@@ -15,10 +15,11 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.data import demo_pairs
+from rawaug.data import demo_pairs, demo_photographs
 from rawaug.evaluation.figures import read_log
 from rawaug.evaluation.trials import Trial, make_trial
 from rawaug.noise import noise_model
+from rawaug.plugin.dataset import RawPairs
 from rawaug.training import loop
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.crops import RealCrops
@@ -228,3 +229,17 @@ def test_fabric_logs_what_the_journal_has(stream: TrainingStream, validation: li
     journal, logged = (read_log(tmp_path / name) for name in ("log.csv", "csv/metrics.csv"))
     assert [row["step"] for row in logged] == [row["step"] for row in journal] == ["2", "4"]
     assert [float(row["psnr"]) for row in logged] == pytest.approx([float(row["psnr"]) for row in journal], rel=1e-5)
+
+
+def test_a_training_learns_the_same_of_pairs_that_the_device_makes(
+    validation: list[Trial], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pictures = list(demo_photographs("train").values())[:2]
+    config = replace(CONFIG, steps=2, validate_every=2)
+    weights = []
+    for kind in ("cuda", "cpu"):
+        monkeypatch.setattr(loop, "MAKE_PAIRS", {kind})
+        stream = TrainingStream(None, RawPairs(pictures, "universal", crop=32), 2, 1.0, seed=0)
+        network = loop.train(stream, validation, NETWORK, config, tmp_path / kind, device="cpu")
+        weights.append(torch.cat([weight.flatten() for weight in network.parameters()]))
+    torch.testing.assert_close(*weights)

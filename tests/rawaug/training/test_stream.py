@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from rawaug import bayer
 from rawaug.bayer import CFA, noise_variance
@@ -128,3 +129,29 @@ def test_processes_divide_a_step_and_a_resume_goes_on_in_it() -> None:
     assert sorted(parts) == whole
     with pytest.raises(ValueError, match="multiple"):
         StepSampler(0, 1, 3, 0, 2)
+
+
+@pytest.mark.parametrize("target", ["raw", "srgb"])
+def test_a_device_makes_the_pairs_that_the_workers_would_have_made(target: Target) -> None:
+    pictures = list(demo_photographs("train").values())[:2]
+    augment = RawAugment.from_pretrained("universal", noise="cycleisp_sidd", target=target)
+
+    def open_stream() -> TrainingStream:
+        return TrainingStream(None, RawPairs(pictures, augment, crop=32, zoom=6.0), batch=4, augmented=1.0, seed=3)
+
+    expected = next(iter(DataLoader(open_stream(), batch_sampler=StepSampler(5, 6, 4))))
+
+    stream = open_stream()
+    make_pairs = stream.leave_pairs_to(torch.device("cpu"))
+    crops, params = next(iter(DataLoader(stream, batch_sampler=StepSampler(5, 6, 4))))
+    assert make_pairs is not None and crops.dtype == torch.uint8 and crops.shape == (4, 3, 32, 32)
+    for part, image in zip(make_pairs(crops, params), expected, strict=True):
+        assert torch.equal(part, image)
+
+
+def test_samples_that_are_not_all_of_pictures_are_made_by_the_workers() -> None:
+    pairs = demo_pairs("train", count=1)
+    real = RealCrops(pairs, noise_model("cycleisp_sidd"), 32, pairs[0].cfa)
+    pictures = RawPairs(list(demo_photographs("train").values())[:1], "universal", crop=32)
+    assert TrainingStream(real, pictures, 4, 0.5, seed=0).leave_pairs_to(torch.device("cpu")) is None
+    assert TrainingStream(real, None, 4, 0.0, seed=0).leave_pairs_to(torch.device("cpu")) is None
