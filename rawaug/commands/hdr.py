@@ -18,8 +18,9 @@ from rawaug.commands import YAML
 from rawaug.errors import count_of
 from rawaug.files import require_output
 from rawaug.io.content import identify_content
+from rawaug.io.exif import mend_exif, read_exif
 from rawaug.io.isolated import isolated
-from rawaug.io.metadata import Metadata, mend_exif, read_exif
+from rawaug.io.metadata import Metadata
 from rawaug.io.pictures import decode_srgb, write_linear
 from rawaug.io.shots import read_shot, read_shot_exposure
 from rawaug.io.stored import PICTURE_FORMATS, StoredPicture, write_stored

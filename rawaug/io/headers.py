@@ -16,6 +16,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+from rawaug.io.boxes import MediaBox, boxes, inner_boxes, primary_item, read_properties
 from rawaug.io.colour import ADOBE_RGB, SRGB_COLOUR, Colour, colour_from_chromaticities, colour_from_code_points
 from rawaug.io.directories import EXIF, INTEROPERABILITY, ORIENTATION, DamagedTags, Directory, TiffFile
 from rawaug.io.jpeg_xl import CODESTREAM, MOST_OF_CODESTREAM, read_codestream
@@ -391,48 +392,20 @@ def _of_bmp(file: BinaryIO) -> Headers:
 # -- boxes of HEIF and JPEG XL -----------------------------------------------------------------------------------------
 
 
-class MediaBox(NamedTuple):
-    """A box, with its name and the places where its contents begin and end."""
-
-    name: bytes
-    start: int
-    end: int
-
-
-def boxes(file: BinaryIO, start: int, end: int) -> Iterator[MediaBox]:
-    """Yield the boxes between two places of a file."""
-    offset = start
-    for _ in range(_MOST_CHUNKS):
-        file.seek(offset)
-        head = file.read(16)
-        if offset + 8 > end or len(head) < 8:
-            return
-        size, name = struct.unpack(">I4s", head[:8])
-        inside = offset + 8
-        if size == 1 and len(head) == 16:
-            (size,) = struct.unpack(">Q", head[8:])
-            inside = offset + 16
-        beyond = offset + size if size else end
-        if beyond < inside or beyond > end:
-            return
-        yield MediaBox(name, inside, beyond)
-        offset = beyond
-
-
 def _of_heif(file: BinaryIO) -> Headers:
     """Read the colour of the primary item, whose profile counts before its code points; the decoder gives EXIF."""
-    meta = _inner_boxes(file, MediaBox(b"", 0, file.seek(0, 2))).get(b"meta")
+    meta = inner_boxes(file, MediaBox(b"", 0, file.seek(0, 2))).get(b"meta")
     if meta is None:
         return Headers()
-    in_meta = _inner_boxes(file, meta._replace(start=meta.start + 4))
-    properties = _inner_boxes(file, in_meta[b"iprp"]) if b"iprp" in in_meta else {}
+    in_meta = inner_boxes(file, meta._replace(start=meta.start + 4))
+    properties = inner_boxes(file, in_meta[b"iprp"]) if b"iprp" in in_meta else {}
     if b"ipco" not in properties:
         return Headers()
 
     all_properties = list(boxes(file, properties[b"ipco"].start, properties[b"ipco"].end))
     indices = list(range(len(all_properties)))
     if b"pitm" in in_meta and b"ipma" in properties:
-        indices = _properties_of_item(file, properties[b"ipma"], _primary_item(file, in_meta[b"pitm"])) or indices
+        indices = read_properties(file, properties[b"ipma"], primary_item(file, in_meta[b"pitm"])) or indices
 
     code_points = None
     for index in indices:
@@ -452,44 +425,6 @@ def _of_heif(file: BinaryIO) -> Headers:
         return Headers(colour=colour_from_code_points(*code_points))
     except ValueError as error:
         return Headers(unread=str(error))
-
-
-def _inner_boxes(file: BinaryIO, outer: MediaBox) -> dict[bytes, MediaBox]:
-    """Find the first box of each name within a box."""
-    inner: dict[bytes, MediaBox] = {}
-    for box in boxes(file, outer.start, outer.end):
-        inner.setdefault(box.name, box)
-    return inner
-
-
-def _primary_item(file: BinaryIO, box: MediaBox) -> int:
-    """Read the number of the item that is the picture."""
-    file.seek(box.start)
-    data = file.read(min(8, box.end - box.start))
-    return int.from_bytes(data[4:8] if data[0] else data[4:6], "big")
-
-
-def _properties_of_item(file: BinaryIO, box: MediaBox, item: int) -> list[int]:
-    """Read the places of an item's properties in their list, the first being 0."""
-    file.seek(box.start)
-    data = file.read(min(box.end - box.start, _MOST_BYTES))
-    wide_items, wide_indices = data[0] > 0, data[3] & 1
-    (count,) = struct.unpack_from(">I", data, 4)
-    offset = 8
-    indices = []
-    for _ in range(count):
-        (number,) = struct.unpack_from(">I" if wide_items else ">H", data, offset)
-        offset += 4 if wide_items else 2
-        associations = data[offset]
-        offset += 1
-        for _ in range(associations):
-            index = data[offset] & 0x7F
-            if wide_indices:
-                index = struct.unpack_from(">H", data, offset)[0] & 0x7FFF
-            offset += 1 + wide_indices
-            if number == item and index:
-                indices.append(index - 1)
-    return indices
 
 
 def _of_jpeg_xl(file: BinaryIO) -> Headers:

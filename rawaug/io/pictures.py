@@ -31,7 +31,7 @@ from rawaug.io.decoding import MAX_PIXELS as MAX_PIXELS
 from rawaug.io.decoding import Decoded, decode, decode_part, load_oiio, reason
 from rawaug.io.decoding import require_utf8 as require_utf8
 from rawaug.io.directories import EXIF, DamagedTags, TiffFile
-from rawaug.io.metadata import read_exif
+from rawaug.io.exif import read_exif
 
 _VIEW_OF_EXIF_ORIENTATION = (0, 1, 3, 2, 4, 5, 7, 6)
 """These views of :func:`rawaug.bayer.turn` bring EXIF orientations 1 to 8 upright."""

@@ -20,17 +20,9 @@ from rawaug.errors import extra
 from rawaug.files import write_bytes
 from rawaug.io.decoding import MAX_PIXELS, decode
 from rawaug.io.directories import TiffFile
+from rawaug.io.exif import Thumbnail, mend_exif, read_exif
 from rawaug.io.headers import webp_chunks
-from rawaug.io.metadata import (
-    Metadata,
-    Thumbnail,
-    byte_order,
-    dress_jpeg,
-    dress_png,
-    dress_tiff,
-    mend_exif,
-    read_exif,
-)
+from rawaug.io.metadata import Metadata, byte_order, dress_jpeg, dress_png, dress_tiff
 from rawaug.io.pictures import require_unit_range
 
 QUALITY = 97
