@@ -122,12 +122,12 @@ class ResidualUNet(Denoiser):
         self.ups = nn.ModuleList()
         self.decoder = nn.ModuleList()
         for size, blocks in zip(sizes, numbers, strict=True):
-            self.encoder.append(_residuals(size, blocks))
+            self.encoder.append(nn.Sequential(*[ResidualBlock(size) for _ in range(blocks)]))
         for size in sizes[:-1]:
             self.downs.append(conv(size, 2 * size, 2, bias=False, stride=2, padding=0))
         for size, blocks in reversed(list(zip(sizes[:-1], numbers[:-1], strict=True))):
             self.ups.append(conv(2 * size, 4 * size, 1, bias=False))
-            self.decoder.append(_residuals(size, blocks))
+            self.decoder.append(nn.Sequential(*[ResidualBlock(size) for _ in range(blocks)]))
         self.coarse = conv(coarse, sizes[-1], bias=False)
         self.tail = conv(width, outputs, bias=False)
 
@@ -261,7 +261,3 @@ class DRUNet(ResidualUNet):
         squares = F.pixel_unshuffle(features, self.patch)
         correction = self.tail(self.body(squares))
         return F.pixel_shuffle(correction, self.patch)
-
-
-def _residuals(width: int, number: int) -> nn.Sequential:
-    return nn.Sequential(*[ResidualBlock(width) for _ in range(number)])

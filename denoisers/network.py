@@ -224,20 +224,14 @@ class Denoiser(nn.Module, ABC):
         return denoised + correction[..., :height, :width]
 
     def _at_one_scale(self, noisy: Tensor, variance: Tensor | None) -> Tensor:
-        """Denoise without the pyramid: f."""
+        """Denoise without the pyramid, f: transform a picture, add the network's correction, and transform it back."""
         if variance is None or not self.reads_variance:
             return self.base_image(noisy) + self._correction(noisy)
 
-        if self.domain != "linear":
-            return self._in_domain(noisy, variance)
+        if self.domain == "linear":
+            noise_map = variance.sqrt() if self.deviation else variance
+            return self.base_image(noisy) + self._correction(noisy, noise_map)
 
-        noise_map = variance
-        if self.deviation:
-            noise_map = variance.sqrt()
-        return self.base_image(noisy) + self._correction(noisy, noise_map)
-
-    def _in_domain(self, noisy: Tensor, variance: Tensor) -> Tensor:
-        """Transform a picture, add the network's correction, and transform it back."""
         domain = DOMAINS[self.domain]
         levels = fit_levels(noisy.float(), variance.float())
         signal = domain.forward(noisy.float(), *levels)

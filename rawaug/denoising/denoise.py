@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Any
 
@@ -103,11 +104,13 @@ def files_for(
         ValueError: if it is a file of no kind, or a setting does not fit it.
     """
     if not _is_raw(source):
-        defaults = {"linear": False, "noise": "auto", "greens": "auto", "defects": "mend", "guard": None}
-        for argument, value in {"linear": linear, **for_raw}.items():
-            if value != defaults[argument]:
-                raise ValueError(f"{source}: is a developed picture; {argument}= is for RAW")
-        denoiser = denoiser or PictureDenoiser.default
+        defaults = inspect.signature(RawFiles).parameters
+        stated = ["linear"] if linear else []
+        stated += [argument for argument, value in for_raw.items() if value != defaults[argument].default]
+        if stated:
+            raise ValueError(f"{source}: is a developed picture; {stated[0]}= is for RAW")
+        if denoiser is None:
+            denoiser = PictureDenoiser.default
         return PictureFiles(open_denoiser(PictureDenoiser, denoiser, strength, self_ensemble, device))
 
     by_pattern = denoiser is None and not linear
