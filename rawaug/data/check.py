@@ -21,7 +21,7 @@ from torch import Tensor
 from rawaug.data.dnd import Dnd
 from rawaug.data.folders import PictureFolder
 from rawaug.data.formats import READABLE
-from rawaug.data.frames import Lazy
+from rawaug.data.frames import Frames
 from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import DATASETS, PICTURES, Pair
@@ -217,7 +217,7 @@ def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
         yield "pictures", partial(PictureFolder, path, allowed_share=1)
 
 
-class _RawFrames(Lazy[RawFrame]):
+class _RawFrames(Frames[RawFrame]):
     """RAW files, read without rendering them."""
 
     def __init__(self, path: Path) -> None:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.data.development import gains_from_neutral, srgb_from_camera
-from rawaug.data.frames import Lazy
+from rawaug.data.frames import Frames
 from rawaug.data.mat import read_array, read_value, to_raw
 from rawaug.data.pairs import DATASETS, Pair
 from rawaug.files import write_bytes
@@ -39,7 +39,7 @@ class Box(NamedTuple):
     right: int
 
 
-class Dnd(Lazy[RawFrame]):
+class Dnd(Frames[RawFrame]):
     """The boxes, frame by frame: 1,000 boxes of 512 x 512. One frame at a time is in memory.
 
     Results go to :func:`write_dnd_submission`, in the same order.

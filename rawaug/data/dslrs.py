@@ -83,7 +83,7 @@ CAMERAS = {
 }
 
 
-class DslrFrames(Frames):
+class DslrFrames(Frames[Pair]):
     """The frames of one camera, 512 x 768: 96 for training, 12 for validation, 24 for test.
 
     Args:

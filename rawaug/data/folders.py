@@ -221,7 +221,7 @@ def reports(pictures: Any) -> list[str]:
     return lines
 
 
-class RawFolder(Frames):
+class RawFolder(Frames[Pair]):
     """The RAW files of a folder and its subfolders, sorted by path; or one file; or a list of both.
 
     A pair's sRGB is the JPEG of the same stem beside the RAW file, if there is one whose size is the mosaic's within

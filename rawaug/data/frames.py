@@ -8,7 +8,6 @@ without reading any frames, that it does not score those that it trains on. Data
 from __future__ import annotations
 
 import os
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar, overload
@@ -33,16 +32,34 @@ class FrameLabel(NamedTuple):
     iso: int
 
 
-class Lazy(Sequence[T], ABC, Generic[T]):
-    """A sequence of named items that are read on access; the last one stays in memory."""
+class Frames(Sequence[T], Generic[T]):
+    """Named pairs, or frames, that are read on access; :meth:`some`, :meth:`map`, :meth:`kept`, ... are views of them.
+
+    The last one that was read stays in memory.
+
+    Args:
+        names: the name of each, which identifies it unless :meth:`frame_files` does.
+
+    Example:
+        >>> from rawaug.data import demo_pairs
+        >>> as_frames(demo_pairs("test", count=2)).some([1]).binned(4)[0].clean.mosaic.shape
+        torch.Size([1, 72, 112])
+    """
+
+    max_pixels: int = MAX_PIXELS
+    """Maximum number of pixels of sRGB pictures and of mosaics in PNG files."""
+    labels: Sequence[FrameLabel] = ()
+    """The labels of the frames, if the dataset knows them without reading a frame."""
+    rendering: str = "sRGB of the pairs"
+    """What has rendered the sRGB of registered pairs."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = list(names)
         self._last: tuple[int, T] | None = None
 
-    @abstractmethod
     def read(self, index: int) -> T:
-        """Read the item at ``index`` in [0, len)."""
+        """Read the one at ``index`` in [0, len)."""
+        raise NotImplementedError(f"{type(self).__name__}: its subclass reads the frames")
 
     def __len__(self) -> int:
         return len(self.names)
@@ -62,24 +79,7 @@ class Lazy(Sequence[T], ABC, Generic[T]):
             self._last = index, self.read(index)
         return self._last[1]
 
-
-class Frames(Lazy[Pair]):
-    """Pairs that are read on access; :meth:`some`, :meth:`map`, :meth:`kept`, ... are views of them.
-
-    Example:
-        >>> from rawaug.data import demo_pairs
-        >>> as_frames(demo_pairs("test", count=2)).some([1]).binned(4)[0].clean.mosaic.shape
-        torch.Size([1, 72, 112])
-    """
-
-    max_pixels: int = MAX_PIXELS
-    """Maximum number of pixels of sRGB pictures and of mosaics in PNG files."""
-    labels: Sequence[FrameLabel] = ()
-    """The labels of the frames, if the dataset knows them without reading a frame."""
-    rendering: str = "sRGB of the pairs"
-    """What has rendered the sRGB of registered pairs."""
-
-    def frame(self, index: int) -> RawFrame:
+    def frame(self: Frames[Pair], index: int) -> RawFrame:
         """Read the captured mosaic of a pair, the noisy one if there is one, without its picture."""
         pair = self[index]
         return pair.noisy or pair.clean
@@ -102,25 +102,25 @@ class Frames(Lazy[Pair]):
         """The stamps of all frames; no file is read."""
         return [self.stamp(index) for index in range(len(self))]
 
-    def some(self, indices: Iterable[int]) -> Frames:
+    def some(self, indices: Iterable[int]) -> Frames[T]:
         """The frames at these indices."""
         return _View(self, indices)
 
-    def map(self, change: Callable[[Pair], Pair], step: str = "", only: Iterable[int] | None = None) -> Frames:
+    def map(self, change: Callable[[T], T], step: str = "", only: Iterable[int] | None = None) -> Frames[T]:
         """All frames, each changed as it is read.
 
         Args:
-            change: a function from a pair to a pair.
+            change: a function from one to another of the same kind.
             step: what it does to the pixels, which becomes a part of the stamps.
             only: the indices of the frames that are changed; all by default.
         """
         return _View(self, range(len(self)), change, step, only)
 
-    def middles(self, crop: int) -> Frames:
+    def middles(self: Frames[Pair], crop: int) -> Frames[Pair]:
         """The middle ``crop x crop`` of each frame."""
         return self.map(lambda pair: pair.middle(crop))
 
-    def binned(self, factor: int, together: bool = False) -> Frames:
+    def binned(self: Frames[Pair], factor: int, together: bool = False) -> Frames[Pair]:
         """All frames, binned by :meth:`Pair.binned`: references with less noise of their own; ValueError below 1."""
         if factor < 1:
             raise ValueError(f"bin must be at least 1, got {factor}")
@@ -129,23 +129,23 @@ class Frames(Lazy[Pair]):
             step += ", around one centre"
         return self.map(lambda pair: pair.binned(factor, together), step)
 
-    def kept(self, megabytes: int = 1024) -> Frames:
+    def kept(self, megabytes: int = 1024) -> Frames[T]:
         """All frames, each read once; up to ``megabytes`` of them stay in memory."""
-        pairs: Cached[Pair] = Cached(self, megabytes)
+        pairs: Cached[T] = Cached(self, megabytes)
         return _View(self, range(len(self)), read=pairs.__getitem__)
 
 
-class _View(Frames):
+class _View(Frames[T]):
     """Some of the frames of a sequence, perhaps changed."""
 
     def __init__(
         self,
-        frames: Frames,
+        frames: Frames[T],
         indices: Iterable[int],
-        change: Callable[[Pair], Pair] | None = None,
+        change: Callable[[T], T] | None = None,
         step: str = "",
         only: Iterable[int] | None = None,
-        read: Callable[[int], Pair] | None = None,
+        read: Callable[[int], T] | None = None,
     ) -> None:
         self.frames = frames
         self.indices = list(indices)
@@ -157,11 +157,11 @@ class _View(Frames):
         if frames.labels:
             self.labels = [frames.labels[index] for index in self.indices]
 
-    def read(self, index: int) -> Pair:
-        pair = self.read_frame(self.indices[index])
+    def read(self, index: int) -> T:
+        frame = self.read_frame(self.indices[index])
         if self.change is None or (self.only is not None and index not in self.only):
-            return pair
-        return self.change(pair)
+            return frame
+        return self.change(frame)
 
     def frame_files(self, index: int) -> Sequence[Path]:
         return self.frames.frame_files(self.indices[index])
@@ -175,7 +175,7 @@ _STAMP_STEP = 4099
 """Step between the values of an image that identify it; a prime, so that no row or column is favoured."""
 
 
-class _InMemory(Frames):
+class _InMemory(Frames[Pair]):
     def __init__(self, pairs: Sequence[Pair]) -> None:
         self.pairs = pairs
         super().__init__([pair.name for pair in pairs])
@@ -196,7 +196,7 @@ class _InMemory(Frames):
         return digest(*parts)[:16]
 
 
-def as_frames(pairs: Sequence[Pair]) -> Frames:
+def as_frames(pairs: Sequence[Pair]) -> Frames[Pair]:
     """Return the pairs as a sequence with names and files, which are available without reading a pair."""
     if isinstance(pairs, Frames):
         return pairs
@@ -208,7 +208,7 @@ def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
     return min(_identities(as_frames(first)) & _identities(as_frames(second)), default=None)
 
 
-def _identities(pairs: Frames) -> set[str]:
+def _identities(pairs: Frames[Pair]) -> set[str]:
     identities: set[str] = set()
     for index, name in enumerate(pairs.names):
         files = pairs.frame_files(index)
@@ -330,7 +330,7 @@ OWN_PICTURES = "pairs"
 """The value of ``data.pictures`` for augmenting the pictures of a recipe's own pairs."""
 
 
-class PairPictures(Lazy[Tensor]):
+class PairPictures(Frames[Tensor]):
     """The pictures of pairs, uint8 ``(3, H, W)``; a pair is read on access to its picture."""
 
     def __init__(self, pairs: Sequence[Pair]) -> None:

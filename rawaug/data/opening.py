@@ -6,7 +6,7 @@ import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from torch.utils.data import ConcatDataset
 
@@ -75,7 +75,7 @@ def open_pairs(
     if is_picture_pairs(str(spec)):
         if not developed:
             raise ValueError(f"{spec} is pairs of developed pictures, for rawaug run srgb; give RAW frames")
-        return open_picture_pairs(str(spec), **settings)
+        return cast(Any, open_picture_pairs(str(spec), **settings))
 
     reader = _reader(DATASETS, str(spec), kind, path, "a RAW file or folder")
     path, split_of_spec = _path_and_split(path)

@@ -66,7 +66,7 @@ class PairFiles(NamedTuple):
 
 
 @DATASETS.register("pairs")
-class PairFolder(Frames):
+class PairFolder(Frames[Pair]):
     """The noisy/clean pairs of a folder and its subfolders, sorted by path; or those of one noisy (or two-in-one) file.
 
     The sRGB picture of a pair is the clean frame, developed without a tone curve. Where no file states white balance

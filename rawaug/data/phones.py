@@ -249,7 +249,7 @@ class _Instance(NamedTuple):
     file: Path
 
 
-class PhoneFrames(Frames):
+class PhoneFrames(Frames[Pair]):
     """The frames of a split, 512 x 512: 320 for training, 40 for validation and 40 for test.
 
     Training has two frames of each of its 160 instances. Validation has one frame of each of SIDD's 40 held-back

@@ -11,7 +11,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,7 +55,7 @@ class PicturePair:
         return self
 
 
-class PicturePairs(Frames):
+class PicturePairs(Frames[PicturePair]):
     """Pairs of developed pictures, read on access: the base class of readers registered in :data:`DATASETS`.
 
     Args:
@@ -72,13 +72,10 @@ class PicturePairs(Frames):
         noisy, clean = self._files[index]
         return read_picture(noisy), read_picture(clean)
 
-    def __iter__(self) -> Iterator[PicturePair]:  # type: ignore[override]
-        return map(self.read, range(len(self)))
-
     def frame_files(self, index: int) -> Sequence[Path]:
         return self._files[index]
 
-    def read(self, index: int) -> PicturePair:  # type: ignore[override]
+    def read(self, index: int) -> PicturePair:
         name = self.names[index]
         noisy, clean = self.load(index)
         if noisy.shape != clean.shape:

@@ -97,7 +97,7 @@ RAWIR_FOLDERS = {"train": "train", "validation": "val", "test": "test"}
 
 
 @DATASETS.register("rawir")
-class Rawir(Frames):
+class Rawir(Frames[Pair]):
     """The pairs below a folder, in RGGB.
 
     A folder with subfolders ``train``, ``val`` or ``test`` has the pairs of a split in its subfolder. ``white`` is in
@@ -201,7 +201,7 @@ _BITS = 10
 
 
 @DATASETS.register("zurich")
-class Zurich(Frames):
+class Zurich(Frames[Pair]):
     """The pairs of a split, sorted by number; PNGs of 8 bits hold a quarter of the digital numbers."""
 
     def __init__(self, path: str | Path, split: str = "train") -> None:
@@ -244,7 +244,7 @@ _UNCLIPPED = 0.9
 
 
 @DATASETS.register("rawbench")
-class RawBench(Frames):
+class RawBench(Frames[Pair]):
     """Shots of a Sony A7C II, ``Scene_0001/Scene_0001_ISO3200_1.ARW``, and their mean at ISO 100 in ``gt`` beside them.
 
     The shots of a scene differ only in ISO. The clean frame is scaled to the exposure of the noisy frame, by the ratio
@@ -298,7 +298,7 @@ REAL_BLACK, REAL_WHITE = 512, 16383
 
 
 @DATASETS.register("real")
-class RealFrames(Frames):
+class RealFrames(Frames[Pair]):
     """The frames of a split, such as ``real:train``; ``noise_profile`` of a clean frame is its own noise."""
 
     def __init__(self, path: str = "", split: str = "test") -> None:

@@ -33,7 +33,7 @@ from rawaug.data.sidd_scenes import (
 from rawaug.io import RawFrame, read_picture
 
 
-class SiddFrames(Frames):
+class SiddFrames(Frames[Pair]):
     """The full frames below a folder: SIDD Small or Medium in RAW, with the sRGB set if it is there.
 
     Noise levels come from ``noise_level_functions.csv``, or are measured against the clean frame if that file is

@@ -14,14 +14,14 @@ from pathlib import Path
 
 from torch import Tensor
 
-from rawaug.data.frames import Lazy
+from rawaug.data.frames import Frames
 from rawaug.data.sidd_blocks import BLOCKS, Once, block_names, blocks_of_scenes
 from rawaug.data.sidd_scenes import HELD_BACK, find_file, find_phone, noise_level_functions
 from rawaug.files import replacing
 from rawaug.io import RawFrame
 
 
-class SiddBenchmark(Lazy[RawFrame]):
+class SiddBenchmark(Frames[RawFrame]):
     """The noisy blocks of ``BenchmarkNoisyBlocksRaw.mat`` below a folder, with their noise levels if published.
 
     Pass the results to :func:`write_submission` in the same order.

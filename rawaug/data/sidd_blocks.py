@@ -91,7 +91,7 @@ class Once(Generic[T]):
         return self._outcome
 
 
-class _Blocks(Frames):
+class _Blocks(Frames[Pair]):
     """Blocks that are all read on the first access; what the blocks of a frame share is cached for the last frame."""
 
     def __init__(self, path: Path, frames: Sequence[str]) -> None:

@@ -205,7 +205,7 @@ _SHOWN = 4
 """Maximum number of methods that a line names."""
 
 
-def measure_own_noise(pairs: Sequence[Pair], most: int = _MOST_MEASURED) -> Frames:
+def measure_own_noise(pairs: Sequence[Pair], most: int = _MOST_MEASURED) -> Frames[Pair]:
     """Measure the own noise of whole references as they are read, unless they state it.
 
     Only ``most`` of them are measured, evenly spaced, since each takes seconds.

@@ -141,7 +141,7 @@ def fit(
     return isp
 
 
-def describe_rendering(pairs: Frames, frames: int, registered: int) -> str:
+def describe_rendering(pairs: Frames[Pair], frames: int, registered: int) -> str:
     """Name the renderings that were fitted, whose tone curve and colours the ISP undoes.
 
     Registered pairs are not JPEGs of the camera.
@@ -172,7 +172,7 @@ class _Watch:
 
 def _open_pairs(
     source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool, mosaics: Mapping[str, Any]
-) -> Frames:
+) -> Frames[Pair]:
     if isinstance(source, (str, Path)):
         source = [source]
     if not hasattr(source, "__getitem__") or not len(source):
@@ -187,7 +187,7 @@ def _open_pairs(
     return as_frames(source)  # type: ignore[arg-type]
 
 
-def _open_named(source: Sequence[str | Path], camera_jpeg: bool, mosaics: Mapping[str, Any]) -> Frames:
+def _open_named(source: Sequence[str | Path], camera_jpeg: bool, mosaics: Mapping[str, Any]) -> Frames[Pair]:
     """Open files and folders as one folder, or a single dataset."""
     for item in source:
         pairs = open_pairs(str(item), split="train", as_clean=False, **mosaics)

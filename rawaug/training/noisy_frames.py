@@ -27,7 +27,7 @@ from denoisers.classical import NonLocalMeans, Stabilised
 from rawaug import bayer
 from rawaug.bayer import CFA, crop_to_cfa
 from rawaug.data.development import develop_packed
-from rawaug.data.frames import Lazy
+from rawaug.data.frames import Frames
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.trials import Trial
 from rawaug.noise import ShotReadModel, camera_law
@@ -160,7 +160,7 @@ def faintness_note(frames: Sequence[NoisyFrame]) -> str:
     )
 
 
-class FrozenPictures(Lazy[NoisyFrame]):
+class FrozenPictures(Frames[NoisyFrame]):
     """Noisy RAW frames of sRGB pictures, which never change; up to :data:`CACHED` of them stay in memory.
 
     Args:

@@ -72,7 +72,7 @@ PHONES = ("GP", "IP", "S6")
 LABELS = [FrameLabel(f"{scene:03d}", phone, iso) for scene in (1, 2) for phone in PHONES for iso in (100, 400, 1600)]
 
 
-class Shots(Frames):
+class Shots(Frames[Pair]):
     """Eighteen tiny frames of two scenes by three phones; notes which were read."""
 
     def __init__(self) -> None:
