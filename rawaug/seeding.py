@@ -38,6 +38,8 @@ def draw_rows(generators: Generators, batch: int, draw: Callable[[torch.Generato
     """
     if isinstance(generators, torch.Generator):
         return draw(generators, batch)
+    if len(generators) == 1:
+        return draw(generators[0], 1)
     return torch.cat([draw(generator, 1) for generator in generators])
 
 

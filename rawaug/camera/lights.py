@@ -123,16 +123,23 @@ def daylight(kelvin: Array) -> Array:
     both = ((c3 * t + c2) * t + c1) * t + c0
 
     x = np.where(kelvin <= 7000, both[..., 0], both[..., 1])
-    return np.stack([x, (2.87 - 3.0 * x) * x - 0.275], axis=-1)
+    xy = np.empty((*x.shape, 2))
+    xy[..., 0] = x
+    xy[..., 1] = (2.87 - 3.0 * x) * x - 0.275
+    return xy
 
 
 def move_off_locus(xy: Array, kelvin: Array, duv: Array) -> Array:
     """Move ``xy`` ``(..., 2)`` by ``duv`` ``(...)`` along the normal of the Planckian locus at ``kelvin`` ``(...)``."""
-    rate = _planckian_uv(kelvin)[1]
-    normal = rate[..., ::-1] * (1.0, -1.0)  # to higher v: the locus runs to lower u as it gets hotter
+    return _move_along(_planckian_uv(kelvin)[1], xy, duv)
+
+
+def _move_along(rate: Array, xy: Array, duv: Array) -> Array:
+    """Move ``xy`` by ``duv`` along the normal of a locus whose (u, v) change with the temperature at ``rate``."""
+    normal = rate[..., ::-1] * _TO_HIGHER_V
     length = np.hypot(rate[..., 0], rate[..., 1])
 
-    uv = xy * (4.0, 6.0) / (12.0 * xy[..., 1:] - 2.0 * xy[..., :1] + 3.0)
+    uv = xy * _XY_IN_UV / (12.0 * xy[..., 1:] - 2.0 * xy[..., :1] + 3.0)
     return _xy_from_uv(uv + (duv / length)[..., None] * normal)
 
 
@@ -153,7 +160,8 @@ def sample_lights(batch: int, generator: Generators, lights: LightRange = _ALL_L
 
     def numbers(draw: Callable[..., torch.Tensor], *shape: int) -> Array:
         rows = draw_rows(generator, batch, lambda g, rows: draw(rows, *shape, generator=g, dtype=torch.float64))
-        return np.asarray(rows.numpy())
+        array: Array = rows.numpy()
+        return array
 
     uniform = numbers(torch.rand, 4)
     duv = _DUV_SPREAD * numbers(torch.randn)
@@ -168,10 +176,11 @@ def sample_lights(batch: int, generator: Generators, lights: LightRange = _ALL_L
     on_daylight &= temperature >= _DAYLIGHT_FROM
 
     by_daylight = daylight(np.maximum(temperature, _DAYLIGHT_FROM))
-    on_locus = np.where(on_daylight[:, None], by_daylight, planckian(temperature))
+    black_body, rate = _planckian_uv(temperature)
+    on_locus = np.where(on_daylight[:, None], by_daylight, _xy_from_uv(black_body))
     lamp = among[(uniform[:, 3] * len(among)).astype(np.int64)]
     xy = np.where(uniform[:, 2:3] < lamps, lamp, on_locus)
-    return _white_point(move_off_locus(xy, temperature, duv))
+    return _white_point(_move_along(rate, xy, duv))
 
 
 def _planckian_uv(kelvin: Array) -> tuple[Array, Array]:
@@ -187,12 +196,20 @@ def _planckian_uv(kelvin: Array) -> tuple[Array, Array]:
 
 def _white_point(xy: Array) -> Array:
     x, y = xy[..., 0], xy[..., 1]
-    return np.stack([x / y, np.ones_like(x), (1.0 - x - y) / y], axis=-1)
+    xyz = np.ones((*x.shape, 3))
+    xyz[..., 0] = x / y
+    xyz[..., 2] = (1.0 - x - y) / y
+    return xyz
 
 
 def _xy_from_uv(uv: Array) -> Array:
-    return uv * (3.0, 2.0) / (2.0 * uv[..., :1] - 8.0 * uv[..., 1:] + 4.0)
+    return uv * _UV_IN_XY / (2.0 * uv[..., :1] - 8.0 * uv[..., 1:] + 4.0)
 
+
+_XY_IN_UV, _UV_IN_XY = np.array([4.0, 6.0]), np.array([3.0, 2.0])
+"""Factors of the numerators of u, v (CIE 1960) in x, y, and of x, y in u, v."""
+_TO_HIGHER_V = np.array([1.0, -1.0])
+"""The locus runs to lower u as it gets hotter."""
 
 _PLANCKIAN = np.array(
     [

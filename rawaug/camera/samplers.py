@@ -36,6 +36,7 @@ from rawaug.seeding import Generators, draw_rows, take_generators
 PLAUSIBLE_GAINS = (0.4, 6.0)
 """Range of red and blue gains over green that are kept; a D65 matrix says nothing about light that needs more."""
 CAMERAS_MIXED = 2
+_FROM_XYZ = XYZ_TO_SRGB.numpy().T
 _ROUNDS = 100
 
 
@@ -130,7 +131,7 @@ class CameraSampler:
 
     def balance(self, weights: Array, light: Array) -> Array:
         """Compute the white balance ``(B, 3)``, green 1, of mixtures ``(B, N)`` in light of white points ``(B, 3)``."""
-        linear = light @ XYZ_TO_SRGB.numpy().T
+        linear = light @ _FROM_XYZ
         matrices = _row_by_row(weights, self.matrices).reshape(-1, 3, 3)
         response = _row_by_row(weights, self.responses) * (matrices * linear[:, None]).sum(axis=2)
         return np.asarray(response[:, 1:2] / response)
@@ -199,7 +200,7 @@ class DataSheetSampler(CameraSampler):
 
 def _row_by_row(rows: Array, matrix: Array) -> Array:
     """Multiply rows ``(B, N)`` by a matrix, with the same bits however many there are, which BLAS does not promise."""
-    return np.concatenate([rows[number : number + 1] @ matrix for number in range(len(rows))])
+    return np.asarray((rows[:, None] @ matrix)[:, 0])
 
 
 def _as_array(tensor: Tensor) -> Array:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import deepcopy
-from functools import partial
+from functools import lru_cache, partial
 from itertools import pairwise
 
 import torch
@@ -29,7 +29,7 @@ from rawaug.errors import count_of
 from rawaug.isp.config import ISPParams
 from rawaug.isp.functional import highlight_rise
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import BatchParams, Stage, Tables, node_colours
+from rawaug.isp.stages import BatchParams, PlaceGain, Stage, Tables, node_colours
 from rawaug.isp.tone import STEPS, to_code
 from rawaug.kernels import can_use_triton, fastest
 from rawaug.kernels.reference import Display, Unprocessing, blur_taps, fall_off, look_up, mask_frame, render, unprocess
@@ -170,8 +170,10 @@ class BakedISP(nn.Module):
             Noisy, clean, variance; None where there is no such pass, and :meth:`forward` or :meth:`colours` and the
             noise have to make them one after the other.
         """
+        if not can_use_triton(srgb):
+            return None
         _require_batch(srgb, params, place, blur)
-        if not can_use_triton(srgb) or self._gain(srgb, params, place) is not None:
+        if self._gain(srgb, params, place) is not None:
             return None
         camera = self._unprocessing(srgb, params, place, blur)
         return fastest(
@@ -361,21 +363,25 @@ def _copy_to_host(isp: DictionaryISP) -> list[DictionaryISP]:
 
 def _batch_params(stages: Sequence[Stage], image: Tensor, params: ISPParams, place: Tensor | None) -> BatchParams:
     batch, _, height, width = image.shape
-    batch_params = BatchParams(
-        matrix=torch.eye(3, dtype=torch.float32).expand(batch, 3, 3),
-        floor=torch.ones(batch, 1, 3, dtype=torch.float32),
-        frame=torch.zeros(batch, 6, dtype=torch.float32),
-        curves=torch.empty(batch, 0, dtype=torch.float32),
-        shading=torch.empty(0, dtype=torch.float32),
-    )
+    batch_params = _neutral_params(batch)
     params = params.map(Tensor.cpu)
     for stage in stages:
         batch_params = stage.adjust(batch_params, params, place, (height, width))
     return batch_params
 
 
-@torch.no_grad()
-@one_thread()  # as above, and the same gains in every process
+@lru_cache(maxsize=64)  # small tensors cost a single crop as much as its pixels
+def _neutral_params(batch: int) -> BatchParams:
+    """The numbers of an ISP that does nothing; stages replace them, and never write to them."""
+    return BatchParams(
+        matrix=torch.eye(3, dtype=torch.float32, device="cpu").expand(batch, 3, 3),
+        floor=torch.ones(batch, 1, 3, dtype=torch.float32, device="cpu"),
+        frame=torch.zeros(batch, 6, dtype=torch.float32, device="cpu"),
+        curves=torch.empty(batch, 0, dtype=torch.float32, device="cpu"),
+        shading=torch.empty(0, dtype=torch.float32, device="cpu"),
+    )
+
+
 def _place_gain(
     stages: Sequence[Stage],
     params: ISPParams,
@@ -389,11 +395,25 @@ def _place_gain(
     Returns:
         ``(B, 1 or 3, H, W)``, or None without any.
     """
-    factors = [stage.place_gain(forward) for stage in stages]
-    place_gains = [factor for factor in factors if factor is not None]
+    place_gains = []
+    for stage in stages:
+        place_gain = stage.place_gain(forward)
+        if place_gain is not None:
+            place_gains.append(place_gain)
     if not place_gains:
         return None
+    return _multiply_gains(place_gains, params, place, size, device)
 
+
+@torch.no_grad()
+@one_thread()  # as above, and the same gains in every process
+def _multiply_gains(
+    place_gains: Sequence[PlaceGain],
+    params: ISPParams,
+    place: Tensor | None,
+    size: tuple[int, int],
+    device: torch.device,
+) -> Tensor:
     height, width = size
     places = [[0, 0, height, width]] * len(params.gains)
     if place is not None:

@@ -67,7 +67,7 @@ def unprocess(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
         np.float32(camera.knee) if camera.colour[:, 5].any() else None,  # else no gain spares highlights
         _present(camera.frame),
         _present(camera.shading),
-        np.array(camera.sites),
+        _as_array(camera.sites),
         _present(camera.taps),
         np.float32(white),
         raw.numpy(),
@@ -92,6 +92,11 @@ def unprocess(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
 
     run_over_rows(batch * height // 2, 2 * width, convert)
     return raw
+
+
+@lru_cache(maxsize=None)
+def _as_array(sites: tuple[tuple[int, int, int], ...]) -> np.ndarray:
+    return np.array(sites)
 
 
 def _present(part: Tensor) -> np.ndarray | None:

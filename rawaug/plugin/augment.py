@@ -28,6 +28,7 @@ from rawaug.errors import count_of
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP, restrict_to_cameras
+from rawaug.kernels import can_use_triton
 from rawaug.kernels.runtime import eager, take_pictures
 from rawaug.noise import Iso, NoiseSpec, noise_model
 from rawaug.noise.models import ShotReadNoise
@@ -231,12 +232,11 @@ class RawAugment(PairMaker):
 
         with _float32(batch):
             setting = self.settings.sample(batch, generator, chosen)
-            return AugmentParams(setting, *self._draw_noise(len(batch), generator, crop))
+            return self._draw_noise(setting, generator, crop)
 
-    def _draw_noise(
-        self, batch: int, generator: torch.Generator, crop: Tensor
-    ) -> tuple[dict[str, Tensor], Tensor, dict[str, Tensor]]:
+    def _draw_noise(self, setting: ISPParams, generator: torch.Generator, crop: Tensor) -> AugmentParams:
         """Draw what follows after the camera settings: the noise, and what the target needs."""
+        batch = len(crop)
         noise = self.noise.sample(batch, generator)
         extras: dict[str, Tensor] = {}
         if self.srgb is not None:
@@ -244,7 +244,7 @@ class RawAugment(PairMaker):
         if self.burst is not None:
             extras |= self.burst.sample(batch, generator)
         extras |= self.settings.sample_blur(batch, generator)
-        return noise, crop, extras
+        return AugmentParams(setting, noise, crop, extras)
 
     @eager
     @torch.no_grad()
@@ -261,10 +261,14 @@ class RawAugment(PairMaker):
 
         self._require_here(batch)
         with _float32(batch):
-            settings = self.settings.sample(batch, generators).map(lambda tensor: tensor.split(1))
+            settings = self.settings.sample(batch, generators)
+            if len(batch) == 1:
+                return self._draw_noise(settings, generators[0], crops)
+
             parts = []
-            for setting, generator, crop in zip(zip(*settings, strict=True), generators, crops.split(1), strict=True):
-                parts.append(AugmentParams(ISPParams(*setting), *self._draw_noise(1, generator, crop)))
+            for row, (generator, crop) in enumerate(zip(generators, crops.split(1), strict=True)):
+                setting = settings.map(lambda tensor, row=row: tensor[row : row + 1])
+                parts.append(self._draw_noise(setting, generator, crop))
         return AugmentParams.concatenate(parts)
 
     def apply_params(self, batch: Tensor, params: AugmentParams) -> RawPair:
@@ -282,7 +286,8 @@ class RawAugment(PairMaker):
     def _shot(self, srgb: Tensor, params: AugmentParams) -> tuple[Tensor, Tensor, Tensor]:
         """Make noisy, clean and variance of single shots, in one pass where there is one."""
         in_colour = self.target == "rgb"
-        if self.pattern is None and isinstance(self.noise, ShotReadNoise) and self.noise.is_plain:
+        in_bayer = self.pattern is None and can_use_triton(srgb)
+        if in_bayer and isinstance(self.noise, ShotReadNoise) and self.noise.is_plain:
             in_one_pass = self.baked.with_noise(
                 srgb,
                 params.isp,

@@ -360,14 +360,17 @@ class RawPairs(_Pairs[Sample]):
             crops = torch.stack([places[number] for number in group])
             drawn_by, of_group = [generators[number] for number in group], [chosen[number] for number in group]
             try:
-                pairs = self.augment.apply(batch, self.augment.sample_each(batch, drawn_by, crops, of_group))
+                pairs = self.augment.make_each(batch, drawn_by, crops, of_group)
             except ValueError as error:
                 names = ", ".join(str(indices[number]) for number in group)
                 raise ValueError(f"picture {names}: {error}") from error
 
             for row, number in enumerate(group):
                 pair = pairs.map(lambda tensor, row=row: tensor[row])
-                form = self.form(pair, self._sample_name(indices[number]), batch[row])
+                name = None
+                if self.form.fields and "name" in self.form.fields:
+                    name = self._sample_name(indices[number])
+                form = self.form(pair, name, batch[row])
                 finished.append(replace_picture(*samples[number], form))
         return finished
 

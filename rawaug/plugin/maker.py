@@ -155,6 +155,18 @@ class PairMaker(nn.Module, ABC):
 
     @eager
     @torch.no_grad()
+    def make_each(
+        self,
+        batch: Tensor,
+        generators: Sequence[torch.Generator],
+        crops: Tensor,
+        chosen: Sequence[ISPParams | None],
+    ) -> RawPair:
+        """Make pairs, each drawn from a generator of its own; the arguments are as for :meth:`sample_each`."""
+        return self.apply_params(batch, self.sample_each(batch, generators, crops, chosen))
+
+    @eager
+    @torch.no_grad()
     def apply(self, inputs: Any, params: AugmentParams | None = None) -> Any:
         """Make the :class:`RawPair` that the parameters describe, bit for bit the same at every call.
 

@@ -94,6 +94,8 @@ class AugmentParams(NamedTuple):
     @classmethod
     def concatenate(cls, parts: Sequence[AugmentParams]) -> AugmentParams:
         """Join the parameters of several batches ``(B, ...)`` to those of one."""
+        if len(parts) == 1:
+            return parts[0]
         first = parts[0]
         isp = ISPParams(*map(torch.cat, zip(*[params.isp for params in parts], strict=True)))
         noise = {name: torch.cat([params.noise[name] for params in parts]) for name in first.noise}
