@@ -6,7 +6,7 @@ vector instructions, except for those of :mod:`rawaug.kernels.vectors`. The expo
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 import torch
@@ -94,7 +94,7 @@ def unprocess(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
     return raw
 
 
-@lru_cache(maxsize=None)
+@cache
 def _as_array(sites: tuple[tuple[int, int, int], ...]) -> np.ndarray:
     return np.array(sites)
 

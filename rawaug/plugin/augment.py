@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy, deepcopy
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -267,7 +268,7 @@ class RawAugment(PairMaker):
 
             parts = []
             for row, (generator, crop) in enumerate(zip(generators, crops.split(1), strict=True)):
-                setting = settings.map(lambda tensor, row=row: tensor[row : row + 1])
+                setting = settings.map(itemgetter(slice(row, row + 1)))
                 parts.append(self._draw_noise(setting, generator, crop))
         return AugmentParams.concatenate(parts)
 

@@ -366,7 +366,7 @@ class RawPairs(_Pairs[Sample]):
                 raise ValueError(f"picture {names}: {error}") from error
 
             for row, number in enumerate(group):
-                pair = pairs.map(lambda tensor, row=row: tensor[row])
+                pair = pairs.map(operator.itemgetter(row))
                 name = None
                 if self.form.fields and "name" in self.form.fields:
                     name = self._sample_name(indices[number])
