@@ -5,6 +5,7 @@ Two names are alike if they have the same letters and digits after these changes
 - a mark is ``M2`` whether it is written ``Mark II``, ``MkII``, ``II`` or Nikon's ``_2``;
 - Sony's ILCE, ILCA, SLT and DSLR are the line A, so that the A7 III is the ILCE-7M3; DSC, DMC and DC, and the words EOS
   and Lumix, are left out;
+- a maker is named once, without what its files add: NIKON CORPORATION NIKON D5000, OLYMPUS IMAGING CORP. E-M1;
 - a camera that Canon sells under three names goes by its number: the Rebel T4i and the Kiss X6i are the 650D.
 """
 
@@ -29,6 +30,8 @@ _MARKS = {"i": 1, "ii": 2, "iii": 3, "iv": 4, "v": 5, "vi": 6, "vii": 7}
 _ROMAN = r"(i{1,3}|iv|v|vii?)(a?)\b"
 _MARK = re.compile(rf"(?:mark|mk)\s*(?:(\d)\b|{_ROMAN})|_(\d)\b|\b{_ROMAN}|(?:(?<=\d)|(?<=\d[rs]))(iii?|iv)\b")
 _LINES = (
+    (r"\b(corporation|corp|imaging|optical|company|co|ltd|camera ag)\b[.,]*", ""),
+    (r"^(\w+)\s+(?=\1\b)|^ricoh\s+(?=pentax\b)", ""),
     (r"[\u03b1\u0251]|\balpha\b", "a"),
     (r"\b(ilce|ilca|slt|dslr)-a?", "a"),
     (r"\b(dsc|dmc|dc)-|\b(eos|lumix)\b", ""),
@@ -42,8 +45,8 @@ def camera_key(name: str) -> str:
     Example:
         >>> camera_key("Sony A7 III") == camera_key("Sony ILCE-7M3"), camera_key("Canon EOS 5D Mark II")
         (True, 'canon5dm2')
-        >>> camera_key("Nikon Z 6_2")
-        'nikonz6m2'
+        >>> camera_key("Nikon Z 6_2"), camera_key("NIKON CORPORATION NIKON D5000")
+        ('nikonz6m2', 'nikond5000')
     """
     text = " ".join(name.casefold().split())
     for pattern, instead in _LINES:

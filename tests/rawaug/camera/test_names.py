@@ -33,6 +33,9 @@ MATRICES, PROFILES = load_cameras().names, load_profiles().names
         ("Nikon Z7 II", "Nikon Z 7_2"),
         ("Panasonic Lumix GH5", "Panasonic DC-GH5"),
         ("Fujifilm XT3", "Fujifilm X-T3"),
+        ("NIKON CORPORATION NIKON D5000", "Nikon D5000"),
+        ("OLYMPUS IMAGING CORP. E-PL5", "Olympus E-PL5"),
+        ("Canon Canon EOS 5D Mark II", "Canon EOS 5D Mark II"),
     ],
 )
 def test_marketing_names_are_those_of_the_files(said: str, listed: str) -> None:
