@@ -1,7 +1,7 @@
 r"""What was measured, for the pages that show it: ``docs/figures.json``.
 
-    rawaug benchmark PMRID.safetensors PBRID.safetensors --data FRAMES --bin 4 --json RESULT.json
-    python -m benchmarks.figures hero6 RESULT.json --frames hero6
+    python -m benchmarks.strengths TABLE.json rawaug-base PBRID.safetensors --sets real:test demo:test
+    python -m benchmarks.figures strengths TABLE.json --plot docs/cost.png "demo test, strong"
 
 A set of figures has a name, the command, commit, machine and seed it comes from, its frames, and the SHA-256 of the
 shipped networks among its columns. Figures are texts by row and column, as pages show them. ``RESULT.json`` is what
@@ -32,6 +32,7 @@ from scipy import stats
 from benchmarks.measure import machine, parser
 from denoisers.files import find_denoiser, list_shipped
 from rawaug.evaluation.benchmark import TOLD
+from rawaug.evaluation.figures import plot_costs
 from rawaug.evaluation.verdict import paired_interval
 from rawaug.files import sha256, write_text
 
@@ -145,18 +146,23 @@ def figures_of_strengths(table: Mapping[str, Any]) -> dict[str, dict[str, str]]:
     """The table of ``benchmarks.strengths`` at known levels, and how far apart denoisers are over all of its rows."""
     by_row: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for key, cells in table.items():
+        if key == "GMAC":
+            continue
         frames, condition, strength, frame = key.split(" | ")
         if condition != TOLD:
             continue
         groups = [_short(frames)]
-        if frame.startswith("hero7"):
-            groups.append("hero7")
+        groups += [camera for camera in ("hero6", "hero7") if frame.startswith(camera)]
         for group in groups:
             row = by_row.setdefault(f"{group}, {strength}", {})
             for name, (raw, srgb, _) in cells.items():
                 row.setdefault(_column(name), []).append((raw, srgb))
 
-    figures: dict[str, dict[str, str]] = {}
+    figures: dict[str, dict[str, str]] = {"GMAC": {}}
+    for name, gmac in table.get("GMAC", {}).items():
+        if gmac is not None:
+            figures["GMAC"][_column(name)] = f"{gmac:.3g}"
+
     ranges: dict[str, dict[str, list[float]]] = {}
     for row_name, scores in by_row.items():
         figures |= figures_of_drawn_noise(row_name, scores)
@@ -210,6 +216,17 @@ def figures_of_bracket(result: Mapping[str, Any]) -> dict[str, dict[str, str]]:
     return figures
 
 
+def plot_row(figures: Mapping[str, Mapping[str, str]], row: str) -> bytes:
+    """Plot the PSNR of a row over the operations of its denoisers, as PNG."""
+    points: dict[str, tuple[float | None, float, float]] = {}
+    for name, cell in figures[row].items():
+        if name != "noisy":
+            raw, srgb = cell.replace("*", "").split(" / ")
+            gmac = figures["GMAC"].get(name)
+            points[name] = (None if gmac is None else float(gmac), float(raw), float(srgb))
+    return plot_costs(points)
+
+
 def _short(frames: str) -> str:
     """The name of a set of frames in a marker: the folder without its path, ``real:test`` without the colon."""
     return Path(frames.partition("@")[0]).name.replace(":", " ")
@@ -227,6 +244,7 @@ def main(command: Sequence[str] | None = None) -> None:
     options.add_argument("--frames", default="", help="beginnings of the names of the frames that count")
     options.add_argument("--on", default="", help="what the frames are; by default their names")
     options.add_argument("--command", default="", help="what wrote the file; by default what it says itself")
+    options.add_argument("--plot", nargs=2, metavar=("PNG", "ROW"), help="PSNR of a row over operations, as a picture")
     options.add_argument("--commit", help="the commit that wrote it, if it is not the present one")
     args = options.parse_args(command)
     result = json.loads(args.result.read_text(encoding="utf-8"))
@@ -235,12 +253,15 @@ def main(command: Sequence[str] | None = None) -> None:
     if "rows" in result:
         figures = figures_of_benchmark(result, args.frames or " ".join(result["frames"]))
         on = on or args.frames or ", ".join(result["frames"])
-    elif all(" | " in key for key in result):
+    elif "GMAC" in result:
         figures = figures_of_strengths(result)
     else:
         figures = figures_of_bracket(result)
     how = args.command or result.get("command", "")
     record(args.name, figures, how, on, result.get("seed", 0), args.commit, result.get("weights_sha256"))
+    if args.plot:
+        picture, row = args.plot
+        Path(picture).write_bytes(plot_row(figures, row))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,8 @@
 
 Denoisers are named as for ``rawaug benchmark``; noise and middles are those of its first table. ``@8`` behind a name is
 a self-ensemble of eight views, ``@4`` behind a set bins it 4 x 4 around the sites. Scores go to the file as they come,
-and what stands there is not scored again, so slow denoisers can be added to a table later.
+and what stands there is not scored again, so slow denoisers can be added to a table later; the operations of each
+denoiser stand there, too. ``python -m benchmarks.figures`` puts the table into docs/figures.json.
 """
 
 from __future__ import annotations
@@ -21,13 +22,16 @@ import torch
 from benchmarks.measure import parser
 from rawaug.data import open_pairs
 from rawaug.denoising.denoiser import RawDenoiser
-from rawaug.evaluation.benchmark import REAL, TOLD, choose_strengths, trials
+from rawaug.evaluation.benchmark import REAL, TOLD, choose_strengths, count_gmac, trials
 from rawaug.evaluation.scores import NOISY, score
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial, measure_own_noise
 from rawaug.progress import progress
 
 Scores = dict[str, Any]
+
+GMAC = "GMAC"
+"""The key of the operations a mosaic megapixel, by denoiser, beside those of the trials."""
 
 
 def main(command: Sequence[str] | None = None) -> None:
@@ -50,6 +54,7 @@ def main(command: Sequence[str] | None = None) -> None:
         everything = [trial for trial in frozen_trials(name, args.crop, args.noise) if trial.condition in conditions]
         for spec in ["noisy", *args.denoisers]:
             add_scores(table, name, spec, everything, args.table)
+    add_costs(table, args.denoisers, args.table)
     print_table(table)
 
 
@@ -77,6 +82,15 @@ def add_scores(table: Scores, name: str, spec: str, everything: Sequence[Trial],
         path.write_text(json.dumps(table, indent=0))
 
 
+def add_costs(table: Scores, specs: Sequence[str], path: Path) -> None:
+    """Count the operations of the denoisers that the table lacks."""
+    costs = table.setdefault(GMAC, {})
+    for spec in specs:
+        if Path(spec).stem not in costs:
+            costs[Path(spec).stem] = count_gmac(open_denoiser(spec))
+            path.write_text(json.dumps(table, indent=0))
+
+
 def open_denoiser(spec: str) -> Any:
     """The noisy input, or a denoiser by its name, with as many views as stand behind its ``@``."""
     if spec == "noisy":
@@ -88,11 +102,12 @@ def open_denoiser(spec: str) -> Any:
 def print_table(table: Scores) -> None:
     """A row for each set, condition and strength; a cell is the mean over frames, RAW / developed."""
     groups: dict[tuple[str, ...], list[Scores]] = {}
-    for key, cells in table.items():
+    scores_by_key = {key: cells for key, cells in table.items() if key != GMAC}
+    for key, cells in scores_by_key.items():
         name, condition, strength, _ = key.split(" | ")
         groups.setdefault((name, condition, strength), []).append(cells)
 
-    columns = list(dict.fromkeys(column for cells in table.values() for column in cells))
+    columns = list(dict.fromkeys(column for cells in scores_by_key.values() for column in cells))
     rows = []
     for group, frames in groups.items():
         row = [*group, str(len(frames))]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -182,6 +183,19 @@ def test_a_figure_of_drawn_noise_is_bold_only_where_every_frame_says_so() -> Non
 
     alone = figures.figures_of_drawn_noise("strong", {"rawaug-base": ahead[:1], "PBRID": behind[:1]})
     assert alone["strong"]["rawaug-base"] == "40.00 / 30.00" and not alone["strong, its interval"]
+
+
+def test_figures_of_strengths_and_the_picture_of_their_costs() -> None:
+    table: dict[str, Any] = {"GMAC": {"rawaug-base": 123.4, "NonLocalMeans": None}}
+    for frame, psnr in (("hero6_1", 40.0), ("hero7_1", 42.0), ("hero7_2", 44.0)):
+        cells = {"noisy": [30.0, 20.0, None], "rawaug-base": [psnr, 30.0, None], "NonLocalMeans": [38.0, 29.0, None]}
+        table[f"/x/GOPRO@4 | levels told | strong | {frame}"] = cells
+        table[f"/x/GOPRO@4 | levels estimated | strong | {frame}"] = {"noisy": [0.0, 0.0, None]}
+    rows = figures.figures_of_strengths(table)
+    assert rows["GMAC"] == {"rawaug-base": "123"}
+    shown = [rows[f"{name}, strong"]["rawaug-base"] for name in ("GOPRO", "hero6", "hero7")]
+    assert [cell.replace("*", "").split(" / ")[0] for cell in shown] == ["42.00", "40.00", "43.00"]
+    assert figures.plot_row(rows, "GOPRO, strong").startswith(b"\x89PNG")
 
 
 def test_figures_are_recorded_with_their_network(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from rawaug.denoising.convolutions import USUAL, expect_seconds
 from rawaug.denoising.denoise import files_for, is_mixed, open_denoiser
 from rawaug.denoising.folder import DenoisedFolder, denoise_file, denoise_folder
 from rawaug.denoising.pictures import PictureDenoiser, PictureFiles
-from rawaug.denoising.raw import Denoised, Greens, RawFiles
+from rawaug.denoising.raw import Denoised, Greens, RawFiles, Strength
 from rawaug.errors import count_of, escape
 from rawaug.files import write_json
 from rawaug.io.content import PICTURE_KINDS
@@ -27,7 +27,7 @@ def run(
     denoiser: str | None = None,
     classical: Annotated[Spec | None, YAML] = None,
     noise: Annotated[tuple[float, float] | str | dict[str, Any], YAML] = "auto",
-    strength: float = 1.0,
+    strength: Strength = 1.0,
     linear: bool = False,
     self_ensemble: bool = False,
     greens: Greens = "auto",
@@ -55,8 +55,9 @@ def run(
             law, else the levels of the folder's files of the same camera and ISO), profile, estimate, camera (the law
             that the denoiser was trained for), an ISP file (uses its stored noise law), a camera's .yaml sheet, the
             name of a camera, [shot_var, read_var], or a law as {name: MeasuredNoise, levels: ...}.
-        strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing; for pictures, a factor on
-            the estimated level of the noise: 2 removes more, 0.5 less.
+        strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing; auto leaves grain of 1% of
+            mid grey, so that fine texture looks natural at low ISO; for pictures, a factor on the estimated level of
+            the noise: 2 removes more, 0.5 less.
         linear: also demosaic, to a linear DNG of full colour; by default with rawaug-joint.
         self_ensemble: average eight views of a network, at eight times the cost.
         greens: auto makes the two greens of a Bayer sensor agree if they clearly differ, since demosaicing turns the
@@ -92,7 +93,8 @@ def run(
             raise ValueError(f"{out}: {source} is a folder, and so is its output; give a name without {extension}")
         if spec is None and is_mixed(Path(source)):
             spec = PictureDenoiser.default
-            pictures = PictureFiles(open_denoiser(PictureDenoiser, spec, strength, self_ensemble, device))
+            factor = 1.0 if isinstance(strength, str) else strength
+            pictures = PictureFiles(open_denoiser(PictureDenoiser, spec, factor, self_ensemble, device))
             result = denoise_folder(
                 source, out, kind, previews=preview, overwrite=overwrite, elsewhere=("rendering", *PICTURE_KINDS)
             )

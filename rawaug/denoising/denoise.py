@@ -12,7 +12,7 @@ from rawaug.denoising.denoiser import D, RawDenoiser
 from rawaug.denoising.folder import Files, denoise_file
 from rawaug.denoising.levels import Noise
 from rawaug.denoising.pictures import LINEAR, PictureDenoiser, PictureFiles
-from rawaug.denoising.raw import Greens, RawFiles
+from rawaug.denoising.raw import Greens, RawFiles, Strength
 from rawaug.files import files_below, require_output
 from rawaug.io import RawFrame
 from rawaug.io.content import ALL_PICTURE_EXTENSIONS, RAW_EXTENSIONS, identify_content, picture_extensions
@@ -25,7 +25,7 @@ def denoise(
     *,
     denoiser: Any = None,
     noise: Noise = "auto",
-    strength: float = 1.0,
+    strength: Strength = 1.0,
     linear: bool = False,
     self_ensemble: bool = False,
     greens: Greens = "auto",
@@ -44,8 +44,9 @@ def denoise(
         denoiser: whatever :meth:`rawaug.RawDenoiser.of` takes: a shipped name, a file, a filter by its name, a network,
             a function, ...; by default the shipped one for the frame's pattern, or for pictures.
         noise: where the noise levels of RAW come from, see :data:`rawaug.denoising.levels.Noise`.
-        strength: 1 removes the noise, 0.7 leaves 30% of it, 0 changes nothing; for pictures, a factor on the estimated
-            level of the noise.
+        strength: 1 removes the noise, 0.7 leaves 30% of it, 0 changes nothing, ``"auto"`` leaves grain of 1% of mid
+            grey, which is most of weak noise and little of strong; for pictures, a factor on the estimated level of
+            the noise.
         linear: also demosaic RAW, to linear camera RGB.
         self_ensemble: average eight views, at eight times the cost.
         greens: ``"keep"`` leaves the two greens of a Bayer sensor that differ as they are.
@@ -85,7 +86,7 @@ def denoise(
 def files_for(
     source: str | Path | RawFrame,
     denoiser: Any = None,
-    strength: float = 1.0,
+    strength: Strength = 1.0,
     linear: bool = False,
     self_ensemble: bool = False,
     device: str = "auto",
@@ -103,12 +104,20 @@ def files_for(
         FileNotFoundError: if there is no such file.
         ValueError: if it is a file of no kind, or a setting does not fit it.
     """
+    grain = strength == "auto"
+    if isinstance(strength, str):
+        if not grain:
+            raise ValueError(f"strength: {strength!r} is unknown; use a number from 0 to 1, or auto")
+        strength = 1.0
+
     if not _is_raw(source):
         defaults = inspect.signature(RawFiles).parameters
         stated = ["linear"] if linear else []
         stated += [argument for argument, value in for_raw.items() if value != defaults[argument].default]
         if stated:
             raise ValueError(f"{source}: is a developed picture; {stated[0]}= is for RAW")
+        if grain:
+            raise ValueError(f"{source}: is a developed picture; strength= is a number for it, by default 1")
         if denoiser is None:
             denoiser = PictureDenoiser.default
         return PictureFiles(open_denoiser(PictureDenoiser, denoiser, strength, self_ensemble, device))
@@ -121,7 +130,7 @@ def files_for(
         raise ValueError(f"{denoiser.name}: denoises the mosaic; linear=True demosaics, too, use {JOINT}")
     if denoiser.demosaics and not linear:
         raise ValueError(f"{denoiser.name}: demosaics too, to a linear DNG; add linear=True")
-    return RawFiles(denoiser, by_pattern=by_pattern, **for_raw)
+    return RawFiles(denoiser, by_pattern=by_pattern, grain=grain, **for_raw)
 
 
 def open_denoiser(

@@ -8,6 +8,13 @@ where smooth places show that they clearly differ (:mod:`rawaug.bayer.greens`). 
 the noise, so that a RAW developer does not smooth once more. With a strength s below 1, (1 - s)^2 of the noise's
 variance is left, and the noise profile says so. A network that also demosaics gives camera RGB.
 
+With ``grain``, s falls with the noise, so that grain of one deviation g is left in every frame,
+
+    s = max(0, 1 - g / d), d = sqrt(shot_var m + read_var) / m
+
+where d is the noise at mid grey m in units of m. At weak noise there is little to remove, and texture as fine as the
+noise, which a network turns into strokes, is kept along with the grain.
+
 A monochrome frame is denoised as the mosaic of a grey scene, which it is.
 """
 
@@ -48,11 +55,17 @@ from rawaug.kernels.runtime import find_device
 MID_GREY = 0.18
 """The signal whose noise is stated for photographers, on the scale black 0, white 1."""
 
+GRAIN = 0.01
+"""What ``grain`` leaves of the noise at mid grey, in units of mid grey: half a code of 8 bits, developed."""
+
 _SOURCES = {"profile": "by its tag", "estimate": "estimated", "given": "as given", "camera": "by its camera's law"}
 """Where noise levels come from, in the words of a line for photographers; a camera or other files are named."""
 
 OTHER_PATTERNS = "rawaug-xtrans"
 """The denoiser of X-Trans and Quad-Bayer frames if none is named."""
+
+Strength = float | Literal["auto"]
+"""The share of the noise that is removed, or ``"auto"``, which leaves the same grain in every frame."""
 
 Greens = Literal["auto", "keep"]
 """Whether greens that clearly differ are made to agree, or kept as they are."""
@@ -100,7 +113,7 @@ class Denoised:
         if self.strength < 1.0:
             removed = f"{self.strength:.0%} of it removed"
 
-        deviation = 100 * math.sqrt(self.shot_var * MID_GREY + self.read_var) / MID_GREY
+        deviation = 100 * _noise_at_mid_grey(self.shot_var, self.read_var)
         source, *remarks = self.noise_source.split("; ")
         is_uncertain = "uncertain" in source
         source = source.partition(",")[0]
@@ -154,6 +167,7 @@ class RawFiles(Files[Denoised]):
             it demosaics, too. None stands for the shipped one of Bayer's patterns.
         noise, greens, defects, guard: as in :func:`rawaug.denoise`.
         by_pattern: denoise frames of patterns that are not Bayer's by the shipped denoiser of those.
+        grain: leave grain of :data:`GRAIN` in every frame, in place of the denoiser's strength.
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -176,6 +190,7 @@ class RawFiles(Files[Denoised]):
         defects: str | Path = "mend",
         guard: bool | None = None,
         by_pattern: bool = False,
+        grain: bool = False,
     ) -> None:
         if greens not in get_args(Greens):
             raise ValueError(f"greens: {greens!r} is unknown; use one of {', '.join(get_args(Greens))}")
@@ -189,6 +204,8 @@ class RawFiles(Files[Denoised]):
             raise ValueError(f"{denoiser.name}: demosaics, too; guard compares mosaics")
         if denoiser.demosaics and defects != "mend":
             raise ValueError(f"{denoiser.name}: demosaics, too; defects is for mosaics")
+        if denoiser.demosaics and grain:
+            raise ValueError(f"{denoiser.name}: takes no strength=; the noisy frame has no full colour to mix in")
         if guard is None:
             guard = denoiser.reads_levels and not denoiser.demosaics and "classical" not in denoiser.settings
 
@@ -200,6 +217,7 @@ class RawFiles(Files[Denoised]):
             self.sites = read_defects(defects)
         self.guard = guard
         self.by_pattern = by_pattern
+        self.grain = grain
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -217,7 +235,9 @@ class RawFiles(Files[Denoised]):
             settings["defects"] = self.defects
         if not self.denoiser.demosaics:
             settings["guard"] = self.guard
-        if self.denoiser.strength != 1.0:
+        if self.grain:
+            settings["strength"] = "auto"
+        elif self.denoiser.strength != 1.0:
             settings["strength"] = self.denoiser.strength
         return settings
 
@@ -270,9 +290,12 @@ class RawFiles(Files[Denoised]):
 
         # The levels of its noise.
         levels, noise_source = None, "not needed"
-        if denoiser.reads_levels or self.guard or self.defects != "mend":
+        if denoiser.reads_levels or self.guard or self.grain or self.defects != "mend":
             shot_var, read_var, noise_source = find_levels(noisy, self.noise)
             levels = shot_var, read_var
+        if self.grain and levels is not None:
+            strength = 1.0 - GRAIN / max(_noise_at_mid_grey(*levels), GRAIN)
+            denoiser = replace(denoiser, strength=strength)
 
         # The result: full colour, or a mosaic that is no worse than its input, with single sites as they were.
         image = denoiser.frame(noisy, levels)
@@ -362,6 +385,10 @@ class RawFiles(Files[Denoised]):
         informed = copy(self)
         informed.noise = levels
         return informed
+
+
+def _noise_at_mid_grey(shot_var: float, read_var: float) -> float:
+    return math.sqrt(shot_var * MID_GREY + read_var) / MID_GREY
 
 
 def equalise_greens(frame: RawFrame, greens: Greens = "auto") -> tuple[RawFrame, GreenDifference | None]:

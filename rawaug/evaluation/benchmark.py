@@ -10,7 +10,6 @@ own. The hash of all noisy inputs says whether the figures of two people can be 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from statistics import fmean
@@ -191,7 +190,7 @@ def benchmark(denoisers: Sequence[RawDenoiser], cases: Sequence[Trial]) -> dict[
     for denoiser in denoisers:
         seconds = fmean(row.seconds for row in rows_by_name[denoiser.name])
         rows[denoiser.name]["seconds"] = round(seconds, 3)
-        rows[denoiser.name]["gmac"] = _gmac(denoiser, cases[0])
+        rows[denoiser.name]["gmac"] = count_gmac(denoiser)
 
     frames = list(dict.fromkeys(trial.frame for trial in cases))
     return {"frames": frames, "hash": hash_trials(cases), "rows": rows}
@@ -246,18 +245,16 @@ def noise_note(cases: Sequence[Trial], strengths: Iterable[str], seed: int) -> s
     )
 
 
-def _gmac(denoiser: RawDenoiser, trial: Trial) -> float | None:
+def count_gmac(denoiser: RawDenoiser) -> float | None:
     """Count the multiplications that PyTorch computes, in 10^9 a megapixel of the mosaic; None if there are none.
 
     They are counted on a whole tile, as on a user's frame: a smaller crop is padded, which costs up to twice as much.
     """
-    image = trial.noisy
-    repeats = [math.ceil(_TILE / 2 / side) for side in image.shape[-2:]]
-    tile = image.repeat(1, 1, *repeats)[..., : _TILE // 2, : _TILE // 2]
+    grey = torch.full((1, 4, _TILE // 2, _TILE // 2), 0.2)
     with FlopCounterMode(display=False) as counter:
-        denoiser(Noisy.of(tile, trial.levels or (1e-3, 1e-6), trial.cfa))
+        denoiser(Noisy.of(grey, (1e-3, 1e-6), bayer.CFA.RGGB))
 
-    return round(counter.get_total_flops() / 2e3 / tile.numel(), 2) or None
+    return round(counter.get_total_flops() / 2e3 / grey.numel(), 2) or None
 
 
 def ranking(result: Mapping[str, Any]) -> Iterator[str]:

@@ -219,6 +219,21 @@ def test_a_strength_below_1_leaves_that_much_of_the_noise(
     assert torch.equal(read_raw(tmp_path / "c.dng").mosaic, before.mosaic)
 
 
+@pytest.mark.parametrize("deviation", [0.004, 0.02, 0.1])
+def test_strength_auto_leaves_the_same_grain_in_every_frame(deviation: float) -> None:
+    """Of white noise on mid grey, by a denoiser that knows the scene; noise below the grain is left."""
+    noise = 0.18 * deviation * torch.randn(1, 256, 256, generator=torch.Generator().manual_seed(0))
+    frame = dataclasses.replace(gradient(), mosaic=0.18 + noise)
+    files = RawFiles(
+        lambda packed: torch.full_like(packed, 0.18), noise=(0.0, (0.18 * deviation) ** 2), strength="auto"
+    )
+    result, done = files.denoise(frame)
+    assert (result.mosaic.std() / 0.18).item() == pytest.approx(min(deviation, 0.01), rel=0.02)
+    assert done.strength == pytest.approx(max(0.0, 1 - 0.01 / deviation)) and files.settings["strength"] == "auto"
+    if deviation > 0.01:
+        assert result.noise_profile[1] == pytest.approx(0.0018**2)
+
+
 def test_in_bfloat16_a_network_of_dense_convolutions_does_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     frame, results = gradient(), []
     for fast in (False, True):
@@ -346,6 +361,8 @@ def test_wrong_wishes_are_refused_before_anything_is_written(
         (["--preview", tmp_path / "b.gif"], "the preview is a .jpg or .png"),
         (["--preview", tmp_path], "is a folder"),
         (["--denoiser", identity, "--strength", "1.5"], "strength must be between 0 and 1, got 1.5"),
+        (["--denoiser", identity, "--strength", "atuo"], "strength"),
+        (["--denoiser", joint, "--linear", "--strength", "auto"], "takes no --strength"),
         (["--denoiser", identity, "--linear"], "--linear demosaics, too, use rawaug-joint"),
         (["--denoiser", joint], "demosaics too, to a linear DNG; add --linear"),
         (["--denoiser", joint, "--linear", "--strength", "0.5"], "takes no --strength"),
