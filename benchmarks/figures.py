@@ -152,8 +152,8 @@ def figures_of_strengths(table: Mapping[str, Any]) -> dict[str, dict[str, str]]:
         if condition != TOLD:
             continue
         groups = [_short(frames)]
-        groups += [camera for camera in ("hero6", "hero7") if frame.startswith(camera)]
-        for group in groups:
+        groups += [camera for camera in ("hero6", "hero7", "hero") if frame.startswith(camera)]
+        for group in dict.fromkeys(groups):
             row = by_row.setdefault(f"{group}, {strength}", {})
             for name, (raw, srgb, _) in cells.items():
                 row.setdefault(_column(name), []).append((raw, srgb))
@@ -228,8 +228,8 @@ def plot_row(figures: Mapping[str, Mapping[str, str]], row: str) -> bytes:
 
 
 def _short(frames: str) -> str:
-    """The name of a set of frames in a marker: the folder without its path, ``real:test`` without the colon."""
-    return Path(frames.partition("@")[0]).name.replace(":", " ")
+    """The name of a set of frames in a marker: the folder in lower case, ``real:test`` without the colon."""
+    return Path(frames.partition("@")[0]).name.replace(":", " ").lower()
 
 
 def _column(name: str) -> str:
