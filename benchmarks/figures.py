@@ -143,7 +143,7 @@ def figures_of_benchmark(result: Mapping[str, Any], frames: str) -> dict[str, di
 
 
 def figures_of_strengths(table: Mapping[str, Any]) -> dict[str, dict[str, str]]:
-    """The table of ``benchmarks.strengths`` at known levels, and how far apart denoisers are over all of its rows."""
+    """The table of ``benchmarks.strengths`` at known levels, by row; a denoiser lacks no frame of its rows."""
     by_row: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for key, cells in table.items():
         if key == "GMAC":
@@ -163,17 +163,10 @@ def figures_of_strengths(table: Mapping[str, Any]) -> dict[str, dict[str, str]]:
         if gmac is not None:
             figures["GMAC"][_column(name)] = f"{gmac:.3g}"
 
-    ranges: dict[str, dict[str, list[float]]] = {}
-    for row_name, scores in by_row.items():
+    for row_name, columns in by_row.items():
+        most = max(map(len, columns.values()))
+        scores = {name: frames for name, frames in columns.items() if len(frames) == most}
         figures |= figures_of_drawn_noise(row_name, scores)
-        for name in scores:
-            for other in scores:
-                gain = fmean(_differences(scores, name, other, 0))
-                ranges.setdefault(other, {}).setdefault(name, []).append(gain)
-
-    for other, columns in ranges.items():
-        texts = {name: f"{min(gains):.1f} to {max(gains):.1f}" for name, gains in columns.items() if name != other}
-        figures[f"over {other}, all rows"] = texts
     return figures
 
 

@@ -250,11 +250,12 @@ def count_gmac(denoiser: RawDenoiser) -> float | None:
 
     They are counted on a whole tile, as on a user's frame: a smaller crop is padded, which costs up to twice as much.
     """
-    grey = torch.full((1, 4, _TILE // 2, _TILE // 2), 0.2)
+    side = _TILE // 2
+    ramp = torch.linspace(0.0, 0.9, side).expand(1, 4, side, side)
     with FlopCounterMode(display=False) as counter:
-        denoiser(Noisy.of(grey, (1e-3, 1e-6), bayer.CFA.RGGB))
+        denoiser(Noisy.of(ramp, (1e-3, 1e-6), bayer.CFA.RGGB))
 
-    return round(counter.get_total_flops() / 2e3 / grey.numel(), 2) or None
+    return round(counter.get_total_flops() / 2e3 / ramp.numel(), 2) or None
 
 
 def ranking(result: Mapping[str, Any]) -> Iterator[str]:
