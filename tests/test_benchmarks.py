@@ -189,8 +189,8 @@ def test_figures_of_strengths_and_the_picture_of_their_costs() -> None:
     table: dict[str, Any] = {"GMAC": {"rawaug-base": 123.4, "NonLocalMeans": None}}
     for frame, psnr in (("hero6_1", 40.0), ("hero7_1", 42.0), ("hero7_2", 44.0)):
         cells = {"noisy": [30.0, 20.0, None], "rawaug-base": [psnr, 30.0, None], "NonLocalMeans": [38.0, 29.0, None]}
-        table[f"/x/HERO7@4 | levels told | strong | {frame}"] = cells
-        table[f"/x/HERO7@4 | levels estimated | strong | {frame}"] = {"noisy": [0.0, 0.0, None]}
+        table[f"/x/GOPRO@4 | levels told | strong | {frame}"] = cells
+        table[f"/x/GOPRO@4 | levels estimated | strong | {frame}"] = {"noisy": [0.0, 0.0, None]}
     rows = figures.figures_of_strengths(table)
     assert rows["GMAC"] == {"rawaug-base": "123"}
     shown = [rows[f"{name}, strong"]["rawaug-base"] for name in ("hero", "hero6", "hero7")]

@@ -21,6 +21,7 @@ import rawaug
 from rawaug.bayer import CFA, mosaic, pack, unpack
 from rawaug.cli import main
 from rawaug.commands.denoise import print_denoised, run
+from rawaug.denoising.denoise import files_for
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.denoising.folder import DenoisedFolder, denoise_file, denoise_folder
 from rawaug.denoising.levels import find_levels
@@ -224,9 +225,8 @@ def test_strength_auto_leaves_the_same_grain_in_every_frame(deviation: float) ->
     """Of white noise on mid grey, by a denoiser that knows the scene; noise below the grain is left."""
     noise = 0.18 * deviation * torch.randn(1, 256, 256, generator=torch.Generator().manual_seed(0))
     frame = dataclasses.replace(gradient(), mosaic=0.18 + noise)
-    files = RawFiles(
-        lambda packed: torch.full_like(packed, 0.18), noise=(0.0, (0.18 * deviation) ** 2), strength="auto"
-    )
+    levels = 0.0, (0.18 * deviation) ** 2
+    files = files_for(frame, lambda packed: torch.full_like(packed, 0.18), "auto", noise=levels)
     result, done = files.denoise(frame)
     assert (result.mosaic.std() / 0.18).item() == pytest.approx(min(deviation, 0.01), rel=0.02)
     assert done.strength == pytest.approx(max(0.0, 1 - 0.01 / deviation)) and files.settings["strength"] == "auto"
