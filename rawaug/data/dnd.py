@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -28,15 +28,6 @@ from rawaug.io import RawFrame
 
 FRAMES, BOXES = 50, 20
 """Number of frames of the published dataset, and number of boxes in a frame."""
-
-
-class Box(NamedTuple):
-    """A box in its frame, counted from 0; the ends lie outside."""
-
-    top: int
-    left: int
-    bottom: int
-    right: int
 
 
 class Dnd(Frames[RawFrame]):
@@ -84,27 +75,29 @@ class Dnd(Frames[RawFrame]):
 
         noisy = self._open_frame[1]
         boxes, cfa, stated = self.frames[number]
-        box = boxes[box_number]
+        top, left, bottom, right = boxes[box_number]
         height, width = noisy.shape[-2:]
-        inside = 0 <= box.top < box.bottom <= height and 0 <= box.left < box.right <= width
+        inside = 0 <= top < bottom <= height and 0 <= left < right <= width
         if not inside:
             raise ValueError(
                 f"{self.file(number)}: box {box_number + 1} of info.mat extends beyond the frame of {height} x {width}"
             )
 
-        cut = noisy[:, box.top : box.bottom, box.left : box.right].contiguous()
-        return RawFrame(cut, cfa.shift(box.top, box.left), name=self.names[index], **stated)
+        cut = noisy[:, top:bottom, left:right].contiguous()
+        return RawFrame(cut, cfa.shift(top, left), name=self.names[index], **stated)
 
 
-def parse_frame(entry: Any, file: Path, number: int) -> tuple[list[Box], CFA, dict[str, Any]]:
+def parse_frame(entry: Any, file: Path, number: int) -> tuple[list[tuple[int, ...]], CFA, dict[str, Any]]:
     """Parse a frame of the struct array ``info``: its boxes, its pattern, and what it states for a RawFrame.
+
+    A box is top, left, bottom and right, counted from 0; the ends lie outside.
 
     ValueError, naming the file, is raised if it is not as published.
     """
     try:
-        boxes = []
+        boxes: list[tuple[int, ...]] = []
         for top, left, bottom, right in np.asarray(entry["boundingboxes"]).reshape(-1, 4).astype(int).tolist():
-            boxes.append(Box(top - 1, left - 1, bottom, right))
+            boxes.append((top - 1, left - 1, bottom, right))
 
         camera, noise = entry["camera"], entry["nlf"]
         colours = ["RGB"[int(colour) - 1] for colour in np.ravel(camera["pattern"])]

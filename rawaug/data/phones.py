@@ -241,14 +241,6 @@ def phone_curve(linear: Tensor, brightness: float, contrast: float) -> Tensor:
     return display + brightness * middle - contrast * middle * (1.0 - 2.0 * display)
 
 
-class _Instance(NamedTuple):
-    """A scene instance: its name, what is drawn for it, and the photograph that it shows."""
-
-    name: str
-    shot: Shot
-    file: Path
-
-
 class PhoneFrames(Frames[Pair]):
     """The frames of a split, 512 x 512: 320 for training, 40 for validation and 40 for test.
 
@@ -275,7 +267,6 @@ class PhoneFrames(Frames[Pair]):
         self.seed = seed
         self.size = size
         self.files = scene_files(path, split)
-        self.instances = self._draw_instances()
 
         numbers: tuple[str, ...] = SHOTS
         if split == "test":
@@ -283,21 +274,22 @@ class PhoneFrames(Frames[Pair]):
         elif split == "validation":
             numbers = SHOTS[1:]
 
-        self.shots = []
+        self.instances = []
         labels = []
         names = []
-        for instance in self.instances:
+        for instance, shot, file in self._draw_instances():
             for number in numbers:
-                self.shots.append((instance, number))
-                labels.append(parse_label(instance.name))
-                names.append(f"{instance.name}_{number}")
+                self.instances.append((instance, shot, file))
+                labels.append(parse_label(instance))
+                names.append(f"{instance}_{number}")
         self.labels = labels
         super().__init__(names)
 
-    def _draw_instances(self) -> list[_Instance]:
+    def _draw_instances(self) -> list[tuple[str, Shot, Path]]:
+        """Draw the name of each scene instance, what is drawn for it, and the photograph that it shows."""
         labels = _training_labels(self.seed) if self.split == "train" else _held_back_labels()
         order: list[int] = []
-        instances: list[_Instance] = []
+        instances: list[tuple[str, Shot, Path]] = []
         for number, scene, code in labels:
             generator = keyed_generator(self.seed, "phones", self.split, number)
             if not order:
@@ -307,24 +299,22 @@ class PhoneFrames(Frames[Pair]):
             shot, brightness = _draw_shot(CAMERAS[code], generator)
             shutter = max(1, round(shot.iso * (1.0 if brightness == "N" else 1.0 / 3.0)))
             name = f"{number:04d}_{scene:03d}_{code}_{shot.iso:05d}_{shutter:05d}_{shot.kelvin}_{brightness}"
-            instances.append(_Instance(name, shot, self.files[order.pop()]))
+            instances.append((name, shot, self.files[order.pop()]))
         return instances
 
     def stamp(self, index: int) -> str:
-        instance, _ = self.shots[index]
-        size = instance.file.stat().st_size
+        _, _, file = self.instances[index]
         height, width = self.size
-        return f"{self.names[index]} seed {self.seed}, {height} x {width} of {instance.file.name} {size}"
+        return f"{self.names[index]} seed {self.seed}, {height} x {width} of {file.name} {file.stat().st_size}"
 
     def read(self, index: int) -> Pair:
-        instance, _ = self.shots[index]
-        code = parse_label(instance.name).phone
-        phone = CAMERAS[code]
+        instance, shot, file = self.instances[index]
+        generator = keyed_generator(self.seed, "phones window", self.split, instance)
+        scene = draw_window(file, self.size, generator, self.max_pixels)
 
-        generator = keyed_generator(self.seed, "phones window", self.split, instance.name)
-        scene = draw_window(instance.file, self.size, generator, self.max_pixels)
+        phone = CAMERAS[self.labels[index].phone]
         noise = keyed_generator(self.seed, "phones noise", self.split, self.names[index])
-        return take_shot(phone, scene, instance.shot, noise, self.names[index])
+        return take_shot(phone, scene, shot, noise, self.names[index])
 
 
 def _training_labels(seed: int) -> list[tuple[int, int, str]]:

@@ -238,15 +238,17 @@ class PictureFiles(Files[DenoisedPicture]):
     """Developed pictures, which are denoised to pictures with their EXIF, ICC profile and orientation.
 
     Args:
-        denoiser: it says where and how strongly pictures are denoised.
+        denoiser: whatever :meth:`PictureDenoiser.of` takes; it says where and how strongly pictures are denoised.
     """
 
     what = "picture"
     formats = PICTURE_FORMATS
     format_advice = f"the source is a developed picture; its output is one of {', '.join(PICTURE_FORMATS)}"
 
-    def __init__(self, denoiser: PictureDenoiser) -> None:
-        self.denoiser = denoiser
+    def __init__(self, denoiser: Any) -> None:
+        if not isinstance(denoiser, PictureDenoiser):
+            denoiser = PictureDenoiser.of(denoiser, "auto", "auto")
+        self.denoiser: PictureDenoiser = denoiser
 
     def listing(self, folder: Path) -> Listing:
         """List the pictures; one with the stem of a RAW file is left out, as the camera's own rendering of it."""

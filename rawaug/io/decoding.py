@@ -439,6 +439,9 @@ def _decode_heic(path: Path, max_pixels: int, headers: Headers) -> Decoded:
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     colours, alpha = _split_alpha(pixels, pixels.shape[-1] in (2, 4))
+    exif = info.get("exif") or None
+    if exif is not None:
+        exif = exif.removeprefix(b"Exif\0\0")
     return Decoded(
         colours=colours,
         alpha=alpha,
@@ -446,14 +449,8 @@ def _decode_heic(path: Path, max_pixels: int, headers: Headers) -> Decoded:
         format="HEIC",
         colour=headers.colour or Colour(info.get("icc_profile") or None),
         orientation=1,
-        headers=Headers(exif=_without_prefix(info.get("exif")), xmp=info.get("xmp") or None),
+        headers=Headers(exif=exif, xmp=info.get("xmp") or None),
     )
-
-
-def _without_prefix(exif: bytes | None) -> bytes | None:
-    if not exif:
-        return None
-    return exif.removeprefix(b"Exif\0\0")
 
 
 def _decode_with_tifffile(path: Path, max_pixels: int, headers: Headers, kind: TiffKind) -> Decoded:
