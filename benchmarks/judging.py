@@ -23,7 +23,8 @@ from torch import Tensor
 
 from benchmarks.measure import parser
 from benchmarks.strengths import frozen_trials
-from rawaug.denoising.denoiser import Noisy, RawDenoiser, noise_variance
+from rawaug.bayer import noise_variance
+from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.evaluation.benchmark import TOLD
 from rawaug.evaluation.judge import judge_noisy
 from rawaug.evaluation.tables import print_rows
