@@ -67,6 +67,24 @@ def test_every_figure_stands_in_the_ledger(page: Path) -> None:
     assert not missing, f"{page.name} has figures that the ledger does not: {', '.join(missing)}"
 
 
+def test_denoise_says_how_far_apart_the_ledger_has_the_shipped_denoisers() -> None:
+    table = LEDGER[LEDGER.index("| frames, strength | noisy |") :]
+    heads, _, *rows = table[: table.index("\n\n")].splitlines()
+    columns = [head.strip(" `") for head in heads.split("|")]
+
+    gains: dict[str, list[float]] = {"rawaug-small": [], "rawaug-best": []}
+    for row in rows:
+        cells = dict(zip(columns, row.replace("*", "").split("|"), strict=True))
+        raw = {name: float(cells[name].split("/")[0]) for name in ("rawaug-base", *gains)}
+        for name, of_rows in gains.items():
+            of_rows.append(abs(raw[name] - raw["rawaug-base"]))
+
+    page = " ".join((ROOT / "docs" / "denoise.md").read_text().split())
+    small, best = (f"{min(of_rows):.1f} to {max(of_rows):.1f} dB" for of_rows in gains.values())
+    assert len(rows) == 28
+    assert f"worse at every strength, by {small}" in page and f"{best} better under drawn noise" in page
+
+
 def test_the_pages_have_figures_to_look_for() -> None:
     assert len(DECIMALS.findall((ROOT / "README.md").read_text())) > 40
     assert len(CARDS) >= 8
