@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import torch
 
@@ -137,17 +136,11 @@ class CropChoice(PictureCrops):
 class HalfDecibel(RawTask):
     """The arms that no recipe can state."""
 
-    real: Sequence[Pair] = ()
-
-    def stream(self, arm: str, frames: Sequence[Any], *others: Any) -> Any:
-        """Keep the frames at hand."""
-        self.real = frames
-        return super().stream(arm, frames, *others)
-
-    def _synthetic_crops(self, arm: str, pictures: Any, augment: RawAugment, noise: NoiseModel) -> Source:
+    def synthetic_crops(self, arm: str, augment: RawAugment, noise: NoiseModel) -> Source:
+        """Make the samples of the arm."""
         if arm == "chosen_crop":
-            return CropChoice(RawPairs(pictures, augment, self.recipe.train.crop))
-        source = super()._synthetic_crops(arm, pictures, augment, noise)
+            return CropChoice(RawPairs(self.frames["pictures"], augment, self.recipe.train.crop))
+        source = super().synthetic_crops(arm, augment, noise)
         if arm in ("as_bright", "their_noise", "tied"):
             return LikeFrames(source, self.real, arm, noise)
         return source

@@ -34,7 +34,7 @@ from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import NOISY
 from rawaug.experiment.run import run
-from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
+from rawaug.experiment.settings import ArmConfig, DataConfig, ISPSource, Recipe
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.plugin.draw import Draw
 from rawaug.training.config import DenoiserConfig, TrainConfig
@@ -133,7 +133,7 @@ def run_d5000(folder: Path, photographs: Path, out: str, beside: Sequence[str]) 
     file.parent.mkdir(parents=True, exist_ok=True)
     fit_isp(squares, FIT).save(file)
 
-    recipe = make_recipe("d5000", photographs, out, blur or 0.0, isp=str(file), noise=short.levels)
+    recipe = make_recipe("d5000", photographs, out, blur or 0.0, isp=ISPSource(str(file)), noise=short.levels)
     for arm in ("own", "sharp"):  # the shot's own picture is as noisy as the shot
         del recipe.arms[arm]
     recipe.arms["soft"].draw = Draw("perturb", blur=blur or 0.0, exposure=-2.0)

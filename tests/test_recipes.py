@@ -15,7 +15,7 @@ from torch import Tensor
 import denoisers
 from rawaug.cli import main
 from rawaug.experiment.recipe import find_kind, find_recipe, read_recipe
-from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
+from rawaug.experiment.settings import ArmConfig, DataConfig, ISPSource, Recipe
 from rawaug.training.estimators import Supervised
 
 FOLDER = Path(__file__).parents[1] / "recipes"
@@ -149,7 +149,7 @@ def test_what_cannot_be_run_is_refused_before_anything_is_fitted(tmp_path: Path,
     with pytest.raises(ValueError, match="cannot be mixed"):
         Recipe(arms={**arm, "r2r": ArmConfig(estimator="r2r")})
     with pytest.raises(ValueError, match="augmented: 1"):
-        Recipe(arms=arm, data=DataConfig(pairs=None), isp="universal")
+        Recipe(arms=arm, data=DataConfig(pairs=None), isp=ISPSource())
     elsewhere = ["--out", str(tmp_path)]
     for flags in (["--steps", "0"], ["--train.batch", "0"], ["--train.crop", "63"], ["--train.checkpoint-every", "0"]):
         key = flags[0].removeprefix("--train.").removeprefix("--").replace("-", "_")

@@ -113,10 +113,10 @@ def open_frames(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> tuple[di
         validate = _listing(frames["validation"], of_validation, name, _MOST_HELD_OUT)
 
     isp = f"fitted to {count_of(len(pairs), 'frame')}"
-    if recipe.isp_source is not None:
-        isp = f"{recipe.isp_source.name}, unchanged"
-        if recipe.isp_source.camera is not None:
-            isp = f"{recipe.isp_source.name} as {recipe.isp_source.camera}"
+    if recipe.isp is not None:
+        isp = f"{recipe.isp.name}, unchanged"
+        if recipe.isp.camera is not None:
+            isp = f"{recipe.isp.name} as {recipe.isp.camera}"
 
     lines = [
         f"train     {train}",
@@ -273,8 +273,8 @@ def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[P
         return
 
     levels = None
-    if recipe.isp_source is not None:
-        levels = recipe.isp_source.load().info.get("noise")
+    if recipe.isp is not None:
+        levels = recipe.isp.load().info.get("noise")
 
     noisy_frames = list(validation)
     if real:

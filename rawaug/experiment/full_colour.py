@@ -40,9 +40,8 @@ from rawaug.evaluation.scores import NOISY
 from rawaug.evaluation.trials import TEST_NOISE, Trial, freeze_noise, make_trials
 from rawaug.experiment.raw import RawTask
 from rawaug.experiment.settings import NoiseSetting, Recipe
-from rawaug.experiment.task import TASKS
+from rawaug.experiment.task import TASKS, change_cfa
 from rawaug.io import RawFrame, write_dng
-from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.targets import Target
@@ -210,6 +209,10 @@ class FullColourRecipe(Recipe):
     full_colour: ClassVar[bool] = True
     test_noise: NoiseSetting = "cycleisp_sidd"
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        noise_model(self.test_noise)  # an unknown name is refused
+
     @property
     def noise_in_test(self) -> Any:
         """The noise of test frames."""
@@ -219,9 +222,10 @@ class FullColourRecipe(Recipe):
 class FullColourTask(RawTask):
     """Denoisers that are compared in full colour; their truth is a frame whose cells become pixels."""
 
-    def __init__(self, recipe: FullColourRecipe) -> None:
-        super().__init__(recipe)
-        self.noise = noise_model(recipe.test_noise)
+    @property
+    def test_noise(self) -> NoiseModel:
+        """The noise of validation and test frames."""
+        return noise_model(self.recipe.test_noise)
 
 
 @dataclass
@@ -264,19 +268,18 @@ class RgbTask(FullColourTask):
     settings = RgbRecipe
     input = _MalvarInput()
 
-    def validation(
-        self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
-    ) -> Sequence[Trial]:
+    def validation(self, cfa: CFA) -> Sequence[Trial]:
         """Take the frames with the noise of the test; without any frames, take pictures as RAW."""
-        if not frames:
-            return super().validation(frames, pictures, isp, noise)
+        if not self.watched:
+            return super().validation(cfa)
 
-        return [rgb_trial(pair, self.noise) for pair in frames]
+        noise = self.test_noise
+        return [rgb_trial(pair, noise) for pair in self.watched]
 
-    def test(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
+    def test(self) -> Sequence[Trial]:
         """Take the frames in RGGB, with every demosaicing."""
-        ways = {method: method for method in self.recipe.demosaicing}
-        return make_trials(frames, lambda pair: rgb_trial(pair, self.noise, ways))
+        noise, ways = self.test_noise, {method: method for method in self.recipe.demosaicing}
+        return make_trials(self.frames["test"], lambda pair: rgb_trial(pair, noise, ways))
 
 
 @dataclass
@@ -341,32 +344,30 @@ class MosaicTask(FullColourTask):
 
     settings = MosaicRecipe
 
-    def stream(
-        self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
-    ) -> TrainingStream:
+    def stream(self, arm: str, cfa: CFA, seed: int) -> TrainingStream:
         """Make crops of pictures as RAW of all patterns."""
         settings, train = self.recipe.arms[arm], self.recipe.loop(arm)
-        augment = RawAugment(isp, noise, draw=settings.draw or self.recipe.draw)
-        crops = MosaicCrops(pictures, augment, train.crop, settings.zoom, self.recipe.patterns)
+        augment = RawAugment(change_cfa(self.isp, cfa), self.noise, draw=settings.draw or self.recipe.draw)
+        crops = MosaicCrops(self.frames["pictures"], augment, train.crop, settings.zoom, self.recipe.patterns)
         return TrainingStream(None, crops, train.batch, 1.0, derive_seed(seed, "stream"))
 
-    def validation(
-        self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
-    ) -> Sequence[Trial]:
+    def validation(self, cfa: CFA) -> Sequence[Trial]:
         """Take the frames in every pattern."""
+        noise = self.test_noise
         trials = []
-        for cfa in self.recipe.test_patterns:
-            for pair in frames:
-                trials.append(planes_trial(pair, cfa, self.noise))
+        for pattern in self.recipe.test_patterns:
+            for pair in self.watched:
+                trials.append(planes_trial(pair, pattern, noise))
 
         return trials
 
-    def test(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
+    def test(self) -> Sequence[Trial]:
         """Take the frames in every pattern."""
+        frames, noise = self.frames["test"], self.test_noise
 
         def make(case: tuple[str, int]) -> Trial:
-            cfa, index = case
-            return mosaic_trial(frames[index], cfa, self.noise)
+            pattern, index = case
+            return mosaic_trial(frames[index], pattern, noise)
 
         cases = list(product(self.recipe.test_patterns, range(len(frames))))
         return make_trials(cases, make)

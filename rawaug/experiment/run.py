@@ -6,13 +6,11 @@ there already (:func:`rawaug.files.cached`), so that a stopped run resumes.
 
 from __future__ import annotations
 
-import copy
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -38,14 +36,14 @@ from rawaug.experiment.settings import Recipe
 from rawaug.experiment.task import TASKS, Task
 from rawaug.files import LOCK, cached, fingerprint, locked, sha256
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseModel, camera_law, noise_model
+from rawaug.noise import camera_law, noise_model
 from rawaug.progress import progress
 from rawaug.registry import Spec, spec_label, split_spec
 from rawaug.training.camera_fit import fit
 from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.launch import is_leader, require_trainable
 from rawaug.training.loop import train
-from rawaug.training.noisy_frames import faintness_note, noisy_frame
+from rawaug.training.noisy_frames import faintness_note
 from rawaug.training.state import first_network
 
 Results = dict[str, Any]
@@ -86,11 +84,10 @@ def run(
     folder = require_free(recipe, overwrite)
     require_trainable(recipe.device, recipe.devices, recipe.train.precision, recipe.train.logger)
     finished_isp = None
-    if recipe.isp_source is not None:
-        finished_isp = recipe.isp_source.load()
+    if recipe.isp is not None:
+        finished_isp = recipe.isp.load()
 
     classical = find_classical(recipe.classical, shown=leads)
-    task: Task = TASKS[recipe.kind](replace(recipe, classical=classical))
     if recipe.noise != "camera":
         noise_model(recipe.noise_at_iso)
     require_networks(recipe)
@@ -112,36 +109,32 @@ def run(
             claim(recipe, overwrite)
 
         for seed in recipe.all_seeds:
-            # Fit the ISP. If it has measured the noise, frames and trials have this noise; else they stay.
-            isp = finished_isp or fit_to_pairs(
-                recipe, frames["pairs"], folder / f"seed{seed}" / "isp.safetensors", seed
-            )
+            # Fit the ISP. If it has measured the noise, the test frames have this noise; else they stay.
+            file = folder / f"seed{seed}" / "isp.safetensors"
+            isp = finished_isp or fit_to_pairs(recipe, frames["pairs"], file, seed)
+            task: Task = TASKS[recipe.kind](replace(recipe, classical=classical), isp, frames)
             if seed == recipe.seed or recipe.noise == "camera":
-                noise = noise_model(recipe.noise_at_iso, info=isp.info)
-                real = as_trained(recipe, frames["pairs"], isp)
-                watched = as_trained(recipe, frames["validation"], isp)
-                trials = task.test(frames["test"], isp, noise)
+                trials = task.test()
                 noisy_rows: dict[str, list[Row]] = {}
             if seed == recipe.seed:
-                training_note = warn_of_noise(recipe, frames["pairs"], real, trials, noise)
+                training_note = warn_of_noise(task, trials)
 
             validation_trials: dict[CFA, Sequence[Trial]] = {}
             for arm in recipe.arms:
                 # Train.
                 arm_folder = folder / f"seed{seed}" / arm
-                arm_isp = change_cfa(isp, find_pattern(recipe, arm, isp))
-                if arm_isp.cfa not in validation_trials:
-                    validation_trials[arm_isp.cfa] = task.validation(watched, frames["pictures"], arm_isp, noise)
-                samples = validation_trials[arm_isp.cfa]
-                network = train_arm(task, arm, seed, frames, real, samples, arm_isp, noise, arm_folder)
+                cfa = find_pattern(recipe, arm, isp)
+                if cfa not in validation_trials:
+                    validation_trials[cfa] = task.validation(cfa)
+                network = train_arm(task, arm, cfa, seed, validation_trials[cfa], arm_folder)
 
                 # Score.
                 if not leads:
                     continue
                 if not noisy_rows:
                     noisy_rows = group_rows(score([task.input], trials), "table")
-                networks[arm] = task.denoiser(arm, network, arm_isp.cfa)
-                scores = score_arm(task, arm, seed, network, arm_isp.cfa, trials, noisy_rows, frames, arm_folder)
+                networks[arm] = task.denoiser(arm, network, cfa)
+                scores = score_arm(task, arm, cfa, seed, network, trials, noisy_rows, arm_folder)
                 for table, summaries in scores.items():
                     tables.setdefault(table, {}).setdefault(arm, []).append(summaries)
 
@@ -153,7 +146,7 @@ def run(
         write_results(recipe, folder, tables, others, frames["test"], unreadable)
         samples = next(iter(validation_trials.values()))
         compared = {table: [*task.filters(table, samples), *baselines] for table in tables}
-        others |= score_others(compared, trials, noisy_rows)
+        others |= score_tables(compared, trials, noisy_rows, "other denoisers")
         results = write_results(recipe, folder, tables, others, frames["test"], unreadable)
 
         # Report: the page shows the first filter, the baselines and the arms.
@@ -209,38 +202,20 @@ def require_networks(recipe: Recipe) -> None:
             raise ValueError(f"denoiser: {config.start or type(network).__name__} gives {gives}; take another network")
 
 
-def as_trained(recipe: Recipe, pairs: Sequence[Any], isp: DictionaryISP) -> Sequence[Any]:
-    """Return the pairs, or a noisy frame of each if no arm sees clean ones; the ISP may have measured their levels."""
-    if not recipe.self_supervised:
-        return pairs
-
-    return [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
-
-
-def warn_of_noise(
-    recipe: Recipe, pairs: Sequence[Pair], real: Sequence[Any], trials: Iterable[Trial], noise: NoiseModel
-) -> str:
-    """Print notes on the frames' own noise; return the one on training frames, which is empty if there is none.
-
-    Args:
-        recipe: the recipe.
-        pairs: the real training frames.
-        real: the same, as :func:`as_trained` gives them.
-        trials: the test frames with their noise.
-        noise: the noise that is added to clean RAW.
-    """
+def warn_of_noise(task: Task, trials: Iterable[Trial]) -> str:
+    """Print notes on the frames' own noise; return the one on training frames, which is empty if there is none."""
     if not is_leader():
         return ""
 
     arms = []
-    for name, arm in recipe.arms.items():
+    for name, arm in task.recipe.arms.items():
         if arm.sees_clean and arm.augmented < 1.0:
             arms.append(name)
 
-    training_note = training_noise_note(pairs, noise, arms)
+    training_note = training_noise_note(task.frames["pairs"], task.noise, arms)
     notes = [added_noise_note(trials), training_note]
-    if recipe.self_supervised:
-        notes.append(faintness_note(real))
+    if task.recipe.self_supervised:
+        notes.append(faintness_note(task.real))
     for note in filter(None, notes):
         say(f"note: {note}")
 
@@ -288,47 +263,23 @@ def find_pattern(recipe: Recipe, arm: str, isp: DictionaryISP) -> CFA:
     return CFA(info.get("cfa", "RGGB"))
 
 
-def change_cfa(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
-    """Put the ISP of a camera behind a CFA: return itself, or a copy if it had another CFA."""
-    if isp.cfa == cfa:
-        return isp
-
-    copied = copy.deepcopy(isp)
-    copied.configure(cfa=str(cfa))
-    return copied
-
-
-def train_arm(
-    task: Task,
-    arm: str,
-    seed: int,
-    frames: dict[str, Any],
-    real: Sequence[Any],
-    validation: Sequence[Trial],
-    isp: DictionaryISP,
-    noise: NoiseModel,
-    folder: Path,
-) -> Denoiser:
+def train_arm(task: Task, arm: str, cfa: CFA, seed: int, validation: Sequence[Trial], folder: Path) -> Denoiser:
     """Train the network of an arm, or read it if it has been trained on the same before.
 
     Args:
         task: the task.
         arm: name of the arm.
+        cfa: the pattern that it is trained for.
         seed: seed of the training.
-        frames: the data of the run, see :func:`rawaug.experiment.data.open_frames`.
-        real: its pairs, as :func:`as_trained` gives them.
         validation: the frozen samples that choose the weights.
-        isp: the ISP in the CFA of the arm.
-        noise: the noise that is added to clean RAW.
         folder: gets the weights, the checkpoint and the log.
     """
-    recipe = task.recipe
+    recipe, frames = task.recipe, task.frames
     settings, config = recipe.arms[arm], recipe.network(arm)
     estimator = ESTIMATORS.make(settings.estimator)
-    pictures = {"pictures": frames["pictures"], "own": real, "noise": real, "more": frames["more"]}[settings.source]
 
     info = {
-        "cfa": str(isp.cfa),
+        "cfa": str(cfa),
         "noise": recipe.noise_at_iso,
         "steps": recipe.loop(arm).steps,
         "seed": seed,
@@ -337,7 +288,7 @@ def train_arm(
         "pictures": recipe.data.pictures,
     }
     if recipe.noise == "camera":
-        info["noise"] = camera_law(isp.info["noise"]).spec()
+        info["noise"] = camera_law(task.isp.info["noise"]).spec()
     if settings.estimator != "supervised":
         info["estimator"] = settings.estimator
     if config.start is not None:
@@ -347,7 +298,7 @@ def train_arm(
     inputs = {
         "settings": recipe.weights_settings(arm),
         "seed": seed,
-        "isp": isp.info["key"],
+        "isp": task.isp.info["key"],
         "pairs": as_frames(frames["pairs"]).stamps(),
         "more": as_frames(frames["more"]).stamps() if settings.source == "more" else [],
         "pictures": picture_stamp(recipe.data.pictures),
@@ -358,7 +309,7 @@ def train_arm(
 
     def make() -> Denoiser:
         return train(
-            task.stream(arm, real, pictures, isp, noise, seed),
+            task.stream(arm, cfa, seed),
             validation,
             config,
             recipe.loop(arm),
@@ -391,12 +342,11 @@ def train_arm(
 def score_arm(
     task: Task,
     arm: str,
+    cfa: CFA,
     seed: int,
     network: Denoiser,
-    cfa: CFA,
     trials: Sequence[Trial],
-    noisy_rows: dict[str, list[Row]],
-    frames: dict[str, Any],
+    noisy_rows: Mapping[str, list[Row]],
     folder: Path,
 ) -> dict[str, dict[str, Any]]:
     """Compute the summaries of an arm by table and kind, ``plain`` and ``self_ensemble``, or read those of before.
@@ -404,17 +354,16 @@ def score_arm(
     Args:
         task: the task.
         arm: name of the arm.
+        cfa: the pattern that it is trained for.
         seed: seed of its training.
         network: its network.
-        cfa: the pattern that the network is trained for.
         trials: the test frames with their noise.
         noisy_rows: the scores of the noisy input, by table.
-        frames: the data of the run, see :func:`rawaug.experiment.data.open_frames`.
         folder: has the weights, and gets ``plain.json`` and ``self_ensemble.json``.
     """
     recipe = task.recipe
     weights = sha256(folder / "denoiser.safetensors")
-    inputs = weights, as_frames(frames["test"]).stamps(), recipe.scores_settings()
+    inputs = weights, as_frames(task.frames["test"]).stamps(), recipe.scores_settings()
 
     kinds = {"plain": 1}
     if recipe.self_ensemble:
@@ -422,9 +371,16 @@ def score_arm(
 
     summaries: dict[str, dict[str, Any]] = {}
     for kind, views in kinds.items():
-        denoiser = task.denoiser(arm, network, cfa, views)
         label = f"{arm}, seed {seed}, {kind}"
-        make = partial(score_tables, denoiser, trials, noisy_rows, label)
+
+        def make(views: int = views, label: str = label) -> dict[str, Any]:
+            denoisers_by_table = {table: [task.denoiser(arm, network, cfa, views)] for table in noisy_rows}
+            scored = score_tables(denoisers_by_table, trials, noisy_rows, f"evaluate {label}")
+            tables = {table: scores[arm] for table, scores in scored.items() if scores}
+            for table, scores in tables.items():
+                print(f"evaluated {', '.join(filter(None, [label, table]))}: {scores.get('psnr', math.nan):.2f} dB")
+            return {"tables": tables}
+
         scores = cached(folder / f"{kind}.json", [kind, *inputs], make, done="already evaluated")
         for table, scores_of_table in scores["tables"].items():
             summaries.setdefault(table, {})[kind] = scores_of_table
@@ -433,33 +389,27 @@ def score_arm(
 
 
 def score_tables(
-    denoiser: Any, trials: Iterable[Trial], noisy_rows: dict[str, list[Row]], label: str
+    denoisers: Mapping[str, Sequence[Any]], trials: Sequence[Trial], noisy_rows: Mapping[str, list[Row]], label: str
 ) -> dict[str, dict[str, Any]]:
-    """Compute the summaries of a denoiser by table; tables whose images it does not take are left out."""
-    taken = (trial for trial in trials if trial.takes(denoiser))
-    rows = group_rows(score([denoiser], taken, f"evaluate {label}"), "table")
-    tables = {table: summary(of_table, noisy_rows[table]) for table, of_table in rows.items()}
-    for table, scores in tables.items():
-        print(f"evaluated {', '.join(filter(None, [label, table]))}: {scores.get('psnr', math.nan):.2f} dB")
+    """Compute the summaries of denoisers by table and name, with one trial in memory at a time.
 
-    return {"tables": tables}
+    Args:
+        denoisers: by table; those that do not take a trial's image are left out.
+        trials: the test frames with their noise.
+        noisy_rows: the scores of the noisy input, by table.
+        label: label of the progress bar.
+    """
+    rows: dict[str, list[Row]] = {table: [] for table in denoisers}
+    for trial in progress(trials, label=label, unit="image"):
+        rows[trial.table] += score(list(filter(trial.takes, denoisers[trial.table])), [trial])
 
-
-def score_others(
-    compared: dict[str, list[Any]], trials: Sequence[Trial], noisy_rows: dict[str, list[Row]]
-) -> dict[str, dict[str, Any]]:
-    """Score the denoisers that arms are compared with, by table and name, with one trial in memory at a time."""
-    rows: dict[str, list[Row]] = {table: [] for table in compared}
-    for trial in progress(trials, label="other denoisers", unit="image"):
-        rows[trial.table] += score(list(filter(trial.takes, compared[trial.table])), [trial])
-
-    others: dict[str, dict[str, Any]] = {}
+    tables: dict[str, dict[str, Any]] = {}
     for table, of_table in rows.items():
-        others[table] = {}
-        for name, of_one in group_rows(of_table).items():
-            others[table][name] = summary(of_one, noisy_rows[table])
+        tables[table] = {}
+        for name, of_denoiser in group_rows(of_table).items():
+            tables[table][name] = summary(of_denoiser, noisy_rows[table])
 
-    return others
+    return tables
 
 
 # -- kinds of experiment -----------------------------------------------------------------------------------------------
@@ -483,8 +433,8 @@ def dry_run(kind: str, settings: Any, overwrite: bool = False) -> None:
     """
     folder = require_free(settings, overwrite)
     if kind in TASKS:
-        if settings.isp_source is not None:
-            settings.isp_source.load()  # a mistyped name is refused before any data are opened
+        if settings.isp is not None:
+            settings.isp.load()  # a mistyped name is refused before any data are opened
         _, listing = open_frames(settings, {})
         print("\n".join(listing))
 

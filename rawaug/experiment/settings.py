@@ -178,6 +178,13 @@ class ISPSource:
         return isp
 
 
+def _by_name(isp: Any) -> Any:
+    """Take the name of an ISP for one whose settings are the usual ones."""
+    if isinstance(isp, str):
+        return ISPSource(isp)
+    return isp
+
+
 @dataclass
 class ArmConfig:
     """One way of training; everything else is the same for all arms.
@@ -283,7 +290,7 @@ class Recipe:
 
     name: str = "experiment"
     data: DataConfig = field(default_factory=DataConfig)
-    isp: ISPSource | str | None = None
+    isp: Annotated[ISPSource | None, BeforeValidator(_by_name)] = None
     fit: FitConfig = field(default_factory=FitConfig)
     noise: NoiseSetting = "cycleisp_sidd"
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
@@ -304,11 +311,12 @@ class Recipe:
         if not self.arms:
             raise ValueError("arms: a recipe needs at least one arm")
         require_bounds(self)
+        self.isp = _by_name(self.isp)
 
         if self.steps is not None:
             self.train = replace(self.train, steps=self.steps)
 
-        if self.isp_source is not None and self.isp_source.iso is not None and not isinstance(self.noise, str):
+        if self.isp is not None and self.isp.iso is not None and not isinstance(self.noise, str):
             raise ValueError("isp.iso: applies to the noise of one camera by name; set noise to its name, or to camera")
 
         self._require_data()
@@ -347,7 +355,7 @@ class Recipe:
         if arm.source != "pictures":
             if self.data.pairs is None:
                 raise ValueError(f"source: {arm.source} needs real pairs; set data.pairs")
-            if not arm.sees_clean or self.target != "raw":
+            if not arm.sees_clean or self.target != "raw" or self.from_pictures:
                 raise ValueError(f"source: {arm.source} is for supervised arms on RAW; leave it out")
 
         name, _ = split_spec(arm.estimator)
@@ -357,28 +365,20 @@ class Recipe:
             raise ValueError(f"weigh: {weigh} is not for noisy targets of {name}; use {' or '.join(weighings)}")
 
     @property
-    def isp_source(self) -> ISPSource | None:
-        """The ISP that is used as it is; None if one is fitted."""
-        if isinstance(self.isp, str):
-            return ISPSource(self.isp)
-
-        return self.isp
-
-    @property
     def draw(self) -> Draw:
         """How camera settings are drawn where an arm does not say so."""
-        if self.isp_source is None:
+        if self.isp is None:
             return Draw()
 
-        return self.isp_source.draw
+        return self.isp.draw
 
     @property
     def noise_at_iso(self) -> Any:
         """The noise, at the ISO of ``isp.iso`` if that is set."""
-        if self.isp_source is None or self.isp_source.iso is None:
+        if self.isp is None or self.isp.iso is None:
             return self.noise
 
-        return {"name": self.noise, "settings": {"iso": self.isp_source.iso}}
+        return {"name": self.noise, "settings": {"iso": self.isp.iso}}
 
     @property
     def noise_in_test(self) -> Any:

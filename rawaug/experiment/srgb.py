@@ -32,10 +32,9 @@ from rawaug.evaluation.picture_trials import picture_trials
 from rawaug.evaluation.scores import score
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.settings import Recipe
-from rawaug.experiment.task import TASKS, Task
+from rawaug.experiment.task import TASKS, Task, change_cfa
 from rawaug.io import RawFrame, develop, write_dng
-from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseModel, noise_model
+from rawaug.noise import noise_model
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.targets import Target
@@ -110,15 +109,15 @@ class SrgbTask(Task):
 
     settings = SrgbRecipe
 
-    def stream(
-        self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
-    ) -> TrainingStream:
+    def stream(self, arm: str, cfa: CFA, seed: int) -> TrainingStream:
         """Make crops of pictures with the camera's noise, noise drawn on them, or both in the arm's shares."""
         settings, train = self.recipe.arms[arm], self.recipe.loop(arm)
+        pictures = self.frames["pictures"]
 
         camera = None
         if settings.srgb_noise is None or settings.srgb_share < 1.0:
-            augment = RawAugment(isp, noise, draw=settings.draw or self.recipe.draw, target=settings.srgb or "srgb")
+            isp, draw = change_cfa(self.isp, cfa), settings.draw or self.recipe.draw
+            augment = RawAugment(isp, self.noise, draw=draw, target=settings.srgb or "srgb")
             camera = PictureCrops(RawPairs(pictures, augment, train.crop, zoom=settings.zoom))
 
         on_pictures = None
@@ -128,15 +127,13 @@ class SrgbTask(Task):
         samples = SrgbSamples(camera, on_pictures, settings.srgb_share, settings.noise_level)
         return TrainingStream(None, samples, train.batch, 1.0, derive_seed(seed, "stream"))
 
-    def validation(
-        self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
-    ) -> Sequence[Trial]:
+    def validation(self, cfa: CFA) -> Sequence[Trial]:
         """Take the frames at every level, developed."""
-        return srgb_trials(frames, self.recipe.levels, "develop validation")
+        return srgb_trials(self.watched, self.recipe.levels, "develop validation")
 
-    def test(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
+    def test(self) -> Sequence[Trial]:
         """Take the frames at every level, developed."""
-        return srgb_trials(frames, self.recipe.levels, "develop test")
+        return srgb_trials(self.frames["test"], self.recipe.levels, "develop test")
 
     def denoiser(self, name: str, network: nn.Module, cfa: CFA, views: int = 1) -> PictureDenoiser:
         """Make a denoiser of the network, in tiles; one that reads a level estimates it."""

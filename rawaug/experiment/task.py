@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from torch import nn
@@ -15,8 +16,9 @@ from rawaug.evaluation.scores import NOISY
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.settings import Recipe
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseModel
+from rawaug.noise import noise_model
 from rawaug.registry import Registry
+from rawaug.training.noisy_frames import noisy_frame
 from rawaug.training.stream import TrainingStream
 
 TASKS = Registry("task", "rawaug.tasks", "rawaug.experiment")
@@ -30,6 +32,13 @@ class Task(ABC):
 
     Args:
         recipe: the settings of the experiment.
+        isp: makes RAW of the pictures.
+        frames: the data by part, see :func:`rawaug.experiment.data.open_frames`.
+
+    Attributes:
+        noise: the noise that is added to clean RAW.
+        real: the real pairs, or a :class:`rawaug.training.noisy_frames.NoisyFrame` of each if no arm sees clean ones.
+        watched: the validation frames in the same form.
     """
 
     settings: ClassVar[type[Recipe]] = Recipe
@@ -38,33 +47,35 @@ class Task(ABC):
     input: ClassVar[Any] = NOISY
     """This denoiser stands for the noisy input in tables."""
 
-    def __init__(self, recipe: Recipe) -> None:
+    def __init__(self, recipe: Recipe, isp: DictionaryISP, frames: Mapping[str, Any]) -> None:
         self.recipe: Any = recipe
+        self.isp = isp
+        self.frames = frames
+        self.noise = noise_model(recipe.noise_at_iso, info=isp.info)
+
+        self.real: Sequence[Any] = frames["pairs"]
+        self.watched: Sequence[Any] = frames["validation"]
+        if recipe.self_supervised:
+            levels = isp.info.get("noise")  # the fit may have measured them
+            self.real = [noisy_frame(pair, levels) for pair in self.real]
+            self.watched = [noisy_frame(pair, levels) for pair in self.watched]
 
     @abstractmethod
-    def stream(
-        self, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel, seed: int
-    ) -> TrainingStream:
+    def stream(self, arm: str, cfa: CFA, seed: int) -> TrainingStream:
         """Make the training samples of an arm.
 
         Args:
             arm: the arm's name in the recipe.
-            frames: the real pairs, or a :class:`rawaug.training.noisy_frames.NoisyFrame` of each if no arm sees clean
-                ones.
-            pictures: the sRGB pictures, or the pairs that the arm's ``source`` names.
-            isp: makes RAW of the pictures, in the CFA of the arm's network.
-            noise: the noise that is added to clean RAW.
+            cfa: the pattern that its network is trained for.
             seed: seed of the run.
         """
 
     @abstractmethod
-    def validation(
-        self, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
-    ) -> Sequence[Trial]:
-        """Make the frozen samples that choose the weights of arms; the arguments are as in :meth:`stream`."""
+    def validation(self, cfa: CFA) -> Sequence[Trial]:
+        """Make the frozen samples that choose the weights of arms of this pattern."""
 
     @abstractmethod
-    def test(self, frames: Sequence[Any], isp: DictionaryISP, noise: NoiseModel) -> Sequence[Trial]:
+    def test(self) -> Sequence[Trial]:
         """Give the test frames their frozen noise; each is made when it is first asked for."""
 
     @abstractmethod
@@ -85,3 +96,13 @@ class Task(ABC):
     def shown(self, trials: Sequence[Trial]) -> list[Trial]:
         """Choose the trials that the page of the run shows."""
         return list(select_for_page(trials))
+
+
+def change_cfa(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
+    """Put the ISP of a camera behind a CFA: return itself, or a copy if it had another CFA."""
+    if isp.cfa == cfa:
+        return isp
+
+    copied = copy.deepcopy(isp)
+    copied.configure(cfa=str(cfa))
+    return copied

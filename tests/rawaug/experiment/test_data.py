@@ -16,7 +16,7 @@ from rawaug.data import Pair, demo_pairs
 from rawaug.data.frames import as_frames
 from rawaug.experiment.data import name_given_pairs, open_frames, read_frames, require_usable, use_all_pairs
 from rawaug.experiment.recipe import find_recipe, read_recipe, recipe_list, shipped_recipes
-from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
+from rawaug.experiment.settings import ArmConfig, DataConfig, ISPSource, Recipe
 from rawaug.io import RawFrame, write_picture
 from rawaug.training.config import TrainConfig
 
@@ -164,7 +164,7 @@ def test_what_frames_lack_is_found_before_anything_is_fitted() -> None:
     require_usable(replace(supervised, train=replace(supervised.train, crop=66)), [pair], [])
     with pytest.raises(ValueError, match="white balance"):
         require_usable(supervised, [replace(pair, clean=replace(pair.clean, color_known=False))], [])
-    require_usable(replace(supervised, isp="universal", train=replace(supervised.train, crop=66)), [pair], [])
+    require_usable(replace(supervised, isp=ISPSource(), train=replace(supervised.train, crop=66)), [pair], [])
 
 
 def test_settings_of_pairs_need_pairs() -> None:
@@ -199,7 +199,7 @@ def test_recipes_are_listed_and_explained_with_their_own_values(capsys: pytest.C
 def test_an_arm_has_a_rate_and_a_weighing_of_its_own_and_at_most_its_own_steps() -> None:
     tuned = ArmConfig(learning_rate=3e-4, weigh="stabilised", steps=10)
     train = TrainConfig(steps=40, learning_rate=7e-4, weigh="mixed")
-    recipe = Recipe(isp="universal", train=train, arms={"a": ArmConfig(), "b": tuned, "c": ArmConfig(steps=90)})
+    recipe = Recipe(isp=ISPSource(), train=train, arms={"a": ArmConfig(), "b": tuned, "c": ArmConfig(steps=90)})
     a, b, c = (recipe.loop(arm) for arm in recipe.arms)
     assert (a.steps, a.learning_rate, a.weigh) == (c.steps, c.learning_rate, c.weigh) == (40, 7e-4, "mixed")
     assert (b.steps, b.learning_rate, b.weigh) == (10, 3e-4, "stabilised")

@@ -41,23 +41,17 @@ class BurstTask(RawTask):
 
     settings = BurstRecipe
 
-    def __init__(self, recipe):
-        super().__init__(recipe)
+    def __init__(self, recipe, isp, frames):
+        super().__init__(recipe, isp, frames)
         shot_var, read_var = recipe.noise
         self.noise = noise_model((shot_var / recipe.shots, read_var / recipe.shots))
 
-    def stream(self, arm, frames, pictures, isp, noise, seed):
-        return super().stream(arm, frames, pictures, isp, self.noise, seed)
-
-    def validation(self, frames, pictures, isp, noise):
-        return super().validation(frames, pictures, isp, self.noise)
-
-    def test(self, frames, isp, noise):
+    def test(self):
         def make(pair):
             clean = replace(pair, noisy=None)
-            return make_trial(clean, self.noise, isp.cfa, condition=f"{self.recipe.shots} shots")
+            return make_trial(clean, self.noise, self.isp.cfa, condition=f"{self.recipe.shots} shots")
 
-        return make_trials(frames, make)
+        return make_trials(self.frames["test"], make)
 '''
 
 RECIPE = """

@@ -19,7 +19,7 @@ from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import NOISY, score
 from rawaug.experiment.full_colour import MosaicRecipe, full_colour, libraw_demosaic, mosaic_trial, planes_trial
-from rawaug.experiment.settings import ArmConfig
+from rawaug.experiment.settings import ArmConfig, ISPSource
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.seeding import keyed_generator
@@ -86,7 +86,7 @@ def test_a_recipe_without_shares_or_with_unknown_patterns_is_refused() -> None:
     arms = {"any": ArmConfig(augmented=1.0)}
     for patterns, said in (({"X": 1.0}, "CFA 'X' is unknown"), ({"RGGB": 0.0}, "patterns: shares must be")):
         with pytest.raises(ValueError, match=said):
-            MosaicRecipe(isp="universal", patterns=patterns, arms=arms)
+            MosaicRecipe(isp=ISPSource(), patterns=patterns, arms=arms)
 
 
 def test_the_recipe_trains_and_scores_by_pattern(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -204,7 +204,7 @@ def test_the_noise_of_a_camera_is_at_the_iso_of_the_isp() -> None:
     assert recipe.noise_at_iso == {"name": "Nikon D750", "settings": {"iso": 800}} and recipe.draw.light == "A"
     assert camera.load().info["cameras"] == ["Nikon D750"]
     assert camera.load().info["key"] != ISPSource().load().info["key"]
-    assert Recipe(arms=arms, data=data, isp="universal").noise_at_iso == "cycleisp_sidd"
+    assert Recipe(arms=arms, data=data, isp=ISPSource()).noise_at_iso == "cycleisp_sidd"
 
 
 def test_the_noise_of_a_recipe_may_be_several_cameras_at_an_iso_of_their_own() -> None:

@@ -21,7 +21,7 @@ from rawaug.experiment.data import open_frames
 from rawaug.experiment.full_colour import RgbRecipe, demosaic_mosaic, full_colour, rgb_trial
 from rawaug.experiment.run import run
 from rawaug.experiment.run import run as train_denoiser
-from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
+from rawaug.experiment.settings import ArmConfig, DataConfig, ISPSource, Recipe
 from rawaug.io import RawFrame
 from rawaug.io.pictures import decode_srgb
 from rawaug.metrics import psnr
@@ -85,7 +85,7 @@ def test_what_is_smooth_is_demosaiced_to_itself(method: str) -> None:
 
 def small(folder: Path, **changes: Any) -> RgbRecipe:
     return RgbRecipe(
-        isp="universal",
+        isp=ISPSource(),
         arms={"joint": ArmConfig(1.0)},
         denoiser=DenoiserConfig("JointDRUNet", {"width": 4, "scales": 2}),
         train=TrainConfig(steps=2, batch=1, crop=32, validate_every=1),
@@ -122,7 +122,7 @@ def test_what_it_cannot_compare_is_refused(tmp_path: Path) -> None:
         run(replace(small(tmp_path), denoiser=DenoiserConfig("UNet")), test=[a_pair()], validation=[])
     with pytest.raises(ValueError, match=r"denoiser: .*JointDRUNet"):
         train_denoiser(
-            Recipe(arms={"a": ArmConfig(1.0)}, isp="universal", denoiser=small(tmp_path).denoiser, out=str(tmp_path))
+            Recipe(arms={"a": ArmConfig(1.0)}, isp=ISPSource(), denoiser=small(tmp_path).denoiser, out=str(tmp_path))
         )
     with pytest.raises(ValueError, match="targets"):
         replace(small(tmp_path), arms={"joint": ArmConfig(0.5)}, data=DataConfig())

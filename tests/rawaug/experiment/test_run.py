@@ -12,9 +12,10 @@ import pytest
 
 from rawaug.errors import MissingExtra
 from rawaug.experiment import run as running
+from rawaug.experiment.raw import RawTask
 from rawaug.experiment.run import dry_run, run, warn_of_noise
 from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
-from rawaug.noise import noise_model
+from rawaug.isp.model import DictionaryISP
 from rawaug.training.config import TrainConfig
 from rawaug.training.launch import require_trainable
 
@@ -59,8 +60,8 @@ def test_a_dry_run_repeats_the_notes_of_the_run(
 ) -> None:
     monkeypatch.setattr(running, "added_noise_note", lambda trials: "the references are noisy")
     monkeypatch.setattr(running, "training_noise_note", lambda *_: "")
-    noise = noise_model("cycleisp_sidd")
-    monkeypatch.setattr(running, "run_kind", lambda *_: warn_of_noise(recipe, [], [], [], noise))
+    task = RawTask(recipe, DictionaryISP(), {"pairs": [], "validation": []})
+    monkeypatch.setattr(running, "run_kind", lambda *_: warn_of_noise(task, []))
 
     dry_run("ablation", SimpleNamespace(name="x", out=recipe.out, shortest=lambda: recipe))
     assert "note: the references are noisy" in capsys.readouterr().out

@@ -20,7 +20,7 @@ from rawaug.evaluation.scores import score, to_domain
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.data import open_frames
 from rawaug.experiment.run import run
-from rawaug.experiment.settings import ArmConfig, DataConfig
+from rawaug.experiment.settings import ArmConfig, DataConfig, ISPSource
 from rawaug.experiment.srgb import REAL, SrgbRecipe, best_filter, developed, srgb_trials
 from rawaug.io.pictures import write_picture
 from rawaug.metrics import psnr
@@ -40,7 +40,7 @@ SMALL = [
 RECIPE = SrgbRecipe(
     name="a",
     data=DataConfig(pairs=None, pictures="tiny:"),
-    isp="universal",
+    isp=ISPSource(),
     arms={"gaussian": ArmConfig(1.0, srgb_noise="Gaussian")},
     denoiser=DenoiserConfig(settings={"width": 4, "scales": 2, "channels": 3, "variance_map": False}),
     train=TrainConfig(steps=1, batch=1, crop=32),

@@ -15,11 +15,10 @@ from rawaug.data import demo_pairs, demo_photographs
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.raw import RawTask
-from rawaug.experiment.run import as_trained
-from rawaug.experiment.settings import ArmConfig, DataConfig, Recipe
+from rawaug.experiment.settings import ArmConfig, DataConfig, ISPSource, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
-from rawaug.noise import FixedLevels, SensorNoise, noise_model
+from rawaug.noise import FixedLevels, SensorNoise
 from rawaug.plugin.augment import RawAugment
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.estimators import R2R, Noise2Noise, Noisier, NoisyCrop, SelfSupervised
@@ -100,14 +99,12 @@ def test_a_self_supervised_recipe_never_meets_a_clean_frame(pictures: list[torch
         black = replace(pair.clean, mosaic=0 * pair.clean.mosaic)
         spoilt.append(replace(pair, clean=black, srgb=0 * pair.srgb))
     recipe = Recipe(arms={"r2r": ArmConfig(0.5, estimator="r2r")}, train=TrainConfig(batch=2, crop=32))
-    isp, noise = DictionaryISP(), noise_model("cycleisp_sidd")
 
     def seen(pairs: list[Pair]) -> list[torch.Tensor]:
         known = [drop_clean(pair) for pair in pairs]
-        task = RawTask(recipe)
-        frames = as_trained(recipe, known, isp)
-        stream = task.stream("r2r", frames, pictures, isp, noise, seed=0)
-        watched = task.validation(frames, pictures, isp, noise)
+        task = RawTask(recipe, DictionaryISP(), {"pairs": known, "validation": known, "pictures": pictures})
+        stream = task.stream("r2r", pairs[0].cfa, seed=0)
+        watched = task.validation(pairs[0].cfa)
         assert watched[0].develop is None
         return [*stream[0], *stream[1], watched[0].noisy, watched[0].clean, watched[0].variance]
 
@@ -189,11 +186,13 @@ def test_the_held_out_score_ranks_as_clean_frames_do() -> None:
 def test_without_validation_pairs_pictures_are_watched(pictures: list[torch.Tensor]) -> None:
     recipe = Recipe(
         data=DataConfig(pairs=None, validation=None),
-        isp="universal",
+        isp=ISPSource(),
+        noise=LEVELS,
         arms={"convex": ArmConfig(1.0)},
         train=TrainConfig(crop=32),
     )
-    samples = RawTask(recipe).validation([], pictures, DictionaryISP(), noise_model(LEVELS))
+    task = RawTask(recipe, DictionaryISP(), {"pairs": [], "validation": [], "pictures": pictures})
+    samples = task.validation(CFA.RGGB)
     assert len(samples) == 16 and samples[0].noisy.shape == (1, 4, 16, 16)
 
 

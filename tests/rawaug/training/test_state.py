@@ -12,8 +12,9 @@ from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.trials import make_trial
-from rawaug.experiment.run import change_cfa, find_pattern
+from rawaug.experiment.run import find_pattern
 from rawaug.experiment.settings import ArmConfig, Recipe
+from rawaug.experiment.task import change_cfa
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
