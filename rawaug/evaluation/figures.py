@@ -227,7 +227,7 @@ def _plot_curve(
         axis.set_yscale("log")
     axis.locator_params(axis="x", integer=True)
     axis.legend(fontsize=8)
-    return _png(figure)
+    return _encode(figure, "png")
 
 
 def plot_costs(rows: Mapping[str, tuple[float | None, float, float]]) -> bytes:
@@ -253,10 +253,6 @@ def plot_costs(rows: Mapping[str, tuple[float | None, float, float]]) -> bytes:
         axes[k].xaxis.set_minor_formatter(NullFormatter())
 
     figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
-    return _png(figure)
-
-
-def _png(figure: Any) -> bytes:
     return _encode(figure, "png")
 
 

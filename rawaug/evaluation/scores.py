@@ -123,36 +123,31 @@ def score(denoisers: Sequence[ScoredDenoiser], trials: Iterable[Trial], label: s
 
     for trial in trials:
         for denoiser in denoisers:
-            yield from _score_one(denoiser, trial)
+            noisy = trial.input_for(denoiser)
 
+            start = time.perf_counter()
+            denoised = denoiser(noisy)
+            seconds = (time.perf_counter() - start) / (noisy.image.numel() / 1e6)
 
-def _score_one(denoiser: ScoredDenoiser, trial: Trial) -> Iterator[Row]:
-    """Make the rows of one denoiser on one trial: several if several ways lead to the trial's domain."""
-    noisy = trial.input_for(denoiser)
+            for name, image in to_domain(denoiser.name, denoised, trial):
+                metrics = compare_images(image, trial)
+                error = 10.0 ** (-metrics[0] / 10.0)
+                share = None
+                if trial.own is not None and error > 0:
+                    share = trial.own / error
 
-    start = time.perf_counter()
-    denoised = denoiser(noisy)
-    seconds = (time.perf_counter() - start) / (noisy.image.numel() / 1e6)
-
-    for name, image in to_domain(denoiser.name, denoised, trial):
-        metrics = compare_images(image, trial)
-        error = 10.0 ** (-metrics[0] / 10.0)
-        share = None
-        if trial.own is not None and error > 0:
-            share = trial.own / error
-
-        yield Row(
-            name,
-            trial.frame,
-            trial.condition,
-            trial.strength,
-            trial.domain,
-            *metrics,
-            own_noise=share,
-            levels=noisy.levels,
-            levels_from_clean=trial.levels_from_clean,
-            seconds=seconds,
-        )
+                yield Row(
+                    name,
+                    trial.frame,
+                    trial.condition,
+                    trial.strength,
+                    trial.domain,
+                    *metrics,
+                    own_noise=share,
+                    levels=noisy.levels,
+                    levels_from_clean=trial.levels_from_clean,
+                    seconds=seconds,
+                )
 
 
 def to_domain(name: str, denoised: Tensor, trial: Trial) -> Iterator[tuple[str, Tensor]]:
@@ -208,7 +203,14 @@ def summary(rows: Iterable[Row], noisy: Iterable[Row] = ()) -> dict[str, Any]:
         PSNR of two equal frames. Entries that do not apply are left out.
     """
     rows, noisy = list(rows), list(noisy)
-    images = list(map(_image, rows))
+    images: list[dict[str, Any]] = []
+    for row in rows:
+        image: dict[str, Any] = {"name": row.frame}
+        if row.levels is not None:
+            image["shot_var"], image["read_var"] = row.levels
+        if row.levels_from_clean:
+            image["levels_from_clean"] = True
+        images.append(image)
     result: dict[str, Any] = {"images": images}
 
     flagged = sum(row.levels_from_clean for row in rows)
@@ -248,17 +250,6 @@ def _add_means(result: dict[str, Any], key: str, rows: Sequence[Row], metric: st
         result[f"{key}_worst25"], result[f"{key}_best25"] = worst_and_best_quarter(values)
 
     return faults
-
-
-def _image(row: Row) -> dict[str, Any]:
-    """Describe an image for the JSON, besides its scores."""
-    image: dict[str, Any] = {"name": row.frame}
-    if row.levels is not None:
-        image["shot_var"], image["read_var"] = row.levels
-    if row.levels_from_clean:
-        image["levels_from_clean"] = True
-
-    return image
 
 
 def _own_noise(rows: Sequence[Row], images: Sequence[dict[str, Any]]) -> dict[str, float]:

@@ -55,7 +55,12 @@ def write_tables(page: Path, parts: Iterable[Mapping[str, Any]]) -> list[Path]:
 
         name = re.sub(r"[^a-z0-9]+", "_", part["heading"].lower()).strip("_") or "table"
         path = page.with_name(f"{page.stem}_{name}.csv")
-        _write_csv(path, part["head"], part["rows"])
+        table = io.StringIO(newline="")
+        writer = csv.writer(table, lineterminator="\n")
+        writer.writerow(map(_plain, part["head"]))
+        for row, cells in part["rows"].items():
+            writer.writerow([_plain(row), *cells])
+        write_text(table.getvalue(), path)
         paths.append(path)
 
         path = path.with_suffix(".tex")
@@ -63,16 +68,6 @@ def write_tables(page: Path, parts: Iterable[Mapping[str, Any]]) -> list[Path]:
         paths.append(path)
 
     return paths
-
-
-def _write_csv(path: Path, head: Sequence[str], rows: Mapping[str, Sequence[str]]) -> None:
-    """Write a table with the names of its columns in ``head`` and its cells by the name of a row."""
-    table = io.StringIO(newline="")
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(map(_plain, head))
-    for name, cells in rows.items():
-        writer.writerow([_plain(name), *cells])
-    write_text(table.getvalue(), path)
 
 
 def _plain(name: str) -> str:

@@ -83,7 +83,12 @@ def make_table(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, co
         methods[name] = [{"plain": scores}]
     methods |= results
 
-    keeping_noise = _keeping_noise(methods)
+    # Methods that score more than a perfect denoiser would keep the references' own noise.
+    keeping_noise = set()
+    for name, runs in methods.items():
+        if any(run["plain"].get("own_noise", 0.0) > 1.0 for run in runs):
+            keeping_noise.add(name)
+
     table = Table([], {}, set())
     cells: dict[str, list[str]] = {}
     for head, (kind, key) in columns.items():
@@ -151,17 +156,6 @@ def _not_told_apart(best: Sequence[str], methods: Runs, kind: str, key: str) -> 
     if len(marked) == len(methods):
         return []
     return marked
-
-
-def _keeping_noise(methods: Runs) -> set[str]:
-    """Find the methods that score more than a perfect denoiser would, since they keep the references' own noise."""
-    names = set()
-    for name, runs in methods.items():
-        for run in runs:
-            if run["plain"].get("own_noise", 0.0) > 1.0:
-                names.add(name)
-
-    return names
 
 
 def first_runs(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:

@@ -266,10 +266,18 @@ def _kept_noise(arm: str, runs: Sequence[Summary], rival: str, other: Summary) -
     if other["psnr"] > best["psnr"]:
         name, scores = rival, other
 
-    own_noise, test_noise = _noise_of_references(scores)
-    if own_noise is None:
+    own_variances = []
+    test_variances = []
+    for image in scores["images"]:
+        if "own_noise" not in image:
+            continue
+        own_variances.append(image["own_noise"] * _squared_error(image["psnr"]))
+        if "psnr_noisy" in image:
+            test_variances.append(_squared_error(image["psnr_noisy"]))
+    if not own_variances:
         return ""
 
+    own_noise = fmean(own_variances)
     decides = f"to decide, {CLEANER_TEST}, or test on noisy and clean captures (pairs:PATH)"
     if scores["own_noise"] > 1.0:
         return (
@@ -277,38 +285,17 @@ def _kept_noise(arm: str, runs: Sequence[Summary], rival: str, other: Summary) -
             f"{-10 * math.log10(own_noise):.1f} dB on these references, whose noise it has kept; {decides}"
         )
 
-    if test_noise is None:
+    if not test_variances:
         return ""
 
     gap = abs(_squared_error(best["psnr"]) - _squared_error(other["psnr"]))
-    by_keeping = own_noise**2 / (own_noise + test_noise)
+    by_keeping = own_noise**2 / (own_noise + fmean(test_variances))
     if abs(best["psnr"] - other["psnr"]) >= MATTERS and gap <= by_keeping:
         return f"{arm} and {rival} differ by no more than a method gains by keeping the references' noise; {decides}"
 
     return ""
 
 
-def _noise_of_references(summary: Summary) -> tuple[float | None, float | None]:
-    """Get the mean variance of the references' own noise and of the noise added to them; None if not known."""
-    own_variances = []
-    test_variances = []
-    for image in summary["images"]:
-        if "own_noise" not in image:
-            continue
-        own_variances.append(image["own_noise"] * _squared_error(image["psnr"]))
-        if "psnr_noisy" in image:
-            test_variances.append(_squared_error(image["psnr_noisy"]))
-
-    return _mean_or_none(own_variances), _mean_or_none(test_variances)
-
-
 def _squared_error(psnr: float) -> float:
     """Compute the mean squared error at a PSNR in dB."""
     return float(10.0 ** (-psnr / 10.0))
-
-
-def _mean_or_none(values: Sequence[float]) -> float | None:
-    if not values:
-        return None
-
-    return fmean(values)

@@ -72,8 +72,8 @@ def open_frames(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> tuple[di
     count = len(every)
     source = given.get("validation", data.validation)
     held_out = isinstance(source, str) and source == HELD_OUT
-    if held_out:
-        count -= _number_held_out(len(every))
+    if held_out and len(every) > 1:
+        count -= min(max(1, len(every) // 5), _MOST_HELD_OUT)
     pairs: Sequence[Pair] = as_frames(every).some(select_pairs(every, count, data.count, data.select))
     if data.crop is not None:
         pairs = as_frames(pairs).middles(data.crop)
@@ -157,14 +157,6 @@ def _prepare(recipe: Recipe, frames: Sequence[Any], part: str) -> Sequence[Any]:
         frames = as_frames(frames).middles(crop)
 
     return as_frames(frames).kept()
-
-
-def _number_held_out(available: int) -> int:
-    """Compute how many of the available frames are held out; of a single one, none is."""
-    if available < 2:
-        return 0
-
-    return min(max(1, available // 5), _MOST_HELD_OUT)
 
 
 def _require_unseen(test: Sequence[Any], frames: Sequence[Any], part: str) -> None:
