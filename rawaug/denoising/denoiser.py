@@ -162,16 +162,18 @@ class ImageDenoiser(ABC):
     def __call__(self, noisy: Noisy) -> Tensor:
         """Denoise the image; the result is on the CPU."""
 
-    def _compute(self, run: Callable[..., Tensor], *inputs: Tensor | None) -> Tensor:
-        """Call ``run`` on the device and in the precision of this denoiser; the result is on the CPU."""
-        inputs = tuple(value if value is None else value.to(self.device) for value in inputs)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
-            return run(*inputs).cpu()
+    def _compute(self, run: Callable[..., Tensor], *inputs: Tensor | None, shape: Sequence[int]) -> Tensor:
+        """Call ``run`` on the device and in the precision of this denoiser.
 
-    def _require_sound(self, denoised: Tensor, noisy: Tensor, expected: Sequence[int]) -> Tensor:
-        """Return the result for a noisy image if it has the expected shape and is finite; else raise an error."""
-        if tuple(denoised.shape) != tuple(expected) or (self.checked and not denoised.isfinite().all()):
-            shapes = f"{tuple(denoised.shape)} for {tuple(noisy.shape)}"
+        Returns:
+            The result, on the CPU; an error is raised if it has another shape, or is not finite.
+        """
+        moved = [value if value is None else value.to(self.device) for value in inputs]
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
+            denoised = run(*moved).cpu()
+
+        if tuple(denoised.shape) != tuple(shape) or (self.checked and not denoised.isfinite().all()):
+            shapes = f"{tuple(denoised.shape)}, expected {tuple(shape)}"
             raise ValueError(f"{self.name}: the result is not finite, or of another shape: {shapes}")
         return denoised
 
@@ -309,12 +311,11 @@ class RawDenoiser(ImageDenoiser):
         if self.views > 1:
             each = partial(each_with_progress, unit="view group")
             run = denoisers.SelfEnsemble(run, trained_for, views=self.views, each=each)
-        denoised = self._compute(run, image, variance)
 
         shape = tuple(image.shape)
         if self.demosaics:
             shape = (1, 3, 2 * shape[2], 2 * shape[3])
-        self._require_sound(denoised, image, shape)
+        denoised = self._compute(run, image, variance, shape=shape)
         return crop_to_pattern(denoised, trained_for, cfa)
 
     def _denoise_mosaic(self, noisy: Noisy) -> Tensor:
@@ -327,8 +328,8 @@ class RawDenoiser(ImageDenoiser):
             raise ValueError(f"{self.name}: needs the variance of the noise")
 
         tiles = partial(denoisers.denoise_tiles, self.any_pattern, tile=2 * self.tiles[0], each=each_with_progress)
-        denoised = self._compute(partial(denoise_mosaic, tiles, cfa=noisy.cfa), noisy.image, noisy.variance)
-        return self._require_sound(denoised, noisy.image, noisy.image.shape)
+        run = partial(denoise_mosaic, tiles, cfa=noisy.cfa)
+        return self._compute(run, noisy.image, noisy.variance, shape=noisy.image.shape)
 
     def frame(self, frame: RawFrame, levels: Levels | None) -> Tensor:
         """Denoise the mosaic ``(1, H, W)`` of a frame, to at most 1; full colour ``(3, H, W)`` if it ``demosaics``.

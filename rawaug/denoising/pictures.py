@@ -126,8 +126,7 @@ class PictureDenoiser(ImageDenoiser):
         if self.explain_kept(noisy.image) is not None:
             return noisy.image.clone()
 
-        mean = self._compute(self._average_views, noisy.image).clamp_(0.0, 1.0)
-        return self._require_sound(mean, noisy.image, noisy.image.shape)
+        return self._compute(self._average_views, noisy.image, shape=noisy.image.shape).clamp_(0.0, 1.0)
 
     def explain_kept(self, srgb: Tensor) -> str | None:
         """Explain why a picture ``(1, 3, H, W)`` stays as it is: it was drawn, not taken; None if it is denoised."""

@@ -229,7 +229,8 @@ def test_strength_auto_leaves_the_same_grain_in_every_frame(deviation: float) ->
     files = files_for(frame, lambda packed: torch.full_like(packed, 0.18), "auto", noise=levels)
     result, done = files.denoise(frame)
     assert (result.mosaic.std() / 0.18).item() == pytest.approx(min(deviation, 0.01), rel=0.02)
-    assert done.strength == pytest.approx(max(0.0, 1 - 0.01 / deviation)) and files.settings["strength"] == "auto"
+    assert done.strength == pytest.approx(max(0.0, 1 - 0.01 / deviation))
+    assert files.settings is not None and files.settings["strength"] == "auto"
     if deviation > 0.01:
         assert result.noise_profile[1] == pytest.approx(0.0018**2)
 
