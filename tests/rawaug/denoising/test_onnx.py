@@ -9,7 +9,10 @@ from typing import Any
 import pytest
 import torch
 
+import denoisers
+from denoisers.onnx import OnnxNetwork, compile_openvino
 from rawaug.bayer import CFA
+from rawaug.commands.export import export
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.io import RawFrame, write_dng
 
@@ -81,3 +84,21 @@ def test_a_graph_of_one_input_is_blind_and_one_of_three_is_refused(tmp_path: Pat
     onnx.save(model, str(file))
     with pytest.raises(ValueError, match="denoiser"):
         RawDenoiser.of(file)
+
+
+def test_openvino_computes_what_onnx_runtime_does(tmp_path: Path) -> None:
+    pytest.importorskip("openvino", reason="pip install rawaug[openvino]")
+    network = denoisers.build("UNet", width=4, scales=2)
+    for weights in network.parameters():  # the last ones are zeros at first
+        weights.data.uniform_(-0.2, 0.2, generator=torch.Generator().manual_seed(0))
+    denoisers.save(network, tmp_path / "small.safetensors", {"cfa": "RGGB"})
+    export(tmp_path / "small.safetensors", tmp_path / "small.onnx")
+    run = OnnxNetwork(tmp_path / "small.onnx")
+    for height, width in ((32, 48), (16, 64), (32, 48)):
+        noisy = torch.rand(1, 4, height, width, generator=torch.Generator().manual_seed(height))
+        inputs = {"noisy": noisy.numpy(), "variance": (1e-3 * noisy + 1e-5).numpy()}
+        compiled = compile_openvino(run.path, inputs)
+        assert compiled is not None and compiled is not run.session.run
+        (expected,) = run.session.run(None, inputs)
+        torch.testing.assert_close(torch.as_tensor(compiled(inputs)[0]), torch.as_tensor(expected), atol=1e-5, rtol=0)
+        torch.testing.assert_close(run(noisy, 1e-3 * noisy + 1e-5), torch.as_tensor(expected), atol=1e-5, rtol=0)
