@@ -75,7 +75,9 @@ def test_a_fifth_task_is_one_file(tmp_path: Path, capsys: pytest.CaptureFixture[
     command = ["--import", str(tmp_path / "burst.py"), "run", str(tmp_path / "burst.yaml"), "--out", str(tmp_path)]
     assert main([*command[:4], "--keys"]) == 0
     assert "shots of a scene" in capsys.readouterr().out
+    command += ["--isp.camera", "Nikon D750"]
     assert main(command) == main([*command, "--shots", "1", "--name", "one"]) == 0
+    assert capsys.readouterr().out.count("universal as Nikon D750") == 2
 
     burst = json.loads((tmp_path / "burst" / "results.json").read_text())["4 shots"]
     single = json.loads((tmp_path / "one" / "results.json").read_text())["1 shots"]
