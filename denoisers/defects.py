@@ -6,7 +6,8 @@ light over the pixels around it (a spread of 0.4 pixels puts an eighth of the pe
 a defect changes one pixel. It is replaced by the mean of its neighbours, leaving out the lowest and the highest.
 
 Texture that is as fine as pixels has single ones that pass for defects, and many more that nearly do; defects stand out
-clearly. An image in which more than twice as many nearly do as do is therefore left alone.
+clearly. Where more than twice as many nearly do as do, within 64 pixels, they are therefore left alone. The count is
+that of the pixel's own surroundings, so that it does not depend on the tile in which a pixel is denoised.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ ALONE = 4.0
 """A defect departs from its neighbours at least this many times as far as the pixels that touch it, one excepted."""
 NEARLY_ALONE = 2.0
 """Where many pixels depart this many times as far, those that depart further are the finest texture, not defects."""
+AROUND = 64
+"""Texture is looked for within so many pixels of the mosaic, less than by which tiles overlap."""
 SPREAD = 0.1
 """The four pixels beside a light depart with it by this share, on average, or more; those beside a defect do not."""
 
@@ -57,11 +60,22 @@ def mend_planes(signal: Tensor) -> Tensor:
     is_candidate = ~is_spread & (F.pixel_shuffle(_is_beyond(signal, low, high).to(signal.dtype), 2) > 0)
     is_defect = is_candidate & (departure.abs() > ALONE * second_largest)
     is_nearly = is_candidate & (departure.abs() > NEARLY_ALONE * second_largest)
-    count, count_nearly = (mask.to(signal.dtype).sum((1, 2, 3), keepdim=True) for mask in (is_defect, is_nearly))
-    is_texture = count_nearly > 2 * count + 1
+    is_texture = _count_around(is_nearly) > 2 * _count_around(is_defect) + 1
 
     replaced = F.pixel_unshuffle((is_defect & ~is_texture).to(signal.dtype), 2) > 0
     return torch.where(replaced, mean, signal)
+
+
+def _count_around(mask: Tensor) -> Tensor:
+    """Count the pixels that are marked within :data:`AROUND` of each one of a mask ``(B, 1, H, W)``."""
+    height, width = mask.shape[-2:]
+    padded = F.pad(mask.float(), (AROUND + 1, AROUND, AROUND + 1, AROUND))
+    sums = padded.cumsum(-1).cumsum(-2)  # whole numbers below 2^24, which float32 holds exactly
+
+    side = 2 * AROUND + 1
+    below, above = sums[..., side:, :], sums[..., :height, :]
+    bands = below - above
+    return bands[..., side:] - bands[..., :width]
 
 
 def mend_mosaic(signal: Tensor, planes: Tensor) -> Tensor:

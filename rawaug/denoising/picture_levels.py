@@ -1,7 +1,8 @@
 r"""How strong the noise of a developed picture is for a network that is told so, and how sure it is that there is any.
 
-.. math:: \sigma = \exp(a + b \ln r - c \rho_1 + d \rho_2), \qquad
-   w = S(p - q \ln(r / r_{25})), \qquad S(z) = \frac{1}{1 + e^{-z}}
+.. math:: \sigma = \exp(a + b \ln r - c \rho_1 + d \rho_2), \quad
+   s \le \sigma / r \le \min(u\, e^{v \max(0, \rho_1)}, t \max(1, 10 / r)^{3/2}), \quad
+   w = S(p - q \ln(r / r_{25})), \quad S(z) = \frac{1}{1 + e^{-z}}
 
 A network f that is told the level of the noise, its standard deviation, also works where the level is unknown. What it
 then removes, :math:`x - f(x, 0)`, tells the level. Its deviation is measured over squares of 16 x 16 pixels, of which
@@ -13,12 +14,16 @@ needs a higher level the further the grain reaches, which shows in what is remov
 are its correlations between pixels one and two apart, in the half of the squares that have the least of it. Demosaicing
 makes neighbours alike, but hardly pixels two apart; the wide filters of a camera's noise reduction make both alike.
 
+That line is for weak noise which cameras have finished. White noise, whose :math:`\rho_1` is 0, and strong noise are
+removed nearly whole, and r itself is their deviation. Told much more, the network removes detail, and told less, it
+leaves coarse grain. Hence the bounds: s to t times r where r is above 10 codes, and at most u times r for white noise.
+
 w is the share of the network's correction that is applied, near 1 for a noisy picture and smaller for a clean one.
 Noise lies evenly over a picture and texture does not, so the ratio of the median to the lower quartile tells them
 apart. A low level would not do instead, since a network that is told next to nothing takes the level for unknown.
 
 The constants are those with which pictures are denoised best (CC15, developed frames, drawn noise) while clean
-photographs stay as they are.
+photographs stay as they are; those of the bounds were chosen on the training photographs with drawn noise.
 """
 
 from __future__ import annotations
@@ -34,9 +39,13 @@ from rawaug.errors import extra
 
 LEVEL, BY_REMOVED, BY_NEIGHBOURS, BY_SECOND_NEIGHBOURS = 1.89, 0.65, 2.5, 3.1
 """The constants a, b, c and d of the level."""
+LEAST, MOST_OF_WHITE, MOST_BY_NEIGHBOURS, MOST_OF_STRONG = 1.05, 1.15, 12.0, 1.6
+"""The constants s, u, v and t of the bounds."""
 SHARE, SHARE_BY_UNEVENNESS = 7.0, 5.4
 """The constants p and q of the share."""
 
+_STRONG = 10.0
+"""From this removed deviation on, in codes, noise is strong."""
 _LOWEST = 2.0
 """No lower level is told, in codes, since the network takes one near 0 for unknown."""
 _PARTS, _PART, _SQUARE = 3, 256, 16
@@ -76,9 +85,14 @@ def estimate_level(network: Any, srgb: Tensor) -> tuple[float, float]:
     neighbours = one_apart[even].sum() / power
     second_neighbours = two_apart[even].sum().clamp_min(0.0) / power
 
-    log_level = LEVEL + BY_REMOVED * (255.0 * median).log()
+    codes = 255.0 * median
+    log_level = LEVEL + BY_REMOVED * codes.log()
     log_level = log_level - BY_NEIGHBOURS * neighbours + BY_SECOND_NEIGHBOURS * second_neighbours
-    level = log_level.exp().clamp_min(_LOWEST) / 255.0
+
+    most_of_white = MOST_OF_WHITE * (MOST_BY_NEIGHBOURS * neighbours.clamp_min(0.0)).exp()
+    most_of_strong = MOST_OF_STRONG * (_STRONG / codes).clamp_min(1.0) ** 1.5
+    most = codes * torch.minimum(most_of_white, most_of_strong)
+    level = log_level.exp().clamp_min(LEAST * codes).minimum(most).clamp_min(_LOWEST) / 255.0
 
     share = SHARE - SHARE_BY_UNEVENNESS * (median / quartile).log()
     return float(level), float(share.sigmoid())

@@ -239,6 +239,20 @@ def test_a_point_of_light_is_no_defect_wherever_it_falls(row: float, column: flo
 
 
 @torch.no_grad()
+def test_what_is_mended_does_not_depend_on_the_tile() -> None:
+    generator = torch.Generator().manual_seed(0)
+    signal = 50.0 + torch.randn(1, 4, 128, 400, generator=generator)
+    signal[0, 1, 60, 100] = signal[0, 2, 61, 230] = 200.0
+    texture = torch.rand(1, 4, 128, 150, generator=generator) ** 6 * 400.0
+    signal[..., 250:] += texture
+
+    whole = mend_planes(signal)
+    assert whole[0, 1, 60, 100] < 60.0
+    assert whole[0, 2, 61, 230] > 190.0, "it is beside the texture"
+    part = mend_planes(signal[..., 20:240])
+    assert torch.equal(part[..., 40:-40], whole[..., 60:200])
+
+
 def test_a_network_that_mends_is_not_moved_by_hot_pixels() -> None:
     net = awake(DRUNet(width=4, scales=3, blocks=1, variance_map=False, domain="anscombe", mend=True))
     noisy = pair(1, 4, 32, 32)[0].clamp_min(0.0) * 0.1

@@ -114,6 +114,19 @@ def test_grain_that_reaches_beyond_neighbours_asks_for_a_higher_level() -> None:
     assert levels[1] > 1.5 * levels[0]
 
 
+@pytest.mark.parametrize("deviation", [5.0, 20.0, 60.0])
+def test_the_level_of_white_and_of_strong_noise_is_what_is_removed(deviation: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    white = torch.randn(1, 3, 256, 256, generator=generator)
+    coarse = gaussian_blur(white, torch.tensor([1.5]))
+
+    level, _ = estimate_level(_RemovesAll(), 0.5 + deviation / 255.0 * white)
+    assert 1.0 <= 255.0 * level / deviation <= 1.25
+    if deviation > 10.0:
+        level, _ = estimate_level(_RemovesAll(), 0.5 + deviation / 255.0 * coarse / coarse.std())
+        assert 1.0 <= 255.0 * level / deviation <= 1.7
+
+
 def test_a_self_ensemble_denoises_a_turned_picture_to_the_turned_result() -> None:
     denoiser = PictureDenoiser.of("rawaug-srgb@10", views=8)
     upright, turned = (denoiser(Noisy(bayer.turn(noisy()[None], view))) for view in (0, 5))
