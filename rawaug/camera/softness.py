@@ -32,8 +32,8 @@ MTF50 = math.sqrt(math.log(2.0) / 2.0) / math.pi
 PUBLISHED = (0.0, 1.0)
 """A range of blur in pixels for cameras of which nothing is known. To be as soft as frames of five cameras (Canon S40
 and G2, GoPro HERO6 and HERO7, Nikon D5000), sharp photographs need 0.5 to 1, and photographs that are soft themselves 0
-to 1 (``python -m benchmarks.softness``). It is not drawn by default: its worth to a network is not measured, and a
-denoiser solved in closed form gains by it on sharp frames as well (``python -m benchmarks.worth_of_blur``)."""
+to 1 (``python -m benchmarks.softness``). ``recipes/base.yaml`` draws it: after a short training its networks gain by
+it at every strength and on real noise (docs/results_isp.md). Elsewhere it is not drawn by default."""
 
 STEEPNESS = {0.0: 0.696, 0.4: 0.672, 0.5: 0.633, 0.6: 0.589, 0.7: 0.538, 0.8: 0.501, 1.0: 0.451}
 """The steepness of photographs by the blur in pixels: the median of the 0.9 quantiles of 69 (the same benchmark)."""
