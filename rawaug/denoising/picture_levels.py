@@ -1,7 +1,7 @@
 r"""How strong the noise of a developed picture is for a network that is told so, and how sure it is that there is any.
 
 .. math:: \sigma = \exp(a + b \ln r - c \rho_1 + d \rho_2), \quad
-   s \le \sigma / r \le \min(u\, e^{v \max(0, \rho_1)}, t \max(1, 10 / r)^{3/2}), \quad
+   s \le \sigma / r \le \min(u\, e^{v \max(0, \rho_1)} \max(1, 4 / r)^{3/2}, t \max(1, 10 / r)^{3/2}), \quad
    w = S(p - q \ln(r / r_{25})), \quad S(z) = \frac{1}{1 + e^{-z}}
 
 A network f that is told the level of the noise, its standard deviation, also works where the level is unknown. What it
@@ -16,7 +16,8 @@ makes neighbours alike, but hardly pixels two apart; the wide filters of a camer
 
 That line is for weak noise which cameras have finished. White noise, whose :math:`\rho_1` is 0, and strong noise are
 removed nearly whole, and r itself is their deviation. Told much more, the network removes detail, and told less, it
-leaves coarse grain. Hence the bounds: s to t times r where r is above 10 codes, and at most u times r for white noise.
+leaves coarse grain. Hence the bounds: s to t times r where r is above 10 codes, and at most u times r for white noise
+where r is above 4. Where little is removed, it says little.
 
 w is the share of the network's correction that is applied, near 1 for a noisy picture and smaller for a clean one.
 Noise lies evenly over a picture and texture does not, so the ratio of the median to the lower quartile tells them
@@ -44,8 +45,8 @@ LEAST, MOST_OF_WHITE, MOST_BY_NEIGHBOURS, MOST_OF_STRONG = 1.05, 1.15, 12.0, 1.6
 SHARE, SHARE_BY_UNEVENNESS = 7.0, 5.4
 """The constants p and q of the share."""
 
-_STRONG = 10.0
-"""From this removed deviation on, in codes, noise is strong."""
+_WHOLE, _STRONG = 4.0, 10.0
+"""From these removed deviations on, in codes, white noise is removed whole, and noise is strong."""
 _LOWEST = 2.0
 """No lower level is told, in codes, since the network takes one near 0 for unknown."""
 _PARTS, _PART, _SQUARE = 3, 256, 16
@@ -90,6 +91,7 @@ def estimate_level(network: Any, srgb: Tensor) -> tuple[float, float]:
     log_level = log_level - BY_NEIGHBOURS * neighbours + BY_SECOND_NEIGHBOURS * second_neighbours
 
     most_of_white = MOST_OF_WHITE * (MOST_BY_NEIGHBOURS * neighbours.clamp_min(0.0)).exp()
+    most_of_white = most_of_white * (_WHOLE / codes).clamp_min(1.0) ** 1.5
     most_of_strong = MOST_OF_STRONG * (_STRONG / codes).clamp_min(1.0) ** 1.5
     most = codes * torch.minimum(most_of_white, most_of_strong)
     level = log_level.exp().clamp_min(LEAST * codes).minimum(most).clamp_min(_LOWEST) / 255.0
