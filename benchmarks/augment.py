@@ -1,12 +1,16 @@
 """What the augmentation costs: million sRGB pixels a second, against other ways to the same RAW, and peak memory.
 
     python -m benchmarks.augment [--device cpu|cuda] [--quick] [--json FILE] [--threads N]
+    python -m benchmarks.augment --beside CHECKOUT       # the targets on a CPU, and those of another commit, in turn
 
 Every method makes clean RAW, noisy RAW and the variance map, packed, of photographs: a training batch of 16 crops, and
 pictures of 12 Mpix. *upi* is Brooks' pipeline as published: picture by picture and operation by operation, from floats,
 with its own noise. *copy* turns bytes into as many floats as are made of them, and does no more; *drawn before* is
 rawaug without the draw of its parameters; *rgb*, *srgb* and *burst* are its other targets; *blurred* softens linear
 light. All are timed in turn, and the fastest run of each counts.
+
+``--beside`` takes CPU time, which other programs lengthen less: processes of the two checkouts in turn, three each; the
+least of four calls in a process, and the median of the processes.
 
 The roofline is the bandwidth of a large copy in the same run, bytes read plus bytes written a second. A pixel counts
 as :data:`COUNTED` bytes, whatever a method moves; rawaug's two passes move :data:`MOVED`.
@@ -15,13 +19,17 @@ as :data:`COUNTED` bytes, whatever a method moves; rawaug's two passes move :dat
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from statistics import median
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,6 +41,16 @@ from rawaug.paper.baselines.upi import UPI, unprocess_pixels
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.targets import Burst, Srgb, Target
+
+ROOT = Path(__file__).parents[1]
+TARGETS: dict[str, dict[str, Any]] = {
+    "raw": {},
+    "rgb": {"target": "rgb"},
+    "srgb": {"target": "srgb"},
+    "srgb, finished": {"target": Srgb(finish=True)},
+    "burst of 4": {"burst": Burst(4)},
+}
+"""Settings of RawAugment that ``--beside`` times, besides UPI."""
 
 COUNTED = 3 + 4 + 4
 """Bytes a pixel that any augmentation must move: uint8 in, noisy and clean RAW out in float32."""
@@ -114,13 +132,47 @@ def measure(batch: Tensor, repeats: int, gb_s: float) -> dict[str, dict[str, flo
     return rows
 
 
-def child(task: str, args: argparse.Namespace, **environment: str) -> float:
-    """Run this file's ``task`` in a process of its own; the number that it prints."""
-    command = [sys.executable, "-m", "benchmarks.augment", "--task", task]
+def child(task: str, args: argparse.Namespace, root: Path = ROOT, **environment: str) -> Any:
+    """Run this file's ``task`` with the packages of a checkout in a process of its own; the JSON that it prints."""
+    command = [sys.executable, __file__, "--task", task]
     command += ["--threads", str(args.threads), "--device", str(args.device)]
-    root = Path(__file__).parents[1]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ | environment, cwd=root)
-    return float(done.stdout)
+    environment = {**os.environ, **environment, "PYTHONPATH": str(root)}
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment, cwd=root)
+    return json.loads(done.stdout)
+
+
+@torch.no_grad()
+def cpu_times() -> dict[str, float]:
+    """CPU milliseconds of UPI and of each target, for 16 crops of 256 x 256."""
+    batch, generator = pictures(16, 256, 256), torch.Generator().manual_seed(0)
+    floats = batch / 255.0
+    runs: dict[str, Callable[[], object]] = {"upi": lambda: [published_upi(each[None], generator) for each in floats]}
+    for name, settings in TARGETS.items():
+        augment = RawAugment.from_pretrained("universal", **settings)
+        runs[name] = lambda augment=augment: augment(batch, torch.Generator().manual_seed(3))  # type: ignore[misc]
+
+    best = dict.fromkeys(runs, float("inf"))
+    for name in [*runs] * 5:  # the first call compiles
+        begin = time.process_time()
+        runs[name]()
+        best[name] = min(best[name], 1e3 * (time.process_time() - begin))
+    return best
+
+
+def compare(args: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """CPU milliseconds of this checkout and of ``args.beside``, and how many times as fast this one is."""
+    times: dict[Path, list[dict[str, float]]] = {ROOT: [], args.beside: []}
+    for root in [*times] * 3:
+        times[root].append(child("targets", args, root))
+
+    rows = {}
+    for name in times[ROOT][0]:
+        now, before = [median(each[name] for each in runs) for runs in times.values()]
+        ratios = [b[name] / a[name] for a, b in zip(*times.values(), strict=True)]
+        row = {"ms": now, "before": before, "as fast": median(ratios), "least": min(ratios), "most": max(ratios)}
+        row["of UPI"] = median(each["upi"] / each[name] for each in times[ROOT])
+        rows[name] = row
+    return rows
 
 
 def peak_memory(device: torch.device, height: int = 3000, width: int = 4000) -> float:
@@ -143,13 +195,21 @@ def first_call(device: torch.device) -> float:
 
 def main() -> None:
     parser = arguments(__doc__, repeats=40, quick="few runs, and 3 Mpix instead of 12")
-    parser.add_argument("--task", choices=["memory", "first"], help=argparse.SUPPRESS)
+    parser.add_argument("--task", choices=["memory", "first", "targets"], help=argparse.SUPPRESS)
+    parser.add_argument("--beside", type=Path, help="another checkout, to compare the targets with")
     args = parser.parse_args()
     if args.task:
         torch.set_num_threads(args.threads)
-        print(peak_memory(args.device) if args.task == "memory" else first_call(args.device))
+        tasks: dict[str, Callable[[], Any]] = {"targets": cpu_times}
+        tasks |= {"memory": partial(peak_memory, args.device), "first": partial(first_call, args.device)}
+        print(json.dumps(tasks[args.task]()))
         return
     figures = start(args)
+    if args.beside:
+        figures["targets"] = compare(args)
+        show(figures["targets"])
+        finish(figures, args)
+        return
     # First, for a process inherits the peak of the one that starts it.
     figures["peak memory"] = {"of input and output": child("memory", args)}
     with tempfile.TemporaryDirectory() as folder:
