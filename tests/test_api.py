@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 from importlib import import_module
 from pathlib import Path
@@ -9,6 +10,8 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+
+import rawaug
 
 PAGE = Path(__file__).parents[1] / "docs" / "api.md"
 ENTRY = re.compile(r"^::: (\S+)\n((?:[ ]+.*\n)*)", re.MULTILINE)
@@ -51,3 +54,19 @@ def test_the_page_shows_what_a_package_exports(package: str) -> None:
         if name != "__version__" and not any(getattr(module, name) is entry for entry in shown):
             missing.append(name)
     assert not missing
+
+
+def test_a_first_import_leaves_the_garbage_collector_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, counts = list[str](), [0, 0, 5]
+    monkeypatch.setattr(gc, "freeze", lambda: calls.append("freeze"))
+    monkeypatch.setattr(gc, "unfreeze", lambda: calls.append("unfreeze"))
+    monkeypatch.setattr(gc, "get_freeze_count", lambda: counts.pop(0))
+
+    rawaug._import("rawaug.bayer")
+    assert calls == ["freeze", "unfreeze"] and gc.isenabled()
+    with pytest.raises(ImportError):
+        rawaug._import("rawaug.nothing")
+    assert calls == ["freeze", "unfreeze"] and gc.isenabled()
+
+    rawaug._import("rawaug.bayer")
+    assert len(calls) == 2, "what a user has frozen stays frozen"
