@@ -22,6 +22,7 @@ import torch
 from denoisers.network import Denoiser, Shared, conv
 from rawaug.bayer import CFA
 from rawaug.data import Pair, open_pairs
+from rawaug.io import RawFrame
 from rawaug.noise import Compose, RowNoise, ShotReadNoise, noise_levels
 from torch import Tensor
 
@@ -57,7 +58,6 @@ SCRIPT = """
 import rawaug
 import torch
 from rawaug.data import demo_pictures
-from rawaug.io import RawFrame
 from torch.utils.data import DataLoader, Dataset
 from typing import assert_type
 
