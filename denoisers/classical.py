@@ -8,6 +8,7 @@ filter sees noise of one level everywhere; alone, it works at the mean level. Th
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import product
@@ -25,6 +26,9 @@ from rawaug.registry import Registry
 
 FILTERS = Registry("classical filter", "rawaug.filters", "denoisers")
 """This maps names to filters, which are subclasses of :class:`Classical`."""
+
+STRIP = 128
+"""Non-local means filters so many rows at a time, in packed pixels."""
 
 Planes = np.ndarray[Any, np.dtype[np.float32]]
 
@@ -110,10 +114,22 @@ class NonLocalMeans(Classical):
     needs = ("skimage",)
 
     def denoise(self, planes: Planes) -> Planes:
-        """Filter ``(h, w, 4)``; patches are compared over all four planes at once."""
+        """Filter ``(h, w, 4)``; patches are compared over all four planes at once.
+
+        Strips of rows are filtered side by side, by as many threads as PyTorch has, with the rows that they reach.
+        """
         denoise_nl_means = self.library("skimage.restoration").denoise_nl_means
         settings = {"patch_size": 5, "patch_distance": 6, "fast_mode": True, "channel_axis": -1}
-        return denoise_nl_means(planes, h=0.8 * self.strength, sigma=1.0, **settings)
+        reach = 8  # half of a patch beyond the distance
+
+        def filter_strip(top: int) -> Planes:
+            start = max(top - reach, 0)
+            rows = planes[start : top + STRIP + reach]
+            filtered = denoise_nl_means(rows, h=0.8 * self.strength, sigma=1.0, **settings)
+            return filtered[top - start :][:STRIP]
+
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+            return np.concatenate(list(pool.map(filter_strip, range(0, len(planes), STRIP))))
 
 
 @FILTERS.register("Wavelet")

@@ -7,10 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from skimage.restoration import denoise_nl_means
 from torch import Tensor
 
 from denoisers import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
-from denoisers.classical import Classical
+from denoisers.classical import STRIP, Classical
 
 SIGMA = 0.03
 OWN = [NonLocalMeans, Wavelet, TotalVariation]
@@ -114,3 +115,11 @@ def test_stabilised_beats_the_mean_level_under_shot_noise() -> None:
         Stabilised(NonLocalMeans())(noisy, torch.rand_like(noisy))
     white = Stabilised(TotalVariation())(noisy, shot_var=0.0, read_var=1e-3)
     assert torch.equal(white, TotalVariation()(noisy, torch.full_like(noisy, 1e-3))), "without shot noise, as it is"
+
+
+def test_strips_of_non_local_means_are_those_of_the_whole() -> None:
+    planes = np.random.default_rng(0).normal(10.0, 1.0, (2 * STRIP + 1, 20, 4)).astype(np.float32)
+    planes += np.linspace(0.0, 50.0, 20, dtype=np.float32)[:, None]
+    settings = {"patch_size": 5, "patch_distance": 6, "fast_mode": True, "channel_axis": -1}
+    whole = denoise_nl_means(planes, h=0.8, sigma=1.0, **settings)
+    np.testing.assert_allclose(NonLocalMeans().denoise(planes), whole, atol=1e-4)
