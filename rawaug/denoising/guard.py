@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from denoisers.defects import mend_planes
+from denoisers.defects import AROUND, mend_planes
 from denoisers.domains import DOMAINS
 from rawaug.bayer import noise_variance
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
@@ -49,6 +49,9 @@ MOST_DEFECTS = 1e-3
 
 FLAT_CONTRAST = 0.25
 """A flat place has less contrast than this share of the noise's variance after denoising."""
+
+STRIP = 256
+"""A frame is mended so many rows of cells at a time."""
 
 _STEPS = 40
 """Weights are multiples of one part in as many."""
@@ -206,11 +209,27 @@ def _mend(noisy: Noisy, denoised: Tensor) -> Tensor:
     levels = [torch.full((1, 1, 1, 1), level) for level in noisy.levels]
     domain = DOMAINS["anscombe"]
     signal = domain.forward(noisy.image, *levels)
-    mended = mend_planes(signal)
+    mended = _mend_strips(signal)
     is_defect = mended != signal
     if float(is_defect.float().mean()) > MOST_DEFECTS:
         return noisy.image
 
-    replacement = domain.inverse(mended, *levels)
-    is_defect &= (denoised - replacement).abs() < (denoised - noisy.image).abs()
-    return torch.where(is_defect, replacement, noisy.image)
+    # The few values that change, ``(1, 1, 1, N)``.
+    value = noisy.image[is_defect]
+    replacement = domain.inverse(mended[is_defect].reshape(1, 1, 1, -1), *levels).flatten()
+    result = denoised[is_defect]
+    is_agreed = (result - replacement).abs() < (result - value).abs()
+    image = noisy.image.clone()
+    image[is_defect] = torch.where(is_agreed, replacement, value)
+    return image
+
+
+def _mend_strips(signal: Tensor) -> Tensor:
+    """Mend planes ``(1, 4, h, w)`` by strips, to the same bits as at once, which takes a gigabyte for 12 megapixels."""
+    margin = AROUND // 2 + 2
+    strips = []
+    for top in range(0, signal.shape[2], STRIP):
+        start = max(top - margin, 0)
+        mended = mend_planes(signal[:, :, start : top + STRIP + margin])
+        strips.append(mended[:, :, top - start :][:, :, :STRIP])
+    return torch.cat(strips, dim=2)

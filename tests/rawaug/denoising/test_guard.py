@@ -11,7 +11,7 @@ import rawaug
 from denoisers.defects import mend_planes
 from rawaug import RawDenoiser, bayer
 from rawaug.denoising.denoiser import Noisy
-from rawaug.denoising.guard import guard_result
+from rawaug.denoising.guard import STRIP, _mend_strips, guard_result
 from rawaug.io import RawFrame
 
 LEVELS = (1e-3, 1e-6)
@@ -100,6 +100,17 @@ def test_lone_pixels_of_texture_stay_texture() -> None:
     clean = textured(0.15).clamp(max=0.9)
     signal = clean / 0.01  # hardly any noise
     assert torch.equal(mend_planes(signal), signal)
+
+
+def test_a_frame_is_mended_by_strips_as_at_once() -> None:
+    signal = 20.0 + torch.randn(1, 4, 2 * STRIP + 3, 24, generator=torch.Generator().manual_seed(0))
+    signal[0, 2, 100, 7] += 60.0  # a defect
+    signal[0, 0, STRIP - 1, 12] += 60.0  # as alone, but with texture near it, in the next strip
+    texture = signal[0, :, STRIP + 24 : STRIP + 30 : 2, 4:20:4]
+    texture += torch.tensor([60.0, 20.0, 0.0, 20.0])[:, None, None]
+    at_once = mend_planes(signal)
+    assert (at_once != signal).nonzero().tolist() == [[0, 2, 100, 7]]
+    assert torch.equal(_mend_strips(signal), at_once)
 
 
 def test_a_frame_is_guarded_unless_told_otherwise() -> None:
