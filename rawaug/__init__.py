@@ -77,9 +77,9 @@ def __getattr__(name: str) -> Any:
 
 
 def _import(name: str) -> Any:
-    """Import a module without looking for garbage, which there is none of among the million objects of PyTorch.
+    """Import a module while the garbage collector rests: the million objects that PyTorch makes hold no garbage.
 
-    They go straight to the oldest generation, where they would be after three searches of a tenth of a second.
+    They go straight to the oldest generation, which they would reach after three searches of a tenth of a second.
     """
     if not gc.isenabled() or gc.get_freeze_count():
         return import_module(name)

@@ -46,7 +46,7 @@ class Pair:
             not know such levels.
 
     Raises:
-        ValueError: if the pattern is not Bayer's, shapes or dtypes disagree, or a side is odd.
+        ValueError: if the pattern is not Bayer's, patterns, shapes or dtypes disagree, or a side is odd.
 
     Example:
         >>> picture, mosaic = torch.zeros(3, 4, 6, dtype=torch.uint8), torch.zeros(1, 4, 6)
@@ -71,6 +71,8 @@ class Pair:
 
         images = {"clean": self.clean.mosaic, "srgb": self.srgb, "noisy_srgb": self.noisy_srgb}
         if self.noisy is not None:
+            if self.noisy.cfa != self.clean.cfa:
+                raise ValueError(f"pair {self.name}: clean has the pattern {self.clean.cfa}, noisy {self.noisy.cfa}")
             images["noisy"] = self.noisy.mosaic
         size = tuple(self.clean.mosaic.shape[-2:])
         for key, image in images.items():

@@ -86,12 +86,13 @@ class RealCrops:
     def draw(self, generator: torch.Generator) -> Sample:
         """Draw a sample of packed RAW ``(4, crop / 2, crop / 2)``."""
         pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
-        if pair.noisy is None or pair.noisy.noise_profile is None:
+        if pair.noisy is None:
             packed = packed_crop(pair.name, [pair.clean.mosaic], pair.cfa, self.crop, self.cfa, generator)
             return add_noise(packed, self.noise, generator)
 
         mosaics = [pair.clean.mosaic, pair.noisy.mosaic]
         clean, noisy = packed_crop(pair.name, mosaics, pair.cfa, self.crop, self.cfa, generator)
+        assert pair.noisy.noise_profile is not None  # all pairs have been asked for their levels
         shot_var, read_var = pair.noisy.noise_profile
         variance = bayer.noise_variance(noisy, torch.tensor(shot_var), torch.tensor(read_var))
         return Sample(noisy, clean, variance)

@@ -170,6 +170,12 @@ def test_sites_that_are_binned_together_share_one_centre(factor: int) -> None:
     assert left == pytest.approx(bin_mosaic_variance(factor, together=True), rel=0.03)
 
 
+def test_both_frames_of_a_pair_have_one_pattern() -> None:
+    clean = RawFrame(torch.zeros(1, 4, 6), "RGGB")
+    with pytest.raises(ValueError, match=r"RGGB.*GRBG"):
+        Pair("a", clean, torch.zeros(3, 4, 6, dtype=torch.uint8), replace(clean, cfa="GRBG"))
+
+
 @pytest.mark.parametrize("cfa", ["XTRANS", "RGBW"])
 def test_other_patterns_are_refused(cfa: str) -> None:
     with pytest.raises(ValueError, match=f"CFA '{cfa}' is not a Bayer pattern"):
