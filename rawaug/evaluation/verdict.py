@@ -49,7 +49,7 @@ _INPUT = "the noisy input"
 CLEANER_TEST = "bin the references (bin 4), or add the noise of a higher ISO"
 """Advice for making a test less sensitive to the noise of its references."""
 
-_MORE = "more test frames (data.test) or seeds (seeds: 3) would decide"
+_MORE = "more test frames (data.test) or more seeds (seeds) would decide"
 
 Summary = Mapping[str, Any]
 """The scores of one method, see :func:`rawaug.evaluation.scores.summary`."""
