@@ -435,13 +435,13 @@ def fingerprint(*settings: Any) -> str:
     return digest(json.dumps(settings, sort_keys=True, default=str).encode())[:16]
 
 
-def read_keyed_json(path: Path) -> tuple[dict[str, Any], str | None]:
-    """Read a JSON object and the key that :func:`cached` has written into it; text that is none counts as empty."""
+def read_keyed_json(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read a JSON object, and apart from it the key that :func:`cached` has written; other text counts as empty."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        return content, content.pop("key", None)
+        return content, {"key": content.pop("key", None)}
     except (ValueError, AttributeError, TypeError):
-        return {}, None
+        return {}, {}
 
 
 def write_keyed_json(value: Mapping[str, Any], path: Path, key: str) -> None:
@@ -453,7 +453,7 @@ def cached(
     path: Path,
     inputs: Any,
     make: Callable[[], T],
-    read: Callable[[Path], tuple[Any, str | None]] = read_keyed_json,
+    read: Callable[[Path], tuple[Any, Mapping[str, Any]]] = read_keyed_json,
     write: Callable[[Any, Path, str], None] = write_keyed_json,
     done: str = "",
 ) -> T:
@@ -463,7 +463,8 @@ def cached(
         path: file of the result.
         inputs: everything that the result depends on, as JSON: settings, seeds, stamps of frames.
         make: makes the result.
-        read: ``read(path)`` gives a result and the key that it was written with; a JSON object by default.
+        read: ``read(path)`` gives a result and what its file says of it, in which ``key`` is the hash of the inputs; a
+            JSON object by default.
         write: ``write(result, path, key)``.
         done: what is printed before the path if there is nothing to make, such as ``"already trained"``.
 
@@ -480,8 +481,8 @@ def cached(
     """
     key = fingerprint(inputs)
     if path.is_file():
-        result, stored = read(path)
-        if stored == key:
+        result, info = read(path)
+        if info.get("key") == key:
             if done:
                 print(f"{done}: {path}")
             return result

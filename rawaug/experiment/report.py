@@ -9,7 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from denoisers.files import find_denoiser
 from rawaug.bayer import noise_variance
+from rawaug.data.folders import reports
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.figures import Panels, crops_at_100, plot_curves, save_picture
 from rawaug.evaluation.page import Page
@@ -18,52 +20,37 @@ from rawaug.evaluation.tables import first_runs, print_table
 from rawaug.evaluation.trials import own_noise_note
 from rawaug.evaluation.verdict import verdict
 from rawaug.experiment.settings import Recipe
+from rawaug.experiment.task import Task, find_classical
 from rawaug.files import write_json
 from rawaug.io.pictures import write_picture
 from rawaug.registry import spec_label, split_spec
-from rawaug.training.launch import is_leader
 
 _MOST_ROWS = 3
 """``picture.png`` has at most this many test frames of RAW."""
 
-Tables = Mapping[str, Mapping[str, Sequence[Mapping[str, Any]]]]
-"""By table and arm, one entry for each seed: the summaries ``plain`` and ``self_ensemble``."""
-
-Others = Mapping[str, Mapping[str, Mapping[str, Any]]]
-"""By table and name, the summary of a denoiser that arms are compared with."""
+Tables = Mapping[str, Mapping[str, Mapping[str, Any]]]
+"""By table, ``results`` has the summaries ``plain`` and ``self_ensemble`` for each seed of an arm, and ``others`` the
+summary of each denoiser that arms are compared with, by name."""
 
 
-def say(*lines: str) -> None:
-    """Print the lines that are not empty, in the process that writes."""
-    text = "\n".join(filter(None, lines))
-    if text and is_leader():
-        print(text)
-
-
-def write_results(
-    recipe: Recipe, folder: Path, tables: Tables, others: Others, test: Sequence[Any], unreadable: Sequence[str]
-) -> dict[str, Any]:
+def write_results(task: Task, folder: Path, tables: Tables, unreadable: Sequence[str]) -> dict[str, Any]:
     """Write ``results.json`` and return the scores of the arms; a table without a name is not named there either.
 
     Args:
-        recipe: the recipe.
+        task: the task.
         folder: folder of the run.
-        tables: the scores of the arms.
-        others: the scores of the others, as far as there are any.
-        test: the test frames.
+        tables: the scores, as far as there are any.
         unreadable: lines that name frames which cannot be read.
     """
-    results: dict[str, Any] = dict(tables)
-    by_table: dict[str, Any] = {}
-    for table, arms in tables.items():
-        by_table[table] = {"results": arms, "others": others[table]}
+    by_table: Mapping[str, Any] = tables
+    results: dict[str, Any] = {table: scores["results"] for table, scores in tables.items()}
     if set(tables) == {""}:
-        results, by_table = results[""], by_table[""]
+        by_table, results = tables[""], results[""]
 
-    content = {"recipe": asdict(recipe), **by_table}
-    if recipe.target == "srgb":  # scores of RAW state the frames' own noise themselves
+    content = {"recipe": asdict(task.recipe), **by_table}
+    if task.recipe.target == "srgb":  # scores of RAW state the frames' own noise themselves
         content["own_noise"] = {}
-        for pair in test:
+        for pair in task.frames["test"]:
             levels = pair.clean.noise_profile if isinstance(pair, Pair) else None  # developed pictures state none
             if levels is not None:
                 content["own_noise"][pair.name] = noise_variance(pair.clean.mosaic, *levels).mean().item()
@@ -75,52 +62,48 @@ def write_results(
 
 
 def write_report(
-    recipe: Recipe,
+    task: Task,
     folder: Path,
-    frames: Mapping[str, Any],
     tables: Tables,
-    others: Others,
-    compared: Mapping[str, Sequence[Any]],
     panels: Sequence[Panels],
     training_note: str,
-    notes: Sequence[str],
+    unreadable: Sequence[str],
 ) -> None:
     """Write the picture and the page, and print the tables, the verdict and the command to use.
 
     Args:
-        recipe: the recipe.
+        task: the task.
         folder: folder of the run.
-        frames: the data of the run, see :func:`rawaug.experiment.data.open_frames`.
-        tables: the scores of the arms.
-        others: the scores of the others.
-        compared: the other denoisers, by table.
+        tables: the scores.
         panels: the frames of the page.
         training_note: a line on training frames that have much noise themselves; empty if there are none.
-        notes: lines on pictures and frames that were left out.
+        unreadable: lines that name frames which cannot be read.
 
     Raises:
         ValueError: if a score is not a number; everything else has been written by then.
     """
-    settings = f"real pairs: {len(frames['pairs'])}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
+    recipe: Recipe = task.recipe
+
+    # Verdicts, and what they recommend.
+    sentences, uses, first = [], {}, {}
+    for table, scores in tables.items():
+        decision = verdict(scores["results"], scores["others"])
+        uses[table] = decision.use
+        sentences.append(with_name(table[:1].upper() + table[1:], decision.sentence, ": "))
+        for name, summary in first_runs(scores["results"], scores["others"]).items():
+            first[with_name(name, table)] = summary
+
+    commands = usage(recipe, folder, tables, uses)
+    own_noise = own_noise_note(first)
+
+    # The page.
+    settings = f"real pairs: {len(task.frames['pairs'])}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
     title = f"{recipe.name} tested on {recipe.data.test} ({settings})"
     if recipe.full_colour:
         title += ": linear camera RGB"
     elif recipe.target == "srgb":
         title += ": developed sRGB"
 
-    # Verdicts, and what they recommend.
-    verdicts, sentences, first = {}, [], {}
-    for table, arms in tables.items():
-        verdicts[table] = verdict(arms, others[table])
-        sentences.append(with_name(table[:1].upper() + table[1:], verdicts[table].sentence, ": "))
-        for name, scores in first_runs(arms, others[table]).items():
-            first[with_name(name, table)] = scores
-
-    uses = {table: decision.use for table, decision in verdicts.items()}
-    commands = usage(recipe, folder, tables, uses)
-    own_noise = own_noise_note(first)
-
-    # The page.
     page = Page(title, " ".join(filter(None, sentences)))
     facts = {
         "Noise": recipe.noise_in_test,
@@ -128,10 +111,10 @@ def write_report(
         "Training frames": training_note,
         "Own noise": own_noise,
     }
-    page.add_facts(facts, next(iter(tables.values())))
-    page.add("Methods", terms=explain_methods(recipe, compared))
-    for table, arms in tables.items():
-        page.add_scores(arms, others[table], table)
+    page.add_facts(facts, next(iter(tables.values()))["results"])
+    page.add("Methods", terms=explain_methods(recipe))
+    for table, scores in tables.items():
+        page.add_scores(scores["results"], scores["others"], table)
 
     logs = {}
     for arm in recipe.arms:
@@ -153,18 +136,18 @@ def write_report(
         save_picture(panels[:_MOST_ROWS], picture)
 
     # What is printed.
-    for table, arms in tables.items():
-        print_table(arms, with_name(title, table, ": "), others[table])
-    say(page.lead, own_noise, training_note)
-    print(f"table: {folder / 'results.json'}\npicture: {picture}\npage: {folder / 'report.html'}")
-    say(*notes, *commands)
+    for table, scores in tables.items():
+        print_table(scores["results"], with_name(title, table, ": "), scores["others"])
+    paths = f"table: {folder / 'results.json'}\npicture: {picture}\npage: {folder / 'report.html'}"
+    lines = [page.lead, own_noise, training_note, paths, *reports(task.frames["pictures"]), *unreadable, *commands]
+    print(*filter(None, lines), sep="\n")
 
     summaries: list[Mapping[str, Any]] = []
-    for table, arms in tables.items():
-        for runs in arms.values():
+    for scores in tables.values():
+        for runs in scores["results"].values():
             for run in runs:
                 summaries += run.values()
-        summaries += others[table].values()
+        summaries += scores["others"].values()
     require_numbers(summaries)
 
 
@@ -173,16 +156,13 @@ def with_name(name: str, table: str, between: str = ", ") -> str:
     return between.join(filter(None, [name, table]))
 
 
-def explain_methods(recipe: Recipe, compared: Mapping[str, Sequence[Any]]) -> dict[str, str]:
-    """Write a line on each row of the tables, by name; ``compared`` are the denoisers besides arms, by table."""
-    filters = {spec_label(spec) for spec in recipe.classical}
-
+def explain_methods(recipe: Recipe) -> dict[str, str]:
+    """Write a line on each method, by the name that its rows begin with."""
     texts = {}
-    for denoisers in compared.values():
-        for denoiser in denoisers:
-            texts[denoiser.name] = "trained weights as they are"
-            if denoiser.name in filters:
-                texts[denoiser.name] = "a filter, nothing is trained"
+    for spec in find_classical(recipe.classical):
+        texts[spec_label(spec)] = "a filter, nothing is trained"
+    for file in recipe.baselines:
+        texts[find_denoiser(file).stem] = "trained weights as they are"
 
     synthetic = "RAW made from pictures"
     if recipe.target == "srgb":
@@ -231,7 +211,7 @@ def usage(recipe: Recipe, folder: Path, tables: Tables, uses: Mapping[str, str])
     for table, name in uses.items():
         command = method_command(recipe, name)
         if name in weights:
-            scores = [run["plain"].get("psnr", 0.0) for run in tables[table][name]]
+            scores = [run["plain"].get("psnr", 0.0) for run in tables[table]["results"][name]]
             command = weights_command(recipe, weights[name][scores.index(max(scores))])
 
         line = f"to use {name}: {command}"

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack, redirect_stdout
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import asdict, replace
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -20,25 +22,23 @@ from denoisers.classical import FILTERS
 from denoisers.files import find_denoiser
 from denoisers.network import Denoiser
 from rawaug.bayer import CFA
-from rawaug.data.folders import reports
 from rawaug.data.frames import as_frames
 from rawaug.data.opening import picture_stamp
 from rawaug.data.pairs import Pair
-from rawaug.denoising.denoiser import RawDenoiser, require_classical
+from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.figures import make_panels
 from rawaug.evaluation.scores import Row, group_rows, score, summary
 from rawaug.evaluation.trials import Trial, added_noise_note, training_noise_note
 from rawaug.experiment.data import name_given_pairs, open_frames, read_frames, require_usable
 from rawaug.experiment.folder import claim, require_free
 from rawaug.experiment.recipe import EXPERIMENTS
-from rawaug.experiment.report import say, write_report, write_results
+from rawaug.experiment.report import write_report, write_results
 from rawaug.experiment.settings import Recipe
-from rawaug.experiment.task import TASKS, Task
+from rawaug.experiment.task import TASKS, Task, find_classical
 from rawaug.files import LOCK, cached, fingerprint, locked, sha256
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import camera_law, noise_model
 from rawaug.progress import progress
-from rawaug.registry import Spec, spec_label, split_spec
 from rawaug.training.camera_fit import fit
 from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.launch import is_leader, require_trainable
@@ -50,6 +50,14 @@ Results = dict[str, Any]
 """It has, by arm, summaries ``plain`` and ``self_ensemble`` for each seed; several tables come first."""
 
 
+@contextmanager
+def printing_once() -> Iterator[None]:
+    """Print nothing in this block, or function, in all processes of a training but the first."""
+    with redirect_stdout(sys.stdout if is_leader() else io.StringIO()):
+        yield
+
+
+@printing_once()
 def run(
     recipe: Recipe,
     overwrite: bool = False,
@@ -73,12 +81,10 @@ def run(
         By arm, one entry for each seed: the summaries ``plain`` and ``self_ensemble``. If a task has several tables, by
         pattern or level, each of these has such results.
     """
-    given = {}
-    for part, sequence in (("pairs", pairs), ("validation", validation), ("test", test)):
-        if sequence is not None:
-            given[part] = sequence
-    recipe = name_given_pairs(recipe, given)
     leads = is_leader()
+    sequences = {"pairs": pairs, "validation": validation, "test": test}
+    replacements = {part: sequence for part, sequence in sequences.items() if sequence is not None}
+    recipe = name_given_pairs(recipe, replacements)
 
     # Prepare: whatever could be missing or wrong is found before anything is fitted.
     folder = require_free(recipe, overwrite)
@@ -87,7 +93,8 @@ def run(
     if recipe.isp is not None:
         finished_isp = recipe.isp.load()
 
-    classical = find_classical(recipe.classical, shown=leads)
+    if len(find_classical(recipe.classical)) < len(recipe.classical):
+        print(f"classical: BM3D is left out: {FILTERS['BM3D'].missing()}")
     if recipe.noise != "camera":
         noise_model(recipe.noise_at_iso)
     require_networks(recipe)
@@ -95,94 +102,71 @@ def run(
     for file in map(find_denoiser, recipe.baselines):
         baselines.append(RawDenoiser.of(file, recipe.device, name=file.stem).require_mosaic())
 
-    frames, listing = open_frames(recipe, given)
-    say(*listing)
+    frames, listing = open_frames(recipe, replacements)
+    print(*listing, sep="\n")
     frames, unreadable = read_frames(recipe, frames)
-    say(*unreadable)
+    for line in unreadable:
+        print(line)
     require_usable(recipe, frames["pairs"], frames["validation"])
 
+    tables: dict[str, dict[str, dict[str, Any]]] = {}
     networks: dict[str, Any] = {}
-    tables: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    with ExitStack() as stack:
+    with locked(folder / LOCK) if leads else nullcontext():
         if leads:
-            stack.enter_context(locked(folder / LOCK))
             claim(recipe, overwrite)
 
         for seed in recipe.all_seeds:
             # Fit the ISP. If it has measured the noise, the test frames have this noise; else they stay.
             file = folder / f"seed{seed}" / "isp.safetensors"
             isp = finished_isp or fit_to_pairs(recipe, frames["pairs"], file, seed)
-            task: Task = TASKS[recipe.kind](replace(recipe, classical=classical), isp, frames)
-            if seed == recipe.seed or recipe.noise == "camera":
+            task: Task = TASKS[recipe.kind](recipe, isp, frames)
+            if leads and (seed == recipe.seed or recipe.noise == "camera"):
                 trials = task.test()
-                noisy_rows: dict[str, list[Row]] = {}
-            if seed == recipe.seed:
+                noisy_rows = group_rows(score([task.input], trials), "table")
+            if leads and seed == recipe.seed:
                 training_note = warn_of_noise(task, trials)
 
-            validation_trials: dict[CFA, Sequence[Trial]] = {}
+            make_validation = cache(task.validation)  # arms of one pattern share it
             for arm in recipe.arms:
                 # Train.
                 arm_folder = folder / f"seed{seed}" / arm
                 cfa = find_pattern(recipe, arm, isp)
-                if cfa not in validation_trials:
-                    validation_trials[cfa] = task.validation(cfa)
-                network = train_arm(task, arm, cfa, seed, validation_trials[cfa], arm_folder)
+                network = train_arm(task, arm, cfa, seed, make_validation(cfa), arm_folder)
 
                 # Score.
                 if not leads:
                     continue
-                if not noisy_rows:
-                    noisy_rows = group_rows(score([task.input], trials), "table")
                 networks[arm] = task.denoiser(arm, network, cfa)
-                scores = score_arm(task, arm, cfa, seed, network, trials, noisy_rows, arm_folder)
+                kinds = {"plain": networks[arm]}
+                if recipe.self_ensemble:
+                    kinds["self_ensemble"] = task.denoiser(arm, network, cfa, recipe.views)
+                scores = score_arm(task, kinds, trials, noisy_rows, f"{arm}, seed {seed}", arm_folder)
                 for table, summaries in scores.items():
-                    tables.setdefault(table, {}).setdefault(arm, []).append(summaries)
+                    parts = tables.setdefault(table, {"results": {}, "others": {}})
+                    parts["results"].setdefault(arm, []).append(summaries)
 
         if not leads:
             return {arm: [] for arm in recipe.arms}
 
         # Score what the arms are compared with; what there is by then is in results.json.
-        others: dict[str, dict[str, Any]] = {table: {} for table in tables}
-        write_results(recipe, folder, tables, others, frames["test"], unreadable)
-        samples = next(iter(validation_trials.values()))
-        compared = {table: [*task.filters(table, samples), *baselines] for table in tables}
-        others |= score_tables(compared, trials, noisy_rows, "other denoisers")
-        results = write_results(recipe, folder, tables, others, frames["test"], unreadable)
+        write_results(task, folder, tables, unreadable)
+        filters = {table: task.filters(table) for table in tables}
+        compared = {table: [*filters[table], *baselines] for table in tables}
+        for table, summaries in score_tables(compared, trials, noisy_rows, "other denoisers").items():
+            tables[table]["others"] = summaries
+        results = write_results(task, folder, tables, unreadable)
 
         # Report: the page shows the first filter, the baselines and the arms.
-        hidden = {spec_label(spec) for spec in classical[1:]}
         panels = []
         for trial in task.shown(trials):
-            shown = [denoiser for denoiser in compared[trial.table] if denoiser.name not in hidden]
-            shown = [denoiser for denoiser in (*shown, *networks.values()) if trial.takes(denoiser)]
-            panels.append(make_panels(shown, trial, task.input))
+            shown = filter(trial.takes, [*filters[trial.table][:1], *baselines, *networks.values()])
+            panels.append(make_panels(list(shown), trial, task.input))
 
-        notes = [*reports(frames["pictures"]), *unreadable]
-        write_report(recipe, folder, frames, tables, others, compared, panels, training_note, notes)
+        write_report(task, folder, tables, panels, training_note, unreadable)
         return results
 
 
 # -- prepare -----------------------------------------------------------------------------------------------------------
-
-
-def find_classical(specs: Sequence[Spec], shown: bool = True) -> list[Any]:
-    """Find a recipe's classical denoisers, without BM3D if its wheel is missing; if ``shown``, that is printed.
-
-    Raises:
-        ValueError: if another filter's library is missing, or a filter or setting is unknown.
-    """
-    missing = FILTERS["BM3D"].missing()
-    installed = []
-    for spec in specs:
-        name, _ = split_spec(spec)
-        if name != "BM3D" or not missing:
-            installed.append(spec)
-
-    if shown and len(installed) < len(specs):
-        print(f"classical: BM3D is left out: {missing}")
-
-    require_classical(installed)
-    return installed
 
 
 def require_networks(recipe: Recipe) -> None:
@@ -204,9 +188,6 @@ def require_networks(recipe: Recipe) -> None:
 
 def warn_of_noise(task: Task, trials: Iterable[Trial]) -> str:
     """Print notes on the frames' own noise; return the one on training frames, which is empty if there is none."""
-    if not is_leader():
-        return ""
-
     arms = []
     for name, arm in task.recipe.arms.items():
         if arm.sees_clean and arm.augmented < 1.0:
@@ -217,7 +198,7 @@ def warn_of_noise(task: Task, trials: Iterable[Trial]) -> str:
     if task.recipe.self_supervised:
         notes.append(faintness_note(task.real))
     for note in filter(None, notes):
-        say(f"note: {note}")
+        print(f"note: {note}")
 
     return training_note
 
@@ -227,27 +208,19 @@ def warn_of_noise(task: Task, trials: Iterable[Trial]) -> str:
 
 def fit_to_pairs(recipe: Recipe, pairs: Sequence[Pair], file: Path, seed: int) -> DictionaryISP:
     """Fit the ISP to the few pairs, or read it if it was fitted to them before; its hash is ``info["key"]``."""
-    measures_noise = recipe.noise == "camera"
     settings = {**asdict(recipe.fit), "seed": seed}
-    inputs = "isp", settings, as_frames(pairs).stamps(), measures_noise, recipe.self_supervised
+    noise: Literal["on", "off"] = "on" if recipe.noise == "camera" else "off"
+    inputs = "isp", settings, as_frames(pairs).stamps(), noise == "on", recipe.self_supervised
 
-    def make() -> DictionaryISP:
-        noise: Literal["on", "off"] = "off"
-        if measures_noise:
-            noise = "on"
-
-        isp = fit(pairs, noise=noise, **settings)
-        isp.info["key"] = fingerprint(inputs)
-        return isp
-
-    def read(path: Path) -> tuple[DictionaryISP, str | None]:
+    def read(path: Path) -> tuple[DictionaryISP, Mapping[str, Any]]:
         isp = DictionaryISP.from_pretrained(path)
-        return isp, isp.info.get("key")
+        return isp, isp.info
 
     def write(isp: DictionaryISP, path: Path, key: str) -> None:
+        isp.info["key"] = key
         isp.save(path)
 
-    return cached(file, inputs, make, read, write, done="already fitted" if is_leader() else "")
+    return cached(file, inputs, lambda: fit(pairs, noise=noise, **settings), read, write, done="already fitted")
 
 
 def find_pattern(recipe: Recipe, arm: str, isp: DictionaryISP) -> CFA:
@@ -323,17 +296,13 @@ def train_arm(task: Task, arm: str, cfa: CFA, seed: int, validation: Sequence[Tr
             key=fingerprint(inputs),
         )
 
-    def read(path: Path) -> tuple[Denoiser, str | None]:
-        network, stored = denoisers.load(path)
-        return network, stored.get("key")
-
     def write(network: Denoiser, path: Path, key: str) -> None:
         if is_leader():
             denoisers.save(network, path, {"key": key, **info})
             (folder / "last.pt").unlink(missing_ok=True)
 
     path = folder / "denoiser.safetensors"
-    return cached(path, inputs, make, read, write, done="already trained" if is_leader() else "")
+    return cached(path, inputs, make, denoisers.load, write, done="already trained")
 
 
 # -- score -------------------------------------------------------------------------------------------------------------
@@ -341,51 +310,49 @@ def train_arm(task: Task, arm: str, cfa: CFA, seed: int, validation: Sequence[Tr
 
 def score_arm(
     task: Task,
-    arm: str,
-    cfa: CFA,
-    seed: int,
-    network: Denoiser,
+    denoisers: Mapping[str, Any],
     trials: Sequence[Trial],
     noisy_rows: Mapping[str, list[Row]],
+    label: str,
     folder: Path,
 ) -> dict[str, dict[str, Any]]:
     """Compute the summaries of an arm by table and kind, ``plain`` and ``self_ensemble``, or read those of before.
 
     Args:
         task: the task.
-        arm: name of the arm.
-        cfa: the pattern that it is trained for.
-        seed: seed of its training.
-        network: its network.
+        denoisers: the arm's denoisers by kind.
         trials: the test frames with their noise.
         noisy_rows: the scores of the noisy input, by table.
+        label: arm and seed, for what is printed.
         folder: has the weights, and gets ``plain.json`` and ``self_ensemble.json``.
     """
-    recipe = task.recipe
     weights = sha256(folder / "denoiser.safetensors")
-    inputs = weights, as_frames(task.frames["test"]).stamps(), recipe.scores_settings()
-
-    kinds = {"plain": 1}
-    if recipe.self_ensemble:
-        kinds["self_ensemble"] = recipe.views
+    inputs = weights, as_frames(task.frames["test"]).stamps(), task.recipe.scores_settings()
 
     summaries: dict[str, dict[str, Any]] = {}
-    for kind, views in kinds.items():
-        label = f"{arm}, seed {seed}, {kind}"
-
-        def make(views: int = views, label: str = label) -> dict[str, Any]:
-            denoisers_by_table = {table: [task.denoiser(arm, network, cfa, views)] for table in noisy_rows}
-            scored = score_tables(denoisers_by_table, trials, noisy_rows, f"evaluate {label}")
-            tables = {table: scores[arm] for table, scores in scored.items() if scores}
-            for table, scores in tables.items():
-                print(f"evaluated {', '.join(filter(None, [label, table]))}: {scores.get('psnr', math.nan):.2f} dB")
-            return {"tables": tables}
-
+    for kind, denoiser in denoisers.items():
+        make = partial(score_denoiser, denoiser, trials, noisy_rows, f"{label}, {kind}")
         scores = cached(folder / f"{kind}.json", [kind, *inputs], make, done="already evaluated")
         for table, scores_of_table in scores["tables"].items():
             summaries.setdefault(table, {})[kind] = scores_of_table
 
     return summaries
+
+
+def score_denoiser(
+    denoiser: Any, trials: Sequence[Trial], noisy_rows: Mapping[str, list[Row]], label: str
+) -> dict[str, dict[str, Any]]:
+    """Compute the summaries of one denoiser in ``tables``, without those whose pattern it does not take; print them."""
+    by_table = {table: [denoiser] for table in noisy_rows}
+    tables = {}
+    for table, summaries in score_tables(by_table, trials, noisy_rows, f"evaluate {label}").items():
+        if not summaries:
+            continue
+        tables[table] = summaries[denoiser.name]
+        title = ", ".join(filter(None, [label, table]))
+        print(f"evaluated {title}: {tables[table].get('psnr', math.nan):.2f} dB")
+
+    return {"tables": tables}
 
 
 def score_tables(

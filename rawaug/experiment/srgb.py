@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from statistics import fmean
 from tempfile import TemporaryDirectory
@@ -129,6 +129,11 @@ class SrgbTask(Task):
 
     def validation(self, cfa: CFA) -> Sequence[Trial]:
         """Take the frames at every level, developed."""
+        return self.developed_validation
+
+    @cached_property
+    def developed_validation(self) -> list[Trial]:
+        """The validation frames at every level; they choose weights, and the strength of filters."""
         return srgb_trials(self.watched, self.recipe.levels, "develop validation")
 
     def test(self) -> Sequence[Trial]:
@@ -139,10 +144,10 @@ class SrgbTask(Task):
         """Make a denoiser of the network, in tiles; one that reads a level estimates it."""
         return PictureDenoiser.of(network, self.recipe.device, name=name, views=views, checked=False)
 
-    def filters(self, table: str, validation: Sequence[Trial]) -> list[PictureDenoiser]:
+    def filters(self, table: str) -> list[PictureDenoiser]:
         """Make the filters, each at its best strength on the validation frames of this level."""
-        same_level = [trial for trial in validation if trial.table == table]
-        return [best_filter(spec, same_level or validation) for spec in self.recipe.classical]
+        same_level = [trial for trial in self.developed_validation if trial.table == table]
+        return [best_filter(spec, same_level or self.developed_validation) for spec in self.recipe.classical]
 
     def shown(self, trials: Sequence[Trial]) -> list[Trial]:
         """Choose the first frame of each level."""

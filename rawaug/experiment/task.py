@@ -9,15 +9,16 @@ from typing import Any, ClassVar
 
 from torch import nn
 
+from denoisers.classical import FILTERS
 from rawaug.bayer import CFA
-from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.denoising.denoiser import RawDenoiser, require_classical
 from rawaug.evaluation.page import select_for_page
 from rawaug.evaluation.scores import NOISY
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.settings import Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
-from rawaug.registry import Registry
+from rawaug.registry import Registry, Spec, split_spec
 from rawaug.training.noisy_frames import noisy_frame
 from rawaug.training.stream import TrainingStream
 
@@ -89,13 +90,29 @@ class Task(ABC):
             views: number of views of the self-ensemble; 1 for none.
         """
 
-    def filters(self, table: str, validation: Sequence[Trial]) -> list[Any]:
-        """Make the filters of a table; ``validation`` are the trials by which their settings may be chosen."""
-        return [RawDenoiser.of(spec) for spec in self.recipe.classical]
+    def filters(self, table: str) -> list[Any]:
+        """Make the filters that a table has."""
+        return [RawDenoiser.of(spec) for spec in find_classical(self.recipe.classical)]
 
     def shown(self, trials: Sequence[Trial]) -> list[Trial]:
         """Choose the trials that the page of the run shows."""
         return list(select_for_page(trials))
+
+
+def find_classical(specs: Sequence[Spec]) -> list[Spec]:
+    """Find a recipe's classical denoisers, without BM3D if its wheel is missing.
+
+    Raises:
+        ValueError: if another filter's library is missing, or a filter or setting is unknown.
+    """
+    installed = []
+    for spec in specs:
+        name, _ = split_spec(spec)
+        if name != "BM3D" or not FILTERS["BM3D"].missing():
+            installed.append(spec)
+
+    require_classical(installed)
+    return installed
 
 
 def change_cfa(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:

@@ -17,8 +17,9 @@ from rawaug.evaluation.page import Figure, Page, command_line
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.folder import claim, require_free
 from rawaug.experiment.recipe import EXPERIMENTS
-from rawaug.experiment.run import find_classical, run
+from rawaug.experiment.run import run
 from rawaug.experiment.settings import Recipe
+from rawaug.experiment.task import find_classical
 from rawaug.files import write_json
 from rawaug.paper import published
 from rawaug.paper.ablation import SPACES, Ablation, ablate
@@ -126,7 +127,7 @@ def run_paper(paper: Paper, overwrite: bool = False) -> dict[str, Any]:
     for name in paper.parts:
         settings = paper.part(name)
         if isinstance(settings, Recipe):
-            find_classical(settings.classical, shown=False)  # a missing library is named before hours are spent
+            find_classical(settings.classical)  # a missing library is named before hours are spent
 
     folder = claim(paper, overwrite)
     for name in paper.parts:

@@ -65,7 +65,8 @@ def usage(results: Any, others: Any) -> list[str]:
         all_seeds=range(len(results["mine"])),
         target="raw",
     )
-    return report.usage(recipe, Path("runs"), {"": results}, {"": verdict(results, others).use})
+    tables = {"": {"results": results, "others": others}}
+    return report.usage(recipe, Path("runs"), tables, {"": verdict(results, others).use})
 
 
 @pytest.fixture
