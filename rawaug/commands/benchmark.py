@@ -2,13 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Any
 
 from rawaug.commands import YAML, require_results
-from rawaug.data.picture_pairs import is_picture_pairs
-from rawaug.evaluation.comparison import compare_pictures, compare_raw
-from rawaug.files import require_output
+from rawaug.data import open_pairs
+from rawaug.data.frames import as_frames
+from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
+from rawaug.denoising.denoiser import RawDenoiser, shipped_of_mosaics
+from rawaug.denoising.guard import Guarded
+from rawaug.denoising.pictures import PictureDenoiser
+from rawaug.evaluation.benchmark import ON_PAGE, benchmark, choose_strengths, crops, noise_note, ranking, trials
+from rawaug.evaluation.benchmark_page import all_tables, benchmark_notes, benchmark_page
+from rawaug.evaluation.evaluate import named_denoiser
+from rawaug.evaluation.figures import save_picture
+from rawaug.evaluation.harm import measure_harm
+from rawaug.evaluation.page import command_line
+from rawaug.evaluation.picture_trials import picture_scores, print_pictures
+from rawaug.evaluation.table_files import benchmark_table
+from rawaug.evaluation.tables import print_cells
+from rawaug.evaluation.trials import measure_own_noise
+from rawaug.files import require_output, write_json, write_text
 from rawaug.registry import require_between
+
+ALWAYS = "NonLocalMeans"
+"""The filter that is in every table, as are the shipped denoisers of mosaics."""
+
+FRAMES, CROP = 6, 384
+"""Number of frames of RAW, and the side of their middles in pixels of the mosaic."""
 
 
 def run(
@@ -66,28 +89,77 @@ def run(
         if value is not None:
             require_between(f"--{option}", value, 1, 2**20)
 
-    if not is_picture_pairs(data):
-        compare_raw(
-            denoisers,
-            data,
-            bin=bin,
-            count=count,
-            crop=crop,
-            noise=noise,
-            iso=iso,
-            seed=seed,
-            device=device,
-            json=json,
-            report=report,
-            table=table,
-            figure=figure,
-            harm=harm,
-        )
+    if is_picture_pairs(data):
+        for_raw: dict[str, Any] = {"bin": bin != 1, "noise": noise, "iso": iso, "seed": seed, "harm": harm}
+        for_raw |= {"report": report, "table": table, "figure": figure}
+        for key, value in for_raw.items():
+            if value:
+                raise ValueError(f"{data}: has developed pictures; --{key} is for RAW")
+        compare_pictures(denoisers, data, count, crop, device, json)
         return
 
-    for_raw: dict[str, Any] = {"bin": bin != 1, "noise": noise, "iso": iso, "seed": seed, "harm": harm}
-    for_raw |= {"report": report, "table": table, "figure": figure}
-    for key, value in for_raw.items():
-        if value:
-            raise ValueError(f"{data}: has developed pictures; --{key} is for RAW")
-    compare_pictures(denoisers, data, count=count, crop=crop, device=device, json=json)
+    count, crop = count or FRAMES, crop or CROP
+    strengths = choose_strengths(noise, iso)
+
+    # The denoisers of the table; one whose name is taken goes by its spec.
+    by_name: dict[str, RawDenoiser] = {}
+    for spec in dict.fromkeys((ALWAYS, *shipped_of_mosaics(), *denoisers)):
+        denoiser = named_denoiser(spec, device).require_mosaic()
+        if denoiser.name in by_name:
+            denoiser = replace(denoiser, name=spec)
+        by_name[denoiser.name] = denoiser
+    compared = list(by_name.values())
+
+    pairs = open_pairs(data, split="test")
+    pairs = as_frames(pairs).some(range(len(pairs))[:count])
+    frames = measure_own_noise(pairs, count).binned(bin)
+    cases = trials(frames, crop, seed, strengths)
+
+    # Score them.
+    weights = {}
+    for denoiser in compared:
+        if "denoiser_sha256" in denoiser.settings:
+            weights[denoiser.name] = denoiser.settings["denoiser_sha256"]
+
+    facts = {"data": data, "bin": bin, "crop": crop, "seed": seed, "command": command_line()}
+    facts |= {"noise": noise_note(cases, strengths, seed), "weights_sha256": weights}
+    result = {**facts, **benchmark(compared, cases)}
+    if harm:
+        guarded = [Guarded(denoiser) for denoiser in compared if denoiser.name in shipped_of_mosaics()]
+        result["harm"] = measure_harm([*compared, *guarded], frames, crop, seed)
+
+    # Say what came out.
+    for title, head, cells in all_tables(result):
+        print_cells(title, ["denoiser", *head], cells)
+    print(*ranking(result), *benchmark_notes(result), result["noise"], sep="\n")
+
+    if json:
+        write_json(result, json)
+    if table:
+        write_text(benchmark_table(result, command_line()), table)
+        print(f"table: {table}")
+    if figure:
+        print(f"figure: {save_picture(list(crops(compared, cases, ON_PAGE)), Path(figure))}")
+    if report:
+        settings = {"denoisers": list(denoisers), "data": data, "bin": bin, "count": count, "crop": crop}
+        settings |= {"noise": noise, "iso": iso, "seed": seed, "table": table, "figure": figure, "harm": harm}
+        print(f"page: {benchmark_page(result, compared, cases).write(Path(report), settings)}")
+
+
+def compare_pictures(
+    denoisers: Sequence[str], data: str, count: int | None, crop: int | None, device: str, json: str | None
+) -> None:
+    """Compare denoisers on real pairs of pictures; print the table, and write it as JSON."""
+    compared = [PictureDenoiser.of(spec, device) for spec in denoisers]
+    pairs: Sequence[Any] = open_picture_pairs(data)
+    facts: dict[str, Any] = {"data": data}
+    if count is not None:
+        pairs = as_frames(pairs).some(range(len(pairs))[:count])
+    if crop is not None:
+        pairs = as_frames(pairs).middles(crop)
+        facts["crop"] = crop
+
+    result = picture_scores(compared, pairs)
+    print_pictures(data, result)
+    if json:
+        write_json({**facts, **result}, json)

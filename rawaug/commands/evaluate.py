@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,17 +12,25 @@ from rawaug.commands import OPTIONS, YAML, require_results
 from rawaug.data import open_pairs
 from rawaug.data.frames import Readable
 from rawaug.data.pair_folder import PairSettings
-from rawaug.data.picture_pairs import is_picture_pairs
-from rawaug.denoising.denoiser import require_classical
-from rawaug.evaluation.evaluate import evaluate_pictures, evaluate_raw, evaluation_facts, require_finite
+from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
+from rawaug.denoising.denoiser import RawDenoiser, denoiser_file, require_classical
+from rawaug.denoising.pictures import PictureDenoiser
+from rawaug.evaluation.evaluate import evaluate_raw, evaluation_facts, named_denoiser, require_finite
+from rawaug.evaluation.figures import make_panels
+from rawaug.evaluation.page import Page, select_for_page
+from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, print_pictures
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import Row, require_numbers, summary
 from rawaug.evaluation.tables import print_scores
+from rawaug.evaluation.trials import make_trial, make_trials, measure_own_noise, own_noise_note
 from rawaug.files import find_weights, read_metadata, write_json
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseSpec
+from rawaug.noise import NoiseSpec, noise_model
 from rawaug.progress import progress
 from rawaug.registry import Spec
+
+PRESET = "cycleisp_sidd"
+"""The noise of frames without a capture if the denoiser does not say which noise it was trained with."""
 
 
 def run(
@@ -71,36 +81,58 @@ def run(
     require_results(json, report, overwrite, [weights, data])
     require_classical(classical or ())
 
-    number_of_views: int = views or (8 if self_ensemble else 1)
+    if views is None and self_ensemble:
+        views = 8
     settings = settings or PairSettings()
     for_raw = noise is not None or bin != 1 or bool(seed) or report is not None
     if is_isp(weights):
-        if for_raw or number_of_views > 1 or classical:
+        if for_raw or views or classical:
             options = "--self-ensemble, --views, --noise, --seed, --bin, --classical and --report"
             raise ValueError(f"{weights}: is an ISP; {options} are for denoisers")
-        result = evaluate_isp(weights, data, as_shot, tone, json, settings)
-    elif as_shot or tone is not None:
+        return evaluate_isp(weights, data, as_shot, tone, json, settings)
+
+    if as_shot or tone is not None:
         raise ValueError(f"{weights}: is a denoiser; --as-shot and --tone are for ISPs")
-    elif is_picture_pairs(data):
+    if is_picture_pairs(data):
         if for_raw:
             raise ValueError(f"{data}: has developed pictures; --noise, --bin, --seed and --report are for RAW")
-        result = evaluate_pictures(
-            weights, data, views=number_of_views, classical=classical or (), device=device, json=json, settings=settings
-        )
-    else:
-        result = evaluate_raw(
-            weights,
-            data,
-            views=number_of_views,
-            noise=noise,
-            seed=seed,
-            bin=bin,
-            classical=classical or (),
-            device=device,
-            json=json,
-            report=report,
-            settings=settings,
-        )
+        return evaluate_pictures(weights, data, views, classical or (), device, json, settings)
+
+    denoiser = replace(named_denoiser(weights, device), checked=False).require_mosaic()
+    filters = [RawDenoiser.of(spec) for spec in classical or ()]
+    test_noise = noise or denoiser.info.get("noise", PRESET)
+    model = noise_model(test_noise, info=denoiser.info)
+
+    pairs = open_pairs(data, split="test", **vars(settings))
+    frames = Readable(measure_own_noise(pairs).binned(bin).kept())
+    for _ in frames:
+        pass  # finds the pairs that cannot be read
+    trials = make_trials(frames.readable(), lambda pair: make_trial(pair, model, denoiser.cfa, seed))
+
+    facts = {**evaluation_facts("denoiser", data, denoiser_file(weights), bin), "seed": seed}
+    if frames.broken:
+        facts["broken"] = frames.reasons()
+    for scores in evaluate_raw(denoiser, filters, trials, views or 1):
+        result = {**facts, **scores}
+        print_scores(result)
+        if json is not None:
+            write_json(result, json)
+
+    note = own_noise_note({"the denoiser": result, **result.get("classical", {})})
+    if note:
+        print(note)
+    if report:
+        kinds = {"plain": result.get("plain", result)}
+        if "plain" in result:
+            kinds["self_ensemble"] = result
+        about = {"Noise": test_noise, "Seed": str(seed)}
+        title = f"{denoiser.name} on {data}"
+        page = Page.of_scores(title, {denoiser.name: [kinds]}, result.get("classical", {}), about)
+        for trial in select_for_page(trials):
+            page.add_frame(make_panels([*filters, denoiser], trial))
+        command = {"weights": weights, "data": data, "noise": noise, "seed": seed}
+        print(f"page: {page.write(Path(report), command)}")
+
     require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
     return result
 
@@ -142,4 +174,51 @@ def evaluate_isp(
     print_scores(result)
     if json is not None:
         write_json(result, json)
+
+    require_numbers([result])
+    return result
+
+
+def evaluate_pictures(
+    weights: str,
+    data: str,
+    views: int | None,
+    classical: Sequence[Spec],
+    device: str,
+    json: str | None,
+    settings: PairSettings,
+) -> dict[str, Any]:
+    """Print and write the scores of a denoiser of pictures, beside filters; return the result, as in the JSON.
+
+    ``plain`` holds the scores with the default number of views, if more are requested.
+    """
+    if settings != PairSettings(noisy=settings.noisy, clean=settings.clean):
+        raise ValueError(f"{data}: has developed pictures; a CFA and levels are for RAW")
+
+    plain = PictureDenoiser.of(weights, device)
+    filters = [PictureDenoiser.of(spec) for spec in classical]
+    denoisers = [plain, *filters]
+    main = plain
+    if views:
+        main = replace(plain, name=f"{plain.name}, {views} views", views=views)
+        denoisers.insert(1, main)
+
+    pairs = open_picture_pairs(data, settings.noisy, settings.clean)
+    scores = picture_scores(denoisers, pairs)
+    print_pictures(data, scores)
+
+    rows = scores["rows"]
+    result = {
+        **evaluation_facts("denoiser", data),
+        **rows[main.name][PUBLISHED],
+        "registered": rows[main.name][REGISTERED],
+    }
+    if views:
+        result |= {"self_ensemble": True, "views": views, "plain": rows[plain.name][PUBLISHED]}
+    for denoiser in filters:
+        result.setdefault("classical", {})[denoiser.name] = rows[denoiser.name]
+    if json is not None:
+        write_json(result, json)
+
+    require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
     return result

@@ -32,6 +32,7 @@ from rawaug.noise import (
     FixedLevels,
     NoiseLevels,
     NoiseModel,
+    NoiseSpec,
     SensorNoise,
     ShotReadNoise,
     estimate_noise,
@@ -60,6 +61,9 @@ _SENSOR: dict[str, Any] = {
 _OF_SENSORS = ("phone", "strong")
 """The strengths at which real sensors are simulated."""
 
+ON_PAGE = 4
+"""Largest number of frames on the page, and in the figure."""
+
 _TILE = 510
 """Operations are counted on this many pixels a side: a pattern that is moved by a pixel needs no larger tile."""
 
@@ -67,9 +71,7 @@ _CONDITIONS = TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensor
 """What the denoisers are told, or how the sensor behaves; each has a table."""
 
 
-def choose_strengths(
-    noise: str | Sequence[float] | Sequence[str] | None = None, isos: Sequence[float] | None = None
-) -> dict[str, NoiseLevels]:
+def choose_strengths(noise: NoiseSpec | None = None, isos: Sequence[float] | None = None) -> dict[str, NoiseLevels]:
     """Noise levels by the name of their column: :data:`STRENGTHS`, or those of ``noise`` at each of ``isos``.
 
     Raises:

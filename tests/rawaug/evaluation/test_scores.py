@@ -81,7 +81,7 @@ def test_a_denoiser_that_does_nothing_scores_as_its_input(
     assert all(result[f"{key}_worst25"] <= result[key] <= result[f"{key}_best25"] for key in figures)
     assert result["psnr_srgb"] == pytest.approx(result["psnr_srgb_noisy"], abs=1e-3)
     shown: list[dict[str, Any]] = []
-    monkeypatch.setattr("rawaug.evaluation.evaluate.print_scores", shown.append)
+    monkeypatch.setattr("rawaug.commands.evaluate.print_scores", shown.append)
     again = evaluate(str(identity), data="given:", self_ensemble=True, report=str(tmp_path / "new" / "page.html"))
     assert shown == [result, again]  # known before the views are scored
     assert again["plain"]["psnr"] == pytest.approx(again["psnr"], abs=1e-3)  # the network changes nothing
