@@ -81,6 +81,7 @@ def psnr_d(
     config: DownstreamConfig,
     folder: Path,
     seed: int,
+    key: str = "",
 ) -> float:
     """Measure the mean PSNR in dB, on the test frames, of a denoiser that is trained on a method's RAW.
 
@@ -90,19 +91,20 @@ def psnr_d(
         config: network, loop, noise and test frames.
         folder: folder of the training's files, with one folder for each seed, from which a stopped training resumes.
         seed: seed of the training.
+        key: hash of what the weights depend on besides the seed; files of a training with another key are replaced.
     """
     crops = synthesise_crops(model, pictures, noise_model(config.noise), config)
-    net = train_on(crops, config, folder, seed)
+    net = train_on(crops, config, folder, seed, key)
     rows = score_on(net, config, CFA(model.cfa))
     return fmean(row.psnr for row in rows)
 
 
-def train_on(crops: Source, config: DownstreamConfig, folder: Path, seed: int) -> Denoiser:
-    """Train a denoiser on ``crops``; ``config``, ``folder`` and ``seed`` are as in :func:`psnr_d`."""
+def train_on(crops: Source, config: DownstreamConfig, folder: Path, seed: int, key: str = "") -> Denoiser:
+    """Train a denoiser on ``crops``; the other arguments are as in :func:`psnr_d`."""
     stream = TrainingStream(None, crops, config.train.batch, 1.0, derive_seed(seed, "downstream"))
     samples = freeze_samples(crops, "watched")
     label = f"{folder.name} {seed}"
-    return train(stream, samples, config.denoiser, config.train, folder / f"seed{seed}", seed, label=label)
+    return train(stream, samples, config.denoiser, config.train, folder / f"seed{seed}", seed, label=label, key=key)
 
 
 def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> list[Row]:

@@ -369,10 +369,10 @@ class ComparisonRun:
 
             draws = (*samples, downstream.noise, downstream.exposure, downstream.sampling)
             weights = weights_key(downstream.denoiser, downstream.train, draws, validation="watched")
-            folder = self.folder / f"{family.replace('/', '_')}-denoisers-{weights}"
+            folder = self.folder / f"{family.replace('/', '_')}-denoisers"
             result["psnr_d"] = []
             for seed in self.seeds:
-                result["psnr_d"].append(psnr_d(method.model, self.pictures, downstream, folder, seed))
+                result["psnr_d"].append(psnr_d(method.model, self.pictures, downstream, folder, seed, weights))
             return result
 
         facts = (*samples, list(self.seeds), downstream and asdict(downstream))

@@ -149,7 +149,7 @@ def replay_pair(
 
 
 class PictureTask:
-    """The missing pairs of one picture.
+    """The pairs of one picture.
 
     Args:
         picture: an sRGB file.
@@ -158,41 +158,41 @@ class PictureTask:
         per_image: number of pairs that the picture is to have.
     """
 
+    pictures = 1
+
     def __init__(self, picture: Path, key: str, stem: Path, per_image: int) -> None:
         self.picture = picture
         self.key = key
         self.stem = stem
         self.per_image = per_image
-        self.numbers: list[int] = []
 
-        self.pictures = 1
-        self.existing = 0
-        self.todo = True
-        self.broken: dict[str, str] = {}  # a picture that cannot be read is tried again
+    def make(self, maker: Synthesiser) -> tuple[int, int, dict[str, str]]:
+        """Write the pairs that are missing; each one that is there says itself which picture it was made of.
 
-    def find_existing(self) -> None:
-        """Count the pairs that exist, as an earlier run has written them."""
+        Returns:
+            The number of pairs that were made, the number of those that were there, and the reason if the picture
+            cannot be read, which is tried again by the next run.
+        """
         picture_sha256 = None
+        missing = []
         for number in range(self.per_image):
             params = Path(f"{self.stem}_{number}.safetensors")
             if params.exists() and picture_sha256 is None:
                 picture_sha256 = sha256(self.picture)
             if not params.exists() or not _is_whole(params, picture_sha256):
-                self.numbers.append(number)
+                missing.append(number)
 
-        self.existing = self.per_image - len(self.numbers)
-        self.todo = bool(self.numbers)
-
-    def make(self, maker: Synthesiser) -> tuple[int, dict[str, str]]:
-        """Write the missing pairs; return their number, and the reason if the picture cannot be read."""
+        existing = self.per_image - len(missing)
+        if not missing:
+            return 0, existing, {}
         try:
-            origin, pairs = maker.pairs(self.picture, self.key, self.numbers)
+            origin, pairs = maker.pairs(self.picture, self.key, missing)
         except (OSError, ValueError) as error:
-            return 0, {self.key: str(error)}
+            return 0, existing, {self.key: str(error)}
 
         for number, pair in pairs:
             write_pair(Path(f"{self.stem}_{number}"), pair, maker.augment, maker.settings.format, origin)
-        return len(self.numbers), {}
+        return len(missing), existing, {}
 
 
 def _is_whole(params: Path, picture_sha256: str | None) -> bool:

@@ -33,8 +33,8 @@ from rawaug.synthesis.files import TARGETS, Format, PictureTask, Settings, Synth
 from rawaug.synthesis.shards import PER_SHARD, ShardTask
 
 Task = PictureTask | ShardTask
-_Outcome = tuple[int, dict[str, str]]
-"""The number of pairs that a task has made, and the reason for each picture that it could not read."""
+_Outcome = tuple[int, int, dict[str, str]]
+"""The numbers of pairs that a task made and that were there, and the reason for each picture that it cannot read."""
 
 
 @dataclass
@@ -161,19 +161,11 @@ def _settings(format: Format, per_image: int, seed: int, config: AugmentConfig) 
 
 
 def _run(out: Path, tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Synthesis:
-    result = Synthesis(out)
-    todo: list[Task] = []
-    for task in tasks:
-        task.find_existing()
-        result.pictures += task.pictures
-        result.existing += task.existing
-        result.broken |= task.broken
-        if task.todo:
-            todo.append(task)
-
-    outcomes = _run_tasks(todo, settings, max_pixels, workers)
-    for count, broken in progress(outcomes, label="synth", unit="file", total=len(todo), leave=True):
-        result.made += count
+    result = Synthesis(out, pictures=sum(task.pictures for task in tasks))
+    outcomes = _run_tasks(tasks, settings, max_pixels, workers)
+    for made, existing, broken in progress(outcomes, label="synth", unit="file", total=len(tasks), leave=True):
+        result.made += made
+        result.existing += existing
         result.broken |= broken
 
     result.broken = dict(sorted(result.broken.items()))

@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.files import digest, fingerprint, parse_object, replacing, sha256, write_json, write_text
+from rawaug.files import cached, digest, read_keyed_json, replacing, sha256, write_json, write_text
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.targets import Burst
 from rawaug.synthesis.files import Origin, Settings, Synthesiser, pair_levels, replay_pair
@@ -57,19 +57,38 @@ class ShardTask:
         self.per_image = per_image
 
         self.pictures = len(names)
-        self.existing = 0
-        self.todo = True
-        self.broken: dict[str, str] = {}
 
-    def find_existing(self) -> None:
-        """Count the pairs of a shard that is complete."""
-        record = _read_record(self.path)
-        if record and record["pictures_sha256"] == self._digest_pictures():
-            self.existing = record["nsamples"]
-            self.broken = record["broken"]
-            self.todo = False
+    def make(self, maker: Synthesiser) -> tuple[int, int, dict[str, str]]:
+        """Write the shard unless it is there, whole and of the same pictures.
 
-    def _digest_pictures(self) -> str:
+        Returns:
+            The number of pairs that were made, the number of those that were there, and the reason for each picture
+            that cannot be read.
+        """
+        made = 0
+
+        def write() -> dict[str, Any]:
+            nonlocal made
+            broken: dict[str, str] = {}
+            with replacing(self.path) as partial, tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as tar:
+                for index, name in enumerate(self.names, self.first):
+                    picture = self.source / name
+                    try:
+                        origin, pairs = maker.pairs(picture, name, range(self.per_image))
+                    except (OSError, ValueError) as error:
+                        broken[name] = str(error).replace(str(picture), name)
+                        continue
+                    for number, pair in pairs:
+                        _add_sample(tar, f"{index:08d}_{number}", pair, _describe(pair, maker, origin, name, number))
+                        made += 1
+
+            size = self.path.stat().st_size
+            return {"url": self.path.name, "nsamples": made, "filesize": size, "broken": broken}
+
+        record = cached(_record_path(self.path), self._hash_pictures(), write, _read_record)
+        return made, record["nsamples"] - made, record["broken"]
+
+    def _hash_pictures(self) -> list[str]:
         """Hash the pictures; those that cannot be read have no hash."""
         hashes = []
         for name in self.names:
@@ -77,29 +96,7 @@ class ShardTask:
                 hashes.append(sha256(self.source / name))
             except OSError:
                 hashes.append("")
-        return fingerprint(hashes)
-
-    def make(self, maker: Synthesiser) -> tuple[int, dict[str, str]]:
-        """Write the shard; return the number of its pairs, and the reason for each picture that cannot be read."""
-        count = 0
-        broken: dict[str, str] = {}
-        with replacing(self.path) as partial, tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as tar:
-            for index, name in enumerate(self.names, self.first):
-                picture = self.source / name
-                try:
-                    origin, pairs = maker.pairs(picture, name, range(self.per_image))
-                except (OSError, ValueError) as error:
-                    broken[name] = str(error).replace(str(picture), name)
-                    continue
-                for number, pair in pairs:
-                    _add_sample(tar, f"{index:08d}_{number}", pair, _describe(pair, maker, origin, name, number))
-                    count += 1
-
-        size = self.path.stat().st_size
-        record = {"url": self.path.name, "nsamples": count, "filesize": size, "broken": broken}
-        record["pictures_sha256"] = self._digest_pictures()
-        write_json(record, _record_path(self.path))
-        return count, broken
+        return hashes
 
 
 def _shard_path(out: Path, number: int) -> Path:
@@ -110,16 +107,13 @@ def _record_path(shard: Path) -> Path:
     return shard.parent / ".shards" / f"{shard.stem}.json"
 
 
-def _read_record(shard: Path) -> dict[str, Any]:
-    """Read the record that marks a shard as complete; it is empty if there is none, or the shard has another size."""
-    file = _record_path(shard)
-    if not file.is_file() or not shard.is_file():
-        return {}
-
-    record = parse_object(file.read_text())
-    if record["filesize"] != shard.stat().st_size:
-        return {}
-    return record
+def _read_record(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read the record of a shard, and apart from it its key; both are empty if the shard has another size, or none."""
+    record, info = read_keyed_json(file)
+    shard = file.parents[1] / f"{file.stem}.tar"
+    if not shard.is_file() or record.get("filesize") != shard.stat().st_size:
+        return {}, {}
+    return record, info
 
 
 def shard_tasks(
@@ -221,12 +215,11 @@ def replay_sample(sample: Mapping[str, Any], pictures: str | Path, isp: str | Pa
 
 def write_index(out: Path, count: int, settings: Settings) -> None:
     """Write the index and the dataset card once all shards exist."""
-    records = [_read_record(_shard_path(out, number)) for number in range(count)]
-    if not all(records):
-        return
-
     shards = []
-    for record in records:
+    for number in range(count):
+        record, _ = _read_record(_record_path(_shard_path(out, number)))
+        if not record:
+            return
         shards.append({"url": record["url"], "nsamples": record["nsamples"], "filesize": record["filesize"]})
     index = {"__kind__": "wids-shard-index-v1", "wids_version": 1, "name": "rawaug pairs", "shardlist": shards}
     write_json(index, out / "index.json")
