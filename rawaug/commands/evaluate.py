@@ -21,8 +21,9 @@ from rawaug.evaluation.page import Page, select_for_page
 from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, print_pictures
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import Row, require_numbers, summary
-from rawaug.evaluation.tables import print_scores
+from rawaug.evaluation.tables import first_runs, print_scores
 from rawaug.evaluation.trials import make_trial, make_trials, measure_own_noise, own_noise_note
+from rawaug.evaluation.verdict import verdict
 from rawaug.files import find_weights, read_metadata, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseSpec, noise_model
@@ -125,9 +126,11 @@ def run(
         kinds = {"plain": result.get("plain", result)}
         if "plain" in result:
             kinds["self_ensemble"] = result
-        about = {"Noise": test_noise, "Seed": str(seed)}
-        title = f"{denoiser.name} on {data}"
-        page = Page.of_scores(title, {denoiser.name: [kinds]}, result.get("classical", {}), about)
+        scores_by_arm, others = {denoiser.name: [kinds]}, result.get("classical", {})
+        page = Page(f"{denoiser.name} on {data}", verdict(scores_by_arm, others).sentence)
+        own_noise = own_noise_note(first_runs(scores_by_arm, others))
+        page.add_facts({"Noise": test_noise, "Seed": str(seed), "Own noise": own_noise}, scores_by_arm)
+        page.add_scores(scores_by_arm, others)
         for trial in select_for_page(trials):
             page.add_frame(make_panels([*filters, denoiser], trial))
         command = {"weights": weights, "data": data, "noise": noise, "seed": seed}

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import MISSING, fields, is_dataclass
-from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 from annotated_types import Interval
 from cyclopts import Parameter
@@ -85,7 +85,7 @@ def parse_options(words: Sequence[str], settings: type[Any]) -> list[tuple[str, 
     """
     field_names = set()
     for key in list_keys(settings):
-        field_names.update(key.name.split("."))
+        field_names.update(key.split("."))
 
     options = []
     remaining = iter(words)
@@ -207,7 +207,7 @@ def with_values(settings: type[Any], content: Mapping[str, Any], source: object)
         values.pop("experiment", None)
 
     try:
-        _require_keys(settings, values, [key.name for key in list_keys(settings)])
+        _require_keys(settings, values, list_keys(settings))
         return TypeAdapter(settings).validate_python(values)
     except ValidationError as error:
         raise ValueError(f"{source}: {_reason(error.errors()[0], values)}") from None
@@ -215,22 +215,15 @@ def with_values(settings: type[Any], content: Mapping[str, Any], source: object)
         raise ValueError(f"{source}: {error}") from None
 
 
-class Key(NamedTuple):
-    """A key of a recipe: its dotted name, its default, and its meaning."""
-
-    name: str
-    default: Any
-    meaning: str
-
-
-def list_keys(settings: type[Any], above: str = "") -> Iterator[Key]:
-    """Yield the keys of a dataclass and of those in it, as their docstrings explain them."""
+def list_keys(settings: type[Any], above: str = "") -> dict[str, tuple[Any, str]]:
+    """List the keys of a dataclass and of those in it, dotted: their defaults, and what docstrings say they mean."""
     hints = get_type_hints(settings)
     meanings: dict[str, str] = {}
     for base in reversed(settings.__mro__):
         for parameter in parse(base.__doc__ or "").params:
             meanings[parameter.arg_name] = parameter.description or ""
 
+    keys: dict[str, tuple[Any, str]] = {}
     bounds = list_bounds(settings)
     for field in fields(settings):
         part, by_name = _part(hints[field.name])
@@ -246,10 +239,12 @@ def list_keys(settings: type[Any], above: str = "") -> Iterator[Key]:
                 meaning += f" One of {', '.join(names)}."
             if field.name in bounds:
                 meaning += describe_bounds(bounds[field.name])
-            yield Key(name, default, meaning)
+            keys[name] = default, meaning
 
         if part is not None:
-            yield from list_keys(part, f"{name}.NAME." if by_name else f"{name}.")
+            keys |= list_keys(part, f"{name}.NAME." if by_name else f"{name}.")
+
+    return keys
 
 
 def describe_bounds(bounds: Interval) -> str:
@@ -270,30 +265,25 @@ def describe_bounds(bounds: Interval) -> str:
 def print_keys(settings: type[Any], content: Mapping[str, Any]) -> None:
     """Print the keys of a recipe by section, each with its value in ``content``."""
     console = Console(soft_wrap=False)
-    sections: dict[str, list[Key]] = {}
-    for key in list_keys(settings):
-        sections.setdefault(key.name.rpartition(".")[0], []).append(key)
+    tables: dict[str, Table] = {}
+    for key, (default, meaning) in list_keys(settings).items():
+        value: Any = content
+        for part in key.split("."):
+            value = value.get(part, default) if isinstance(value, Mapping) else default
 
-    for section, keys in sections.items():
+        if key == "arms":
+            shown = "by NAME, below"
+        else:
+            shown = "" if value is MISSING else json.dumps(value)
+
+        option = f"--{key.replace('_', '-')}"
+        text = re.sub(r"(:\w+:)?`+([^`]*)`+", r"\2", " ".join(meaning.split()))  # without markup
+        table = tables.setdefault(key.rpartition(".")[0], Table.grid(padding=(0, 2)))
+        table.add_row(Text(option, style="cyan"), Text(text), Text(shown))
+
+    for section, table in tables.items():
         console.print(Text(f"{section or 'recipe'}:", style="bold"))
-        table = Table.grid(padding=(0, 2))
-        for key in keys:
-            option = f"--{key.name.replace('_', '-')}"
-            meaning = re.sub(r"(:\w+:)?`+([^`]*)`+", r"\2", " ".join(key.meaning.split()))  # without markup
-            table.add_row(Text(option, style="cyan"), Text(meaning), Text(_shown_value(key, content)))
         console.print(Padding(table, (0, 0, 1, 2)))
-
-
-def _shown_value(key: Key, content: Mapping[str, Any]) -> str:
-    """Give the value of a key in a recipe's content, or its default, as JSON."""
-    if key.name == "arms":
-        return "by NAME, below"
-
-    value: Any = content
-    for name in key.name.split("."):
-        value = value.get(name, key.default) if isinstance(value, Mapping) else key.default
-
-    return "" if value is MISSING else json.dumps(value)
 
 
 def _part(hint: Any) -> tuple[type[Any] | None, bool]:

@@ -29,8 +29,7 @@ from rawaug.evaluation.tables import (
     levels_note,
     make_table,
 )
-from rawaug.evaluation.trials import Trial, evenly_spaced, own_noise_note
-from rawaug.evaluation.verdict import verdict
+from rawaug.evaluation.trials import Trial, evenly_spaced
 from rawaug.files import write_text
 from rawaug.io.pictures import encode_png
 
@@ -81,31 +80,6 @@ class Page:
         """
         self.parts.append({"heading": heading, "best": (), **content})
 
-    @classmethod
-    def of_scores(
-        cls,
-        title: str,
-        results: Runs,
-        others: Mapping[str, Mapping[str, Any]],
-        facts: Mapping[str, Any] | None = None,
-        arms: Mapping[str, str] | None = None,
-    ) -> Page:
-        """Make a page with scores, which opens with the verdict.
-
-        Args:
-            title: title of the page.
-            results: by arm, one entry per seed.
-            others: summaries of other denoisers, by name.
-            facts: further facts to state, by term; ``Noise`` in the form of a recipe.
-            arms: descriptions of the methods, by name.
-        """
-        page = cls(title, verdict(results, others).sentence)
-        page.add_facts({**(facts or {}), "Own noise": own_noise_note(first_runs(results, others))}, results)
-        if arms:
-            page.add("Methods", terms=arms)
-        page.add_scores(results, others)
-        return page
-
     def add_facts(self, facts: Mapping[str, Any], results: Runs) -> None:
         """Add the command and other facts by term, unless they are empty; ``Noise`` is in the form of a recipe."""
         terms = {"Command": command_line(), **facts}
@@ -134,11 +108,10 @@ class Page:
         first_arm = next(iter(results.values()))
         notes = list(filter(None, [levels_note(first_arm[0]["plain"])]))
         for heading, columns in (("Scores", PLAIN), ("Self-ensemble", ENSEMBLE), ("Worst and best frames", QUARTERS)):
-            table = make_table(results, others, columns)
-            if not table.rows:
+            heads, rows, best = make_table(results, others, columns)
+            if not rows:
                 continue
-            head = ["", *table.columns]
-            self.add(heading + end, texts=notes, head=head, rows=table.rows, best=table.best)
+            self.add(heading + end, texts=notes, head=["", *heads], rows=rows, best=best)
             notes = []  # stated once, with the first table
 
         self.add(f"Every image{end}", **_every_image(first_runs(results, others)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -63,20 +63,16 @@ _PRINTED: Columns = {
 }
 
 
-class Table(NamedTuple):
-    """A table: its columns, cells by row, which are empty if a figure does not apply, and the best cells of columns.
+def make_table(
+    results: Runs, others: Mapping[str, Mapping[str, Any]] | None, columns: Columns
+) -> tuple[list[str], dict[str, list[str]], set[tuple[str, int]]]:
+    """Make a table of the noisy input, other denoisers and the arms, without columns and rows that have no figure.
 
-    Scores that the frames do not tell from the highest are best, too: their paired interval holds 0. A column has no
-    best cell if its highest score comes from keeping the references' own noise.
+    Returns:
+        The headings of its columns; cells by row, which are empty if a figure does not apply; and (row, column) of the
+        best cells. Scores that the frames do not tell from the highest are best, too: their paired interval holds 0. A
+        column has no best cell if its highest score comes from keeping the references' own noise.
     """
-
-    columns: list[str]
-    rows: dict[str, list[str]]
-    best: set[tuple[str, int]]
-
-
-def make_table(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, columns: Columns) -> Table:
-    """Make a table of the noisy input, other denoisers and the arms, without columns and rows that have no figure."""
     first_arm = next(iter(results.values()))
     methods: dict[str, Sequence[Mapping[str, Any]]] = {"noisy input": [{"plain": input_summary(first_arm[0]["plain"])}]}
     for name, scores in (others or {}).items():
@@ -89,8 +85,9 @@ def make_table(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, co
         if any(run["plain"].get("own_noise", 0.0) > 1.0 for run in runs):
             keeping_noise.add(name)
 
-    table = Table([], {}, set())
+    headings: list[str] = []
     cells: dict[str, list[str]] = {}
+    best_cells = set()
     for head, (kind, key) in columns.items():
         values = {}
         for name, runs in methods.items():
@@ -103,16 +100,13 @@ def make_table(results: Runs, others: Mapping[str, Mapping[str, Any]] | None, co
             best = _not_told_apart(best, {name: methods[name] for name in methods if values[name]}, kind, key)
         if keeping_noise.isdisjoint(best):
             for name in best:
-                table.best.add((name, len(table.columns)))
-        table.columns.append(head)
+                best_cells.add((name, len(headings)))
+        headings.append(head)
         for name in methods:
             cells.setdefault(name, []).append(_cell(key, values[name]))
 
-    for name, row in cells.items():
-        if any(row):
-            table.rows[name] = row
-
-    return table
+    rows = {name: row for name, row in cells.items() if any(row)}
+    return headings, rows, best_cells
 
 
 def _best_rows(key: str, values: Mapping[str, Sequence[float]]) -> list[str]:
@@ -252,8 +246,8 @@ def print_table(results: Runs, title: str, others: Mapping[str, Mapping[str, Any
 
     ``results`` has one entry per seed in an arm's list, ``others`` a summary by name.
     """
-    table = make_table(results, others, _PRINTED)
-    print_cells(title, ["arm", *table.columns], table.rows)
+    headings, rows, _ = make_table(results, others, _PRINTED)
+    print_cells(title, ["arm", *headings], rows)
 
     first_arm = next(iter(results.values()))
     note = levels_note(first_arm[0]["plain"])

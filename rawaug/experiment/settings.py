@@ -123,18 +123,16 @@ class DataConfig(PairSettings):
             raise ValueError("data.pictures: pairs takes those of data.pairs, which is null; set one of them")
         if _is_pair_folder(self.pairs) or _is_pair_folder(self.validation) or _is_pair_folder(self.test):
             return
-        for key, value in self._pair_settings().items():
-            if value is not None:
-                raise ValueError(f"data.{key}: applies to {_PAIRS}PATH, which neither pairs, validation nor test is")
+        for setting in fields(PairSettings):
+            if getattr(self, setting.name) is not None:
+                text = f"applies to {_PAIRS}PATH, which neither pairs, validation nor test is"
+                raise ValueError(f"data.{setting.name}: {text}")
 
     def pair_settings(self, spec: str | Sequence[Pair]) -> dict[str, Any]:
         """Give the settings of ``pairs:PATH`` for this spec; there are none for another kind of data."""
         if not _is_pair_folder(spec):
             return {}
 
-        return self._pair_settings()
-
-    def _pair_settings(self) -> dict[str, Any]:
         return {setting.name: getattr(self, setting.name) for setting in fields(PairSettings)}
 
 

@@ -22,6 +22,7 @@ from rawaug.evaluation.figures import WINDOW, Panels, find_detail, plot_curves
 from rawaug.evaluation.page import Page, name_part
 from rawaug.evaluation.table_files import latex_table
 from rawaug.evaluation.trials import raw_trial
+from rawaug.evaluation.verdict import verdict
 from rawaug.io import RawFrame
 
 
@@ -38,7 +39,11 @@ def page(tmp_path: Path) -> str:
     log = tmp_path / "log.csv"
     log.write_text("step,loss,psnr,samples_per_second\n2,0.1,30,9\n4,0.05,31,9\n")
     results = {"real": [{"plain": scores(40.123), "self_ensemble": scores(41.0)}]}
-    made = Page.of_scores("a & b", results, {"Wavelet": scores(37.5)}, {"Noise": "upi"}, {"real": "a U-Net"})
+    others = {"Wavelet": scores(37.5)}
+    made = Page("a & b", verdict(results, others).sentence)
+    made.add_facts({"Noise": "upi"}, results)
+    made.add("Methods", terms={"real": "a U-Net"})
+    made.add_scores(results, others)
     made.add_curves(plot_curves({"real": [log]}))
     generator = torch.Generator().manual_seed(0)
     raw = torch.rand(1, 200, 800, generator=generator)

@@ -133,6 +133,7 @@ def test_the_interval_holds_the_mean_as_often_as_it_says() -> None:
 
 def test_methods_that_the_frames_do_not_tell_apart_share_the_mark() -> None:
     arms = {"a": arm(BASE + 0.5 + WIGGLE), "b": arm(BASE + 0.49 - WIGGLE), "c": arm(BASE + WIGGLE)}
-    assert {name for name, column in make_table(arms, None, PLAIN).best if column == 0} == {"a", "b"}
-    one = {"a": arm([41.0]), "b": arm([40.0])}
-    assert not make_table(one, None, PLAIN).best, "one frame decides nothing"
+    *_, best = make_table(arms, None, PLAIN)
+    assert {name for name, column in best if column == 0} == {"a", "b"}
+    *_, best = make_table({"a": arm([41.0]), "b": arm([40.0])}, None, PLAIN)
+    assert not best, "one frame decides nothing"
