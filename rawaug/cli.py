@@ -29,7 +29,7 @@ from rawaug.progress import hide_progress
 from rawaug.version import __version__
 
 BAD_INPUT = 2
-"""This is the exit status after a user's error."""
+"""Exit status after a user's error."""
 
 COMMANDS = {
     "benchmark": "Compare denoisers on the same frozen noise over clean references.",
@@ -47,16 +47,16 @@ COMMANDS = {
     "submit": "Denoise the noisy blocks of a benchmark, in the form that its server takes.",
     "synth": "Write noisy and clean RAW pairs made from sRGB pictures.",
 }
-"""These are modules of :mod:`rawaug.commands`, each with a function ``run`` whose docstring opens with this line."""
+"""Modules of :mod:`rawaug.commands`, each with a function ``run`` whose docstring opens with the line given here."""
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-"""These numbers are from glibc's malloc.h."""
+"""Numbers of glibc's malloc.h."""
 
 NETWORKS = ("benchmark", "denoise", "evaluate", "judge", "run")
-"""These commands run networks. They take huge pages and keep them, as page faults took a third of their time."""
+"""Commands that run networks: they take huge pages and keep them, as page faults took a third of their time."""
 
 _OWN = {*COMMANDS, "camera", "data", "completion"}
-"""Commands of other packages have none of these names."""
+"""Names that commands of other packages cannot have."""
 
 app = App(
     name="rawaug",

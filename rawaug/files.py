@@ -28,19 +28,16 @@ T = TypeVar("T")
 Content = bytes | memoryview
 
 OF_NO_DATASET = (".DS_Store", "Thumbs.db")
-"""macOS and Windows leave these files in folders."""
+"""Files that macOS and Windows leave in folders."""
 
 LOCK = "rawaug.lock"
-"""The lock file in an output folder has this name."""
+"""Name of the lock file in an output folder."""
 
 MOST_BYTES = 2**32
-"""An input file has at most this size; larger ones are refused before they are read."""
-
-MOST_NAME_BYTES = 200
-"""A name in a recipe that becomes a folder has at most this length."""
+"""Largest size of an input file; larger ones are refused before they are read."""
 
 WEIGHTS = Path(__file__).parent / "weights"
-"""This folder holds the shipped ISPs."""
+"""Folder of the shipped ISPs."""
 
 
 def yaml_value(text: str) -> Any:
@@ -69,7 +66,7 @@ def yaml_value(text: str) -> Any:
 
 
 MOST_YAML_BYTES, MOST_YAML_LEVELS = 2**16, 50
-"""A YAML file of settings has these limits."""
+"""Limits of a YAML file of settings."""
 
 
 def read_yaml(file: str | Path, what: str) -> Any:
@@ -258,22 +255,6 @@ def require_output(
 
     require_folder(path.absolute().parent, path)
     return path
-
-
-def require_folder_name(name: str, key: str) -> None:
-    """Refuse a name in a recipe, perhaps a stranger's, that would not become a single folder inside another one.
-
-    Args:
-        name: the name.
-        key: the key of the recipe, which heads the message.
-
-    Raises:
-        ValueError: if it is empty, ``.`` or ``..``, has a slash, a backslash or what a terminal cannot print, or is too
-            long for the name of a file.
-    """
-    is_one_folder = name not in ("", ".", "..") and not set(name) & set("/\\")
-    if not is_one_folder or not name.isprintable() or len(os.fsencode(name)) > MOST_NAME_BYTES:
-        raise ValueError(f"{key}: {name[:80]!r} cannot be the name of a folder; use letters, digits, - and _")
 
 
 def require_folder(folder: str | Path, output: str | Path | None = None) -> None:

@@ -31,10 +31,10 @@ from rawaug.noise import noise_model
 from rawaug.progress import progress
 
 OPSET = 18
-"""Graphs are written in this version of ONNX's operators."""
+"""Version of ONNX's operators in which graphs are written."""
 
 TOLERANCE = 1e-4
-"""ONNX Runtime and PyTorch may differ by this much, with white at 1."""
+"""Largest difference of ONNX Runtime and PyTorch, with white at 1."""
 
 HALF_TOLERANCE = 5e-3
 """The same in float16, which has 11 bits."""
@@ -46,7 +46,7 @@ DOMAIN = (
 """What the numbers of a file mean, as its metadata say."""
 
 NODES = 33
-"""A .cube has this many nodes along each axis."""
+"""Number of nodes of a .cube along each axis."""
 
 
 def write_onnx(

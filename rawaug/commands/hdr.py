@@ -32,7 +32,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.registry import require_between
 
 MOST_STOPS = 30.0
-"""The exposure can be at most this many stops."""
+"""Largest exposure in stops."""
 
 
 def run(

@@ -31,7 +31,7 @@ from rawaug.noise.profiles import SPREAD, load_profiles, profile_ends
 from rawaug.version import __version__
 
 _WITH_LEVELS = 3
-"""At most this many cameras are listed with the levels of their noise."""
+"""Largest number of cameras that are listed with the levels of their noise."""
 
 
 def run(weights: str, /, *part: str, json: bool = False) -> None:

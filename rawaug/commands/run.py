@@ -26,10 +26,10 @@ from rawaug.experiment.settings import Recipe
 from rawaug.registry import list_bounds, suggest
 
 SHARED = ("channels", "variance_map", "deviation", "domain")
-"""All networks share these settings."""
+"""Settings that all networks share."""
 
 _LARGE = 2**31
-"""Numbers beyond this are allowed, but nobody means them."""
+"""A bound that only keeps memory from being filled: numbers beyond are allowed, but nobody means them."""
 
 
 def run(

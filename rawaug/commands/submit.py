@@ -25,7 +25,7 @@ from rawaug.progress import progress
 from rawaug.registry import Spec
 
 _UNUSED = (0.0, 0.0)
-"""A denoiser that reads no levels gets these."""
+"""The levels of a denoiser that reads none."""
 
 
 def run(

@@ -26,7 +26,7 @@ from rawaug.files import write_bytes
 from rawaug.metrics import psnr
 
 FIGURES = (".png", ".jpg", ".pdf", ".svg")
-"""Figures are written to files of these extensions."""
+"""Extensions of files of figures."""
 
 WINDOW = 64
 """Side of an enlarged window, in packed pixels."""

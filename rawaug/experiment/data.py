@@ -17,13 +17,13 @@ from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.noisy_frames import drop_clean, frame_levels
 
 _MOST_HELD_OUT = 16
-"""At most this many frames are held out for validation: a fifth of them, and at least one."""
+"""Largest number of frames held out for validation: a fifth of them, and at least one."""
 
 _GIVEN = "given pairs"
-"""``data.pairs``, ``data.validation`` and ``data.test`` have this value in the results of pairs given from Python."""
+"""The name, in results, of pairs that a caller gives in place of ``data.pairs``, ``validation`` or ``test``."""
 
 _MARGIN = 6
-"""A frame is larger than its crops by this many pixels, as they are turned and shifted to a pattern."""
+"""Number of pixels by which a frame is larger than its crops, as they are turned and shifted to a pattern."""
 
 _NAMED = 6
 

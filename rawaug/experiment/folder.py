@@ -7,25 +7,45 @@ that change no result.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rawaug.files import LOCK, require_folder, require_folder_name, write_json
+from rawaug.files import LOCK, require_folder, write_json
 from rawaug.training.config import SAME_WEIGHTS
 
 STAMP = "run.json"
-"""This file has the settings of a run."""
+"""Name of the file with the settings of a run."""
 
 _FREE = frozenset({"name", "out", "device", "devices", "seeds", "self_ensemble", "views"})
-"""These keys may change when a run is resumed, as they do not change its results."""
+"""Keys that may change when a run is resumed, as they do not change its results."""
 
 _FREE_ANYWHERE = SAME_WEIGHTS | {"memory_mb"}
-"""These keys in parts of the recipe may change when a run is resumed."""
+"""Keys in parts of the recipe that may change when a run is resumed."""
+
+_MOST_NAME_BYTES = 200
+"""Largest length of a name in a recipe that becomes a folder."""
 
 _SHOWN = 3
-"""An error names at most this many changed keys."""
+"""Largest number of changed keys that an error names."""
+
+
+def require_folder_name(name: str, key: str) -> None:
+    """Refuse a name in a recipe, perhaps a stranger's, that would not become a single folder inside another one.
+
+    Args:
+        name: the name.
+        key: the key of the recipe, which heads the message.
+
+    Raises:
+        ValueError: if it is empty, ``.`` or ``..``, has a slash, a backslash or what a terminal cannot print, or is too
+            long for the name of a file.
+    """
+    is_one_folder = name not in ("", ".", "..") and not set(name) & set("/\\")
+    if not is_one_folder or not name.isprintable() or len(os.fsencode(name)) > _MOST_NAME_BYTES:
+        raise ValueError(f"{key}: {name[:80]!r} cannot be the name of a folder; use letters, digits, - and _")
 
 
 def run_folder(settings: Any) -> Path:

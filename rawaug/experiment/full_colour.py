@@ -50,7 +50,7 @@ from rawaug.training.crops import MosaicCrops
 from rawaug.training.stream import TrainingStream
 
 LIBRAW = ("VNG", "PPG", "AHD", "DCB", "DHT", "AAHD")
-"""These are LibRaw's demosaicings by its names."""
+"""LibRaw's demosaicings, by its names."""
 
 _LEAST = 512
 """LibRaw's interpolation of X-Trans needs a frame of at least this side."""

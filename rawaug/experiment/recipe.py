@@ -12,14 +12,14 @@ from rawaug.files import read_yaml
 from rawaug.registry import Registry, suggest
 
 EXPERIMENTS = Registry("experiment", "rawaug.experiments", "rawaug.paper")
-"""This maps the name in a recipe's key ``experiment`` to an experiment, except for tasks.
+"""Experiments that are no tasks, by their name in a recipe's key ``experiment``.
 
 Experiments are functions ``run(settings, overwrite)``. ``settings`` is a dataclass of the recipe's keys, whose method
 ``shortest()`` gives the settings of a dry run.
 """
 
 _DEFAULT_KIND = "raw"
-"""A recipe without the key ``experiment`` is of this kind."""
+"""The kind of a recipe without the key ``experiment``."""
 
 
 def read_recipe(file: str | Path) -> dict[str, Any]:

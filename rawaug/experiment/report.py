@@ -26,7 +26,7 @@ from rawaug.io.pictures import write_picture
 from rawaug.registry import spec_label, split_spec
 
 _MOST_ROWS = 3
-"""``picture.png`` has at most this many test frames of RAW."""
+"""Largest number of test frames of RAW in ``picture.png``."""
 
 Tables = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """By table, ``results`` has the summaries ``plain`` and ``self_ensemble`` for each seed of an arm, and ``others`` the

@@ -47,7 +47,7 @@ from rawaug.training.noisy_frames import faintness_note
 from rawaug.training.state import first_network
 
 Results = dict[str, Any]
-"""It has, by arm, summaries ``plain`` and ``self_ensemble`` for each seed; several tables come first."""
+"""Summaries ``plain`` and ``self_ensemble`` for each seed, by arm; by table before, if there are several."""
 
 
 @contextmanager

@@ -12,7 +12,8 @@ from pydantic import BeforeValidator
 from rawaug.data.frames import OWN_PICTURES
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import Pair
-from rawaug.files import find_weights, fingerprint, require_folder_name, sha256
+from rawaug.experiment.folder import require_folder_name
+from rawaug.files import find_weights, fingerprint, sha256
 from rawaug.isp.fit import FitConfig
 from rawaug.isp.model import DictionaryISP, restrict_to_cameras
 from rawaug.kernels.runtime import find_device
@@ -26,22 +27,22 @@ from rawaug.training.srgb_noise import noise_on_srgb
 from rawaug.training.srgb_samples import Conditioning
 
 _SHORT_CROP = 256
-"""A dry run uses the middles of frames, of this side in pixels."""
+"""Side in pixels of the middles of frames that a dry run uses."""
 
 _NOT_OF_WEIGHTS = (
     *("name", "out", "device", "devices", "seed", "seeds", "steps", "arms", "isp", "fit"),
     *("views", "self_ensemble", "classical", "baselines"),
 )
-"""No weights depend on these keys, or they do so through the arm, the seed and the ISP."""
+"""Keys on which no weights depend, or which count through the arm, the seed and the ISP."""
 
 HELD_OUT = "auto"
-"""``data.validation`` has this value for a part of ``data.pairs``."""
+"""The value of ``data.validation`` for a part of ``data.pairs``."""
 
 _USUAL = "usual"
-""":class:`DataConfig` replaces this value of ``data.validation`` by the one that suits ``data.pairs``."""
+"""The value of ``data.validation`` that :class:`DataConfig` replaces by the one that suits ``data.pairs``."""
 
 _DEMO = "demo:"
-"""The names of the built-in, simulated frames begin with this."""
+"""The beginning of the names of built-in, simulated frames."""
 
 _PAIRS = "pairs:"
 
@@ -62,7 +63,7 @@ Side = Annotated[int, Interval(ge=32, le=MOST)]
 NoiseSetting = Annotated[
     tuple[float, float] | str | Sequence[str | dict[str, Any]] | dict[str, Any], BeforeValidator(_require_noise_form)
 ]
-"""This is the noise of a recipe, as :func:`rawaug.noise.noise_model` takes it."""
+"""The noise of a recipe, as :func:`rawaug.noise.noise_model` takes it."""
 
 
 @dataclass
@@ -237,7 +238,7 @@ class ArmConfig:
 
     @property
     def sees_clean(self) -> bool:
-        """This says whether the estimator needs clean frames."""
+        """Whether the estimator needs clean frames."""
         name, _ = split_spec(self.estimator)
         return bool(ESTIMATORS[name].sees_clean)
 
@@ -272,19 +273,19 @@ class Recipe:
     """
 
     kind: ClassVar[str] = "raw"
-    """The task that reads these settings has this name."""
+    """The name of the task that reads these settings."""
 
     target: ClassVar[Target] = "raw"
-    """This is the target of the augmentation."""
+    """The target of the augmentation."""
 
     from_pictures: ClassVar[bool] = False
-    """This says whether arms can train on nothing but pictures, with clean targets."""
+    """Whether arms can train on nothing but pictures, with clean targets."""
 
     full_colour: ClassVar[bool] = False
-    """This says whether frames are binned so that the four sites of a cell make a pixel of full colour."""
+    """Whether frames are binned so that the four sites of a cell make a pixel of full colour."""
 
     scoring: ClassVar[tuple[str, ...]] = ()
-    """No weights depend on these further keys, but scores do."""
+    """Further keys on which scores depend, but no weights."""
 
     name: str = "experiment"
     data: DataConfig = field(default_factory=DataConfig)
@@ -444,5 +445,5 @@ class Recipe:
 
     @property
     def self_supervised(self) -> bool:
-        """This says whether the arms may see only noisy frames."""
+        """Whether the arms may see only noisy frames."""
         return not any(arm.sees_clean for arm in self.arms.values())

@@ -47,7 +47,7 @@ from rawaug.training.srgb_samples import NoisyPictures, SrgbSamples
 from rawaug.training.stream import TrainingStream
 
 BLACK, WHITE = 8192.0, 65535.0
-"""The DNG has these black and white levels, which leave room for noise below black."""
+"""Black and white levels of the DNG, which leave room for noise below black."""
 
 _DEVIATIONS = (0.01, 0.015, 0.022, 0.033, 0.05, 0.075, 0.11, 0.16)
 """The standard deviations of white noise among which validation chooses a filter's strength."""

@@ -23,7 +23,7 @@ from rawaug.training.noisy_frames import noisy_frame
 from rawaug.training.stream import TrainingStream
 
 TASKS = Registry("task", "rawaug.tasks", "rawaug.experiment")
-"""This maps the name in a recipe's key ``experiment`` to a subclass of :class:`Task`."""
+"""Subclasses of :class:`Task`, by their name in a recipe's key ``experiment``."""
 
 
 class Task(ABC):
@@ -43,10 +43,10 @@ class Task(ABC):
     """
 
     settings: ClassVar[type[Recipe]] = Recipe
-    """This dataclass has the keys of the task's recipes."""
+    """The dataclass of the task's recipes."""
 
     input: ClassVar[Any] = NOISY
-    """This denoiser stands for the noisy input in tables."""
+    """The denoiser that stands for the noisy input in tables."""
 
     def __init__(self, recipe: Recipe, isp: DictionaryISP, frames: Mapping[str, Any]) -> None:
         self.recipe: Any = recipe

@@ -35,14 +35,14 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.progress import progress
 
 YUV = ((0.299, 0.587, 0.114), (-0.14713, -0.28886, 0.436), (0.615, -0.51499, -0.10001))
-"""This is the matrix from RGB to YUV of ITU-R BT.601."""
+"""The matrix from RGB to YUV of ITU-R BT.601."""
 TITLES = ("x", "x1 tone", "x2 gamma", "x3 colour", "x4 gains", "x5 shading")
 SPACES = ("RGB", "Y", "UV")
 LEFT_OUT = ("tone", "colour", "gains", "shading")
 STRIDE = 4
-"""The pixels of a registered frame that are compared are this far apart in both directions."""
+"""Distance, in both directions, of the pixels of a registered frame that are compared."""
 CLIPPED = 0.98
-"""Pixels of a registered frame with a value from here on are left out."""
+"""The value from which on pixels of a registered frame are left out."""
 
 
 @dataclass

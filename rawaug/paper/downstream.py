@@ -37,7 +37,7 @@ from rawaug.training.loop import train
 from rawaug.training.stream import TrainingStream
 
 SHORTEST_CROP = 256
-"""A dry run scores a part of a test frame with this side, in pixels."""
+"""Side in pixels of the part of a test frame that a dry run scores."""
 
 
 @dataclass

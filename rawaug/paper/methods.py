@@ -39,10 +39,10 @@ FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
 ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples", "own": "own rendering"}
 SAMPLES = 64
 PIXELS = 8192
-"""The forward pass is scored on this many pixels of a frame."""
+"""Number of pixels of a frame on which the forward pass is scored."""
 Method = BaselineISP | DictionaryISP
 Maker = Callable[[Tensor, Tensor], Tensor]
-"""It maps an sRGB patch ``(1, 3, h, w)`` and its coordinates in the frame to a mosaic ``(1, 1, h, w)``."""
+"""A function from an sRGB patch ``(1, 3, h, w)`` and its coordinates in the frame to a mosaic ``(1, 1, h, w)``."""
 
 
 class Fitted(NamedTuple):

@@ -8,9 +8,9 @@ TABLE_1: dict[str, tuple[float, float, float, float, float]] = {
     "U-Net": (39.84, 20.27, 49.61, 49.69, 11.77),
     "Ours": (45.21, 21.58, 66.33, 50.02, 0.59),
 }
-"""These are, on SIDD, PSNR_r in dB, its worst and best quarter, PSNR_d in dB, and millions of parameters."""
+"""On SIDD: PSNR_r in dB, its worst and best quarter, PSNR_d in dB, and millions of parameters."""
 CYCLE = 37.82
-"""This is the PSNR in dB of the cycle sRGB to RAW to sRGB."""
+"""PSNR in dB of the cycle sRGB to RAW to sRGB."""
 TABLE_2: dict[str, tuple[float | None, float | None]] = {
     "UPI": (29.30, None),
     "CycleISP": (29.40, 31.71),
@@ -20,7 +20,7 @@ TABLE_2: dict[str, tuple[float | None, float | None]] = {
     "InvISP with JPEG": (44.42, 46.78),
     "Ours": (43.62, 50.08),
 }
-"""These are, on MIT-Adobe FiveK, PSNR_r in dB of the Nikon D700 and of the Canon EOS 5D."""
+"""On MIT-Adobe FiveK: PSNR_r in dB of the Nikon D700 and of the Canon EOS 5D."""
 TABLE_3: dict[str, tuple[float, float]] = {
     "Noisy": (37.18, 0.850),
     "GLIDE": (41.87, 0.949),
@@ -36,12 +36,12 @@ TABLE_3: dict[str, tuple[float, float]] = {
     "CycleISP": (52.38, 0.990),
     "Ours": (52.48, 0.990),
 }
-"""These are, on SIDD, PSNR in dB and SSIM."""
+"""On SIDD: PSNR in dB and SSIM."""
 ABLATION = {
     "UV": {"x2 gamma": 36.21, "x3 colour": 43.34, "x4 gains": 47.59},
     "Y": {"x4 gains": 39.91, "x5 shading": 51.24},
 }
-"""These are PSNR in dB against RAW after a stage, in chrominance and luminance, as far as the text states it."""
+"""PSNR in dB against RAW after a stage, in chrominance and luminance, as far as the text states it."""
 
 ISP_NAMES = {
     "upi-tuned": "UPI",
@@ -52,7 +52,7 @@ ISP_NAMES = {
     "invisp-jpeg": "InvISP with JPEG",
     "dictionary-encoders": "Ours",
 }
-"""This maps our names of the reconstruction tables' rows to the paper's. Its UPI is tuned to the data by hand."""
+"""The paper's names of the reconstruction tables' rows, by ours. Its UPI is tuned to the data by hand."""
 DENOISER_NAMES = {
     "GLIDE": "GLIDE",
     "KSVD": "KSVD",
@@ -67,4 +67,4 @@ DENOISER_NAMES = {
     "ours_f": "Ours-f",
     "ours_u": "Ours-u",
 }
-"""This maps names of filters and arms to the paper's names of the denoising table's rows."""
+"""The paper's names of the denoising table's rows, by those of filters and arms."""

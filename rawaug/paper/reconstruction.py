@@ -57,9 +57,9 @@ COLUMNS = {
     "psnr_r": "PSNR_r", "worst25": "worst 25%", "best25": "best 25%", "balanced": "balanced", "forward": "RAW to sRGB",
     "cycle": "cycle", "cycle_same_setting": "same setting", "cycle_without_mosaic": "no mosaic", "psnr_d": "PSNR_d",
 }  # fmt: skip
-"""This maps the keys of a row to the headings of their columns."""
+"""Headings of columns, by the key of a row."""
 SHORTEST_SIDE = 128
-"""A dry run scores frames and pictures of this side in pixels."""
+"""Side in pixels of the frames and pictures that a dry run scores."""
 
 
 def print_methods(title: str, rows: Mapping[str, Mapping[str, Any]], ceiling: float) -> None:

@@ -35,9 +35,9 @@ TITLES = {
     "ablation": "Ablation: PSNR against RAW after each stage",
 }
 SHORTEST_CROP = 64
-"""A dry run scores a part of a test frame with this side in pixels."""
+"""Side in pixels of the part of a test frame that a dry run scores."""
 Table = dict[str, dict[str, Any]]
-"""It has a figure, or None, by row and column."""
+"""A figure, or None, by row and column."""
 
 
 @dataclass

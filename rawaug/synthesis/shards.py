@@ -109,9 +109,12 @@ def _record_path(shard: Path) -> Path:
 
 def _read_record(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read the record of a shard, and apart from it its key; both are empty if the shard has another size, or none."""
-    record, info = read_keyed_json(file)
     shard = file.parents[1] / f"{file.stem}.tar"
-    if not shard.is_file() or record.get("filesize") != shard.stat().st_size:
+    if not file.is_file() or not shard.is_file():
+        return {}, {}
+
+    record, info = read_keyed_json(file)
+    if record.get("filesize") != shard.stat().st_size:
         return {}, {}
     return record, info
 

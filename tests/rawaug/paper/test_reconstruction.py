@@ -33,7 +33,7 @@ class Laboratory:
         self.pairs: list[Pair] = []
         self.folds: list[tuple[str, str, tuple[float, int, int], int]] = []
         self.wholes: list[tuple[str, int]] = []
-        self.denoisers: list[Path] = []
+        self.denoisers: list[tuple[Path, int, str]] = []
         self.shown: list[tuple[str, str, str]] = []
         self.stop_after = 10**6
         self.cameras = self.min_side = 0
@@ -78,8 +78,8 @@ class Laboratory:
     def cycle_psnr(self, fitted: Any, pictures: Sequence[torch.Tensor]) -> dict[str, float]:
         return {"cycle": 33.0}
 
-    def psnr_d(self, model: Any, pictures: Any, config: DownstreamConfig, place: Path, seed: int) -> float:
-        self.denoisers.append(place / f"seed{seed}")
+    def psnr_d(self, model: Any, pictures: Any, config: DownstreamConfig, folder: Path, seed: int, key: str) -> float:
+        self.denoisers.append((folder, seed, key))
         return 40.0 + seed
 
 
