@@ -20,12 +20,14 @@ from typing import Any
 import torch
 
 from benchmarks.measure import parser
+from rawaug.commands import parse_value
 from rawaug.data import open_pairs
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.benchmark import REAL, TOLD, choose_strengths, count_gmac, trials
 from rawaug.evaluation.scores import NOISY, score
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial, measure_own_noise
+from rawaug.noise import NoiseSpec
 from rawaug.progress import progress
 
 Scores = dict[str, Any]
@@ -40,7 +42,9 @@ def main(command: Sequence[str] | None = None) -> None:
     options.add_argument("table", type=Path, help="JSON file of all scores")
     options.add_argument("denoisers", nargs="*")
     options.add_argument("--sets", nargs="+", default=["real:test", "real:validation"])
-    options.add_argument("--noise", help="noise in place of the four strengths, as for rawaug benchmark")
+    options.add_argument(
+        "--noise", type=parse_value, help="noise in place of the four strengths, as for rawaug benchmark"
+    )
     options.add_argument("--crop", type=int, default=256, help="side of the middles, in pixels of the mosaic")
     options.add_argument("--sensors", action="store_true", help="score sensors as they are, too")
     options.add_argument("--threads", type=int, default=torch.get_num_threads())
@@ -58,7 +62,7 @@ def main(command: Sequence[str] | None = None) -> None:
     print_table(table)
 
 
-def frozen_trials(spec: str, crop: int, noise: str | None = None) -> list[Trial]:
+def frozen_trials(spec: str, crop: int, noise: NoiseSpec | None = None) -> list[Trial]:
     """The middles of all frames of a set, such as ``FOLDER@4``, under every condition and strength."""
     data, _, factor = spec.partition("@")
     pairs = open_pairs(data, split="test")
