@@ -30,6 +30,7 @@ import torch
 from scipy import stats
 
 from benchmarks.measure import machine, parser
+from benchmarks.strengths import GUARD
 from denoisers.files import find_denoiser, list_shipped
 from rawaug.evaluation.benchmark import TOLD
 from rawaug.evaluation.figures import plot_costs
@@ -37,6 +38,7 @@ from rawaug.evaluation.verdict import paired_interval
 from rawaug.files import sha256, write_text
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures.json"
+OWN_NOISE_OF = "rawaug-base"
 REFERENCE = "PBRID"
 """The strongest published denoiser, to which differences are stated."""
 
@@ -142,9 +144,27 @@ def figures_of_benchmark(result: Mapping[str, Any], frames: str) -> dict[str, di
     return figures
 
 
+def figures_of_harm(harm: Mapping[str, Any]) -> dict[str, dict[str, str]]:
+    """The table of ``rawaug benchmark --harm``: PSNR by condition, and the share of its flux that a light keeps."""
+    figures: dict[str, dict[str, str]] = {}
+    for name, row in harm.items():
+        for condition, scores in row["frames"].items():
+            figures.setdefault(condition, {})[_column(name)] = f"{scores['psnr']:.2f}"
+        for width, psnr in row["fields"].items():
+            figures.setdefault(f"field {width}", {})[_column(name)] = f"{psnr:.2f}"
+        for width, shares in row["kept"].items():
+            for place, share in shares.items():
+                figures.setdefault(f"{width}, {place}", {})[_column(name)] = f"{100 * share:.0f}"
+    return figures
+
+
 def figures_of_strengths(table: Mapping[str, Any]) -> dict[str, dict[str, str]]:
-    """The table of ``benchmarks.strengths`` at known levels, by row; a denoiser lacks no frame of its rows."""
+    """The table of ``benchmarks.strengths`` at known levels, by row; a denoiser lacks no frame of its rows.
+
+    *Own noise* is the share of the references' own noise in the squared error of :data:`OWN_NOISE_OF`.
+    """
     by_row: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    own_noise: dict[str, list[float | None]] = {}
     for key, cells in table.items():
         if key == "GMAC":
             continue
@@ -155,8 +175,10 @@ def figures_of_strengths(table: Mapping[str, Any]) -> dict[str, dict[str, str]]:
         groups += [camera for camera in ("hero6", "hero7", "hero") if frame.startswith(camera)]
         for group in dict.fromkeys(groups):
             row = by_row.setdefault(f"{group}, {strength}", {})
-            for name, (raw, srgb, _) in cells.items():
+            for name, (raw, srgb, own) in cells.items():
                 row.setdefault(_column(name), []).append((raw, srgb))
+                if name == OWN_NOISE_OF:
+                    own_noise.setdefault(f"{group}, {strength}", []).append(own)
 
     figures: dict[str, dict[str, str]] = {"GMAC": {}}
     for name, gmac in table.get("GMAC", {}).items():
@@ -167,6 +189,9 @@ def figures_of_strengths(table: Mapping[str, Any]) -> dict[str, dict[str, str]]:
         most = max(map(len, columns.values()))
         scores = {name: frames for name, frames in columns.items() if len(frames) == most}
         figures |= figures_of_drawn_noise(row_name, scores)
+        shares = [share for share in own_noise.get(row_name, []) if share is not None]
+        if shares:
+            figures[row_name]["own noise"] = f"{100 * fmean(shares):.0f} %"
     return figures
 
 
@@ -213,7 +238,7 @@ def plot_row(figures: Mapping[str, Mapping[str, str]], row: str) -> bytes:
     """Plot the PSNR of a row over the operations of its denoisers, as PNG."""
     points: dict[str, tuple[float | None, float, float]] = {}
     for name, cell in figures[row].items():
-        if name != "noisy":
+        if name not in ("noisy", "own noise"):
             raw, srgb = cell.replace("*", "").split(" / ")
             gmac = figures["GMAC"].get(name)
             points[name] = (None if gmac is None else float(gmac), float(raw), float(srgb))
@@ -227,6 +252,8 @@ def _short(frames: str) -> str:
 
 def _column(name: str) -> str:
     name = name.removesuffix(", published weights")
+    if name.endswith(GUARD):
+        return f"{name.removesuffix(GUARD)}, guarded"
     return NAMES.get(name, name)
 
 
@@ -243,7 +270,10 @@ def main(command: Sequence[str] | None = None) -> None:
     result = json.loads(args.result.read_text(encoding="utf-8"))
 
     on = args.on
-    if "rows" in result:
+    if "harm" in result:
+        figures = figures_of_harm(result["harm"])
+        on = on or ", ".join(result["frames"])
+    elif "rows" in result:
         figures = figures_of_benchmark(result, args.frames or " ".join(result["frames"]))
         on = on or args.frames or ", ".join(result["frames"])
     elif "GMAC" in result:

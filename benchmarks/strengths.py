@@ -4,7 +4,8 @@
         --sets real:test real:validation demo:test RAW_DIR@4
 
 Denoisers are named as for ``rawaug benchmark``; noise and middles are those of its first table. ``@8`` behind a name is
-a self-ensemble of eight views, ``@4`` behind a set bins it 4 x 4 around the sites. Scores go to the file as they come,
+a self-ensemble of eight views, ``+guard`` its guarded result, as by ``rawaug denoise``; ``@4`` behind a set bins it
+4 x 4 around the sites. Scores go to the file as they come,
 and what stands there is not scored again, so slow denoisers can be added to a table later; the operations of each
 denoiser stand there, too. ``python -m benchmarks.figures`` puts the table into docs/figures.json.
 """
@@ -23,6 +24,7 @@ from benchmarks.measure import parser
 from rawaug.commands import parse_value
 from rawaug.data import open_pairs
 from rawaug.denoising.denoiser import RawDenoiser
+from rawaug.denoising.guard import Guarded
 from rawaug.evaluation.benchmark import REAL, TOLD, choose_strengths, count_gmac, trials
 from rawaug.evaluation.scores import NOISY, score
 from rawaug.evaluation.tables import print_rows
@@ -33,7 +35,10 @@ from rawaug.progress import progress
 Scores = dict[str, Any]
 
 GMAC = "GMAC"
-"""The key of the operations a mosaic megapixel, by denoiser, beside those of the trials."""
+"""The key of the operations a mosaic megapixel, by denoiser, beside those of the trials; a guard samples a frame."""
+
+GUARD = "+guard"
+"""Ends the name of a denoiser whose results are guarded."""
 
 
 def main(command: Sequence[str] | None = None) -> None:
@@ -90,17 +95,20 @@ def add_costs(table: Scores, specs: Sequence[str], path: Path) -> None:
     """Count the operations of the denoisers that the table lacks."""
     costs = table.setdefault(GMAC, {})
     for spec in specs:
-        if Path(spec).stem not in costs:
+        if Path(spec).stem not in costs and not spec.endswith(GUARD):
             costs[Path(spec).stem] = count_gmac(open_denoiser(spec))
             path.write_text(json.dumps(table, indent=0))
 
 
 def open_denoiser(spec: str) -> Any:
-    """The noisy input, or a denoiser by its name, with as many views as stand behind its ``@``."""
+    """The noisy input, or a denoiser by its name, with the views behind its ``@``, guarded if it says so."""
     if spec == "noisy":
         return NOISY
-    name, _, views = spec.partition("@")
-    return RawDenoiser.of(name, views=int(views or 1))
+    name, _, views = spec.removesuffix(GUARD).partition("@")
+    denoiser = RawDenoiser.of(name, views=int(views or 1))
+    if spec.endswith(GUARD):
+        return Guarded(denoiser)
+    return denoiser
 
 
 def print_table(table: Scores) -> None:

@@ -188,14 +188,26 @@ def test_a_figure_of_drawn_noise_is_bold_only_where_every_frame_says_so() -> Non
 def test_figures_of_strengths_and_the_picture_of_their_costs() -> None:
     table: dict[str, Any] = {"GMAC": {"rawaug-base": 123.4, "NonLocalMeans": None}}
     for frame, psnr in (("hero6_1", 40.0), ("hero7_1", 42.0), ("hero7_2", 44.0)):
-        cells = {"noisy": [30.0, 20.0, None], "rawaug-base": [psnr, 30.0, None], "NonLocalMeans": [38.0, 29.0, None]}
+        cells = {"noisy": [30.0, 20.0, None], "rawaug-base": [psnr, 30.0, 0.25], "NonLocalMeans": [38.0, 29.0, None]}
+        cells["rawaug-base+guard"] = [psnr + 1.0, 30.0, None]
         table[f"/x/GOPRO@4 | levels told | strong | {frame}"] = cells
         table[f"/x/GOPRO@4 | levels estimated | strong | {frame}"] = {"noisy": [0.0, 0.0, None]}
     rows = figures.figures_of_strengths(table)
-    assert rows["GMAC"] == {"rawaug-base": "123"}
+    assert rows["GMAC"] == {"rawaug-base": "123"} and rows["hero, strong"]["own noise"] == "25 %"
+    assert rows["hero7, strong"]["rawaug-base, guarded"].startswith("44.00 / ")
     shown = [rows[f"{name}, strong"]["rawaug-base"] for name in ("hero", "hero6", "hero7")]
     assert [cell.replace("*", "").split(" / ")[0] for cell in shown] == ["42.00", "40.00", "43.00"]
     assert figures.plot_row(rows, "hero, strong").startswith(b"\x89PNG")
+
+
+def test_figures_of_harm() -> None:
+    harm: dict[str, Any] = {
+        "rawaug-base, guarded": {"frames": {"hot pixels": {"psnr": 47.716}}, "kept": {"1.2": {"on R": 0.994}}}
+    }
+    harm["rawaug-base, guarded"]["fields"] = {"1.2": 60.871}
+    rows = figures.figures_of_harm(harm)
+    cells = [rows[row]["rawaug-base, guarded"] for row in ("hot pixels", "1.2, on R", "field 1.2")]
+    assert cells == ["47.72", "99", "60.87"]
 
 
 def test_figures_are_recorded_with_their_network(tmp_path: Path) -> None:

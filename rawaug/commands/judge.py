@@ -18,6 +18,7 @@ def run(
     denoisers: Annotated[list[str] | None, YAML] = None,
     noise: Annotated[tuple[float, float] | str, YAML] = "auto",
     crop: int | None = None,
+    probes: int = 1,
     seed: int = 0,
     device: str = "auto",
     picture: str | None = None,
@@ -33,7 +34,8 @@ def run(
         noise: where the levels of the noise come from, as for rawaug denoise: auto, profile, estimate, a camera, or
             [shot_var, read_var].
         crop: judge only the middle of this side in pixels, which is faster; by default the whole frame.
-        seed: seed of the small change with which each denoiser makes its second pass.
+        probes: how many small changes each denoiser is run with once more; several take longer and scatter less.
+        seed: seed of the small changes, and of the noise that is drawn on the best result.
         device: where networks run: auto, cpu, cuda, cuda:1, mps.
         picture: write where each denoiser gains and where it harms to this .png; for a single file.
         json: write the figures to this file.
@@ -47,7 +49,7 @@ def run(
 
     judgements = []
     for file in files:
-        judgement = judge(file, denoisers, noise, crop=crop, seed=seed, device=device)
+        judgement = judge(file, denoisers, noise, crop=crop, probes=probes, seed=seed, device=device)
         print_judgement(judgement)
         judgements.append(judgement)
 

@@ -7,10 +7,10 @@ with u of :mod:`rawaug.denoising.risk`. Its deviation is that of the noise's ene
 
 .. math:: \operatorname{var} \sum_i u_i \approx \sum_i (2 \sigma_i^4 + 8 \sigma_i^2 u_i + (k_i - \bar k)^2),
 
-where k is the term of the derivatives, whose single values scatter since one probe measures all of them at once. So an
-error that is a hundredth of the noise needs some 10^6 pixels to be known within a tenth of a decibel. It is the same
-for all denoisers, though, and the difference of two is known far better: its interval comes from blocks. After
-development D, all terms are taken through its derivative J at f(y), which is right to first order:
+where k is the term of the derivatives, whose single values scatter since one probe measures all of them at once. It is
+nearly the same for all denoisers, and the difference of two is known far better: its interval comes from blocks. What
+all have in common is corrected by the best denoiser, whose error is also read from noise drawn on its own result.
+After development D, all terms are taken through its derivative J at f(y), which is right to first order:
 :math:`|J (f - y)|^2 - |J n|^2 + 2 (J \sigma^2 b) \cdot J (f(y + e) - f(y)) / e`, where n is drawn noise.
 
 All of it rests on noise of the stated levels that is independent from pixel to pixel. Flat places show whether it is:
@@ -37,7 +37,7 @@ from rawaug.data.development import render_raw
 from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.levels import Noise, find_levels
 from rawaug.denoising.raw import equalise_greens
-from rawaug.denoising.risk import Probe, estimate_risk, probe_denoiser
+from rawaug.denoising.risk import Probe, bootstrap_error, combine_estimates, estimate_risk, probe_denoiser
 from rawaug.evaluation.figures import new_figure, save_figure
 from rawaug.evaluation.tables import print_rows
 from rawaug.io import RawFrame, read_raw
@@ -87,7 +87,7 @@ class Judged:
     """What is estimated of one denoiser on one frame.
 
     Attributes:
-        psnr: its PSNR in dB; infinite if no error is left that could be told from none.
+        psnr: its PSNR in dB.
         interval: the ends of its 95% interval.
         behind: by how many dB it is behind the best denoiser, and the ends of the 95% interval, which is much narrower.
         colours: PSNR of the planes R, Gr, Gb, B.
@@ -137,6 +137,7 @@ def judge(
     noise: Noise = "auto",
     *,
     crop: int | None = None,
+    probes: int = 1,
     seed: int = 0,
     device: str = "auto",
 ) -> Judgement:
@@ -146,8 +147,9 @@ def judge(
         source: a RAW file of a Bayer sensor, or a frame.
         denoisers: whatever :meth:`rawaug.RawDenoiser.of` takes; by default NonLocalMeans and the shipped networks.
         noise: where the levels come from, see :data:`rawaug.denoising.levels.Noise`.
-        crop: judge only the middle of this side, in pixels of the mosaic; each denoiser makes two passes.
-        seed: seed of the small change of the second pass.
+        crop: judge only the middle of this side, in pixels of the mosaic.
+        probes: number of small changes with which each denoiser is run once more; several scatter less.
+        seed: seed of the small changes, and of the noise that is drawn on the best result.
         device: where networks run: auto, cpu, cuda, ...
 
     Raises:
@@ -178,7 +180,7 @@ def judge(
 
     noisy = Noisy.of(packed, (shot_var, read_var), frame.cfa)
     levels_error = LEVELS_ERROR if noise_source.startswith("estimate") else 0.0
-    return judge_noisy(noisy, opened, develop, frame.name, noise_source, seed, levels_error)
+    return judge_noisy(noisy, opened, develop, frame.name, noise_source, seed, levels_error, probes)
 
 
 def judge_noisy(
@@ -189,6 +191,7 @@ def judge_noisy(
     noise_source: str = "given",
     seed: int = 0,
     levels_error: float = 0.0,
+    probes: int = 1,
 ) -> Judgement:
     """Judge denoisers on packed RAW ``(1, 4, h, w)`` with known levels; see :func:`judge`.
 
@@ -198,50 +201,71 @@ def judge_noisy(
         raise ValueError(f"{name}: judge needs packed RAW (1, 4, h, w) and the levels of its noise")
     image, levels = noisy.image, noisy.levels
 
-    probes: dict[str, Probe] = {}
+    probe_by_name: dict[str, Probe] = {}
     seconds: dict[str, float] = {}
     for denoiser in progress(denoisers, label=name or "judge", unit="denoiser"):
         start = time.perf_counter()
-        probes[denoiser.name] = probe_denoiser(denoiser, noisy, seed)
-        seconds[denoiser.name] = (time.perf_counter() - start) / 2
+        probe_by_name[denoiser.name] = probe_denoiser(denoiser, noisy, seed, probes)
+        seconds[denoiser.name] = (time.perf_counter() - start) / (1 + probes)
 
-    risks = {key: estimate_risk(probe, image, levels) for key, probe in probes.items()}
+    risks = {key: estimate_risk(probe, image, levels) for key, probe in probe_by_name.items()}
     best = min(risks, key=lambda key: float(risks[key].mean()))
-    is_whole = _is_below_white(probes[best])
-    refusals, remarks = _check_noise(noisy, probes[best], is_whole)
-    noise_energy = float((probes[best].variance * is_whole).sum() / is_whole.sum().clamp_min(1))
+    is_whole = _is_below_white(probe_by_name[best])
+    refusals, remarks = _check_noise(noisy, probe_by_name[best], is_whole)
+    noise_energy = float((probe_by_name[best].variance * is_whole).sum() / is_whole.sum().clamp_min(1))
     psnr_noisy = _decibels(noise_energy)
     if refusals:
         return Judgement(name, levels, noise_source, tuple(refusals), tuple(remarks), psnr_noisy, {})
 
+    denoiser = next(one for one in denoisers if one.name == best)
+    bootstrapped = bootstrap_error(denoiser, probe_by_name[best], noisy, is_whole, seed)
+    error = float(risks[best][is_whole].mean())
+    deviation = _deviation(probe_by_name[best], error, is_whole, levels_error * noise_energy)
+    median, *ends = combine_estimates(error, deviation, bootstrapped)
+    for risk in risks.values():
+        risk -= (error - median) * probe_by_name[best].variance / noise_energy
+
     judged = {}
     for key in sorted(risks, key=lambda key: float((risks[key] * is_whole).sum())):
-        one = _judge_one(probes[key], risks[key], risks[best], is_whole, levels_error * noise_energy)
+        one = _judge_one(probe_by_name[key], risks[key], risks[best], is_whole, (median - ends[0], ends[1] - median))
         psnr_srgb = None
         if develop is not None:
-            psnr_srgb = _developed(probes[key], image, develop, seed)
+            psnr_srgb = _developed(probe_by_name[key], image, develop, seed)
         judged[key] = replace(one, psnr_srgb=psnr_srgb, seconds=seconds[key])
     return Judgement(name, levels, noise_source, (), tuple(remarks), psnr_noisy, judged)
 
 
-def _judge_one(probe: Probe, risk: Tensor, least_risk: Tensor, is_whole: Tensor, energy_error: float) -> Judged:
-    """Judge one denoiser beside the best, without the values that are clipped.
+def _deviation(probe: Probe, error: float, is_whole: Tensor, energy_error: float) -> float:
+    """Estimate the standard deviation of the mean of the risk, from that of the noise's energy and of the probe.
 
     ``energy_error`` is the deviation of the noise's energy if its levels are not known exactly.
     """
     count = is_whole.sum().clamp_min(1)
-    error = float((risk * is_whole).sum() / count)
     kept = 2.0 * probe.variance * probe.kept
     spread = 2.0 * probe.variance.square() + 8.0 * probe.variance * max(error, 0.0)
     spread += (kept - (kept * is_whole).sum() / count).square()
-    deviation = math.hypot(float((spread * is_whole).sum().sqrt() / count), energy_error)
-    interval = _decibels(error + _NORMAL * deviation), _decibels(error - _NORMAL * deviation)
+    return math.hypot(float((spread * is_whole).sum().sqrt() / count), energy_error)
+
+
+def _judge_one(
+    probe: Probe, risk: Tensor, least_risk: Tensor, is_whole: Tensor, reach_of_best: tuple[float, float]
+) -> Judged:
+    """Judge one denoiser beside the best, without the values that are clipped.
+
+    ``reach_of_best`` is how far the error of the best denoiser may be below and above its estimate.
+    """
+    count = is_whole.sum().clamp_min(1)
+    error = float((risk * is_whole).sum() / count)
 
     size = _pool(is_whole.to(risk))
     is_judged = size > 0.5
     difference = float(((risk - least_risk) * is_whole).sum() / count)
     by_block = (_pool((risk - least_risk) * is_whole) / size.clamp_min(0.5))[is_judged]
     reach = _NORMAL * float(by_block.std() / math.sqrt(max(1, by_block.numel()))) if by_block.numel() > 1 else math.inf
+    interval = (
+        _decibels(error + math.hypot(reach_of_best[1], reach)),
+        _decibels(error - math.hypot(reach_of_best[0], reach)),
+    )
     least = max(error - difference, 1e-12)
     behind = []
     for step in (difference, difference - reach, difference + reach):
@@ -275,7 +299,9 @@ def _developed(probe: Probe, image: Tensor, develop: Callable[[Tensor], Tensor],
     energy = carry(noise).square().mean()
     # sigma^2 b / e = sigma^2 e / e^2, and e^2 is the same multiple of sigma^2 everywhere
     scale = (probe.variance / probe.change.square()).mean()
-    kept = (carry(probe.change) * carry(probe.response)).mean() * scale
+    kept = torch.zeros(())
+    for change, response in zip(probe.change, probe.response, strict=True):
+        kept += (carry(change[None]) * carry(response[None])).mean() * scale / len(probe.change)
     return _decibels(float(removed - energy + 2.0 * kept))
 
 

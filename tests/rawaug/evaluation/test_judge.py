@@ -15,7 +15,7 @@ import rawaug
 from rawaug import RawDenoiser, bayer
 from rawaug.commands.judge import run
 from rawaug.denoising.denoiser import Noisy
-from rawaug.denoising.risk import estimate_risk, probe_denoiser
+from rawaug.denoising.risk import bootstrap_error, combine_estimates, estimate_risk, probe_denoiser
 from rawaug.evaluation.judge import judge_noisy
 from rawaug.io import RawFrame, write_dng
 from rawaug.metrics import psnr
@@ -69,6 +69,41 @@ def test_the_risk_of_a_linear_filter_is_that_of_algebra() -> None:
     assert sum(shares) / 4 == pytest.approx(1 / 9, abs=0.012)
     with pytest.raises(ValueError, match="levels"):
         probe_denoiser(blurring(3), Noisy(clean))
+
+
+def test_noise_drawn_on_the_result_tells_what_the_energy_of_the_noise_hides() -> None:
+    """Non-local means leave so little of a smooth light that the unbiased estimate errs by more than a third."""
+    clean = 0.3 + 0.1 * torch.linspace(0.0, 1.0, 64).expand(1, 4, 64, 64)
+    everywhere = torch.ones_like(clean, dtype=torch.bool)
+    denoiser = RawDenoiser.of("NonLocalMeans")
+    unbiased, combined = [], []
+    for seed in range(6):
+        noisy = noisy_of(clean, seed)
+        assert noisy.levels is not None
+        probe = probe_denoiser(denoiser, noisy, seed, count=2)
+        truth = float((probe.denoised - clean).square().mean())
+        risk = float(estimate_risk(probe, noisy.image, noisy.levels).mean())
+        deviation = math.sqrt(2.0 / clean.numel()) * float(probe.variance.mean())
+        median, low, high = combine_estimates(risk, deviation, bootstrap_error(denoiser, probe, noisy, everywhere))
+        assert low < median < high
+        unbiased.append(risk / truth - 1.0)
+        combined.append(median / truth - 1.0)
+    assert max(map(abs, combined)) < 0.2 and max(map(abs, unbiased)) > 0.35
+
+
+def test_the_unbiased_estimate_decides_where_it_is_precise() -> None:
+    assert combine_estimates(2.0, 0.01, 1.0)[0] == pytest.approx(2.0, rel=0.01)
+    assert combine_estimates(-1.0, 1.0, 1.0)[0] == pytest.approx(1.0, rel=0.1)
+    assert combine_estimates(5.0, 1.0, 1.0)[2] > combine_estimates(1.0, 1.0, 1.0)[2] + 0.5, "a large one may be true"
+
+
+def test_several_changes_scatter_less(denoisers: list[RawDenoiser]) -> None:
+    noisy = noisy_of(scene(128))
+    kept = [
+        [float(probe_denoiser(denoisers[0], noisy, seed, count).kept.std()) for seed in range(2)] for count in (1, 4)
+    ]
+    assert max(kept[1]) < 0.6 * min(kept[0])
+    assert judge_noisy(noisy, denoisers, probes=2).denoisers.keys() == judge_noisy(noisy, denoisers).denoisers.keys()
 
 
 def test_the_estimate_is_the_truth_within_its_interval_and_finds_the_order(denoisers: list[RawDenoiser]) -> None:
