@@ -5,7 +5,7 @@ r"""What was measured, for the pages that show it: ``docs/figures.json``.
 
 A set of figures has a name, the command, commit, machine and seed it comes from, its frames, and the SHA-256 of the
 shipped networks among its columns. Figures are texts by row and column, as pages show them. ``RESULT.json`` is what
-``rawaug benchmark``, ``benchmarks.bracket`` or ``benchmarks.strengths`` wrote; another benchmark calls :func:`record`.
+``rawaug benchmark``, ``benchmarks.bracket``, ``.strengths`` or ``.strong_pictures`` wrote; others call :func:`record`.
 ``python .ci/figures.py`` then puts the figures into the pages, and a test fails when a network is no longer the one
 that was measured.
 
@@ -31,6 +31,7 @@ from scipy import stats
 
 from benchmarks.measure import machine, parser
 from benchmarks.strengths import GUARD
+from benchmarks.strong_pictures import KINDS
 from denoisers.files import find_denoiser, list_shipped
 from rawaug.evaluation.benchmark import TOLD
 from rawaug.evaluation.figures import plot_costs
@@ -63,7 +64,8 @@ def record(
 
     Args:
         name: the name of the set.
-        figures: texts by row and column; a column with the name of a shipped network is that network.
+        figures: texts by row and column; a column with the name of a shipped network, or with more behind a comma, is
+            that network.
         command: what measured them.
         frames: what they were measured on.
         seed: seed of the noise or of the training.
@@ -79,7 +81,8 @@ def record(
     columns = {column for row in figures.values() for column in row}
     if networks is None:
         networks = {column: sha256(find_denoiser(column)) for column in list_shipped()}
-    networks = {column: networks[column] for column in sorted(columns & networks.keys())}
+    names = {column.partition(", ")[0] for column in columns}
+    networks = {name: networks[name] for name in sorted(names & networks.keys())}
 
     sets = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     sets[name] = {
@@ -234,6 +237,31 @@ def figures_of_bracket(result: Mapping[str, Any]) -> dict[str, dict[str, str]]:
     return figures
 
 
+def figures_of_strong_pictures(scores: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, str]]:
+    """The table of ``benchmarks.strong_pictures``, and by how much ours, blind and told 40, are ahead of all others."""
+    figures: dict[str, dict[str, str]] = {}
+    for kind in KINDS:
+        for spec, by_kind in scores.items():
+            decibels, similarity = zip(*by_kind[kind], strict=True)
+            figures.setdefault(kind, {})[_told(spec)] = f"{fmean(decibels):.2f} / {fmean(similarity):.4f}"
+
+            for ours, words in (("rawaug-srgb", "blind"), ("rawaug-srgb@40", "told 40")):
+                if spec == ours or ours not in scores:
+                    continue
+                gains = [one[0] - other[0] for one, other in zip(scores[ours][kind], by_kind[kind], strict=True)]
+                low, high = paired_interval(gains)
+                cell = f"{fmean(gains):+.2f} ({low:+.2f} to {high:+.2f})"
+                figures.setdefault(f"{kind}, {words} ahead", {})[_told(spec)] = cell
+    return figures
+
+
+def _told(spec: str) -> str:
+    """The name of a denoiser of pictures in a table: ``FFDNet+refill@25`` is *FFDNet, refilled, told 25*."""
+    name, _, level = spec.partition("@")
+    name = Path(name).name.replace("ffdnet_color.safetensors", "FFDNet").replace("+refill", ", refilled")
+    return f"{name}, told {level}" if level else name
+
+
 def plot_row(figures: Mapping[str, Mapping[str, str]], row: str) -> bytes:
     """Plot the PSNR of a row over the operations of its denoisers, as PNG."""
     points: dict[str, tuple[float | None, float, float]] = {}
@@ -273,6 +301,8 @@ def main(command: Sequence[str] | None = None) -> None:
     if "harm" in result:
         figures = figures_of_harm(result["harm"])
         on = on or ", ".join(result["frames"])
+    elif "finished" in result.get("noisy", ()):
+        figures = figures_of_strong_pictures(result)
     elif "rows" in result:
         figures = figures_of_benchmark(result, args.frames or " ".join(result["frames"]))
         on = on or args.frames or ", ".join(result["frames"])

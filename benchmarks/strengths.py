@@ -51,6 +51,7 @@ def main(command: Sequence[str] | None = None) -> None:
         "--noise", type=parse_value, help="noise in place of the four strengths, as for rawaug benchmark"
     )
     options.add_argument("--crop", type=int, default=256, help="side of the middles, in pixels of the mosaic")
+    options.add_argument("--middle", type=int, help="draw the noise on a middle of this side, of frames that are large")
     options.add_argument("--sensors", action="store_true", help="score sensors as they are, too")
     options.add_argument("--threads", type=int, default=torch.get_num_threads())
     args = options.parse_args(command)
@@ -60,18 +61,25 @@ def main(command: Sequence[str] | None = None) -> None:
     conditions = [TOLD, REAL] if args.sensors else [TOLD]
 
     for name in args.sets:
-        everything = [trial for trial in frozen_trials(name, args.crop, args.noise) if trial.condition in conditions]
+        everything = [
+            trial for trial in frozen_trials(name, args.crop, args.noise, args.middle) if trial.condition in conditions
+        ]
         for spec in ["noisy", *args.denoisers]:
             add_scores(table, name, spec, everything, args.table)
     add_costs(table, args.denoisers, args.table)
     print_table(table)
 
 
-def frozen_trials(spec: str, crop: int, noise: NoiseSpec | None = None) -> list[Trial]:
-    """The middles of all frames of a set, such as ``FOLDER@4``, under every condition and strength."""
+def frozen_trials(spec: str, crop: int, noise: NoiseSpec | None = None, middle: int | None = None) -> list[Trial]:
+    """The middles of all frames of a set, such as ``FOLDER@4``, under every condition and strength.
+
+    Noise is drawn on whole frames, or on a ``middle`` of this side.
+    """
     data, _, factor = spec.partition("@")
     pairs = open_pairs(data, split="test")
     frames = measure_own_noise(pairs, len(pairs)).binned(int(factor or 1))
+    if middle is not None:
+        frames = frames.middles(middle)
     return trials(frames, crop, strengths=choose_strengths(noise))
 
 

@@ -210,13 +210,22 @@ def test_figures_of_harm() -> None:
     assert cells == ["47.72", "99", "60.87"]
 
 
+def test_figures_of_strong_pictures() -> None:
+    ours, theirs = ([[26.0, 0.8], [28.0, 0.9]], [[25.0, 0.7], [26.8, 0.8]])
+    scores = {"rawaug-srgb": ours, "/x/ffdnet_color.safetensors+refill@25": theirs}
+    rows = figures.figures_of_strong_pictures({name: {"finished": s, "JPEG": s} for name, s in scores.items()})
+    assert rows["JPEG"] == {"rawaug-srgb": "27.00 / 0.8500", "FFDNet, refilled, told 25": "25.90 / 0.7500"}
+    assert rows["finished, blind ahead"]["FFDNet, refilled, told 25"].startswith("+1.10 (")
+    assert "finished, told 40 ahead" not in rows
+
+
 def test_figures_are_recorded_with_their_network(tmp_path: Path) -> None:
     path = tmp_path / "figures.json"
     for psnr in ("1.00", "2.00"):
-        row = {"strong": {"rawaug-small": psnr, "PBRID": "0.00"}}
+        row = {"strong": {"rawaug-small, guarded": psnr, "PBRID": "0.00"}}
         figures.record("set", row, "rawaug benchmark", "none", commit="abc", path=path)
     recorded = json.loads(path.read_text())["set"]
-    assert recorded["figures"]["strong"]["rawaug-small"] == "2.00" and recorded["commit"] == "abc"
+    assert recorded["figures"]["strong"]["rawaug-small, guarded"] == "2.00" and recorded["commit"] == "abc"
     assert recorded["networks"] == {"rawaug-small": sha256(find_denoiser("rawaug-small"))}
 
 
