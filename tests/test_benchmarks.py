@@ -18,6 +18,7 @@ from benchmarks import (
     figures,
     gpu,
     ingredients,
+    judging,
     measure,
     patterns,
     pictures,
@@ -198,6 +199,18 @@ def test_figures_of_strengths_and_the_picture_of_their_costs() -> None:
     shown = [rows[f"{name}, strong"]["rawaug-base"] for name in ("hero", "hero6", "hero7")]
     assert [cell.replace("*", "").split(" / ")[0] for cell in shown] == ["42.00", "40.00", "43.00"]
     assert figures.plot_row(rows, "hero, strong").startswith(b"\x89PNG")
+
+
+def test_an_order_is_contradicted_only_by_intervals_that_are_apart() -> None:
+    """A cell is estimate, its interval, truth, and the interval of what it is behind the best by."""
+    best, near = [41.0, 40.5, 41.5, 40.9, 0.0, 0.0], [40.9, 40.4, 41.4, 41.0, -0.1, 0.3]
+    row = judging.summarise([{"best": best, "near": near}] * 2)
+    assert row["exchanged"] == pytest.approx(0.1) and row["contradicted"] == 0.0 and row["held"] == 4
+
+    far = [*near[:4], 0.05, 0.15]
+    row = judging.summarise([{"best": best, "far": far}] * 2)
+    assert row["exchanged"] == row["contradicted"] == pytest.approx(0.1)
+    assert judging.summarise([{"best": best, "far": [*far[:3], 40.8, *far[4:]]}])["exchanged"] == 0.0
 
 
 def test_figures_of_harm() -> None:
