@@ -22,8 +22,8 @@ from rawaug.data.pairs import Pair
 from rawaug.data.phones import PhoneFrames
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
+from rawaug.isp.fit.atoms import measure_gain_errors, plausible_matrices
 from rawaug.isp.fit.samples import CLIPPED_RAW, sample_pixels
-from rawaug.isp.fit.start import measure_gain_errors, plausible_matrices
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import worst_and_best_quarter
 

@@ -177,9 +177,13 @@ class ToneMap(Stage):
         super().__init__(config)
         self.reverse_network = ToneNetwork()
         self.forward_network = ToneNetwork()
+        self.toe: Tensor | None = None
+        """a of ``x1 = x + a (1 - x)``, a scalar, which is the reverse pass at the start of a fit; None else."""
 
     def reverse(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:
         """Compute x1 from sRGB, both ``(B, 3, H, W)``, by the reverse network."""
+        if self.toe is not None:
+            return x + self.toe * (1.0 - x)
         return self.reverse_network(x)
 
     def forward(self, x: Tensor, params: ISPParams | None, coordinates: Tensor | None = None) -> Tensor:

@@ -4,13 +4,6 @@ The loss on RAW is ``(y_hat - y)^2 / (4 (y_hat + 0.01))``, with the denominator 
 the error of a reading proportional to its square root, and weights that do not depend on ``y`` keep noise unbiased.
 The loss on sRGB includes the images between the stages (Conde et al., AAAI 2022, "Training").
 
-*Encoders* are trained last, with tone and dictionaries frozen, on the RAW that either direction's weights make:
-``L = sum_f log(MSE_f(w_r) + eps) + log(MSE_f(w_f) + eps) + c |w_r - w_f|^2``. For every fold, curve, tone and atoms are
-fitted anew without its frames, then constants and encoders are compared on these. *End-to-end training* refines an ISP
-that is already fitted: ``L = |y_hat - y|^2 + |x_hat - x|^2 + 0.1 sum_k |x_k^f - x_k^r|^2 + 0.01 |w_r - w_f|^2`` on
-random pixels of random frames, with the weights that both encoders choose. A tenth of the frames is watched, and the
-best parameters are restored.
-
 A fit has stages; a stage is a loss and its tensors. The draws of a step are keyed by (seed, stage, step), so that a
 resumed fit ends with the same bits as one that was not stopped.
 """
@@ -20,7 +13,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -30,11 +22,15 @@ from torch import Tensor
 from rawaug.files import read_tensors, write_tensors
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.samples import FitFrames, FrameSummary, PixelSamples
-from rawaug.isp.fit.start import measure_lights
+from rawaug.isp.fit.samples import FitFrames, PixelSamples
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.stages import ToneMap
+from rawaug.isp.tone import ToneCurve
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
+
+_MOST_FRAMES = 16
+"""Maximum number of frames in a step of the fit without encoders."""
 
 
 def reading_error(predicted: Tensor, part: PixelSamples) -> Tensor:
@@ -70,18 +66,12 @@ def cycle_error(
     return (error * part.cell_weight).sum() / (3.0 * part.cell_weight.sum()).clamp_min(1.0)
 
 
-def mean_square(isp: DictionaryISP, part: PixelSamples, params: ISPParams) -> Tensor:
+def frame_mse(isp: DictionaryISP, part: PixelSamples, params: ISPParams) -> Tensor:
     """Compute the mean squared error of every frame ``(F,)`` on its unclipped pixels."""
     count = len(part.srgb)
     params = params.map(lambda tensor: tensor.expand(count, *tensor.shape[1:]))
     error = (isp.reverse_pixels(part.srgb, params, part.coordinates) - part.target) ** 2 * part.known
     return error.sum((1, 2, 3)) / part.known.sum((1, 2, 3)).clamp_min(1.0)
-
-
-def _weight_distance(ours: ISPParams, theirs: ISPParams) -> Tensor:
-    """Compute ``|w_r - w_f|^2``, the sum over both dictionaries, a scalar."""
-    colour = (ours.colour_weights - theirs.colour_weights).square().sum()
-    return colour + (ours.gain_weights - theirs.gain_weights).square().sum()
 
 
 @torch.no_grad()
@@ -91,7 +81,7 @@ def mean_psnr(isp: DictionaryISP, frames: FitFrames, as_shot: bool = False) -> f
     for number, shot in enumerate(frames.shots):
         balance = shot.white_balance if as_shot else None
         params = isp.with_white_balance(isp.choose(shot.srgb), balance)
-        values.append(mean_square(isp, frames.some([number]).pixels, params))
+        values.append(frame_mse(isp, frames.some([number]).pixels, params))
 
     return float(-10.0 * torch.cat(values).log10().mean())
 
@@ -125,6 +115,39 @@ def adam(
         optimiser.step()
         step += 1
         yield value.detach()
+
+
+def draw_batch(pixels: PixelSamples, count: int, generator: torch.Generator) -> tuple[Tensor | slice, PixelSamples]:
+    """Draw the frames of a step (all, if there are few) and ``count`` random pixels, the same numbers of each frame."""
+    frames: Tensor | slice = slice(None)
+    if len(pixels.srgb) > _MOST_FRAMES:
+        frames = torch.randperm(len(pixels.srgb), generator=generator)[:_MOST_FRAMES]
+
+    drawn = pixels.srgb.shape[-1]
+    index = torch.randint(drawn, (min(count, drawn),), generator=generator)
+    return frames, pixels.pick(index, frames)
+
+
+def trained_tensors(isp: DictionaryISP, forward: bool, up_to: int = 5) -> dict[str, Tensor]:
+    """The tensors of the stages that a fit of a pass changes, as ``stage.name``, of the stages that make x1 ... x_k.
+
+    Parameters whose names start with ``forward_`` belong to the forward pass, all others to the reverse pass. At the
+    start of a fit, the toe stands for the tone network.
+    """
+    tensors: dict[str, Tensor] = {}
+    for stage in isp.ordered_stages:
+        if stage.makes > up_to:
+            continue
+        if isinstance(stage, ToneMap) and stage.toe is not None and not forward:
+            tensors[f"{stage.name}.toe"] = stage.toe
+            continue
+
+        for key, parameter in stage.named_parameters():
+            if key.startswith("forward_") == forward:
+                tensors[f"{stage.name}.{key}"] = parameter
+        if isinstance(stage, ToneCurve) and stage.slopes is not None and not forward:
+            tensors[f"{stage.name}.slopes"] = stage.slopes
+    return tensors
 
 
 class Descent:
@@ -172,16 +195,22 @@ class Descent:
             watch: gives a score on held-out frames; the stage then ends with the tensors that scored best.
         """
 
-        def scores(step: int) -> str:
+        def evaluate(step: int) -> str:
             text = ""
             if report is not None and step:
                 text += report()
             if watch is not None:
-                text += self._note(stage, step, watch(), tensors)
+                score = watch()
+                scores = self.scores.setdefault(stage, [])
+                if not scores or score > self.best(stage)[1]:
+                    self._keep(stage, tensors)
+                scores.append((step, score))
+                text += f"held out {score:.2f} dB"
             return text
 
-        if not self._has_end(stage, tensors):
-            scores(0)
+        is_done = all(f"{stage}/{name}" in self._ends for name in tensors)
+        if not is_done:
+            evaluate(0)
             for tensor in tensors.values():
                 tensor.requires_grad_()
 
@@ -196,7 +225,7 @@ class Descent:
             for step, value in enumerate(bar, 1):
                 losses.append(value)
                 if step % self.report_steps == 0 or step == steps:
-                    bar.set_postfix_str(f"loss {torch.stack(losses).mean():.2e} {scores(step)}", refresh=False)
+                    bar.set_postfix_str(f"loss {torch.stack(losses).mean():.2e} {evaluate(step)}", refresh=False)
                     losses.clear()
 
             if watch is None:
@@ -208,264 +237,16 @@ class Descent:
             tensor.data.copy_(self._ends[f"{stage}/{name}"])
             tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
 
+    def _keep(self, stage: str, tensors: Mapping[str, Tensor]) -> None:
+        for name, tensor in tensors.items():
+            self._ends[f"{stage}/{name}"] = tensor.detach().clone()
+
     def best(self, stage: str) -> tuple[int, float]:
         """The first step of a watched stage that scored best, and its score."""
         step, score = max(self.scores[stage], key=lambda entry: entry[1])
         return step, score
 
-    def curve(self, stage: str) -> list[float]:
-        """At most :data:`CURVE_POINTS` scores of a watched stage, with the first and the last, to two decimals."""
-        scores = self.scores[stage]
-        last = len(scores) - 1
-        count = min(CURVE_POINTS, last + 1)
-        numbers = [round(k * last / max(1, count - 1)) for k in range(count)]
-        return [round(scores[number][1], 2) for number in numbers]
-
     def finish(self) -> None:
         """Remove the state, because the fit is done."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
-
-    def _has_end(self, stage: str, tensors: Mapping[str, Tensor]) -> bool:
-        return all(f"{stage}/{name}" in self._ends for name in tensors)
-
-    def _keep(self, stage: str, tensors: Mapping[str, Tensor]) -> None:
-        for name, tensor in tensors.items():
-            self._ends[f"{stage}/{name}"] = tensor.detach().clone()
-
-    def _note(self, stage: str, step: int, score: float, tensors: Mapping[str, Tensor]) -> str:
-        """Note a score, and the tensors if it is the best so far."""
-        scores = self.scores.setdefault(stage, [])
-        if not scores or score > self.best(stage)[1]:
-            self._keep(stage, tensors)
-        scores.append((step, score))
-        return f"held out {score:.2f} dB"
-
-
-FRAMES_A_STEP = 4
-ENCODER_PIXELS, ENCODER_RATE = 1024, 1e-3
-FEWEST_FRAMES, FOLDS = 12, 4
-"""For encoders with "auto": the minimum number of frames, and the number of folds of the cross-validation."""
-
-_MANY_FRAMES = 50
-"""Minimum number of frames for end-to-end training by default."""
-STEPS, LEARNING_RATE = 1000, 2e-4
-"""Number of steps, and learning rate, of end-to-end training."""
-_CONSISTENCY = 0.01
-"""Weight of the distance between the weights of both directions."""
-PUBLISHED_RATE, PUBLISHED_FRAMES, _PUBLISHED_PIXELS = 2e-3, 8, 256
-"""Rate of the published fit, which learns nearly everything end to end, and frames and pixels in a step."""
-_LOG_WEIGHT = 0.02
-"""Weight of the logarithm of an error beside the squared errors of the other pass."""
-CURVE_POINTS = 13
-"""Number of scores of a watched training in an ISP's record."""
-_LOSS_SCALE = 1e4
-"""Factor on squared errors: they are near 1e-4, and the encoders' share would vanish beside Adam's epsilon of 1e-8."""
-
-Refit = Callable[[FitFrames, str, FitConfig], DictionaryISP]
-"""A function that fits an ISP without encoders to some frames; the text names the fit in its progress."""
-
-
-def _gain_left_out(frames: FitFrames, folds: int, gain: Callable[[FitFrames, FitFrames, str], float]) -> float:
-    """Average ``gain(left out, kept, name of the fold)`` over the frames, each of which is left out once."""
-    count = len(frames.shots)
-    total = 0.0
-    for fold in range(folds):
-        out, kept = frames.split(range(fold, count, folds))
-        total += len(out.shots) * gain(out, kept, f" without part {fold + 1} of {folds}")
-
-    return total / count
-
-
-def with_better_tone(frames: FitFrames, config: FitConfig, refit: Refit) -> tuple[FitConfig, float | None]:
-    """Decide the setting ``tone``; also return the gain of the curve in dB if both were compared."""
-    if config.tone != "auto":
-        return config, None
-    if len(frames.shots) < 2:
-        return replace(config, tone="learned"), None
-
-    def better(out: FitFrames, kept: FitFrames, part: str) -> float:
-        learned = refit(kept, f", learned{part}", replace(config, tone="learned"))
-        curve = refit(kept, f", curve{part}", replace(config, tone="curve"))
-        return mean_psnr(curve, out, True) - mean_psnr(learned, out, True)
-
-    gain = _gain_left_out(frames, min(FOLDS, len(frames.shots)), better)
-    return replace(config, tone="curve" if gain > 0 else "learned"), gain
-
-
-def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent, refit: Refit) -> None:
-    """Train the encoders, or keep the constants, as ``config.encoders`` says.
-
-    Args:
-        isp: the ISP, fitted up to its atoms.
-        frames: all frames of the fit.
-        config: the settings of the fit.
-        descent: runs the training.
-        refit: fits an ISP without encoders to some of the frames, to judge encoders on the others.
-    """
-
-    def better(out: FitFrames, kept: FitFrames, part: str) -> float:
-        """Compute by how many dB encoders beat constants on frames that no stage of the fit has seen."""
-        refitted = refit(kept, part, config)
-        refitted.use_encoders(False)
-        constants = mean_psnr(refitted, out)
-        _train(refitted, kept, config, descent, f"encoders{part}")
-        return mean_psnr(refitted, out) - constants
-
-    mode = config.encoders
-    isp.use_encoders(False)
-    if mode == "auto" and len(frames.shots) >= FEWEST_FRAMES:
-        gain = _gain_left_out(frames, FOLDS, better)
-        isp.info["encoders_gain_db"] = round(gain, 2)
-        mode = "on" if gain > 0 else "off"
-
-    if mode == "on":
-        _train(isp, frames, config, descent, "encoders")
-
-
-def _train(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent, stage: str) -> None:
-    isp.use_encoders(True, descent.seed)
-    tensors = {}
-    for name, parameter in isp.named_parameters():
-        if "_encoders." in name and ".layers." in name:
-            tensors[name] = parameter
-
-    def loss(generator: torch.Generator) -> Tensor:
-        # The frames of a step have the same random pixels.
-        numbers = torch.randint(len(frames.shots), (FRAMES_A_STEP,), generator=generator).tolist()
-        index = torch.randint(frames.pixels.srgb.shape[-1], (ENCODER_PIXELS,), generator=generator)
-
-        losses = []
-        for number in numbers:
-            part, shot = frames.pixels.pick(index, torch.tensor([number])), frames.shots[number]
-            losses.append(_encoder_loss(isp, part, shot, config, generator))
-        return torch.stack(losses).mean()
-
-    descent.run(stage, loss, tensors, config.encoder_steps, ENCODER_RATE)
-
-
-def _encoder_loss(
-    isp: DictionaryISP, part: PixelSamples, shot: FrameSummary, config: FitConfig, generator: torch.Generator
-) -> Tensor:
-    srgb, raw = _same_piece(shot.srgb, isp.remove_shading(shot.raw, None), generator)
-    ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
-    our_error = (mean_square(isp, part, ours) + config.mse_floor).log()
-    their_error = (mean_square(isp, part, theirs) + config.mse_floor).log()
-    return (our_error + their_error).sum() + config.consistency * _weight_distance(ours, theirs)
-
-
-def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Cut the same random piece from both thumbnails, maybe flipped, so that the encoders cannot learn the frames."""
-    share = 0.5 + 0.5 * torch.rand(2, generator=generator)
-    start = torch.rand(2, generator=generator) * (1.0 - share)
-    flip = bool(torch.rand((), generator=generator) < 0.5)
-    pieces = []
-    for image in (srgb, raw):
-        sides = torch.tensor(image.shape[-2:])
-        top, left = (start * sides).long().tolist()
-        height, width = (share * sides).long().clamp_min(1).tolist()
-        piece = image[..., top : top + height, left : left + width]
-        pieces.append(piece.flip(-1) if flip else piece)
-
-    return pieces[0], pieces[1]
-
-
-def joint_steps(config: FitConfig, frames: int) -> int:
-    """The number of steps of end-to-end training on this number of frames."""
-    if config.joint_steps is not None:
-        return config.joint_steps
-    return STEPS if frames >= _MANY_FRAMES else 0
-
-
-def train_jointly(
-    isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent, watched: FitFrames | None = None
-) -> FitFrames | None:
-    """Refine everything at once, if ``config.joint_steps`` asks for it; the gain is noted in ``isp.info``.
-
-    The properties of the atoms that as-shot gains depend on are measured anew afterwards.
-
-    Args:
-        isp: the fitted ISP.
-        frames: all frames of the fit.
-        config: the settings of the fit.
-        descent: runs the training.
-        watched: frames that choose the best step; by default a tenth of the others, which is held out.
-
-    Returns:
-        The watched frames; None without a training.
-    """
-    count = len(frames.shots)
-    steps = joint_steps(config, count)
-    if steps == 0:
-        return None
-    if watched is None and count < 2:
-        raise ValueError("joint_steps: end-to-end training holds frames out for validation; give two frames or more")
-
-    trained = frames
-    if watched is None:
-        watched, trained = frames.split(range(0, count, 10)[: max(1, count // 2)])
-
-    published = config.method == "published"
-    frames_a_step, pixels, rate = FRAMES_A_STEP, config.batch, LEARNING_RATE
-    if published:
-        frames_a_step, pixels, rate = PUBLISHED_FRAMES, min(config.batch, _PUBLISHED_PIXELS), PUBLISHED_RATE
-
-    def loss(generator: torch.Generator) -> Tensor:
-        losses = []
-        for part, srgb, raw in _draw_batches(trained, frames_a_step, pixels, generator):
-            raw = isp.remove_shading(raw, None)
-            if published:
-                srgb, raw = _same_piece(srgb, raw, generator)
-
-            losses.append(len(srgb) * _joint_loss(isp, part, srgb, raw, config))
-
-        return _LOSS_SCALE * torch.stack(losses).sum() / frames_a_step
-
-    tensors = dict(isp.named_parameters())
-    descent.run("end to end", loss, tensors, steps, rate, watch=lambda: mean_psnr(isp, watched))
-
-    step, score = descent.best("end to end")
-    if step > 0:
-        measure_lights(isp, trained)
-    _, first_score = descent.scores["end to end"][0]
-    isp.info["joint"] = {
-        "steps": steps,
-        "kept_step": step,
-        "gain_db": round(score - first_score, 2),
-        "curve": descent.curve("end to end"),
-    }
-    return watched
-
-
-def _draw_batches(
-    frames: FitFrames, count: int, pixels: int, generator: torch.Generator
-) -> list[tuple[PixelSamples, Tensor, Tensor]]:
-    """Draw ``count`` frames, with replacement, in batches of one size: pixels, thumbnails of sRGB and of RAW."""
-    numbers = torch.randint(len(frames.shots), (count,), generator=generator).tolist()
-    index = torch.randint(frames.pixels.srgb.shape[-1], (pixels,), generator=generator)
-    groups: dict[tuple[torch.Size, torch.Size], list[int]] = {}
-    for k in numbers:
-        shot = frames.shots[k]
-        groups.setdefault((shot.srgb.shape, shot.raw.shape), []).append(k)
-
-    batches = []
-    for members in groups.values():
-        shots = [frames.shots[k] for k in members]
-        srgb = torch.cat([shot.srgb for shot in shots])
-        raw = torch.cat([shot.raw for shot in shots])
-        batches.append((frames.pixels.pick(index, torch.tensor(members)), srgb, raw))
-
-    return batches
-
-
-def _joint_loss(isp: DictionaryISP, part: PixelSamples, srgb: Tensor, raw: Tensor, config: FitConfig) -> Tensor:
-    """Compute the loss of B frames: ``srgb`` ``(B, 3, h, w)`` and ``raw`` ``(B, 3, h', w')``, without shading."""
-    ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
-    back: dict[str, Tensor] = {}
-    back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.coordinates, back)
-    cycle = cycle_error(isp, part, theirs, back, config)
-    distance = _weight_distance(ours, theirs) / len(srgb)
-    error = mean_square(isp, part, ours)
-    if config.raw_loss == "log":
-        error = _LOG_WEIGHT * (error + config.mse_floor).log()
-    return error.mean() + cycle + _CONSISTENCY * config.consistency * distance

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,31 +30,15 @@ from rawaug.camera.own import Camera
 from rawaug.files import digest
 from rawaug.isp import functional, stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
+from rawaug.isp.fit.atoms import REACH_ATOMS, measure_gain_errors, set_dictionaries
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.curve import StartCurve, start_forward, trained_tensors
-from rawaug.isp.fit.descent import (
-    Descent,
-    adam,
-    cycle_error,
-    reading_error,
-    train_encoders,
-    train_jointly,
-    with_better_tone,
-)
+from rawaug.isp.fit.descent import Descent, adam, cycle_error, draw_batch, mean_psnr, reading_error, trained_tensors
+from rawaug.isp.fit.encoders import Refit, gain_left_out, train_encoders, train_jointly
 from rawaug.isp.fit.samples import FitFrames, FramePair, FrameSummary, PixelSamples, sample_pixels
-from rawaug.isp.fit.start import (
-    FEWEST_PIXELS,
-    REACH_ATOMS,
-    FrameColour,
-    Tie,
-    fit_fall_off,
-    least_squares,
-    measure_gain_errors,
-    set_dictionaries,
-)
+from rawaug.isp.fit.start import FEWEST_PIXELS, FrameColour, fit_colours, fit_fall_off, linear_light, set_curve, tie
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import LensShading
-from rawaug.isp.tone import to_linear
+from rawaug.isp.stages import Gamma, LensShading, ToneMap
+from rawaug.isp.tone import ToneCurve, to_linear
 from rawaug.kernels.runtime import one_thread
 from rawaug.progress import progress as progress_of
 from rawaug.seeding import derive_seed
@@ -67,8 +52,6 @@ _DIMMEST = 0.01
 """Minimum share of a corner's light that a mask must take to be tried."""
 _SHADING_PAYS = 0.5
 """Maximum ratio of the squared errors with and without a mask for keeping the mask."""
-FRAMES_A_STEP = 16
-"""Maximum number of frames in a step."""
 _START_STEPS, _START_RATE = 1000, 3e-3
 """Number of steps, and rate, of the descent that brings the tone near that of the ISP that a fit starts from."""
 _MOST_LEFT_OUT = 0.1
@@ -107,30 +90,36 @@ def fit_isp(
     held_out: FitFrames | None = None
     if watched is not None:
         held_out = sample_pixels(watched, config.pixels, config.seed, config.noisy)
-    path = None if state is None else Path(state)
-    descent = Descent(path, _key(config, frames, camera), config.seed, progress)
+
+    # A kept state is used only by a fit with the same settings and pixels.
+    facts: list[Any] = [__version__, config]
+    facts.append([(shot.name, shot.camera, shot.white_balance) for shot in frames.shots])
+    if camera is not None:
+        facts.append(camera)
+    settings = repr(tuple(facts)).encode()
+    key = digest(settings, frames.pixels.srgb.numpy().tobytes(), frames.pixels.target.numpy().tobytes())
+    descent = Descent(None if state is None else Path(state), key, config.seed, progress)
 
     def refit(some: FitFrames, part: str, config: FitConfig) -> DictionaryISP:
-        return _Fit(some, config, descent, part, camera).fit_reverse()
+        isp, _ = fit_reverse(some, config, descent, part, camera)
+        return isp
 
     with one_thread():
-        config, gain = with_better_tone(frames, config, refit)
-        fit = _Fit(frames, config, descent, camera=camera)
-        fit.fit_reverse(report)
-        train_encoders(fit.isp, frames, config, descent, refit)
-        fit.fit_forward()
-        held_out = train_jointly(fit.isp, frames, config, descent, held_out)
-        measure_gain_errors(fit.isp, held_out)
+        config, gain = choose_tone(frames, config, refit)
+        isp, colour = fit_reverse(frames, config, descent, camera=camera, report=report)
+        train_encoders(isp, frames, config, descent, refit)
+        fit_forward(isp, colour, frames, config, descent)
+        held_out = train_jointly(isp, frames, config, descent, held_out)
+        measure_gain_errors(isp, held_out)
 
     descent.finish()
-    info = fit.isp.info
     if gain is not None:
-        info["curve_gain_db"] = round(gain, 2)
-    info["registered"] = sum(shot.registered for shot in frames.shots)
-    info["frames"] = [shot.name for shot in frames.shots]
-    info["steps"] = config.steps
-    info["seed"] = config.seed
-    return fit.isp.eval()
+        isp.info["curve_gain_db"] = round(gain, 2)
+    isp.info["registered"] = sum(shot.registered for shot in frames.shots)
+    isp.info["frames"] = [shot.name for shot in frames.shots]
+    isp.info["steps"] = config.steps
+    isp.info["seed"] = config.seed
+    return isp.eval()
 
 
 def _with_enough_pixels(frames: FitFrames) -> FitFrames:
@@ -159,18 +148,23 @@ def _with_enough_pixels(frames: FitFrames) -> FitFrames:
     return frames.some(good)
 
 
-def _key(config: FitConfig, frames: FitFrames, camera: Camera | None) -> str:
-    """Hash the settings and pixels that identify a kept state."""
-    facts: list[Any] = [__version__, config]
-    facts.append([(shot.name, shot.camera, shot.white_balance) for shot in frames.shots])
-    if camera is not None:
-        facts.append(camera)
+def choose_tone(frames: FitFrames, config: FitConfig, refit: Refit) -> tuple[FitConfig, float | None]:
+    """Decide the setting ``tone``; also return the gain of the curve in dB if both were compared."""
+    if config.tone != "auto":
+        return config, None
+    if len(frames.shots) < 2:
+        return replace(config, tone="learned"), None
 
-    settings = repr(tuple(facts)).encode()
-    return digest(settings, frames.pixels.srgb.numpy().tobytes(), frames.pixels.target.numpy().tobytes())
+    def better(out: FitFrames, kept: FitFrames, part: str) -> float:
+        learned = refit(kept, f", learned{part}", replace(config, tone="learned"))
+        curve = refit(kept, f", curve{part}", replace(config, tone="curve"))
+        return mean_psnr(curve, out, True) - mean_psnr(learned, out, True)
+
+    gain = gain_left_out(frames, better)
+    return replace(config, tone="curve" if gain > 0 else "learned"), gain
 
 
-def _new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
+def _make_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
     """Make an ISP of the size that these frames need, drawn from the seed."""
     patterns = {shot.cfa for shot in shots}
     count = min(config.most_atoms, len(shots))
@@ -195,225 +189,107 @@ def _new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
     return DictionaryISP(ISPConfig(**settings), derive_seed(config.seed, "isp"))
 
 
-class _Fit:
-    """The ISP being fitted, with every frame's own colour; ``part`` ends the names of its stages."""
+def fit_reverse(
+    frames: FitFrames,
+    config: FitConfig,
+    descent: Descent,
+    part: str = "",
+    camera: Camera | None = None,
+    report: Callable[[DictionaryISP], str] | None = None,
+) -> tuple[DictionaryISP, FrameColour]:
+    """Run stages 1 to 3, which fit the reverse pass, without encoders.
 
-    def __init__(
-        self, frames: FitFrames, config: FitConfig, descent: Descent, part: str = "", camera: Camera | None = None
-    ) -> None:
-        self.samples, self.shots = frames
-        self.known_matrix: Tensor | None = None
-        if camera is not None:
-            self.known_matrix = torch.stack([camera.matrix_for(shot.white_balance) for shot in self.shots])
+    Args:
+        frames: the frames to fit.
+        config: the settings of the fit.
+        descent: runs stages 1 and 2.
+        part: ends the names of the stages, if the frames are a part of all.
+        camera: the camera's figures, from which the frames' matrices start.
+        report: gets the ISP as it would be now, every 50 steps of stage 2.
 
-        self.config, self.descent, self.part = config, descent, part
-        self.isp = _new_isp(self.shots, config)
-        self.curve = StartCurve(self.isp)
-        self.tie = Tie(self.shots)
-        self.colour = self._start()
+    Returns:
+        The ISP, and every frame's colour, of which its atoms were made.
+    """
+    isp = _make_isp(frames.shots, config)
+    known_matrix: Tensor | None = None
+    if camera is not None:
+        known_matrix = torch.stack([camera.matrix_for(shot.white_balance) for shot in frames.shots])
 
-    @torch.no_grad()
-    def _start(self) -> FrameColour:
-        """Solve by least squares under the curve of the standard that fits best."""
-        tried = []
-        for curve in _STANDARD_CURVES:
-            self.curve.set(*curve)
-            self.colour = FrameColour.from_product(self._least_squares())
-            tried.append((self._error(), curve, self.colour))
+    colour = _fit_curve(isp, frames, config, descent, part, known_matrix)
+    if config.start is not None:
+        other = DictionaryISP.from_pretrained(config.start)
+        colour = _start_from(isp, other, colour, frames.pixels, known_matrix)
+    _fit_tone(isp, colour, frames, config, descent, part, report)
+    set_dictionaries(isp, colour, frames, config)
+    return isp, colour
 
-        _, curve, colour = min(tried, key=lambda one: one[0])
-        self.curve.set(*curve)
-        return colour
 
-    def _least_squares(self) -> Tensor:
-        return least_squares(self._apply_curve(self.samples), self.samples, self.known_matrix)
+def _fit_curve(
+    isp: DictionaryISP,
+    frames: FitFrames,
+    config: FitConfig,
+    descent: Descent,
+    part: str,
+    known_matrix: Tensor | None,
+) -> FrameColour:
+    """Run stage 1 without the mask and, if the readings fall off towards the corners, with it as well.
 
-    def fit_reverse(self, report: Callable[[DictionaryISP], str] | None = None) -> DictionaryISP:
-        """Run stages 1 to 3, which fit the reverse pass, without encoders."""
-        self.fit_curve()
-        self.fit_tone(report)
-        self.set_atoms(self.isp)
-        return self.isp
+    Stages of ``isp`` change, and that of the shading goes if it does not pay. Returns every frame's colour.
+    """
+    # The start: least squares under the curve of the standard that fits best.
+    starts = []
+    for curve in _STANDARD_CURVES:
+        set_curve(isp, *curve)
+        with torch.no_grad():
+            colour, error = fit_colours(linear_light(isp, frames.pixels), frames.pixels, known_matrix)
+        starts.append((error, curve, colour))
+    _, curve, colour = min(starts, key=lambda start: start[0])
+    set_curve(isp, *curve)
 
-    # -- stage 1 ----------------------------------------------------------------------------------------------------
+    def loss(generator: torch.Generator) -> Tensor:
+        chosen, pixels = draw_batch(frames.pixels, config.batch, generator)
+        predicted = functional.correct_colour(linear_light(isp, pixels), colour.pick(chosen).product())
+        return reading_error(predicted, pixels) + tie(colour, frames)
 
-    def fit_curve(self) -> None:
-        """Run stage 1 without the mask and, if the readings fall off towards the corners, with it as well."""
-        shading = self.isp.find(LensShading)
-        mode = self.config.shading if shading else "off"
-        if mode != "on":
-            self._descend_on_curve("curve", with_mask=False)
-        if shading is None:
-            return
-        without_shading = tuple(name for name in self.isp.config.stages if name != shading.name)
-        if mode == "off":
-            self.isp.configure(stages=without_shading)
-            return
+    def current_error() -> float:
+        with torch.no_grad():
+            predicted = functional.correct_colour(linear_light(isp, frames.pixels), colour.product())
+            return float(reading_error(predicted, frames.pixels))
 
-        mean, precision = fit_fall_off(self._apply_curve(self.samples), self.samples, self.colour.product())
-        if mode == "auto" and not _darkens_corners(mean, precision):
-            self.isp.configure(stages=without_shading)
-            return
+    shading = isp.find(LensShading)
+    mode = config.shading if shading else "off"
+    steps = CURVE_STEPS if config.curve_steps is None else config.curve_steps
+    numbers = trained_tensors(isp, forward=False, up_to=2) | colour._asdict()
+    if mode != "on":
+        descent.run(f"curve{part}", loss, numbers, steps, _CURVE_RATE)
 
-        error = self._error()
-        before = {}
-        for name, tensor in self._few_numbers(with_mask=False).items():
-            before[name] = tensor.detach().clone()
+    keeps_mask = False
+    if shading is not None and mode != "off":
+        with torch.no_grad():
+            mean, precision = fit_fall_off(linear_light(isp, frames.pixels), frames.pixels, colour.product())
+        keeps_mask = mode == "on" or _darkens_corners(mean, precision)
 
+    if shading is not None and keeps_mask:
+        error = current_error()
+        before = {name: tensor.detach().clone() for name, tensor in numbers.items()}
         shading.mask.set(mean, precision)
-        self._descend_on_curve("curve and shading")
-        if mode == "auto" and self._error() > _SHADING_PAYS * error:
-            self.isp.configure(stages=without_shading)
-            for name, tensor in self._few_numbers().items():
+        mask = {f"{shading.name}.mask.{key}": parameter for key, parameter in shading.mask.named_parameters()}
+        descent.run(f"curve and shading{part}", loss, numbers | mask, steps, _CURVE_RATE)
+
+        if mode == "auto" and current_error() > _SHADING_PAYS * error:
+            keeps_mask = False
+            for name, tensor in numbers.items():
                 tensor.data.copy_(before[name])
 
-    @torch.no_grad()
-    def _error(self) -> float:
-        predicted = functional.correct_colour(self._apply_curve(self.samples), self.colour.product())
-        return float(reading_error(predicted, self.samples))
+    if shading is not None and not keeps_mask:
+        isp.configure(stages=tuple(name for name in isp.config.stages if name != shading.name))
 
-    def _apply_curve(self, part: PixelSamples) -> Tensor:
-        """Compute x2 by the curve, times the mask, which a frame's matrix takes to RAW."""
-        return self.curve.apply(part.srgb, part.coordinates)
-
-    def _descend_on_curve(self, stage: str, with_mask: bool = True) -> None:
-        tensors = self._few_numbers(with_mask)
-
-        def loss(generator: torch.Generator) -> Tensor:
-            frames, part = self._draw(generator)
-            predicted = functional.correct_colour(self._apply_curve(part), self.colour.pick(frames).product())
-            return reading_error(predicted, part) + self.tie(self.colour)
-
-        steps = CURVE_STEPS if self.config.curve_steps is None else self.config.curve_steps
-        self.descent.run(stage + self.part, loss, tensors, steps, _CURVE_RATE)
-
-    # -- stage 2 ----------------------------------------------------------------------------------------------------
-
-    def fit_tone(self, report: Callable[[DictionaryISP], str] | None) -> None:
-        """Run stage 2, the tone and each frame's colour; ``report`` gets the ISP as it would be now."""
-        self.curve.start_networks()
-        if self.config.start is not None:
-            self._start_from(DictionaryISP.from_pretrained(self.config.start))
-
-        tensors = self._colours() | trained_tensors(self.isp, forward=False)
-
-        def loss(generator: torch.Generator) -> Tensor:
-            frames, part = self._draw(generator)
-            predicted = self.isp.reverse_pixels(part.srgb, self.colour.pick(frames).params(), part.coordinates)
-            return reading_error(predicted, part) + self.tie(self.colour)
-
-        def status() -> str:
-            if report is None:
-                return ""
-
-            isp = deepcopy(self.isp)  # as it would be if this stage ended now
-            self.set_atoms(isp)
-            return report(isp.eval())
-
-        name = f"sRGB to RAW{self.part}"
-        self.descent.run(name, loss, tensors, self.config.steps, self.config.learning_rate, status)
-
-    def _start_from(self, other: DictionaryISP) -> None:
-        """Start the tone from that of another ISP, or the best of its curves, if that improves the frames."""
-        greys = torch.linspace(0.0, 1.0, 256).expand(1, 3, 1, -1)
-        colours = torch.cat([greys, stages.node_colours(9).flatten(2)[:, :, None]], dim=3)
-        tensors = list(trained_tensors(self.isp, forward=False, up_to=2).values())
-
-        before = [tensor.detach().clone() for tensor in tensors]
-        colour = self.colour
-        error, _ = self._tone_error(self.isp.linear)
-        best, target = self._best_tone(other, colours)
-        if best >= error:
-            return
-
-        for tensor in tensors:
-            tensor.requires_grad_()
-
-        descent = adam(
-            tensors,
-            _START_RATE,
-            lambda step: ((self.isp.linear(colours) - target) ** 2 / (target + 0.01)).mean(),
-            lambda step: step / _START_STEPS,
-        )
-        for _ in descent:
-            pass
-
-        for tensor in tensors:
-            tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
-
-        started, self.colour = self._tone_error(self.isp.linear)
-        if started >= error:
-            self.colour = colour
-            for tensor, old in zip(tensors, before, strict=True):
-                tensor.data.copy_(old)
-
-    @torch.no_grad()
-    def _best_tone(self, other: DictionaryISP, colours: Tensor) -> tuple[float, Tensor]:
-        """Compute the least error under another ISP's tone, or one of its curves, and x2 of ``colours`` by it."""
-        curves: list[Callable[[Tensor], Tensor]] = [other.linear]
-        if other.tone is not None:
-            curves = [partial(_apply_table, table) for table in other.tone.curves]
-
-        errors = [self._tone_error(curve)[0] for curve in curves]
-        best = errors.index(min(errors))
-        return errors[best], curves[best](colours)
-
-    @torch.no_grad()
-    def _tone_error(self, linear: Callable[[Tensor], Tensor]) -> tuple[float, FrameColour]:
-        """Compute the error under a tone with each frame's best colour, and that colour."""
-        shading = self.isp.find(LensShading)
-        x = linear(self.samples.srgb)
-        if shading is not None:
-            x = x * shading.mask(self.samples.coordinates)
-
-        colour = FrameColour.from_product(least_squares(x, self.samples, self.known_matrix))
-        return float(reading_error(functional.correct_colour(x, colour.product()), self.samples)), colour
-
-    def _few_numbers(self, with_mask: bool = True) -> dict[str, Tensor]:
-        return self.curve.numbers(with_mask) | self._colours()
-
-    def _colours(self) -> dict[str, Tensor]:
-        return {"log_scale": self.colour.log_scale, "matrix": self.colour.matrix}
-
-    def _draw(self, generator: torch.Generator) -> tuple[Tensor | slice, PixelSamples]:
-        """Draw the frames of a step (all, if there are few) and their pixels."""
-        count, pixels = self.samples.srgb.shape[0], self.samples.srgb.shape[-1]
-        frames: Tensor | slice = slice(None)
-        if count > FRAMES_A_STEP:
-            frames = torch.randperm(count, generator=generator)[:FRAMES_A_STEP]
-
-        index = torch.randint(pixels, (min(self.config.batch, pixels),), generator=generator)
-        return frames, self.samples.pick(index, frames)
-
-    # -- stage 3 ----------------------------------------------------------------------------------------------------
-
-    def set_atoms(self, isp: DictionaryISP) -> None:
-        """Run stage 3: make the frames' colours the atoms of ``isp``."""
-        set_dictionaries(isp, self.colour, self.samples, self.shots, self.config)
-
-    # -- stage 5 ----------------------------------------------------------------------------------------------------
-
-    def fit_forward(self) -> None:
-        """Run stage 5: fit the forward networks to the reverse pass."""
-        isp = self.isp
-        start_forward(isp)
-        tensors = trained_tensors(isp, forward=True)
-
-        def loss(generator: torch.Generator) -> Tensor:
-            frames, part = self._draw(generator)
-            params = self.colour.pick(frames).params()
-            back: dict[str, Tensor] = {}
-            with torch.no_grad():
-                back["raw"] = isp.reverse_pixels(part.cell_srgb, params, part.coordinates, back)
-            return cycle_error(isp, part, params, back, self.config)
-
-        if tensors:
-            self.descent.run("RAW to sRGB", loss, tensors, self.config.steps, self.config.learning_rate)
-
-
-def _apply_table(table: Tensor, srgb: Tensor) -> Tensor:
-    """Map pictures ``(B, 3, H, W)`` to linear light by a table ``(1021,)``."""
-    return to_linear(srgb, table.expand(len(srgb), -1))
+    # From now on the tone network takes the place of the toe.
+    tone = isp.find(ToneMap)
+    if tone is not None and tone.toe is not None:
+        tone.reverse_network.start_from(float(tone.toe))
+        tone.toe = None
+    return colour
 
 
 def _darkens_corners(mean: Tensor, precision: Tensor) -> bool:
@@ -421,3 +297,114 @@ def _darkens_corners(mean: Tensor, precision: Tensor) -> bool:
     corners = torch.tensor([[0.6, 0.8], [0.6, -0.8], [-0.6, 0.8], [-0.6, -0.8]]) - mean
     exponent = 0.5 * torch.einsum("ki,ij,kj->k", corners, precision, corners)
     return bool((exponent > _DIMMEST).any())
+
+
+def _start_from(
+    isp: DictionaryISP, other: DictionaryISP, colour: FrameColour, pixels: PixelSamples, known_matrix: Tensor | None
+) -> FrameColour:
+    """Start the tone from that of another ISP, or the best of its curves, if that improves the frames.
+
+    Returns every frame's colour under the tone that the fit starts from.
+    """
+
+    @torch.no_grad()
+    def fit_under(curve: Callable[[Tensor], Tensor]) -> tuple[FrameColour, float]:
+        return fit_colours(linear_light(isp, pixels, curve), pixels, known_matrix)
+
+    curves: list[Callable[[Tensor], Tensor]] = [other.linear]
+    if other.tone is not None:
+        curves = [partial(_apply_table, table) for table in other.tone.curves]
+    errors = [fit_under(curve)[1] for curve in curves]
+    best = curves[errors.index(min(errors))]
+    _, error = fit_under(isp.linear)
+    if min(errors) >= error:
+        return colour
+
+    # Descend towards x2 by the other's tone, on greys and on the colours of a cube.
+    greys = torch.linspace(0.0, 1.0, 256).expand(1, 3, 1, -1)
+    colours = torch.cat([greys, stages.node_colours(9).flatten(2)[:, :, None]], dim=3)
+    with torch.no_grad():
+        target = best(colours)
+    tensors = list(trained_tensors(isp, forward=False, up_to=2).values())
+    before = [tensor.detach().clone() for tensor in tensors]
+    for tensor in tensors:
+        tensor.requires_grad_()
+
+    descent = adam(
+        tensors,
+        _START_RATE,
+        lambda step: ((isp.linear(colours) - target) ** 2 / (target + 0.01)).mean(),
+        lambda step: step / _START_STEPS,
+    )
+    for _ in descent:
+        pass
+
+    for tensor in tensors:
+        tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
+
+    started_colour, started_error = fit_under(isp.linear)
+    if started_error < error:
+        return started_colour
+
+    for tensor, old in zip(tensors, before, strict=True):
+        tensor.data.copy_(old)
+    return colour
+
+
+def _apply_table(table: Tensor, srgb: Tensor) -> Tensor:
+    """Map pictures ``(B, 3, H, W)`` to linear light by a table ``(1021,)``."""
+    return to_linear(srgb, table.expand(len(srgb), -1))
+
+
+def _fit_tone(
+    isp: DictionaryISP,
+    colour: FrameColour,
+    frames: FitFrames,
+    config: FitConfig,
+    descent: Descent,
+    part: str,
+    report: Callable[[DictionaryISP], str] | None,
+) -> None:
+    """Run stage 2, the tone and each frame's colour; ``report`` gets the ISP as it would be now."""
+
+    def loss(generator: torch.Generator) -> Tensor:
+        chosen, pixels = draw_batch(frames.pixels, config.batch, generator)
+        predicted = isp.reverse_pixels(pixels.srgb, colour.pick(chosen).params(), pixels.coordinates)
+        return reading_error(predicted, pixels) + tie(colour, frames)
+
+    def status() -> str:
+        if report is None:
+            return ""
+
+        current = deepcopy(isp)
+        set_dictionaries(current, colour, frames, config)
+        return report(current.eval())
+
+    tensors = colour._asdict() | trained_tensors(isp, forward=False)
+    descent.run(f"sRGB to RAW{part}", loss, tensors, config.steps, config.learning_rate, status)
+
+
+def fit_forward(
+    isp: DictionaryISP, colour: FrameColour, frames: FitFrames, config: FitConfig, descent: Descent
+) -> None:
+    """Run stage 5: fit the forward pass of ``isp`` to its reverse pass, in the frames' own colours."""
+    # It starts with the power of the reverse pass, or with its curves, which keep their slopes.
+    power, table = isp.find(Gamma), isp.find(ToneCurve)
+    with torch.no_grad():
+        if power is not None:
+            power.forward_gamma.copy_(power.reverse_gamma)
+        if table is not None:
+            table.dictionary.curves.copy_(table.bend())
+            table.slopes = None
+
+    def loss(generator: torch.Generator) -> Tensor:
+        chosen, pixels = draw_batch(frames.pixels, config.batch, generator)
+        params = colour.pick(chosen).params()
+        back: dict[str, Tensor] = {}
+        with torch.no_grad():
+            back["raw"] = isp.reverse_pixels(pixels.cell_srgb, params, pixels.coordinates, back)
+        return cycle_error(isp, pixels, params, back, config)
+
+    tensors = trained_tensors(isp, forward=True)
+    if tensors:
+        descent.run("RAW to sRGB", loss, tensors, config.steps, config.learning_rate)

@@ -8,7 +8,7 @@ are compared as averages over blocks instead, where every channel is known.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple, Protocol
 
 import torch
@@ -125,17 +125,13 @@ class PixelSamples(NamedTuple):
     cell_raw: Tensor
     cell_weight: Tensor
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> PixelSamples:
-        """Apply a function to every tensor."""
-        return PixelSamples(*map(change, self))
-
-    def of_frames(self, index: Tensor) -> PixelSamples:
-        """Take the pixels of the frames of an index ``(f,)``."""
-        return self.map(lambda tensor: tensor[index])
+    def of_frames(self, index: Tensor | slice) -> PixelSamples:
+        """Take the pixels of the frames of an index ``(f,)`` or a slice."""
+        return PixelSamples(*[tensor[index] for tensor in self])
 
     def pick(self, index: Tensor, frames: Tensor | slice = slice(None)) -> PixelSamples:
         """Pick the pixels of an index ``(p,)`` from every frame, or from those of an index ``(f,)``."""
-        return self.map(lambda tensor: tensor[frames].index_select(-1, index))
+        return PixelSamples(*[tensor[frames].index_select(-1, index) for tensor in self])
 
 
 class FitFrames(NamedTuple):
@@ -157,12 +153,7 @@ class FitFrames(NamedTuple):
     @property
     def as_shot(self) -> Tensor:
         """The as-shot multipliers of R, G and B of each frame, ``(F, 3)``."""
-        return as_shot(self.shots)
-
-
-def as_shot(shots: Sequence[FrameSummary]) -> Tensor:
-    """The as-shot multipliers of R, G and B of each frame, ``(F, 3)``."""
-    return torch.tensor([shot.white_balance for shot in shots])
+        return torch.tensor([shot.white_balance for shot in self.shots])
 
 
 def sample_pixels(pairs: Iterable[FramePair], pixels: int, seed: int, noisy: bool = False) -> FitFrames:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rawaug.data.phones import CAMERAS, Shot, take_shot
-from rawaug.isp.fit.start import plausible_matrices
+from rawaug.isp.fit.atoms import plausible_matrices
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading
 

@@ -10,10 +10,12 @@ import pytest
 import torch
 
 from rawaug.data.pairs import Pair
-from rawaug.isp.fit import FitConfig, descent, fit_isp, pipeline
-from rawaug.isp.fit.descent import Descent, joint_steps, mean_psnr, train_jointly
+from rawaug.isp.fit import FitConfig, encoders, fit_isp, pipeline
+from rawaug.isp.fit.atoms import measure_lights
+from rawaug.isp.fit.descent import Descent, mean_psnr
+from rawaug.isp.fit.encoders import CURVE_POINTS, joint_steps, train_jointly
 from rawaug.isp.fit.samples import FitFrames, sample_pixels
-from rawaug.isp.fit.start import measure_lights
+from rawaug.isp.fit.start import FrameColour
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading
 
@@ -32,7 +34,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
         "PUBLISHED_FRAMES": 4,
     }
     for name, value in quick.items():
-        monkeypatch.setattr(descent, name, value)
+        monkeypatch.setattr(encoders, name, value)
 
 
 def config(wanted: str, encoder_steps: int = 30) -> FitConfig:
@@ -86,23 +88,24 @@ def test_frames_that_judge_were_left_out_of_curve_tone_and_atoms_too(
     exact_pair: Callable[..., Pair], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = config("auto", encoder_steps=1)
-    monkeypatch.setattr(descent, "FEWEST_FRAMES", 4)
+    monkeypatch.setattr(encoders, "FEWEST_FRAMES", 4)
     fitted: list[set[str]] = []
     judged: list[tuple[set[str], set[str]]] = []
 
-    class Noted(pipeline._Fit):
-        def fit_reverse(self, *args: Any) -> DictionaryISP:
-            isp = super().fit_reverse(*args)
-            assert self.samples.srgb.shape[0] == self.colour.matrix.shape[0] == len(self.shots)
-            fitted.append({shot.name for shot in self.shots})
-            return isp
+    fit_reverse = pipeline.fit_reverse
+
+    def noted(frames: FitFrames, *args: Any, **settings: Any) -> tuple[DictionaryISP, FrameColour]:
+        isp, colour = fit_reverse(frames, *args, **settings)
+        assert len(frames.pixels.srgb) == len(colour.matrix) == len(frames.shots)
+        fitted.append({shot.name for shot in frames.shots})
+        return isp, colour
 
     def mean_psnr(isp: DictionaryISP, frames: FitFrames) -> float:
         judged.append((fitted[-1], {shot.name for shot in frames.shots}))
         return 0.0
 
-    monkeypatch.setattr(pipeline, "_Fit", Noted)
-    monkeypatch.setattr(descent, "mean_psnr", mean_psnr)
+    monkeypatch.setattr(pipeline, "fit_reverse", noted)
+    monkeypatch.setattr(encoders, "mean_psnr", mean_psnr)
     fit_isp(lit_frames(exact_pair, 4, informative=True), settings, progress=False)
     everything = {f"shot{k}" for k in range(4)}
     assert fitted[0] == everything and len(fitted) == 3 and len(judged) == 4
@@ -129,7 +132,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     monkeypatch.setattr(Descent, "report_steps", 5)
 
     def train(isp: DictionaryISP, frames: FitFrames, steps: int, learning_rate: float) -> None:
-        monkeypatch.setattr(descent, "LEARNING_RATE", learning_rate)
+        monkeypatch.setattr(encoders, "LEARNING_RATE", learning_rate)
         train_jointly(isp, frames, replace(CONFIG, joint_steps=steps), Descent(None, "", 0, False))
 
     return train
@@ -154,7 +157,7 @@ def test_where_every_step_is_worse_the_start_remains(
     trained(isp, sample_pixels(frames, CONFIG.pixels, CONFIG.seed), steps=10, learning_rate=1.0)
     record = isp.info["joint"]
     assert (record["steps"], record["kept_step"], record["gain_db"]) == (10, 0, 0.0)
-    assert record["curve"][0] == max(record["curve"])
+    assert record["curve"][0] == max(record["curve"]) and len(record["curve"]) <= CURVE_POINTS
     assert all(torch.equal(value, before[key]) for key, value in isp.state_dict().items())
 
 

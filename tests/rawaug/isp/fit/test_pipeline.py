@@ -15,7 +15,8 @@ from rawaug.io import RawFrame
 from rawaug.isp.description import tone_table
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.descent import Descent, with_better_tone
+from rawaug.isp.fit.descent import Descent
+from rawaug.isp.fit.pipeline import choose_tone
 from rawaug.isp.fit.samples import FitFrames, sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
@@ -197,5 +198,5 @@ def two_frames(exact_pairs: list[Pair]) -> FitFrames:
 @pytest.mark.parametrize("better", ["learned", "curve"])
 def test_auto_takes_what_is_better_on_frames_left_out(two_frames: FitFrames, better: str) -> None:
     off = {"learned": 1.0, "curve": 1.0} | {better: 0.0}
-    decided, gain = with_better_tone(two_frames, replace(CURVE, tone="auto"), refitted(off))
+    decided, gain = choose_tone(two_frames, replace(CURVE, tone="auto"), refitted(off))
     assert decided.tone == better and gain is not None and (gain > 0) == (better == "curve")

@@ -15,19 +15,9 @@ from rawaug.data.pairs import Pair
 from rawaug.io import RawFrame
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig, fit_isp
+from rawaug.isp.fit.atoms import best_constants, reach_atoms, set_dictionaries, set_priors
 from rawaug.isp.fit.samples import sample_pixels
-from rawaug.isp.fit.start import (
-    TIE,
-    TIE_RANGE,
-    FrameColour,
-    Tie,
-    best_constants,
-    fit_fall_off,
-    least_squares,
-    reach_atoms,
-    set_dictionaries,
-    set_priors,
-)
+from rawaug.isp.fit.start import TIE, TIE_RANGE, FrameColour, fit_fall_off, least_squares, tie
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 
@@ -134,7 +124,7 @@ def test_many_frames_pass_the_networks_a_few_at_a_time(
     exact_pair: Callable[..., Pair], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frames = [exact_pair(f"shot{k}", (1.7, 1.0, 1.6), k % 2) for k in range(40)]
-    samples, shots = sample_pixels(frames, 512, seed=0)
+    drawn = sample_pixels(frames, 512, seed=0)
     colour = FrameColour.from_product(torch.eye(3).expand(len(frames), 3, 3))
     isp = DictionaryISP(ISPConfig(colour_atoms=4, gain_atoms=4))
     counts: list[int] = []
@@ -145,7 +135,7 @@ def test_many_frames_pass_the_networks_a_few_at_a_time(
         return reverse_pixels(x, *args)
 
     monkeypatch.setattr(isp, "reverse_pixels", counted)
-    set_dictionaries(isp, colour, samples, shots, FitConfig(prior_steps=1))
+    set_dictionaries(isp, colour, drawn, FitConfig(prior_steps=1))
     assert max(counts) < len(frames) // 2  # a network's activations are some ten times as large as its picture
     assert sum(counts) % len(frames) == 0  # and each frame passes every time
 
@@ -233,15 +223,15 @@ def test_content_that_goes_with_the_place_feigns_no_fall_off(exact_pair: Callabl
 
 
 def test_a_tie_is_within_a_camera_and_bounded(exact_pairs: list[Pair], camera_matrix: torch.Tensor) -> None:
-    _, shots = sample_pixels(exact_pairs, 8, seed=0)
-    product = camera_matrix / torch.tensor([shot.white_balance for shot in shots])[:, :, None]
-    assert Tie(shots)(FrameColour.from_product(product)) < 1e-9
+    frames = sample_pixels(exact_pairs, 8, seed=0)
+    product = camera_matrix / frames.as_shot[:, :, None]
+    assert tie(FrameColour.from_product(product), frames) < 1e-9
     product[1, 0] *= 1.02
-    small = Tie(shots)(FrameColour.from_product(product))
-    apart = [shot._replace(camera=shot.name) for shot in shots]
-    assert small > 1e-6 > 1e-9 > Tie(apart)(FrameColour.from_product(product))
+    small = tie(FrameColour.from_product(product), frames)
+    apart = frames._replace(shots=[shot._replace(camera=shot.name) for shot in frames.shots])
+    assert small > 1e-6 > 1e-9 > tie(FrameColour.from_product(product), apart)
     product[1] = torch.rand(3, 3, generator=torch.Generator().manual_seed(0))
-    assert small < Tie(shots)(FrameColour.from_product(product)) < TIE * 12 * TIE_RANGE**2
+    assert small < tie(FrameColour.from_product(product), frames) < TIE * 12 * TIE_RANGE**2
 
 
 def test_one_frame_whose_metadata_lie_does_not_spoil_the_others(
