@@ -32,7 +32,7 @@ from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.evaluation.trials import make_trial
 from rawaug.experiment.recipe import find_recipe, read_recipe
 from rawaug.files import write_json
-from rawaug.isp.model import DictionaryISP, restrict_to_cameras
+from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.paper.baselines import UPI
 from rawaug.paper.downstream import DownstreamConfig, MadeCrops, score_on, train_on
@@ -91,7 +91,7 @@ def sources(
     yield "without consistent gains", made(universal(), Draw(sampling="independent"))
     calibrated = RawAugment(universal(), noise_model({"pair_psnr": PAIR_PSNR}))
     yield f"pairs of {PAIR_PSNR} dB", PictureCrops(RawPairs(pictures, calibrated, crop))
-    yield "without the wide hull", made(restrict_to_cameras(universal(), NARROW))
+    yield "without the wide hull", made(universal().with_cameras(NARROW))
     for name, specs in real.items():
         pairs = [pair for spec in specs for pair in open_pairs(spec)]
         yield f"real RAW, {name}", RealCrops(pairs, noise, crop, CFA.RGGB)

@@ -201,7 +201,7 @@ def _describe_isp(path: Path) -> str:
     for code in (16, 32, 64, 128, 192, 255):
         points.append(f"{code} {curve[code].item():.4f}")
     lines.append(f"  tone and gamma, grey code to linear: {', '.join(points)}")
-    for stage in isp.ordered_stages:
+    for stage in isp.stages.ordered:
         if stage.extra_repr():
             lines.append(f"  {stage.name}: {stage.extra_repr()}")
     for key, value in isp.info.items():

@@ -83,7 +83,7 @@ def _draw_stages(augment: RawAugment, whole: Tensor, count: int, seed: int) -> A
         params = augment.sample(srgb[None], generator, torch.tensor([[top, left, *frame, 0]]))
         pair = augment.apply(srgb[None], params)
         gains = "{:.2f} {:.2f} {:.2f}".format(*pair.params.isp.gains[0].tolist())
-        developed = isp.forward_pixels(sensor.demosaic(augment.mosaic(pair.clean)), setting).clamp(0, 1)
+        developed = isp.stages.forward(sensor.demosaic(augment.mosaic(pair.clean)), setting).clamp(0, 1)
         panels[f"draw {k + 1}: gains {gains}\nmean {pair.clean.mean().item():.3f}"] = developed[0]
 
     columns = max(len(panels) - count, 4)

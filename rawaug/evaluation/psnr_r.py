@@ -52,13 +52,13 @@ def psnr_r(
         params = choose(pair.srgb[None])
 
         def reverse(patch: Tensor, place: Tensor) -> Tensor:
-            return bayer.mosaic(isp.reverse_pixels(as_float(patch), params, place), pair.cfa)
+            return bayer.mosaic(isp.stages.reverse(as_float(patch), params, place), pair.cfa)
 
         return windows_psnr(reverse, pair, patches)
 
     srgb, raw, clipped, coordinates = block_averages(pair.srgb, pair.clean.mosaic, pair.cfa)
     params = choose(srgb[None])
-    estimate = isp.reverse_pixels(srgb[None], params, coordinates)[0]
+    estimate = isp.stages.reverse(srgb[None], params, coordinates)[0]
     return block_psnr(estimate, raw, clipped)
 
 

@@ -15,7 +15,7 @@ from rawaug.data.pairs import Pair
 from rawaug.experiment.folder import require_folder_name
 from rawaug.files import find_weights, fingerprint, sha256
 from rawaug.isp.fit import FitConfig
-from rawaug.isp.model import DictionaryISP, restrict_to_cameras
+from rawaug.isp.model import DictionaryISP
 from rawaug.kernels.runtime import find_device
 from rawaug.noise import noise_model
 from rawaug.plugin.draw import Draw
@@ -170,7 +170,7 @@ class ISPSource:
         isp = DictionaryISP.from_pretrained(self.name)
         key = sha256(find_weights(self.name))
         if self.camera is not None:
-            isp = restrict_to_cameras(isp, self.camera)
+            isp = isp.with_cameras(self.camera)
             key = fingerprint(key, isp.info)
 
         isp.info["key"] = key

@@ -267,7 +267,7 @@ def stage_pictures(
         Pictures ``(3, H, W)`` in [0, 1] by title; linear ones are shown through the sRGB curve.
     """
     result = augment.isp.reverse(srgb[None], setting, coordinates=place, intermediates=True)
-    stage_of = {f"x{stage.makes}": stage.name for stage in augment.isp.ordered_stages}
+    stage_of = {f"x{stage.makes}": stage.name for stage in augment.isp.stages.ordered}
 
     pictures = {"sRGB x": srgb / 255.0}
     image = srgb[None]
@@ -444,7 +444,7 @@ def _develop(example: Example, part: Tensor, scale: int = 1) -> np.ndarray:
     height, width = example.srgb.shape[-2:]
     corner, frame = (top // scale, left // scale), (height // scale, width // scale)
     place = frame_coordinates(rgb.shape[-2], rgb.shape[-1], corner, frame)
-    return _to_uint8(augment.isp.forward_pixels(rgb[None], _as_batch(example.pair.params.isp), place)[0])
+    return _to_uint8(augment.isp.stages.forward(rgb[None], _as_batch(example.pair.params.isp), place)[0])
 
 
 def _as_batch(setting: ISPParams) -> ISPParams:

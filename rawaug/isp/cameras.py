@@ -3,16 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from rawaug.bayer import CFA
 from rawaug.camera.lights import D65, compute_mired, weights_in_light, white_point
 from rawaug.camera.matrices import gains_in_light, load_cameras
-from rawaug.camera.own import Camera
+from rawaug.camera.names import find_camera
+from rawaug.camera.own import Camera, as_camera, is_camera_file
+from rawaug.isp.config import ISPInfo
 from rawaug.isp.dictionary import CameraDictionary, log_light
 from rawaug.isp.stages import interpolate_shares
 from rawaug.registry import suggest
+
+
+def read_cameras(
+    cameras: str | Path | Camera | Sequence[str | Path | Camera],
+) -> tuple[list[Camera], list[str]]:
+    """Find cameras by their names, or read their data sheets.
+
+    Args:
+        cameras: names of published cameras, cameras of one's own, or paths of their YAML files.
+
+    Returns:
+        The sheets of all cameras if one has a sheet, else none; and the published names of those without.
+
+    Raises:
+        FileNotFoundError: if a camera's file is missing.
+        ValueError: if a name is unknown, or the cameras have several patterns.
+    """
+    if isinstance(cameras, (str, Path, Camera)):
+        cameras = [cameras]
+
+    sheets: list[Camera] = []
+    published: list[str] = []
+    for camera in cameras:
+        if isinstance(camera, Camera) or is_camera_file(camera):
+            sheets.append(as_camera(camera))
+        else:
+            published.append(find_camera(str(camera), load_cameras().names))
+
+    if sheets:  # the table of published cameras has no patterns
+        cfa = sheets[0].cfa
+        sheets += [replace(Camera.published(name), cfa=cfa) for name in published]
+        patterns = sorted({sheet.cfa for sheet in sheets})
+        if len(patterns) > 1:
+            raise ValueError(f"cameras have several patterns, {', '.join(patterns)}; give those of one pattern")
+    return sheets, published
 
 
 def published_atoms(names: Sequence[str]) -> CameraDictionary:
@@ -77,3 +117,17 @@ def data_sheet_tones(cameras: Sequence[Camera], curves: Mapping[str, Tensor]) ->
             unknown = f"camera {camera.name!r}: tone {camera.tone!r:.80} is unknown"
             raise ValueError(f"{unknown}; use points or one of {', '.join(names)}{suggest(camera.tone, names)}")
     return tones
+
+
+def data_sheet_info(cameras: Sequence[Camera]) -> ISPInfo:
+    """What an ISP records of the cameras that it was made of; the noise is that of a single one."""
+    info: ISPInfo = {
+        "cameras": [camera.name for camera in cameras],
+        "own_cameras": [camera.to_json() for camera in cameras],
+    }
+    if cameras[0].cfa not in CFA.__members__:
+        info["pattern"] = cameras[0].cfa
+    noise = cameras[0].noise_spec()
+    if len(cameras) == 1 and noise is not None:
+        info["noise"] = noise
+    return info

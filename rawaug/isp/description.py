@@ -26,25 +26,25 @@ def reverse_table(isp: DictionaryISP, setting: ISPParams, nodes: int = 33) -> Te
         Linear camera RGB ``(nodes ** 3, 3)``, black 0 and white 1, red changing fastest.
     """
     cube = node_colours(nodes)
-    shading = isp.find(LensShading)
+    shading = isp.stages.find(LensShading)
     centre = torch.zeros(2)
     if shading is not None:
         centre = shading.mask.mean
 
     coordinates = centre[None, :, None, None].expand(1, 2, *cube.shape[-2:])
-    return isp.reverse_pixels(cube, setting, coordinates)[0].flatten(1).T.contiguous()
+    return isp.stages.reverse(cube, setting, coordinates)[0].flatten(1).T.contiguous()
 
 
 @torch.no_grad()
 def tone_table(isp: DictionaryISP) -> Tensor:
     """Compute linear x2 of the 256 greys of sRGB, ``(256, 3)``: tone and gamma in one curve per channel."""
-    return isp.linear(torch.linspace(0.0, 1.0, 256).expand(1, 3, 1, -1))[0, :, 0].T.contiguous()
+    return isp.stages.linear(torch.linspace(0.0, 1.0, 256).expand(1, 3, 1, -1))[0, :, 0].T.contiguous()
 
 
 @torch.no_grad()
 def describe_isp(isp: DictionaryISP) -> dict[str, Any]:
     """Describe an ISP as JSON: its atoms, curves and mask, its typical setting, and the record of the fit."""
-    setting, shading, info = isp.typical_setting(), isp.find(LensShading), dict(isp.info)
+    setting, shading, info = isp.typical_setting(), isp.stages.find(LensShading), dict(isp.info)
     mask = shading and {"mean": shading.mask.mean.tolist(), "precision": shading.mask.precision.tolist()}
     return {
         "kind": "isp",

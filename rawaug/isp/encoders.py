@@ -1,7 +1,8 @@
 """Encoders choose the weights of a dictionary's atoms for a picture, ``w = softmax(b + E(I))``.
 
 ``I`` are the N images that the atoms make of the picture (Conde et al., AAAI 2022, "Parameter Dictionaries"). ``b`` is
-a learned constant, which decides alone if there is no network ``E``.
+a learned constant, which decides alone if there is no network ``E``. In the reverse pass the colour atoms take x2 to
+x3, and the gain atoms x3 to x4; in the forward pass it is the other way round, by the inverse of each atom.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from rawaug.isp.config import ISPConfig
+from rawaug.isp.dictionary import ColourDictionary, GainDictionary
+from rawaug.isp.functional import apply_gains, inverse_gains
 
 THUMBNAIL = 48
 """Longest side of an encoder's input, in pixels."""
@@ -61,6 +64,31 @@ class Encoders(nn.Module):
         super().__init__()
         self.colour = AtomEncoder(config.colour_atoms)
         self.gain = AtomEncoder(config.gain_atoms)
+
+    def weigh_reverse(
+        self, x2: Tensor, colour: ColourDictionary, gain: GainDictionary, knee: float | None
+    ) -> tuple[Tensor, Tensor]:
+        """Weigh the atoms for linear images x2 ``(B, 3, h, w)``; ``knee`` is that of the inverse gains.
+
+        Returns:
+            Weights ``(B, N)`` of the colour atoms and ``(B, M)`` of the gain atoms.
+        """
+        candidates = torch.einsum("nij,bjhw->bnihw", colour.atoms(), x2)
+        colour_weights = self.colour(candidates)
+        x3 = torch.einsum("bn,bnihw->bihw", colour_weights, candidates)
+
+        balanced = []
+        for gains in gain.channel_gains():
+            balanced.append(inverse_gains(x3, gains.expand(len(x3), 3), knee))
+        return colour_weights, self.gain(torch.stack(balanced, dim=1))
+
+    def weigh_forward(self, x4: Tensor, colour: ColourDictionary, gain: GainDictionary) -> tuple[Tensor, Tensor]:
+        """Weigh the atoms for linear images x4 ``(B, 3, h, w)``, as :meth:`weigh_reverse` does for x2."""
+        gain_weights = self.gain(x4[:, None] * gain.channel_gains()[None, :, :, None, None])
+
+        x3 = apply_gains(x4, gain.combine(gain_weights))
+        candidates = torch.einsum("nij,bjhw->bnihw", torch.linalg.pinv(colour.atoms()), x3)
+        return self.colour(candidates), gain_weights
 
 
 def thumbnail(image: Tensor) -> Tensor:

@@ -125,14 +125,14 @@ def render_exposure(isp: DictionaryISP, raw: Tensor, params: ISPParams, ev: floa
     light = linear_light(isp, raw, params).amax(dim=1, keepdim=True)
 
     compressed = raw * _compress(light) / light.clamp_min(_MIDDLE_GREY)
-    return isp.forward_pixels(compressed, params).clamp(0.0, 1.0)
+    return isp.stages.forward(compressed, params).clamp(0.0, 1.0)
 
 
 @torch.no_grad()
 def linear_light(isp: DictionaryISP, raw: Tensor, params: ISPParams) -> Tensor:
     """Convert RAW ``(B, 3, H, W)`` to linear sRGB of the same shape, neither compressed nor clipped."""
     light = raw
-    for stage in reversed(isp.ordered_stages):
+    for stage in reversed(isp.stages.ordered):
         if stage.makes > 2:
             light = stage.forward(light, params)
     return light
@@ -140,7 +140,7 @@ def linear_light(isp: DictionaryISP, raw: Tensor, params: ISPParams) -> Tensor:
 
 def _linear_reverse(isp: DictionaryISP, x: Tensor, params: ISPParams) -> Tensor:
     """Compute x5 from x with a plain division by the gains, as highlight-safe gains are not linear in the scene."""
-    for stage in isp.ordered_stages:
+    for stage in isp.stages.ordered:
         if isinstance(stage, WhiteBalance):
             x = inverse_gains(x, params.gains, knee=None)
         else:

@@ -199,13 +199,13 @@ class BakedISP(nn.Module):
 
     def _gain(self, image: Tensor, params: ISPParams, place: Tensor | None) -> Tensor | None:
         size = image.shape[-2], image.shape[-1]
-        return _place_gain(self.host.ordered_stages, params, place, size, image.device, forward=False)
+        return _place_gain(self.host.stages.ordered, params, place, size, image.device, forward=False)
 
     def _unprocessing(
         self, srgb: Tensor, params: ISPParams, place: Tensor | None, blur: Tensor | None = None
     ) -> Unprocessing:
         table = self.table
-        matrix, floor, frame, curves, shading = _batch_params(self.host.ordered_stages, srgb, params, place)
+        matrix, floor, frame, curves, shading = _batch_params(self.host.stages.ordered, srgb, params, place)
         if curves.numel():
             table = table[:0]
             if srgb.dtype == torch.uint8:
@@ -292,7 +292,7 @@ class FastForward(nn.Module):
 
     def _gain(self, image: Tensor, params: ISPParams, place: Tensor | None) -> Tensor | None:
         size = image.shape[-2], image.shape[-1]
-        stages = self._host[0].ordered_stages
+        stages = self._host[0].stages.ordered
         return _place_gain(stages, params, place, size, image.device, forward=True)
 
     def _demosaic(self, raw: Tensor, methods: Sequence[str], numbers: Tensor, gains: Tensor) -> Tensor:
@@ -316,7 +316,7 @@ class FastForward(nn.Module):
 
     def _display(self, linear: Tensor, params: ISPParams, place: Tensor | None) -> Display:
         table = self.table
-        matrix, floor, frame, curves, shading = _batch_params(self._host[0].ordered_stages, linear, params, place)
+        matrix, floor, frame, curves, shading = _batch_params(self._host[0].stages.ordered, linear, params, place)
         if curves.numel():
             table = table[:0]
             light = (
@@ -336,12 +336,12 @@ class FastForward(nn.Module):
 @one_thread()  # the same tables in every process
 def _tables(isp: DictionaryISP, nodes: int, forward: bool = False) -> tuple[Tensor, Tensor]:
     """Make the tables of a pass: x2, or sRGB of the forward pass, and attention, which is empty if there is none."""
-    if any(first.makes >= second.makes for first, second in pairwise(isp.ordered_stages)):
+    if any(first.makes >= second.makes for first, second in pairwise(isp.stages.ordered)):
         order = " ".join(isp.config.stages)
         raise ValueError(f"augmentation needs the ISP's stages in the usual order, got {order}; fit it anew")
     cube = node_colours(nodes)
     with torch.autocast(isp.gain.log_gains.device.type, enabled=False):
-        tables, stages = Tables(cube, cube), isp.ordered_stages
+        tables, stages = Tables(cube, cube), isp.stages.ordered
         if forward:
             tables, stages = Tables(cube, cube.square()), stages[::-1]
         for stage in stages:

@@ -38,6 +38,15 @@ def as_display_referred(srgb: Tensor) -> Tensor:
     return as_float(srgb)
 
 
+def as_mosaic(raw: Tensor) -> Tensor:
+    """Convert RAW to float32; ValueError unless it is a floating-point mosaic ``(B, 1, H, W)`` of finite values."""
+    if raw.ndim != 4 or raw.shape[1] != 1 or not raw.is_floating_point():
+        raise ValueError(f"RAW must be a floating-point mosaic (B, 1, H, W), got {tuple(raw.shape)} {raw.dtype}")
+    if raw.device.type == "cpu" and (damaged := int((~raw.detach().isfinite()).sum())):
+        raise ValueError(f"RAW must be finite, got NaN or infinity in {damaged} of {raw.numel()} values")
+    return raw.float()
+
+
 def require_display_range(image: Tensor) -> None:
     """Raise ValueError if floats of an image of any shape leave [0, 1] by more than half an 8-bit level, or are NaN."""
     # This is checked on the CPU only; reading a value back would stall other devices.

@@ -25,9 +25,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.isp.config import ISPParams
+from rawaug.bayer import CFA
+from rawaug.isp.config import ISPInfo, ISPParams
 from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, nearest_in_hull
 from rawaug.isp.tone import ToneDictionary
 from rawaug.kernels.reference import apply_curves
@@ -69,7 +71,7 @@ def with_grey(colour: ColourDictionary, params: ISPParams, colour_weights: Tenso
 
 def fuse_stated(
     colour: ColourDictionary,
-    gain_errors: Tensor,
+    info: ISPInfo,
     params: ISPParams,
     white_balance: Tensor | tuple[float, ...] | None,
     digital_gain: Tensor | float | None,
@@ -78,7 +80,8 @@ def fuse_stated(
 
     Args:
         colour: the colour atoms.
-        gain_errors: the covariances S_e and S_n, float64 ``(2, 3, 3)``.
+        info: the record of the ISP, whose ``gain_errors`` are the covariances S_e and S_n that its fit has measured.
+            Without them it believes the file, but for the digital gain if that is stated as well.
         params: the settings that were chosen.
         white_balance, digital_gain: as for :meth:`rawaug.DictionaryISP.reverse`.
 
@@ -89,7 +92,10 @@ def fuse_stated(
         ValueError: if a multiplier is not positive, or the shapes are for another number of pictures.
     """
     batch = len(params.gains)
-    chosen, stated = gain_errors.to(params.gains.device)
+    chosen, stated = torch.eye(3).double(), torch.full((3, 3), DIGITAL_SLACK).double()
+    if "gain_errors" in info:
+        chosen, stated = torch.tensor(info["gain_errors"], dtype=torch.float64)
+    chosen, stated = chosen.to(params.gains.device), stated.to(params.gains.device)
     covariance = chosen.expand(batch, 3, 3)
 
     if white_balance is not None:
@@ -165,8 +171,24 @@ def weigh_tones(tone: Tone, names: Sequence[str], like: Tensor) -> Tensor:
 # -- readings ----------------------------------------------------------------------------------------------------------
 
 
-def require_places(raw_samples: Tensor, x: Tensor) -> None:
-    """Raise ValueError unless readings ``(B, K, 3)`` of row, column and value lie in the pictures ``(B, 3, H, W)``."""
+def locate_readings(
+    raw_samples: Tensor, x: Tensor, coordinates: Tensor, cfa: CFA
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Look up what the pictures have where RAW was read.
+
+    Args:
+        raw_samples: ``(B, K, 3)`` of row, column and RAW value.
+        x: sRGB as float ``(B, 3, H, W)``.
+        coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame.
+        cfa: the pattern of the RAW.
+
+    Returns:
+        sRGB ``(B, 3, 1, K)`` and coordinates ``(B, 2, 1, K)`` there; 1 in the channel of the reading, ``(B, 3, K)``;
+        and the readings, ``(B, K)``.
+
+    Raises:
+        ValueError: if a reading is NaN or lies outside the picture.
+    """
     if raw_samples.ndim != 3 or len(raw_samples) != len(x) or raw_samples.shape[2] != 3 or not raw_samples.shape[1]:
         raise ValueError(f"raw_samples are ({len(x)}, K, 3) of (row, column, value), got {tuple(raw_samples.shape)}")
     if not raw_samples.isfinite().all():
@@ -175,6 +197,14 @@ def require_places(raw_samples: Tensor, x: Tensor) -> None:
     sides = torch.tensor(x.shape[-2:], device=raw_samples.device)
     if ((raw_samples[..., :2] < 0) | (raw_samples[..., :2] >= sides)).any():
         raise ValueError(f"raw_samples: a row or column is outside the picture, {x.shape[-2]} x {x.shape[-1]}")
+
+    rows, columns, value = raw_samples[..., 0].long(), raw_samples[..., 1].long(), raw_samples[..., 2]
+    batch = torch.arange(len(x), device=x.device)[:, None]
+    pixels = x[batch, :, rows, columns].transpose(1, 2)[:, :, None]
+    places = coordinates.expand(len(x), -1, -1, -1)[batch, :, rows, columns].transpose(1, 2)[:, :, None]
+    channel = torch.tensor(cfa.channels, device=x.device)[rows % 2, columns % 2]
+    site = F.one_hot(channel, 3).transpose(1, 2).to(x)
+    return pixels, places, site, value
 
 
 def solve_gains(x5: Tensor, site: Tensor, value: Tensor, params: ISPParams) -> tuple[ISPParams, Tensor]:

@@ -13,36 +13,38 @@ from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.camera.lights import light_range
-from rawaug.camera.matrices import load_cameras
-from rawaug.camera.names import find_camera
-from rawaug.camera.own import Camera, as_camera, is_camera_file, own_cameras
+from rawaug.camera.own import Camera, is_camera_file, own_cameras
 from rawaug.camera.samplers import CameraSampler, DataSheetSampler
 from rawaug.errors import count_of
 from rawaug.files import find_weights, parse_object, read_tensors, to_json, write_tensors
 from rawaug.isp import functional, fusion
-from rawaug.isp.cameras import data_sheet_atoms, data_sheet_shading, data_sheet_tones, published_atoms
+from rawaug.isp.cameras import (
+    data_sheet_atoms,
+    data_sheet_info,
+    data_sheet_shading,
+    data_sheet_tones,
+    published_atoms,
+    read_cameras,
+)
 from rawaug.isp.config import ISPConfig, ISPInfo, ISPParams, ISPResult
 from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, GainDictionary, convex_weights
 from rawaug.isp.encoders import AtomEncoder, Encoders, thumbnail
 from rawaug.isp.fusion import Tone
-from rawaug.isp.stages import STAGES, FallOff, Stage
+from rawaug.isp.stages import STAGES, FallOff, Stages
 from rawaug.isp.tone import ToneCurve, ToneDictionary
 from rawaug.seeding import Generators, derive_seed, initialise_from
 
 _ADVICE = "fit or copy it again"
 _INFINITE = ("colour.spread",)
 """Tensors that may hold infinity: the width is infinite if the light does not limit the colour."""
-
-S = TypeVar("S", bound=Stage)
 
 
 class DictionaryISP(nn.Module):
@@ -72,11 +74,7 @@ class DictionaryISP(nn.Module):
                 self.colour = CameraDictionary(self.config.colour_atoms, self.config.cameras)
             self.gain = GainDictionary(self.config.gain_atoms)
 
-            self.stages = nn.ModuleDict()
-            for name in self.config.stages:
-                stage = STAGES[name](self.config)
-                self.stages[stage.name] = stage
-
+            self.stages = Stages({name: STAGES[name](self.config) for name in self.config.stages})
             self.reverse_encoders, self.forward_encoders = Encoders(self.config), Encoders(self.config)
         self.use_encoders(self.config.encoders, seed)
 
@@ -94,18 +92,6 @@ class DictionaryISP(nn.Module):
     def cfa(self) -> CFA:
         """The pattern of the RAW that this ISP makes."""
         return CFA(self.config.cfa)
-
-    @property
-    def ordered_stages(self) -> list[Stage]:
-        """The stages in reverse order."""
-        return [cast(Stage, stage) for stage in self.stages.values()]
-
-    def find(self, kind: type[S]) -> S | None:
-        """The stage of this class, or None."""
-        for stage in self.ordered_stages:
-            if isinstance(stage, kind):
-                return stage
-        return None
 
     def with_atoms(
         self,
@@ -128,13 +114,12 @@ class DictionaryISP(nn.Module):
         isp.colour = colour
         cameras = len(colour.known) if isinstance(colour, CameraDictionary) else 0
         isp.configure(colour_atoms=len(colour.matrices), cameras=cameras)
-        for encoders in (isp.reverse_encoders, isp.forward_encoders):
-            encoders.colour = AtomEncoder(len(colour.matrices))
-
         if gain is not None:
             isp.gain = gain
             isp.configure(gain_atoms=len(gain.log_gains))
-            for encoders in (isp.reverse_encoders, isp.forward_encoders):
+        for encoders in (isp.reverse_encoders, isp.forward_encoders):
+            encoders.colour = AtomEncoder(len(colour.matrices))
+            if gain is not None:
                 encoders.gain = AtomEncoder(len(gain.log_gains))
 
         if tone is not None:
@@ -150,6 +135,40 @@ class DictionaryISP(nn.Module):
         isp.configure(stages=tuple(stages))
         return isp
 
+    @torch.no_grad()
+    def with_cameras(self, cameras: str | Path | Camera | Sequence[str | Path | Camera]) -> DictionaryISP:
+        """Make an ISP whose atoms are some cameras; tones and lights stay those of this ISP.
+
+        Args:
+            cameras: names of published cameras, cameras of your own (:class:`rawaug.Camera`) or paths of their YAML
+                files.
+
+        Raises:
+            FileNotFoundError: if a camera's file is missing.
+            ValueError: if the atoms of this ISP are not published cameras, or a name is unknown.
+        """
+        if not isinstance(self.colour, CameraDictionary):
+            raise ValueError("camera: needs an ISP with published cameras, such as universal")
+
+        sheets, published = read_cameras(cameras)
+        if not sheets:
+            isp = self.with_atoms(colour=published_atoms(published))
+            isp.info = {**self.info, "cameras": published}
+            return isp.to(self.colour.matrices.device).eval()
+
+        assert self.tone is not None
+        tones = data_sheet_tones(sheets, dict(zip(self.info["tones"], self.tone.curves, strict=True)))
+        isp = self.with_atoms(
+            colour=data_sheet_atoms(sheets),
+            tone=ToneDictionary.from_curves(torch.stack(list(tones.values()))),
+            falloff=data_sheet_shading(sheets),
+        )
+        isp.info = {**self.info, **data_sheet_info(sheets), "tones": list(tones)}
+        isp.info.pop("holds", None)
+        if sheets[0].cfa in CFA.__members__:
+            isp.configure(cfa=sheets[0].cfa)
+        return isp.to(self.colour.matrices.device).eval()
+
     def configure(self, **changes: Any) -> None:
         """Change settings that need no new parameters: ``cfa``, ``knee``, or ``stages`` to fewer of them."""
         config = replace(self.config, **changes)
@@ -158,8 +177,8 @@ class DictionaryISP(nn.Module):
                 raise ValueError(f"stages: {name!r} is not in this ISP, which has {' '.join(self.stages)}")
 
         self.config = config
-        self.stages = nn.ModuleDict({name: self.stages[name] for name in config.stages})
-        for stage in self.ordered_stages:
+        self.stages = Stages({name: self.stages[name] for name in config.stages})
+        for stage in self.stages.ordered:
             stage.config = config
 
     def use_encoders(self, enabled: bool, seed: int = 0) -> None:
@@ -178,9 +197,8 @@ class DictionaryISP(nn.Module):
     @property
     def tone(self) -> ToneDictionary | None:
         """The dictionary of tone curves; None if the curve is learned."""
-        if ToneCurve.name not in self.stages:
-            return None
-        return cast(ToneCurve, self.stages[ToneCurve.name]).dictionary
+        stage = self.stages.find(ToneCurve)
+        return None if stage is None else stage.dictionary
 
     def typical_tones(self) -> Tensor:
         """Weights ``(K,)`` of the tone curves for a picture of which nothing is known; none if the curve is learned."""
@@ -254,38 +272,16 @@ class DictionaryISP(nn.Module):
         if not self.config.encoders:
             return self.params_from_weights(encoders.colour(srgb), encoders.gain(srgb))
 
-        x2 = self.linear(thumbnail(functional.as_float(srgb)))
-        candidates = torch.einsum("nij,bjhw->bnihw", self.colour.atoms(), x2)
-        colour_weights = encoders.colour(candidates)
-        x3 = torch.einsum("bn,bnihw->bihw", colour_weights, candidates)
-
-        balanced = []
-        for gains in self.gain.channel_gains():
-            balanced.append(functional.inverse_gains(x3, gains.expand(len(x3), 3), self.config.knee))
-        return self.params_from_weights(colour_weights, encoders.gain(torch.stack(balanced, dim=1)))
+        x2 = self.stages.linear(thumbnail(functional.as_float(srgb)))
+        weights = encoders.weigh_reverse(x2, self.colour, self.gain, self.config.knee)
+        return self.params_from_weights(*weights)
 
     def choose_forward(self, x4: Tensor) -> ISPParams:
         """Choose the settings of linear images before white balance, x4 ``(B, 3, H, W)``, by the forward encoders."""
-        small = thumbnail(x4)
-        balanced = small[:, None] * self.gain.channel_gains()[None, :, :, None, None]
-        gain_weights = self.forward_encoders.gain(balanced)
-
-        x3 = functional.apply_gains(small, self.gain.combine(gain_weights))
-        candidates = torch.einsum("nij,bjhw->bnihw", torch.linalg.pinv(self.colour.atoms()), x3)
-        return self.params_from_weights(self.forward_encoders.colour(candidates), gain_weights)
+        weights = self.forward_encoders.weigh_forward(thumbnail(x4), self.colour, self.gain)
+        return self.params_from_weights(*weights)
 
     # -- what is known of a shot ------------------------------------------------------------------------------------
-
-    def gain_errors(self) -> Tensor:
-        """The covariances S_e and S_n of the errors of the gains of grey, float64 ``(2, 3, 3)``; see the fusion.
-
-        They are those that the fit has measured. An ISP without any believes the file, but for the digital gain if that
-        is stated as well.
-        """
-        measured = self.info.get("gain_errors")
-        if measured is not None:
-            return torch.tensor(measured, dtype=torch.float64)
-        return torch.stack([torch.eye(3), torch.full((3, 3), fusion.DIGITAL_SLACK)]).double()
 
     def with_white_balance(
         self,
@@ -302,7 +298,7 @@ class DictionaryISP(nn.Module):
         Raises:
             ValueError: if a multiplier is not positive, or the shapes are for another number of pictures.
         """
-        params, _ = fusion.fuse_stated(self.colour, self.gain_errors(), params, white_balance, digital_gain)
+        params, _ = fusion.fuse_stated(self.colour, self.info, params, white_balance, digital_gain)
         return params
 
     def with_tone(self, params: ISPParams, tone: Tone | None) -> ISPParams:
@@ -348,20 +344,12 @@ class DictionaryISP(nn.Module):
         Raises:
             ValueError: if a reading is NaN or lies outside the picture.
         """
-        fusion.require_places(raw_samples, x)
-
-        # The pixels, coordinates and channels of the readings.
-        rows, columns, value = raw_samples[..., 0].long(), raw_samples[..., 1].long(), raw_samples[..., 2]
-        batch = torch.arange(len(x), device=x.device)[:, None]
-        pixels = x[batch, :, rows, columns].transpose(1, 2)[:, :, None]
-        places = coordinates.expand(len(x), -1, -1, -1)[batch, :, rows, columns].transpose(1, 2)[:, :, None]
-        channel = torch.tensor(self.cfa.channels, device=x.device)[rows % 2, columns % 2]
-        site = F.one_hot(channel, 3).transpose(1, 2).to(x)
+        pixels, places, site, value = fusion.locate_readings(raw_samples, x, coordinates, self.cfa)
 
         def reverse(setting: ISPParams) -> Tensor:
-            return self.reverse_pixels(pixels, setting, places)[:, :, 0]
+            return self.stages.reverse(pixels, setting, places)[:, :, 0]
 
-        stated = fusion.fuse_stated(self.colour, self.gain_errors(), params, white_balance, digital_gain)
+        stated = fusion.fuse_stated(self.colour, self.info, params, white_balance, digital_gain)
         chosen = params.colour_weights
         return fusion.fuse_readings(reverse, self.colour, self.tone, chosen, *stated, pixels, site, value)
 
@@ -421,7 +409,7 @@ class DictionaryISP(nn.Module):
                 params = self.with_raw_samples(params, x, raw_samples, places, white_balance, digital_gain)
 
             images: dict[str, Tensor] = {}
-            x5 = self.reverse_pixels(x, params, coordinates, images if intermediates else None)
+            x5 = self.stages.reverse(x, params, coordinates, images if intermediates else None)
             return ISPResult(bayer.mosaic(x5, self.cfa), params, images)
 
     def _float32(self, like: Tensor) -> torch.autocast:
@@ -460,73 +448,17 @@ class DictionaryISP(nn.Module):
             ValueError: if ``raw`` is no such mosaic or not finite, or an argument is for another number of pictures.
         """
         with self._float32(raw):
-            x5 = bayer.demosaic(_require_mosaic(raw), self.cfa)
+            x5 = bayer.demosaic(functional.as_mosaic(raw), self.cfa)
             if params is None:
-                params = self.choose_forward(self.remove_shading(x5, coordinates))
+                params = self.choose_forward(self.stages.remove_shading(x5, coordinates))
             params = self.with_white_balance(params, white_balance)
             params = self.with_tone(params, tone)
 
-            if not intermediates:
-                srgb = self.forward_pixels(x5, params, coordinates)
-                return ISPResult(srgb.clamp(0.0, 1.0), params)
-
-            images: dict[str, Tensor] = {"x5": x5}
-            srgb = self.forward_pixels(x5, params, coordinates, images)
+            images: dict[str, Tensor] = {}
+            if intermediates:
+                images["x5"] = x5
+            srgb = self.stages.forward(x5, params, coordinates, images if intermediates else None)
             return ISPResult(srgb.clamp(0.0, 1.0), params, images)
-
-    def reverse_pixels(
-        self, x: Tensor, params: ISPParams, coordinates: Tensor | None = None, seen: dict[str, Tensor] | None = None
-    ) -> Tensor:
-        """Run the reverse pass without its mosaic.
-
-        Args:
-            x: sRGB as float ``(B, 3, H, W)``; or P pixels of it ``(B, 3, 1, P)``, as the pass is pointwise.
-            params: the settings of the pictures.
-            coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame; by default the picture is the frame.
-            seen: a dict to fill with x1 ... x5 by name.
-
-        Returns:
-            Linear camera colour x5, of the shape of ``x``.
-        """
-        for stage in self.ordered_stages:
-            x = stage.reverse(x, params, coordinates)
-            if seen is not None:
-                seen[f"x{stage.makes}"] = x
-        return x
-
-    def forward_pixels(
-        self, x: Tensor, params: ISPParams, coordinates: Tensor | None = None, seen: dict[str, Tensor] | None = None
-    ) -> Tensor:
-        """Run the forward pass after demosaicing; the result is not clipped.
-
-        Args:
-            x: linear camera colour x5 ``(B, 3, H, W)``.
-            params: the settings of the pictures.
-            coordinates: as in :meth:`reverse_pixels`.
-            seen: a dict to fill with x4 ... x1 by name.
-
-        Returns:
-            sRGB, of the shape of ``x``.
-        """
-        for stage in reversed(self.ordered_stages):
-            x = stage.forward(x, params, coordinates)
-            if seen is not None and stage.makes > 1:
-                seen[f"x{stage.makes - 1}"] = x
-        return x
-
-    def linear(self, x: Tensor) -> Tensor:
-        """Compute x2 from sRGB, both ``(B, 3, H, W)``, by the stages in their usual order; it needs no setting."""
-        for stage in sorted(self.ordered_stages, key=lambda stage: stage.makes):
-            if stage.makes <= 2:
-                x = stage.reverse(x, None)
-        return x
-
-    def remove_shading(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
-        """Compute x4 from x5, both ``(B, 3, H, W)``; the forward encoders look at x4."""
-        for stage in reversed(self.ordered_stages):
-            if stage.makes >= 5:
-                x = stage.forward(x, None, coordinates)
-        return x
 
     # -- as numbers -------------------------------------------------------------------------------------------------
 
@@ -565,7 +497,7 @@ class DictionaryISP(nn.Module):
         """
         if is_camera_file(name):
             try:
-                return restrict_to_cameras(cls.from_pretrained("universal"), name)
+                return cls.from_pretrained("universal").with_cameras(name)
             except ValueError as error:
                 text = str(error)
                 if text.startswith(str(name)):
@@ -592,70 +524,3 @@ class DictionaryISP(nn.Module):
             reason = " ".join(str(error).split())
             raise ValueError(f"{path}: its configuration is damaged ({reason}); {_ADVICE}") from error
         return isp.eval()
-
-
-@torch.no_grad()
-def restrict_to_cameras(
-    isp: DictionaryISP, names: str | Path | Camera | Sequence[str | Path | Camera]
-) -> DictionaryISP:
-    """Make an ISP whose atoms are some cameras; the tones and lights stay those of ``isp``.
-
-    Args:
-        isp: an ISP of published cameras, such as ``universal``.
-        names: names of published cameras, cameras of your own (:class:`rawaug.Camera`) or paths of their YAML files.
-
-    Raises:
-        FileNotFoundError: if a camera's file is missing.
-        ValueError: if the atoms of ``isp`` are not published cameras, or a name is unknown.
-    """
-    if not isinstance(isp.colour, CameraDictionary):
-        raise ValueError("camera: needs an ISP with published cameras, such as universal")
-    if isinstance(names, (str, Path, Camera)):
-        names = [names]
-
-    sheets: list[Camera] = []
-    published: list[str] = []
-    for name in names:
-        if isinstance(name, Camera) or is_camera_file(name):
-            sheets.append(as_camera(name))
-        else:
-            published.append(find_camera(str(name), load_cameras().names))
-
-    if not sheets:
-        narrowed = isp.with_atoms(colour=published_atoms(published))
-        narrowed.info = {**isp.info, "cameras": published}
-        return narrowed.to(isp.colour.matrices.device).eval()
-
-    # The table of published cameras has no patterns.
-    cfa = sheets[0].cfa
-    sheets += [replace(Camera.published(name), cfa=cfa) for name in published]
-    patterns = sorted({camera.cfa for camera in sheets})
-    if len(patterns) > 1:
-        raise ValueError(f"cameras have several patterns, {', '.join(patterns)}; give those of one pattern")
-
-    assert isp.tone is not None
-    curves = dict(zip(isp.info["tones"], isp.tone.curves, strict=True))
-    tones = data_sheet_tones(sheets, curves)
-    tone = ToneDictionary.from_curves(torch.stack(list(tones.values())))
-    narrowed = isp.with_atoms(colour=data_sheet_atoms(sheets), tone=tone, falloff=data_sheet_shading(sheets))
-
-    narrowed.info = {**isp.info, "cameras": [camera.name for camera in sheets], "tones": list(tones)}
-    narrowed.info["own_cameras"] = [camera.to_json() for camera in sheets]
-    narrowed.info.pop("holds", None)
-    if cfa in CFA.__members__:
-        narrowed.configure(cfa=cfa)
-    else:
-        narrowed.info["pattern"] = cfa
-    noise = sheets[0].noise_spec()
-    if len(sheets) == 1 and noise is not None:
-        narrowed.info["noise"] = noise
-    return narrowed.to(isp.colour.matrices.device).eval()
-
-
-def _require_mosaic(raw: Tensor) -> Tensor:
-    """Return RAW as float32; ValueError unless it is a floating-point mosaic ``(B, 1, H, W)`` of finite values."""
-    if raw.ndim != 4 or raw.shape[1] != 1 or not raw.is_floating_point():
-        raise ValueError(f"RAW must be a floating-point mosaic (B, 1, H, W), got {tuple(raw.shape)} {raw.dtype}")
-    if raw.device.type == "cpu" and (damaged := int((~raw.detach().isfinite()).sum())):
-        raise ValueError(f"RAW must be finite, got NaN or infinity in {damaged} of {raw.numel()} values")
-    return raw.float()

@@ -32,7 +32,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, TypeVar, cast
 
 import torch
 import torch.nn.functional as F
@@ -158,6 +158,82 @@ class Stage(nn.Module, ABC):
             and B. None without any.
         """
         return None
+
+
+S = TypeVar("S", bound=Stage)
+
+
+class Stages(nn.ModuleDict):
+    """The stages of an ISP by name, in reverse order. Everything but the mosaic happens here.
+
+    Images are ``(B, 3, H, W)``, or P pixels of them ``(B, 3, 1, P)``, as the stages are pointwise.
+    """
+
+    @property
+    def ordered(self) -> list[Stage]:
+        """The stages in reverse order."""
+        return [cast(Stage, stage) for stage in self.values()]
+
+    def find(self, kind: type[S]) -> S | None:
+        """The stage of this class, or None."""
+        for stage in self.ordered:
+            if isinstance(stage, kind):
+                return stage
+        return None
+
+    def reverse(
+        self, x: Tensor, params: ISPParams, coordinates: Tensor | None = None, seen: dict[str, Tensor] | None = None
+    ) -> Tensor:
+        """Run the reverse pass without its mosaic.
+
+        Args:
+            x: sRGB as float ``(B, 3, H, W)``.
+            params: the settings of the pictures.
+            coordinates: ``(1 or B, 2, H, W)`` of the pixels in the full frame; by default the picture is the frame.
+            seen: a dict to fill with x1 ... x5 by name.
+
+        Returns:
+            Linear camera colour x5, of the shape of ``x``.
+        """
+        for stage in self.ordered:
+            x = stage.reverse(x, params, coordinates)
+            if seen is not None:
+                seen[f"x{stage.makes}"] = x
+        return x
+
+    def forward(
+        self, x: Tensor, params: ISPParams, coordinates: Tensor | None = None, seen: dict[str, Tensor] | None = None
+    ) -> Tensor:
+        """Run the forward pass after demosaicing; the result is not clipped.
+
+        Args:
+            x: linear camera colour x5 ``(B, 3, H, W)``.
+            params: the settings of the pictures.
+            coordinates: as in :meth:`reverse`.
+            seen: a dict to fill with x4 ... x1 by name.
+
+        Returns:
+            sRGB, of the shape of ``x``.
+        """
+        for stage in reversed(self.ordered):
+            x = stage.forward(x, params, coordinates)
+            if seen is not None and stage.makes > 1:
+                seen[f"x{stage.makes - 1}"] = x
+        return x
+
+    def linear(self, x: Tensor) -> Tensor:
+        """Compute x2 from sRGB, both ``(B, 3, H, W)``, by the stages in their usual order; it needs no setting."""
+        for stage in sorted(self.ordered, key=lambda stage: stage.makes):
+            if stage.makes <= 2:
+                x = stage.reverse(x, None)
+        return x
+
+    def remove_shading(self, x: Tensor, coordinates: Tensor | None) -> Tensor:
+        """Compute x4 from x5, both ``(B, 3, H, W)``; the forward encoders look at x4."""
+        for stage in reversed(self.ordered):
+            if stage.makes >= 5:
+                x = stage.forward(x, None, coordinates)
+        return x
 
 
 def node_colours(nodes: int) -> Tensor:

@@ -165,7 +165,7 @@ def stage_psnr(isp: DictionaryISP, pair: Pair, white_balance: bool) -> list[list
         params = isp.with_white_balance(params, pair.clean.white_balance)
 
     images: dict[str, Tensor] = {}
-    isp.reverse_pixels(srgb, params, coordinates, images)
+    isp.stages.reverse(srgb, params, coordinates, images)
 
     rows = []
     image = srgb

@@ -326,7 +326,7 @@ def _cycles(model: Method, x: Tensor) -> dict[str, Tensor]:
 def cycle_without_mosaic(isp: DictionaryISP, srgb: Tensor) -> Tensor:
     """Convert sRGB ``(B, 3, H, W)`` to x5 and back under one setting, which shows what the stages alone lose."""
     params = isp.choose(srgb)
-    return isp.forward_pixels(isp.reverse_pixels(srgb, params), params).clamp(0.0, 1.0)
+    return isp.stages.forward(isp.stages.reverse(srgb, params), params).clamp(0.0, 1.0)
 
 
 def mosaic_only_psnr(pictures: Sequence[Tensor], cfa: CFA | str = "RGGB") -> float:

@@ -28,7 +28,7 @@ from rawaug.camera.own import Camera
 from rawaug.errors import count_of
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fast import BakedISP, FastForward
-from rawaug.isp.model import DictionaryISP, restrict_to_cameras
+from rawaug.isp.model import DictionaryISP
 from rawaug.kernels import can_use_triton
 from rawaug.kernels.runtime import eager, take_pictures
 from rawaug.noise import Iso, NoiseSpec, noise_model
@@ -194,7 +194,7 @@ class RawAugment(PairMaker):
         elif not isinstance(isp, DictionaryISP):
             isp = DictionaryISP.from_pretrained(isp)
         if camera is not None:
-            isp = restrict_to_cameras(isp, camera)
+            isp = isp.with_cameras(camera)
 
         if noise is None:
             noise = usual_noise(isp)
@@ -560,7 +560,7 @@ def freeze(module: M) -> M:
 
 def _isp_of_camera(camera: Camera | str | Path) -> DictionaryISP:
     """The ISP ``universal`` with the user's own camera in place of the published ones."""
-    return restrict_to_cameras(DictionaryISP.from_pretrained("universal"), camera)
+    return DictionaryISP.from_pretrained("universal").with_cameras(camera)
 
 
 def _noise_of_cameras(camera: str | Path | Camera | Sequence[str | Path | Camera]) -> str | list[str]:

@@ -387,8 +387,8 @@ def _color(pair: RawPair, augment: RawAugment) -> tuple[tuple[float, float, floa
     # With raw = C x / gains for linear sRGB x, grey is s / gains in the camera, where s are the sums of C's rows. So
     # white balance is gains / s, whose green is the exposure, and C with its rows over s is the matrix's inverse.
     setting = pair.params.isp
-    matrix = setting.matrix if augment.isp.find(ColorCorrection) else torch.eye(3)
-    gains = setting.gains if augment.isp.find(WhiteBalance) else torch.ones(3)
+    matrix = setting.matrix if augment.isp.stages.find(ColorCorrection) else torch.eye(3)
+    gains = setting.gains if augment.isp.stages.find(WhiteBalance) else torch.ones(3)
     grey = matrix.sum(1)
     balance = gains / grey
     if not balance.min() > 0:
@@ -408,7 +408,7 @@ def _black(darkest: float) -> float:
 def _shading_maps(augment: RawAugment, pair: RawPair) -> tuple[GainMap, ...]:
     """Make gain maps that correct the shading, if the ISP has any: its Gaussian part, or the tables of a camera."""
     height, width = augment.mosaic(pair.clean).shape[-2:]
-    falloff = augment.isp.find(FallOff)
+    falloff = augment.isp.stages.find(FallOff)
     if falloff is not None:
         tables = torch.einsum("n,nchw->chw", pair.params.isp.colour_weights, falloff.tables)
         spacing = 1 / (FALLOFF_NODES - 1)
@@ -425,7 +425,7 @@ def _shading_maps(augment: RawAugment, pair: RawPair) -> tuple[GainMap, ...]:
             maps.append(corrections)
         return tuple(maps)
 
-    lens = augment.isp.find(LensShading)
+    lens = augment.isp.stages.find(LensShading)
     if lens is None:
         return ()
 

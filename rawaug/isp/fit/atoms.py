@@ -167,7 +167,7 @@ def _reverse_in_parts(isp: DictionaryISP, samples: PixelSamples, params: ISPPara
     for index in torch.arange(count).split(_FRAMES_AT_ONCE):
         part = samples.of_frames(index)
         of_part = ISPParams(*[tensor[index] for tensor in params])
-        parts.append(isp.reverse_pixels(part.srgb, of_part, part.coordinates))
+        parts.append(isp.stages.reverse(part.srgb, of_part, part.coordinates))
 
     return torch.cat(parts)
 

@@ -59,7 +59,7 @@ def cycle_error(
     """
     ahead: dict[str, Tensor] = {}
     start = back["raw"].detach() if config.noisy else part.cell_raw
-    error = (isp.forward_pixels(start, params, part.coordinates, ahead) - part.cell_srgb) ** 2
+    error = (isp.stages.forward(start, params, part.coordinates, ahead) - part.cell_srgb) ** 2
     for name, image in ahead.items():
         if name in back:
             error = error + config.intermediate * (image - back[name]) ** 2
@@ -70,7 +70,7 @@ def frame_mse(isp: DictionaryISP, part: PixelSamples, params: ISPParams) -> Tens
     """Compute the mean squared error of every frame ``(F,)`` on its unclipped pixels."""
     count = len(part.srgb)
     params = params.map(lambda tensor: tensor.expand(count, *tensor.shape[1:]))
-    error = (isp.reverse_pixels(part.srgb, params, part.coordinates) - part.target) ** 2 * part.known
+    error = (isp.stages.reverse(part.srgb, params, part.coordinates) - part.target) ** 2 * part.known
     return error.sum((1, 2, 3)) / part.known.sum((1, 2, 3)).clamp_min(1.0)
 
 
@@ -135,7 +135,7 @@ def trained_tensors(isp: DictionaryISP, forward: bool, up_to: int = 5) -> dict[s
     start of a fit, the toe stands for the tone network.
     """
     tensors: dict[str, Tensor] = {}
-    for stage in isp.ordered_stages:
+    for stage in isp.stages.ordered:
         if stage.makes > up_to:
             continue
         if isinstance(stage, ToneMap) and stage.toe is not None and not forward:

@@ -114,7 +114,7 @@ def _train(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: De
 def _encoder_loss(
     isp: DictionaryISP, part: PixelSamples, shot: FrameSummary, config: FitConfig, generator: torch.Generator
 ) -> Tensor:
-    srgb, raw = _same_piece(shot.srgb, isp.remove_shading(shot.raw, None), generator)
+    srgb, raw = _same_piece(shot.srgb, isp.stages.remove_shading(shot.raw, None), generator)
     ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
     our_error = (frame_mse(isp, part, ours) + config.mse_floor).log()
     their_error = (frame_mse(isp, part, theirs) + config.mse_floor).log()
@@ -186,7 +186,7 @@ def train_jointly(
     def loss(generator: torch.Generator) -> Tensor:
         losses = []
         for part, srgb, raw in _draw_batches(trained, frames_a_step, pixels, generator):
-            raw = isp.remove_shading(raw, None)
+            raw = isp.stages.remove_shading(raw, None)
             if published:
                 srgb, raw = _same_piece(srgb, raw, generator)
 
@@ -241,7 +241,7 @@ def _joint_loss(isp: DictionaryISP, part: PixelSamples, srgb: Tensor, raw: Tenso
     """Compute the loss of B frames: ``srgb`` ``(B, 3, h, w)`` and ``raw`` ``(B, 3, h', w')``, without shading."""
     ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
     back: dict[str, Tensor] = {}
-    back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.coordinates, back)
+    back["raw"] = isp.stages.reverse(part.cell_srgb, ours, part.coordinates, back)
     cycle = cycle_error(isp, part, theirs, back, config)
     distance = _weight_distance(ours, theirs) / len(srgb)
     error = frame_mse(isp, part, ours)

@@ -256,7 +256,7 @@ def _fit_curve(
             predicted = functional.correct_colour(linear_light(isp, frames.pixels), colour.product())
             return float(reading_error(predicted, frames.pixels))
 
-    shading = isp.find(LensShading)
+    shading = isp.stages.find(LensShading)
     mode = config.shading if shading else "off"
     steps = CURVE_STEPS if config.curve_steps is None else config.curve_steps
     numbers = trained_tensors(isp, forward=False, up_to=2) | colour._asdict()
@@ -285,7 +285,7 @@ def _fit_curve(
         isp.configure(stages=tuple(name for name in isp.config.stages if name != shading.name))
 
     # From now on the tone network takes the place of the toe.
-    tone = isp.find(ToneMap)
+    tone = isp.stages.find(ToneMap)
     if tone is not None and tone.toe is not None:
         tone.reverse_network.start_from(float(tone.toe))
         tone.toe = None
@@ -311,12 +311,12 @@ def _start_from(
     def fit_under(curve: Callable[[Tensor], Tensor]) -> tuple[FrameColour, float]:
         return fit_colours(linear_light(isp, pixels, curve), pixels, known_matrix)
 
-    curves: list[Callable[[Tensor], Tensor]] = [other.linear]
+    curves: list[Callable[[Tensor], Tensor]] = [other.stages.linear]
     if other.tone is not None:
         curves = [partial(_apply_table, table) for table in other.tone.curves]
     errors = [fit_under(curve)[1] for curve in curves]
     best = curves[errors.index(min(errors))]
-    _, error = fit_under(isp.linear)
+    _, error = fit_under(isp.stages.linear)
     if min(errors) >= error:
         return colour
 
@@ -333,7 +333,7 @@ def _start_from(
     descent = adam(
         tensors,
         _START_RATE,
-        lambda step: ((isp.linear(colours) - target) ** 2 / (target + 0.01)).mean(),
+        lambda step: ((isp.stages.linear(colours) - target) ** 2 / (target + 0.01)).mean(),
         lambda step: step / _START_STEPS,
     )
     for _ in descent:
@@ -342,7 +342,7 @@ def _start_from(
     for tensor in tensors:
         tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
 
-    started_colour, started_error = fit_under(isp.linear)
+    started_colour, started_error = fit_under(isp.stages.linear)
     if started_error < error:
         return started_colour
 
@@ -369,7 +369,7 @@ def _fit_tone(
 
     def loss(generator: torch.Generator) -> Tensor:
         chosen, pixels = draw_batch(frames.pixels, config.batch, generator)
-        predicted = isp.reverse_pixels(pixels.srgb, colour.pick(chosen).params(), pixels.coordinates)
+        predicted = isp.stages.reverse(pixels.srgb, colour.pick(chosen).params(), pixels.coordinates)
         return reading_error(predicted, pixels) + tie(colour, frames)
 
     def status() -> str:
@@ -389,7 +389,7 @@ def fit_forward(
 ) -> None:
     """Run stage 5: fit the forward pass of ``isp`` to its reverse pass, in the frames' own colours."""
     # It starts with the power of the reverse pass, or with its curves, which keep their slopes.
-    power, table = isp.find(Gamma), isp.find(ToneCurve)
+    power, table = isp.stages.find(Gamma), isp.stages.find(ToneCurve)
     with torch.no_grad():
         if power is not None:
             power.forward_gamma.copy_(power.reverse_gamma)
@@ -402,7 +402,7 @@ def fit_forward(
         params = colour.pick(chosen).params()
         back: dict[str, Tensor] = {}
         with torch.no_grad():
-            back["raw"] = isp.reverse_pixels(pixels.cell_srgb, params, pixels.coordinates, back)
+            back["raw"] = isp.stages.reverse(pixels.cell_srgb, params, pixels.coordinates, back)
         return cycle_error(isp, pixels, params, back, config)
 
     tensors = trained_tensors(isp, forward=True)

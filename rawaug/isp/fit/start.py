@@ -38,7 +38,7 @@ _CAMERA_RIDGE = 1e-3
 @torch.no_grad()
 def set_curve(isp: DictionaryISP, gamma: float, toe: float) -> None:
     """Set the curve of an ISP to ``(x + toe (1 - x))^gamma``; a table is this minus its value at black."""
-    tone, power, table = isp.find(ToneMap), isp.find(Gamma), isp.find(ToneCurve)
+    tone, power, table = isp.stages.find(ToneMap), isp.stages.find(Gamma), isp.stages.find(ToneCurve)
     if tone is not None:
         tone.toe = torch.tensor(toe)
     if power is not None:
@@ -52,8 +52,8 @@ def set_curve(isp: DictionaryISP, gamma: float, toe: float) -> None:
 
 def linear_light(isp: DictionaryISP, pixels: PixelSamples, curve: Callable[[Tensor], Tensor] | None = None) -> Tensor:
     """Compute x2 times the mask ``(F, 3, 1, P)``, which ``M_f`` takes to RAW; by default by the ISP's own curve."""
-    x = (curve or isp.linear)(pixels.srgb)
-    shading = isp.find(LensShading)
+    x = (curve or isp.stages.linear)(pixels.srgb)
+    shading = isp.stages.find(LensShading)
     if shading is not None:
         x = x * shading.mask(pixels.coordinates)
     return x

@@ -15,7 +15,6 @@ import rawaug
 from rawaug.bayer import CFA
 from rawaug.camera.lights import light_xyz
 from rawaug.camera.own import Camera
-from rawaug.isp.model import restrict_to_cameras
 
 CCMS = {
     2850.0: [[1.9, -0.7, -0.2], [-0.4, 2.0, -0.6], [0.0, -0.9, 1.9]],
@@ -132,7 +131,7 @@ def test_a_sheet_states_its_shading(tmp_path: Path) -> None:
     shares = camera.shading_in("A")
     assert shares is not None and shares[2].tolist() == table and camera.shading_in("D50") is not None
     universal = rawaug.DictionaryISP.from_pretrained("universal")
-    isp = restrict_to_cameras(universal, camera)
+    isp = universal.with_cameras(camera)
     augment = rawaug.RawAugment(isp)
     isp.save(tmp_path / "isp.safetensors")
     again = rawaug.RawAugment.from_pretrained(tmp_path / "isp.safetensors")

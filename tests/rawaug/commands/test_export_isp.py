@@ -25,11 +25,11 @@ def isp(request: pytest.FixtureRequest) -> DictionaryISP:
 
 def centred(isp: DictionaryISP, srgb: torch.Tensor, white_balance: tuple[float, ...] | None = None) -> torch.Tensor:
     """Camera RGB at the centre of the lens shading."""
-    shading = isp.find(LensShading)
+    shading = isp.stages.find(LensShading)
     mean = torch.zeros(2) if shading is None else shading.mask.mean
     place = mean[None, :, None, None].expand(1, 2, *srgb.shape[-2:])
     with torch.no_grad():
-        return isp.reverse_pixels(srgb, isp.typical_setting(white_balance), place)
+        return isp.stages.reverse(srgb, isp.typical_setting(white_balance), place)
 
 
 def test_the_cube_interpolates_the_reverse_pass(isp: DictionaryISP, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from rawaug.isp.dictionary import (
     project_to_simplex,
 )
 from rawaug.isp.fast import BakedISP
-from rawaug.isp.model import DictionaryISP, restrict_to_cameras
+from rawaug.isp.model import DictionaryISP
 from rawaug.isp.tone import STEPS
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
@@ -105,7 +105,7 @@ def test_white_and_grey_are_divided_by_the_gains(universal: DictionaryISP) -> No
     curve = universal.tone.combine(setting.tone_weights)
     for code in (100, 255):
         picture = torch.full((8, 3, 2, 2), code / 255)
-        made = universal.reverse_pixels(picture, setting)[:, :, 0, 0]
+        made = universal.stages.reverse(picture, setting)[:, :, 0, 0]
         torch.testing.assert_close(made * setting.gains, curve[:, code * STEPS, None].expand(8, 3), atol=1e-5, rtol=0)
         baked = BakedISP(universal)(picture, setting)[:, [0, 1, 3], 0, 0]  # R, Gr and B of the packed RAW
         torch.testing.assert_close(baked, made, atol=1e-5, rtol=0)
@@ -147,7 +147,7 @@ def test_the_balance_in_a_light_is_that_of_the_matrix_from_xyz(universal: Dictio
 def test_independent_gains_are_those_of_other_light(universal: DictionaryISP, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same cameras as in a consistent draw, and the same spread of gains, in no relation to each other."""
     assert isinstance(universal.colour, CameraDictionary)
-    camera = restrict_to_cameras(universal, ["Nikon D750", "Leica S3"]).colour
+    camera = universal.with_cameras(["Nikon D750", "Leica S3"]).colour
     assert isinstance(camera, CameraDictionary)
     monkeypatch.setattr(samplers, "CAMERAS_MIXED", 1)
 
@@ -165,7 +165,7 @@ def test_independent_gains_are_those_of_other_light(universal: DictionaryISP, mo
 
 def test_one_named_camera_has_its_own_matrix_and_balance(universal: DictionaryISP) -> None:
     own = load_cameras().select(["Nikon D750"])
-    nikon = restrict_to_cameras(universal, "nikon d750")
+    nikon = universal.with_cameras("nikon d750")
     setting = nikon.draw_setting(5, generator())
     torch.testing.assert_close(setting.matrix, camera_from_srgb(own).float().expand(5, 3, 3))
     assert setting.gains.std(dim=0).max() > 0.1
@@ -175,9 +175,9 @@ def test_one_named_camera_has_its_own_matrix_and_balance(universal: DictionaryIS
     torch.testing.assert_close(gains_in_light(back, d65), gains_in_light(own, d65), atol=1e-3, rtol=0)
     torch.testing.assert_close(back, own, atol=1e-4, rtol=0)
     with pytest.raises(ValueError, match="not listed"):
-        restrict_to_cameras(universal, "Box Brownie")
+        universal.with_cameras("Box Brownie")
     with pytest.raises(ValueError, match="published cameras"):
-        restrict_to_cameras(DictionaryISP(), "Nikon D750")
+        DictionaryISP().with_cameras("Nikon D750")
 
 
 def test_what_cannot_be_drawn_is_refused() -> None:

@@ -33,7 +33,7 @@ def scene(isp: DictionaryISP) -> Tensor:
 @torch.no_grad()
 def exposed(isp: DictionaryISP, scene: Tensor, stops: float) -> Tensor:
     """The 8-bit picture that the ISP makes of a scene."""
-    srgb = isp.forward_pixels(scene * 2.0**stops, isp.choose(torch.zeros_like(scene)))
+    srgb = isp.stages.forward(scene * 2.0**stops, isp.choose(torch.zeros_like(scene)))
     return (srgb.clamp(0, 1) * 255).round().to(torch.uint8)
 
 

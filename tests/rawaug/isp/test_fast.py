@@ -64,7 +64,7 @@ def test_the_mask_keeps_to_the_place_that_a_turned_crop_has_in_its_frame(view: i
     isp = full_isp()
     frame = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))
     params = isp.choose(frame)
-    x5 = isp.reverse_pixels(frame, params)
+    x5 = isp.stages.reverse(frame, params)
     crop, expected = (bayer.turn(x[..., 6:26, 34:50], view) for x in (frame, x5))
     raw = BakedISP(isp)(crop, params, torch.tensor([[6, 34, 40, 60, view]]))
     assert psnr(raw, bayer.pack_rgb(expected, isp.cfa)).item() > 75.0
@@ -118,9 +118,9 @@ def forward_curved(**settings: object) -> DictionaryISP:
     """:func:`full_isp`, whose forward networks do something as well."""
     isp, generator = full_isp(**settings), torch.Generator().manual_seed(5)
     with torch.no_grad():
-        if tone := isp.find(ToneMap):
+        if tone := isp.stages.find(ToneMap):
             list(tone.forward_network.parameters())[-2].normal_(std=0.05, generator=generator)
-        if (lens := isp.find(LensShading)) and lens.forward_attention:
+        if (lens := isp.stages.find(LensShading)) and lens.forward_attention:
             for layers in (lens.forward_attention.layers, lens.forward_attention.place_layers):
                 list(layers.parameters())[-2].normal_(std=0.05, generator=generator)
     return isp
@@ -145,7 +145,7 @@ def test_fast_forward_is_the_isp_above_60_db(name: str) -> None:
 def error_below_white(isp: DictionaryISP, made: Tensor, x5: Tensor, params: ISPParams) -> float:
     """PSNR against the exact pass where its linear light is at most white; above, the fast one clips before tone."""
     seen: dict[str, Tensor] = {}
-    exact = isp.forward_pixels(x5, params, None, seen).clamp(0.0, 1.0)
+    exact = isp.stages.forward(x5, params, None, seen).clamp(0.0, 1.0)
     balanced = seen["x3"] <= params.gains.amin(dim=1)[:, None, None, None]
     below = ((seen["x2"] <= 1.0) & balanced).all(dim=1, keepdim=True).expand_as(exact)
     assert below.float().mean() > 0.4
@@ -158,7 +158,7 @@ def test_fast_forward_undoes_the_mask_where_the_crop_was(view: int) -> None:
     isp = forward_curved()
     x5 = 0.3 * torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))
     params = isp.choose(x5)
-    whole = isp.forward_pixels(x5, params).clamp(0.0, 1.0)
+    whole = isp.stages.forward(x5, params).clamp(0.0, 1.0)
     crop, expected = (bayer.turn(x[..., 6:26, 34:50], view).contiguous() for x in (x5, whole))
     made = FastForward(isp)(crop, params, torch.tensor([[6, 34, 40, 60, view]]))
     assert psnr(made, expected).item() > 50.0
@@ -181,7 +181,7 @@ def test_gradients_of_fast_forward_are_those_of_the_isp() -> None:
     params = isp.draw_setting(1, torch.Generator().manual_seed(2))
     x5 = 0.1 + 0.1 * torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
     found = []
-    for forward in (FastForward(isp), isp.forward_pixels):
+    for forward in (FastForward(isp), isp.stages.forward):
         x, gains = x5.clone().requires_grad_(), params.gains.clone().requires_grad_()
         forward(x, params._replace(gains=gains)).square().sum().backward()
         found.append((x.grad, gains.grad))

@@ -17,7 +17,7 @@ def isp() -> DictionaryISP:
 
 
 def test_it_has_encoders_and_both_masks_in_no_more_parameters_than_published(isp: DictionaryISP) -> None:
-    lens = isp.find(LensShading)
+    lens = isp.stages.find(LensShading)
     assert isp.config.encoders and lens is not None and lens.reverse_attention is not None
     assert sum(p.numel() for p in isp.parameters()) <= 590_000
 
@@ -36,7 +36,7 @@ def test_its_dictionaries_are_plausible_matrices_and_gains(isp: DictionaryISP) -
 
 
 def test_its_mask_darkens_corners_about_the_middle(isp: DictionaryISP) -> None:
-    lens = isp.find(LensShading)
+    lens = isp.stages.find(LensShading)
     assert lens is not None
     corners = torch.tensor([[0.7, 0.7], [0.7, -0.7], [-0.7, 0.7], [-0.7, -0.7]]).T[None, :, None]
     mask = lens.mask(corners)

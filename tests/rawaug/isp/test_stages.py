@@ -148,8 +148,8 @@ def test_a_new_stage_is_reversed_baked_chosen_by_and_saved(tmp_path: Path, srgb:
     isp = DictionaryISP(ISPConfig(stages=("squeeze", *POINTWISE_STAGES[1:]), encoders=True))
     result = isp.reverse(srgb, intermediates=True)
     torch.testing.assert_close(result.intermediates["x1"], srgb - 0.3 * srgb * (1.0 - srgb))
-    x5 = isp.reverse_pixels(srgb, result.params)
-    torch.testing.assert_close(isp.forward_pixels(x5, result.params), srgb, atol=1e-4, rtol=0)
+    x5 = isp.stages.reverse(srgb, result.params)
+    torch.testing.assert_close(isp.stages.forward(x5, result.params), srgb, atol=1e-4, rtol=0)
     baked = BakedISP(isp)
     for chosen, expected in zip(baked.host.choose(srgb), result.params, strict=True):
         torch.testing.assert_close(chosen, expected, atol=1e-3, rtol=0)

@@ -24,11 +24,11 @@ def full_isp(**settings: Any) -> DictionaryISP:
     generator = torch.Generator().manual_seed(0)
     isp = DictionaryISP(ISPConfig(cfa="GBRG", colour_atoms=3, gain_atoms=3, **settings)).requires_grad_(False)
     isp.colour.matrices.add_(0.3 * torch.rand(3, 3, 3, generator=generator))
-    if tone := isp.find(ToneMap):
+    if tone := isp.stages.find(ToneMap):
         list(tone.reverse_network.parameters())[-2].normal_(std=0.05, generator=generator)
     if isp.tone:
         isp.tone.curves[0] **= 2
-    if lens := isp.find(LensShading):
+    if lens := isp.stages.find(LensShading):
         lens.mask.set(torch.tensor([0.1, 0.0]), 0.5 * torch.eye(2))
         if lens.reverse_attention:
             for layers in (lens.reverse_attention.layers, lens.reverse_attention.place_layers):

@@ -55,7 +55,7 @@ def test_defects_of_the_sensor_stay_and_its_noise_does_not(universal: Dictionary
 @pytest.mark.parametrize("attention", [False, True])
 def test_the_shading_of_the_lens_does_not_move_with_the_scene(attention: bool) -> None:
     isp = DictionaryISP(ISPConfig(attention=attention))
-    lens = isp.find(LensShading)
+    lens = isp.stages.find(LensShading)
     assert lens is not None
     lens.mask.set(torch.tensor([0.1, 0.0]), torch.tensor([[9.0, 2.0], [2.0, 5.0]]))
     if lens.reverse_attention is not None:

@@ -134,9 +134,9 @@ def both_passes(isp: DictionaryISP, part: PixelSamples) -> tuple[dict[str, Tenso
     """Intermediate images of the two passes under the reverse weights, and the sRGB of the forward one."""
     params = isp.choose(part.srgb)
     back: dict[str, Tensor] = {}
-    back["raw"] = isp.reverse_pixels(part.cell_srgb, params, part.coordinates, back)
+    back["raw"] = isp.stages.reverse(part.cell_srgb, params, part.coordinates, back)
     ahead: dict[str, Tensor] = {}
-    srgb = isp.forward_pixels(part.cell_raw, params, part.coordinates, ahead)
+    srgb = isp.stages.forward(part.cell_raw, params, part.coordinates, ahead)
     return back, ahead, srgb
 
 
@@ -175,7 +175,7 @@ def test_a_fit_shows_the_forward_encoders_what_the_forward_pass_does(
     if stage == "encoders":
         encoders._encoder_loss(isp, part, shots[0], CLEAN, torch.Generator().manual_seed(0))
     else:
-        encoders._joint_loss(isp, part, shots[0].srgb, isp.remove_shading(shots[0].raw, None), CLEAN)
+        encoders._joint_loss(isp, part, shots[0].srgb, isp.stages.remove_shading(shots[0].raw, None), CLEAN)
     shaded = shots[0].raw.std((2, 3)) / shots[0].raw.mean((2, 3))
     corrected = seen[0].std((3, 4)) / seen[0].mean((3, 4)).abs()
     assert corrected.max() < 0.2 * shaded.max()  # borders of the demosaicing remain

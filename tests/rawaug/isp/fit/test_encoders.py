@@ -209,7 +209,7 @@ def test_the_published_fit_learns_encoders_and_both_masks_end_to_end(exact_pair:
     assert isp.info["joint"]["steps"] == 40 and isp.info["joint"]["kept_step"] > 0
     chosen = [isp.choose(pairs[k].srgb[None]) for k in (0, 2)]
     assert not torch.allclose(chosen[0].colour_weights, chosen[1].colour_weights)
-    lens = isp.find(LensShading)
+    lens = isp.stages.find(LensShading)
     assert lens is not None and lens.reverse_attention is not None
     assert lens.reverse_attention.place_layers[-1].weight.abs().max() > 0  # type: ignore[operator]
 

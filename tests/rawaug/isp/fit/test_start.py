@@ -128,13 +128,13 @@ def test_many_frames_pass_the_networks_a_few_at_a_time(
     colour = FrameColour.from_product(torch.eye(3).expand(len(frames), 3, 3))
     isp = DictionaryISP(ISPConfig(colour_atoms=4, gain_atoms=4))
     counts: list[int] = []
-    reverse_pixels = isp.reverse_pixels
+    reverse = isp.stages.reverse
 
     def counted(x: torch.Tensor, *args: Any) -> torch.Tensor:
         counts.append(len(x))
-        return reverse_pixels(x, *args)
+        return reverse(x, *args)
 
-    monkeypatch.setattr(isp, "reverse_pixels", counted)
+    monkeypatch.setattr(isp.stages, "reverse", counted)
     set_dictionaries(isp, colour, drawn, FitConfig(prior_steps=1))
     assert max(counts) < len(frames) // 2  # a network's activations are some ten times as large as its picture
     assert sum(counts) % len(frames) == 0  # and each frame passes every time
