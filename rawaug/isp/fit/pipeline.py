@@ -33,7 +33,7 @@ from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.atoms import REACH_ATOMS, measure_gain_errors, set_dictionaries
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.descent import Descent, adam, cycle_error, draw_batch, mean_psnr, reading_error, trained_tensors
-from rawaug.isp.fit.encoders import Refit, gain_left_out, train_encoders, train_jointly
+from rawaug.isp.fit.end_to_end import Refit, gain_left_out, train_encoders, train_jointly
 from rawaug.isp.fit.samples import FitFrames, FramePair, FrameSummary, PixelSamples, sample_pixels
 from rawaug.isp.fit.start import FEWEST_PIXELS, FrameColour, fit_colours, fit_fall_off, linear_light, set_curve, tie
 from rawaug.isp.model import DictionaryISP

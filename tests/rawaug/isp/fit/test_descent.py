@@ -14,7 +14,7 @@ from torch import Tensor
 
 from rawaug.data.pairs import Pair
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.fit import FitConfig, encoders, fit_isp, pipeline
+from rawaug.isp.fit import FitConfig, end_to_end, fit_isp, pipeline
 from rawaug.isp.fit.descent import Descent, cycle_error, reading_error
 from rawaug.isp.fit.samples import FitFrames, PixelSamples, sample_pixels
 from rawaug.isp.model import DictionaryISP
@@ -173,9 +173,9 @@ def test_a_fit_shows_the_forward_encoders_what_the_forward_pass_does(
     seen: list[Tensor] = []
     isp.forward_encoders.colour.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
     if stage == "encoders":
-        encoders._encoder_loss(isp, part, shots[0], CLEAN, torch.Generator().manual_seed(0))
+        end_to_end._encoder_loss(isp, part, shots[0], CLEAN, torch.Generator().manual_seed(0))
     else:
-        encoders._joint_loss(isp, part, shots[0].srgb, isp.stages.remove_shading(shots[0].raw, None), CLEAN)
+        end_to_end._joint_loss(isp, part, shots[0].srgb, isp.stages.remove_shading(shots[0].raw, None), CLEAN)
     shaded = shots[0].raw.std((2, 3)) / shots[0].raw.mean((2, 3))
     corrected = seen[0].std((3, 4)) / seen[0].mean((3, 4)).abs()
     assert corrected.max() < 0.2 * shaded.max()  # borders of the demosaicing remain

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from rawaug.data.pairs import Pair
-from rawaug.isp.fit import FitConfig, encoders, fit_isp, pipeline
+from rawaug.isp.fit import FitConfig, end_to_end, fit_isp, pipeline
 from rawaug.isp.fit.atoms import measure_lights
 from rawaug.isp.fit.descent import Descent, mean_psnr
-from rawaug.isp.fit.encoders import CURVE_POINTS, joint_steps, train_jointly
+from rawaug.isp.fit.end_to_end import CURVE_POINTS, joint_steps, train_jointly
 from rawaug.isp.fit.samples import FitFrames, sample_pixels
 from rawaug.isp.fit.start import FrameColour
 from rawaug.isp.model import DictionaryISP
@@ -34,7 +34,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
         "PUBLISHED_FRAMES": 4,
     }
     for name, value in quick.items():
-        monkeypatch.setattr(encoders, name, value)
+        monkeypatch.setattr(end_to_end, name, value)
 
 
 def config(wanted: str, encoder_steps: int = 30) -> FitConfig:
@@ -88,7 +88,7 @@ def test_frames_that_judge_were_left_out_of_curve_tone_and_atoms_too(
     exact_pair: Callable[..., Pair], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = config("auto", encoder_steps=1)
-    monkeypatch.setattr(encoders, "FEWEST_FRAMES", 4)
+    monkeypatch.setattr(end_to_end, "FEWEST_FRAMES", 4)
     fitted: list[set[str]] = []
     judged: list[tuple[set[str], set[str]]] = []
 
@@ -105,7 +105,7 @@ def test_frames_that_judge_were_left_out_of_curve_tone_and_atoms_too(
         return 0.0
 
     monkeypatch.setattr(pipeline, "fit_reverse", noted)
-    monkeypatch.setattr(encoders, "mean_psnr", mean_psnr)
+    monkeypatch.setattr(end_to_end, "mean_psnr", mean_psnr)
     fit_isp(lit_frames(exact_pair, 4, informative=True), settings, progress=False)
     everything = {f"shot{k}" for k in range(4)}
     assert fitted[0] == everything and len(fitted) == 3 and len(judged) == 4
@@ -132,7 +132,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     monkeypatch.setattr(Descent, "report_steps", 5)
 
     def train(isp: DictionaryISP, frames: FitFrames, steps: int, learning_rate: float) -> None:
-        monkeypatch.setattr(encoders, "LEARNING_RATE", learning_rate)
+        monkeypatch.setattr(end_to_end, "LEARNING_RATE", learning_rate)
         train_jointly(isp, frames, replace(CONFIG, joint_steps=steps), Descent(None, "", 0, False))
 
     return train
