@@ -25,7 +25,7 @@ from rawaug.commands import parse_value
 from rawaug.data import open_pairs
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.denoising.guard import Guarded
-from rawaug.evaluation.benchmark import REAL, TOLD, choose_strengths, count_gmac, trials
+from rawaug.evaluation.benchmark import REAL, TOLD, benchmark_trials, choose_strengths, count_gmac
 from rawaug.evaluation.scores import NOISY, score
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial, measure_own_noise
@@ -80,7 +80,7 @@ def frozen_trials(spec: str, crop: int, noise: NoiseSpec | None = None, middle: 
     frames = measure_own_noise(pairs, len(pairs)).binned(int(factor or 1))
     if middle is not None:
         frames = frames.middles(middle)
-    return trials(frames, crop, strengths=choose_strengths(noise))
+    return benchmark_trials(frames, crop, strengths=choose_strengths(noise))
 
 
 def add_scores(table: Scores, name: str, spec: str, everything: Sequence[Trial], path: Path) -> None:

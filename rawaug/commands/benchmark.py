@@ -14,14 +14,22 @@ from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
 from rawaug.denoising.denoiser import RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.guard import Guarded
 from rawaug.denoising.pictures import PictureDenoiser
-from rawaug.evaluation.benchmark import ON_PAGE, benchmark, choose_strengths, crops, noise_note, ranking, trials
+from rawaug.evaluation.benchmark import (
+    ON_PAGE,
+    benchmark,
+    benchmark_trials,
+    choose_strengths,
+    make_crops,
+    noise_note,
+    ranking,
+)
 from rawaug.evaluation.benchmark_page import all_tables, benchmark_notes, benchmark_page
 from rawaug.evaluation.evaluate import named_denoiser
 from rawaug.evaluation.figures import save_picture
 from rawaug.evaluation.harm import measure_harm
 from rawaug.evaluation.page import command_line
 from rawaug.evaluation.picture_trials import picture_scores, print_pictures
-from rawaug.evaluation.table_files import benchmark_table
+from rawaug.evaluation.table_files import latex_benchmark
 from rawaug.evaluation.tables import print_cells
 from rawaug.evaluation.trials import measure_own_noise
 from rawaug.files import require_output, write_json, write_text
@@ -113,7 +121,7 @@ def run(
     pairs = open_pairs(data, split="test")
     pairs = as_frames(pairs).some(range(len(pairs))[:count])
     frames = measure_own_noise(pairs, count).binned(bin)
-    cases = trials(frames, crop, seed, strengths)
+    trials = benchmark_trials(frames, crop, seed, strengths)
 
     # Score them.
     weights = {}
@@ -122,8 +130,8 @@ def run(
             weights[denoiser.name] = denoiser.settings["denoiser_sha256"]
 
     facts = {"data": data, "bin": bin, "crop": crop, "seed": seed, "command": command_line()}
-    facts |= {"noise": noise_note(cases, strengths, seed), "weights_sha256": weights}
-    result = {**facts, **benchmark(compared, cases)}
+    facts |= {"noise": noise_note(trials, strengths, seed), "weights_sha256": weights}
+    result = {**facts, **benchmark(compared, trials)}
     if harm:
         guarded = [Guarded(denoiser) for denoiser in compared if denoiser.name in shipped_of_mosaics()]
         result["harm"] = measure_harm([*compared, *guarded], frames, crop, seed)
@@ -136,14 +144,14 @@ def run(
     if json:
         write_json(result, json)
     if table:
-        write_text(benchmark_table(result, command_line()), table)
+        write_text(latex_benchmark(result, command_line()), table)
         print(f"table: {table}")
     if figure:
-        print(f"figure: {save_picture(list(crops(compared, cases, ON_PAGE)), Path(figure))}")
+        print(f"figure: {save_picture(list(make_crops(compared, trials, ON_PAGE)), Path(figure))}")
     if report:
         settings = {"denoisers": list(denoisers), "data": data, "bin": bin, "count": count, "crop": crop}
         settings |= {"noise": noise, "iso": iso, "seed": seed, "table": table, "figure": figure, "harm": harm}
-        print(f"page: {benchmark_page(result, compared, cases).write(Path(report), settings)}")
+        print(f"page: {benchmark_page(result, compared, trials).write(Path(report), settings)}")
 
 
 def compare_pictures(

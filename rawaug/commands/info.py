@@ -127,14 +127,10 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
         lines.append(f"{camera['name']:<{width}}  {matrix:<6}  {iso}")
         if len(rows) <= _WITH_LEVELS:
             for level, shot_var, read_var in camera.get("noise", ()):
-                lines.append(_level_row(level, shot_var, read_var))
+                shot_range = "{:.2e} to {:.2e}".format(*shot_var)
+                read_range = "{:.2e} to {:.2e}".format(*read_var)
+                lines.append(f"  ISO {level:<7g} shot_var {shot_range}   read_var {read_range}")
     return "\n".join(lines)
-
-
-def _level_row(iso: float, shot_var: tuple[float, float], read_var: tuple[float, float]) -> str:
-    shot_range = "{:.2e} to {:.2e}".format(*shot_var)
-    read_range = "{:.2e} to {:.2e}".format(*read_var)
-    return f"  ISO {iso:<7g} shot_var {shot_range}   read_var {read_range}"
 
 
 def read_facts(weights: str | Path) -> dict[str, Any]:

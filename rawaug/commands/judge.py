@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from rawaug.commands import YAML, require_results
-from rawaug.evaluation.judge import Judgement, judge, plot_judgement, print_judgement
+from rawaug.evaluation.judge import judge, plot_judgement, print_judgement
 from rawaug.files import require_output, write_json
 
 
@@ -54,18 +54,14 @@ def run(
         judgements.append(judgement)
 
     if json:
-        write_json({"files": [_as_json(judgement) for judgement in judgements]}, json)
+        content = [asdict(judgement) for judgement in judgements]
+        for result in content:
+            for scores in result["denoisers"].values():
+                del scores["gain"]  # a map of blocks
+        write_json({"files": content}, json)
     if picture and judgements[0].denoisers:
         plot_judgement(judgements[0], Path(picture))
         print(f"picture: {picture}")
     refused = [judgement.name for judgement in judgements if judgement.refusals]
     if refused:
         raise ValueError(f"{', '.join(refused)}: not judged, for the reasons above")
-
-
-def _as_json(judgement: Judgement) -> dict[str, Any]:
-    """Make JSON of what was found on a frame, without the maps of blocks."""
-    result = asdict(judgement)
-    for scores in result["denoisers"].values():
-        del scores["gain"]
-    return result

@@ -99,11 +99,5 @@ def _estimate_levels(blocks: list[RawFrame]) -> tuple[float, float]:
 
 def submit_dnd(path: str, out: str, denoiser: RawDenoiser) -> None:
     """Denoise DND's boxes below the folder ``path``, and write the 50 files of the submission into ``out``."""
-    boxes = Dnd(path)
-    write_dnd_submission(out, _denoised_boxes(boxes, denoiser))
-
-
-def _denoised_boxes(boxes: Dnd, denoiser: RawDenoiser) -> Iterator[Tensor]:
-    for box in progress(boxes, label="benchmark", unit="box"):
-        levels = box.noise_profile or _UNUSED
-        yield denoiser.frame(box, levels).clamp(0.0, 1.0)
+    boxes = progress(Dnd(path), label="benchmark", unit="box")
+    write_dnd_submission(out, (denoiser.frame(box, box.noise_profile or _UNUSED).clamp(0.0, 1.0) for box in boxes))

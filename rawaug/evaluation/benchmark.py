@@ -90,7 +90,7 @@ def choose_strengths(noise: NoiseSpec | None = None, isos: Sequence[float] | Non
     return levels_by_iso
 
 
-def trials(
+def benchmark_trials(
     frames: Iterable[Pair], crop: int, seed: int = 0, strengths: Mapping[str, NoiseLevels] | None = None
 ) -> list[Trial]:
     """Make the middles of all frames under every condition and strength; same frames and seed give the same bits.
@@ -106,23 +106,23 @@ def trials(
     strengths = strengths or choose_strengths()
     with_faults = set(_OF_SENSORS).intersection(strengths) or set(strengths)
 
-    cases: list[Trial] = []
+    trials: list[Trial] = []
     for frame in progress(frames, label="noise", unit="frame"):
         middle = frame.middle(crop)
         for name, levels in strengths.items():
             exact = draw_noisy(frame, name, levels, seed)
-            cases.append(_middle(exact, middle, crop, TOLD, name))
+            trials.append(_middle(exact, middle, crop, TOLD, name))
 
             with suppress(ValueError):  # too little of the frame is flat
                 estimate = estimate_noise(bayer.unpack(exact.image, frame.cfa)[0], frame.cfa)
                 estimated = Noisy.of(exact.image, (estimate.shot_var, estimate.read_var), frame.cfa)
-                cases.append(_middle(estimated, middle, crop, ESTIMATED, name))
+                trials.append(_middle(estimated, middle, crop, ESTIMATED, name))
 
             if name in with_faults:
                 faulty = draw_noisy(frame, name, levels, seed, real=True)
-                cases.append(_middle(faulty, middle, crop, REAL, name))
+                trials.append(_middle(faulty, middle, crop, REAL, name))
 
-    return cases
+    return trials
 
 
 def draw_noisy(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real: bool = False) -> Noisy:
@@ -162,28 +162,28 @@ def _middle(noisy: Noisy, frame: Pair, crop: int, condition: str, strength: str)
 
 def hash_trials(trials: Iterable[Trial]) -> str:
     """Eight digits of the SHA-256 of all noisy inputs, rounded to steps of 2^-12, on which all processors agree."""
-    cases = list(trials)
-    strengths = _strengths_in(cases)
-    cases.sort(key=lambda trial: (_CONDITIONS.index(trial.condition), strengths.index(trial.strength)))
+    trials = list(trials)
+    strengths = _strengths_in(trials)
+    trials.sort(key=lambda trial: (_CONDITIONS.index(trial.condition), strengths.index(trial.strength)))
 
     images = []
-    for trial in cases:
+    for trial in trials:
         steps = (trial.noisy * 4096).round().to(torch.int32)
         images.append(steps.numpy().tobytes())
 
     return digest(*images)[:8]
 
 
-def benchmark(denoisers: Sequence[RawDenoiser], cases: Sequence[Trial]) -> dict[str, Any]:
-    """Score every denoiser, by its name, on these :func:`trials`, along with the noisy input.
+def benchmark(denoisers: Sequence[RawDenoiser], trials: Sequence[Trial]) -> dict[str, Any]:
+    """Score every denoiser, by its name, on these :func:`benchmark_trials`, along with the noisy input.
 
     Returns:
         ``frames``, ``hash``, and ``rows`` by name: ``gmac`` and ``seconds`` per mosaic megapixel, and ``scores`` by
         condition and strength, means of :data:`rawaug.evaluation.scores.METRICS` and, in ``images``, the scores of each
         frame.
     """
-    strengths = _strengths_in(cases)
-    rows_by_name = group_rows(score([NOISY, *denoisers], cases, "benchmark"))
+    strengths = _strengths_in(trials)
+    rows_by_name = group_rows(score([NOISY, *denoisers], trials, "benchmark"))
 
     rows: dict[str, dict[str, Any]] = {}
     for name, of_one in rows_by_name.items():
@@ -194,13 +194,13 @@ def benchmark(denoisers: Sequence[RawDenoiser], cases: Sequence[Trial]) -> dict[
         rows[denoiser.name]["seconds"] = round(seconds, 3)
         rows[denoiser.name]["gmac"] = count_gmac(denoiser)
 
-    frames = list(dict.fromkeys(trial.frame for trial in cases))
-    return {"frames": frames, "hash": hash_trials(cases), "rows": rows}
+    frames = list(dict.fromkeys(trial.frame for trial in trials))
+    return {"frames": frames, "hash": hash_trials(trials), "rows": rows}
 
 
-def _strengths_in(cases: Iterable[Trial]) -> list[str]:
+def _strengths_in(trials: Iterable[Trial]) -> list[str]:
     """List the strengths of these trials, in their order."""
-    return list(dict.fromkeys(trial.strength for trial in cases))
+    return list(dict.fromkeys(trial.strength for trial in trials))
 
 
 def _by_condition(rows: Sequence[Row], strengths: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -226,12 +226,12 @@ def _by_condition(rows: Sequence[Row], strengths: Sequence[str]) -> dict[str, di
     return scores
 
 
-def noise_note(cases: Sequence[Trial], strengths: Iterable[str], seed: int) -> str:
-    """Describe the noise of these :func:`trials` in a sentence, by strength and levels, and say that it is drawn."""
+def noise_note(trials: Sequence[Trial], strengths: Iterable[str], seed: int) -> str:
+    """Describe the noise of :func:`benchmark_trials` in a sentence, by strength and levels, and that it is drawn."""
     parts = []
     for name in strengths:
         levels = []
-        for trial in cases:
+        for trial in trials:
             if trial.levels is not None and (trial.condition, trial.strength) == (TOLD, name):
                 levels.append(trial.levels)
 
@@ -291,7 +291,7 @@ def paired_gains(result: Mapping[str, Any], first: str, second: str, strength: s
     return gains
 
 
-def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str, list[str]]]]:
+def benchmark_tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str, list[str]]]]:
     """Yield title, columns and cells by denoiser of each condition's table; heads say how many could be estimated."""
     count = len(result["frames"])
 
@@ -349,12 +349,12 @@ def display_strength(strengths: Collection[str]) -> str:
     return last
 
 
-def crops(denoisers: Sequence[RawDenoiser], cases: Iterable[Trial], most: int) -> Iterator[Panels]:
+def make_crops(denoisers: Sequence[RawDenoiser], trials: Iterable[Trial], most: int) -> Iterator[Panels]:
     """Make pictures for the page: the first ``most`` frames with noise of :func:`display_strength`, by denoiser."""
-    cases = list(cases)
-    strength = display_strength(_strengths_in(cases))
+    trials = list(trials)
+    strength = display_strength(_strengths_in(trials))
     count = 0
-    for trial in cases:
+    for trial in trials:
         if trial.condition == TOLD and trial.strength == strength and count < most:
             yield make_panels(denoisers, trial)
             count += 1

@@ -7,7 +7,7 @@ from typing import Any
 
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.errors import count_of
-from rawaug.evaluation.benchmark import ON_PAGE, TOLD, collect_costs, crops, display_strength, tables
+from rawaug.evaluation.benchmark import ON_PAGE, TOLD, benchmark_tables, collect_costs, display_strength, make_crops
 from rawaug.evaluation.figures import plot_costs
 from rawaug.evaluation.harm import harm_tables
 from rawaug.evaluation.page import Figure, Page
@@ -16,7 +16,7 @@ from rawaug.evaluation.trials import Trial, own_noise_note
 
 def all_tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str, list[str]]]]:
     """Yield the tables of the strengths, and those of where denoisers harm if that was measured."""
-    yield from tables(result)
+    yield from benchmark_tables(result)
     if "harm" in result:
         yield from harm_tables(result["harm"])
 
@@ -44,7 +44,7 @@ def benchmark_notes(result: Mapping[str, Any]) -> list[str]:
     return notes
 
 
-def benchmark_page(result: Mapping[str, Any], denoisers: Sequence[RawDenoiser], cases: Sequence[Trial]) -> Page:
+def benchmark_page(result: Mapping[str, Any], denoisers: Sequence[RawDenoiser], trials: Sequence[Trial]) -> Page:
     """Make the page: tables, quality over cost, and crops of some frames by every denoiser."""
     page = Page(f"Denoisers on {result['data']}", result["noise"])
     page.add(texts=benchmark_notes(result))
@@ -56,7 +56,7 @@ def benchmark_page(result: Mapping[str, Any], denoisers: Sequence[RawDenoiser], 
     page.add("Quality and cost", figures=[chart])
 
     page.add("Pictures", texts=[f"Noise: {strength}, levels told; PSNR of RAW."])
-    for panels in crops(denoisers, cases, ON_PAGE):
+    for panels in make_crops(denoisers, trials, ON_PAGE):
         page.add_frame(panels, result["crop"])
 
     return page

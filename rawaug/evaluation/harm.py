@@ -71,8 +71,8 @@ def measure_harm(
     everyone = [NOISY, *denoisers]
     rows: dict[str, dict[str, Any]] = {denoiser.name: {"frames": {}} for denoiser in everyone}
 
-    cases = [_frame_trial(frame.middle(crop), column, seed) for column in FRAMES for frame in frames]
-    for name, scores in group_rows(score(everyone, cases, "harm")).items():
+    trials = [_frame_trial(frame.middle(crop), column, seed) for column in FRAMES for frame in frames]
+    for name, scores in group_rows(score(everyone, trials, "harm")).items():
         for column, of_column in group_rows(scores, "strength").items():
             rows[name]["frames"][column] = summary(of_column)
 

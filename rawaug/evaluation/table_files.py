@@ -119,7 +119,7 @@ def _escape_latex(text: str) -> str:
     return escape(text).translate(_LATEX)
 
 
-def benchmark_table(result: Mapping[str, Any], command: str) -> str:
+def latex_benchmark(result: Mapping[str, Any], command: str) -> str:
     """Format a benchmark at known levels as a LaTeX ``tabular`` with booktabs, RAW and sRGB in columns of their own.
 
     A cell is the mean PSNR over frames and its standard error. It is bold if the paired difference to every other row,

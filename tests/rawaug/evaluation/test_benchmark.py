@@ -20,13 +20,13 @@ from rawaug.evaluation.benchmark import (
     ESTIMATED,
     STRENGTHS,
     TOLD,
+    benchmark_trials,
     choose_strengths,
     count_gmac,
     hash_trials,
     ranking,
-    trials,
 )
-from rawaug.evaluation.table_files import benchmark_table
+from rawaug.evaluation.table_files import latex_benchmark
 from rawaug.evaluation.trials import make_trial
 from rawaug.noise import FixedLevels, NoiseEstimate, estimate_noise, noise_model
 
@@ -64,7 +64,7 @@ def test_the_function_of_the_docs_is_compared(
 def test_noise_has_the_stated_variance_and_the_same_bits_again() -> None:
     frames = list(open_pairs("demo:test", split="test"))[:1]
     strengths = {name: levels for name, levels in choose_strengths().items() if name in ("phone", "very strong")}
-    found, again, other = (trials(frames, 256, seed, strengths) for seed in (0, 0, 1))
+    found, again, other = (benchmark_trials(frames, 256, seed, strengths) for seed in (0, 0, 1))
     assert hash_trials(found) == hash_trials(again) != hash_trials(other)
     for trial in found:
         if trial.condition == TOLD:
@@ -85,14 +85,14 @@ def test_estimated_levels_do_not_depend_on_the_clean_frame(monkeypatch: pytest.M
 
     monkeypatch.setattr("rawaug.evaluation.benchmark.estimate_noise", estimate)
     frame = open_pairs("demo:test")[0]
-    told, estimated, _ = trials([frame], 10_000, strengths={"strong": FixedLevels(*STRENGTHS["strong"])})
+    told, estimated, _ = benchmark_trials([frame], 10_000, strengths={"strong": FixedLevels(*STRENGTHS["strong"])})
     assert (told.condition, estimated.condition) == (TOLD, ESTIMATED) and estimated.levels != told.levels
     assert torch.equal(pack(seen[0][None], frame.cfa), told.noisy) and torch.equal(told.noisy, estimated.noisy)
 
 
 def test_noise_of_the_callers_is_that_of_evaluate() -> None:
     frame = replace(open_pairs("demo:test")[0], noisy=None)
-    found = trials([frame], crop=10_000, strengths=choose_strengths("SonyA7S2", [1600, 6400]))
+    found = benchmark_trials([frame], crop=10_000, strengths=choose_strengths("SonyA7S2", [1600, 6400]))
     assert {trial.strength for trial in found} == {"ISO 1600", "ISO 6400"}
     (told,) = (trial for trial in found if (trial.condition, trial.strength) == (TOLD, "ISO 6400"))
     evaluated = make_trial(frame, noise_model("SonyA7S2", iso=6400))
@@ -116,13 +116,13 @@ def test_only_a_lead_beyond_the_spread_of_frames_is_bold_in_a_paper() -> None:
     frames = [38.0, 45.0, 41.0, 50.0, 36.0, 43.0]
     clear = result_of(mine=[psnr + 0.5 + k / 100 for k, psnr in enumerate(frames)], theirs=frames)
     assert re.search(
-        r"^mine & \\textbf\{42\.\d\d \$\\pm\$ 2\.\d\d\} & \\textbf", benchmark_table(clear, "cmd"), re.MULTILINE
+        r"^mine & \\textbf\{42\.\d\d \$\\pm\$ 2\.\d\d\} & \\textbf", latex_benchmark(clear, "cmd"), re.MULTILINE
     )
     (line,) = ranking(clear)
     assert line.startswith("phone: mine against theirs: +0.5") and line.endswith("ahead in 6 of 6 frames")
 
     open_ = result_of(mine=[psnr + (2.0 if k else -8.0) for k, psnr in enumerate(frames)], theirs=frames)
-    assert "textbf" not in benchmark_table(open_, "cmd")
+    assert "textbf" not in latex_benchmark(open_, "cmd")
 
 
 def test_operations_are_counted_on_a_whole_tile() -> None:

@@ -48,6 +48,15 @@ def test_it_is_found_before_any_work(
     assert not list(Path(recipe.out).iterdir())
 
 
+def test_a_run_says_that_bm3d_is_missing_and_goes_on(
+    recipe: Recipe, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "bm3d", None)
+    with pytest.raises(ValueError, match="'upii'"):
+        run(replace(recipe, classical=["BM3D"], noise="upii"))
+    assert "BM3D is left out: bm3d is not installed" in capsys.readouterr().out
+
+
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     require_trainable("cpu", 1, "bf16-mixed")
     monkeypatch.setitem(sys.modules, "matplotlib", None)

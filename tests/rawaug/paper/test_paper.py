@@ -16,7 +16,7 @@ from rawaug.files import write_bytes
 from rawaug.io.pictures import encode_png
 from rawaug.paper import published
 from rawaug.paper.order import compare_order, order_sentence
-from rawaug.paper.tables import PARTS, Paper, read_tables, run_paper, still_falling
+from rawaug.paper.paper import PARTS, Paper, read_tables, run_paper, still_falling
 
 ROW = {"parameters": 590_000, "seconds": 1.0, "mpix_s": 1.0}
 
