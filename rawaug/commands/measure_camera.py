@@ -7,13 +7,14 @@ from dataclasses import replace
 import yaml
 
 from rawaug.camera.own import Camera, as_camera
+from rawaug.data.pairs import centre
 from rawaug.errors import count_of, escape
 from rawaug.files import files_in, require_output, write_text
 from rawaug.io import RawFrame, read_raw
 from rawaug.io.raw import RAW_EXTENSIONS
 
 _SIDE = 1024
-"""The middle of a frame that is measured has at most this many rows and columns."""
+"""Side of the middle of a frame that is measured, in pixels."""
 
 
 def run(*, dark: str, flat: str, out: str, camera: str | None = None, overwrite: bool = False) -> None:
@@ -44,9 +45,7 @@ def _read(folder: str) -> list[RawFrame]:
             broken.append(str(error))
             continue
 
-        height, width = frame.mosaic.shape[-2:]
-        top, left = max(0, height - _SIDE) // 4 * 2, max(0, width - _SIDE) // 4 * 2
-        middle = frame.mosaic[:, top : top + _SIDE, left : left + _SIDE].clone()
+        middle = centre(frame.mosaic, _SIDE, _SIDE).clone()  # the rest need not stay in memory
         frames.append(replace(frame, mosaic=middle))
 
     if broken:

@@ -34,6 +34,7 @@ from torch.nn import functional as F
 
 from rawaug import bayer
 from rawaug.data.development import render_raw
+from rawaug.data.pairs import centre
 from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.levels import Noise, find_levels
 from rawaug.denoising.raw import equalise_greens
@@ -172,7 +173,7 @@ def judge(
 
     packed = bayer.pack(frame.mosaic[None], frame.cfa)
     if crop is not None:
-        packed = _middle(packed, crop // 2)
+        packed = centre(packed, crop // 2, crop // 2, step=1)
 
     def develop(image: Tensor) -> Tensor:
         mosaic = bayer.unpack(image, frame.cfa)[0]
@@ -227,11 +228,11 @@ def judge_noisy(
 
     judged = {}
     for key in sorted(risks, key=lambda key: float((risks[key] * is_whole).sum())):
-        one = _judge_one(probe_by_name[key], risks[key], risks[best], is_whole, (median - ends[0], ends[1] - median))
+        scores = _judge_one(probe_by_name[key], risks[key], risks[best], is_whole, (median - ends[0], ends[1] - median))
         psnr_srgb = None
         if develop is not None:
             psnr_srgb = _developed(probe_by_name[key], image, develop, seed)
-        judged[key] = replace(one, psnr_srgb=psnr_srgb, seconds=seconds[key])
+        judged[key] = replace(scores, psnr_srgb=psnr_srgb, seconds=seconds[key])
     return Judgement(name, levels, noise_source, (), tuple(remarks), psnr_noisy, judged)
 
 
@@ -338,13 +339,13 @@ def _check_noise(noisy: Noisy, probe: Probe, is_whole: Tensor) -> tuple[list[str
         remarks.append("no place is flat enough to check its noise against the levels")
         return refusals, remarks
 
-    correlation, where = _correlation(residual, is_flat, noisy.cfa)
+    correlation, neighbours = _correlation(residual, is_flat, noisy.cfa)
     lines = _banding(residual, is_flat)
     if lines and abs(correlation) < _OF_LINES:
         refusals.append(lines)
     elif not CORRELATED[0] < correlation < CORRELATED[1]:
         cause = "demosaiced, binned or compressed with loss?"
-        return [f"its noise is correlated: {correlation:+.2f} between {where} ({cause})"], remarks
+        return [f"its noise is correlated: {correlation:+.2f} between {neighbours} ({cause})"], remarks
     if wrong:
         refusals.insert(0, f"the levels do not fit: its noise has a variance of {', '.join(wrong)}")
     return refusals, remarks
@@ -380,7 +381,7 @@ def _correlation(residual: Tensor, is_flat: Tensor, cfa: str) -> tuple[float, st
     mosaic = bayer.unpack(residual, cfa)[0, 0]
     mask = is_flat[0, 0].repeat_interleave(2 * _PLACE, 0).repeat_interleave(2 * _PLACE, 1)
     mosaic = mosaic[: mask.shape[0], : mask.shape[1]]
-    worst, where = 0.0, ""
+    worst, neighbours = 0.0, ""
     lags = {
         (0, 1): "pixels side by side",
         (1, 0): "pixels one above the other",
@@ -395,8 +396,8 @@ def _correlation(residual: Tensor, is_flat: Tensor, cfa: str) -> tuple[float, st
         correlation = float(product.mean() / energy.mean().clamp_min(1e-12))
         is_sure = abs(correlation) > _SURE / math.sqrt(max(1, product.numel()))
         if is_sure and abs(correlation) > abs(worst):
-            worst, where = correlation, words
-    return worst, where
+            worst, neighbours = correlation, words
+    return worst, neighbours
 
 
 def _banding(residual: Tensor, is_flat: Tensor) -> str:
@@ -432,12 +433,6 @@ def _pool(values: Tensor, side: int = BLOCK) -> Tensor:
     return F.avg_pool2d(values.mean(1, keepdim=True), side)
 
 
-def _middle(packed: Tensor, side: int) -> Tensor:
-    height, width = packed.shape[-2:]
-    top, left = max(0, (height - side) // 2), max(0, (width - side) // 2)
-    return packed[..., top : top + side, left : left + side]
-
-
 def _decibels(error: float) -> float:
     return -10.0 * math.log10(error) if error > 0 else math.inf
 
@@ -457,14 +452,14 @@ def print_judgement(judgement: Judgement) -> None:
         return
 
     rows = [["noisy input", f"{judgement.psnr_noisy:.2f}", "", "", "", "", "", ""]]
-    for name, one in judgement.denoisers.items():
-        low, high = one.interval
-        distance, least, most = one.behind
-        behind = "best" if distance == 0 else f"{distance:.2f} ({least:.2f} to {most:.2f})"
-        colours = " ".join(f"{value:.1f}" for value in one.colours)
-        srgb = "" if one.psnr_srgb is None else f"{one.psnr_srgb:.2f}"
-        cells = [f"{one.psnr:.2f}", f"{low:.2f} to {high:.2f}", behind, colours, srgb]
-        rows.append([name, *cells, f"{one.harmed:.1%}", f"{one.seconds:.1f}"])
+    for name, scores in judgement.denoisers.items():
+        low, high = scores.interval
+        distance, nearest, farthest = scores.behind
+        behind = "best" if distance == 0 else f"{distance:.2f} ({nearest:.2f} to {farthest:.2f})"
+        colours = " ".join(f"{value:.1f}" for value in scores.colours)
+        srgb = "" if scores.psnr_srgb is None else f"{scores.psnr_srgb:.2f}"
+        cells = [f"{scores.psnr:.2f}", f"{low:.2f} to {high:.2f}", behind, colours, srgb]
+        rows.append([name, *cells, f"{scores.harmed:.1%}", f"{scores.seconds:.1f}"])
     head = ["denoiser", "PSNR", "95%", "behind the best", "R Gr Gb B", "sRGB", "harmed", "s"]
     print_rows(f"{judgement.name}: estimated PSNR in dB, without a clean frame", head, rows)
 
@@ -480,8 +475,8 @@ def plot_judgement(judgement: Judgement, path: Path) -> None:
     axes = figure.subplots(lines, columns, squeeze=False)
     for axis in axes.flat:
         axis.set_axis_off()
-    for axis, (name, one) in zip(axes.flat, judgement.denoisers.items(), strict=False):
-        shown = axis.imshow(one.gain[0, 0].numpy(), cmap="RdYlGn", vmin=-1.0, vmax=1.0, interpolation="nearest")
-        axis.set_title(f"{name}\n{one.psnr:.2f} dB, {one.harmed:.1%} harmed", fontsize=9, parse_math=False)
+    for axis, (name, scores) in zip(axes.flat, judgement.denoisers.items(), strict=False):
+        shown = axis.imshow(scores.gain[0, 0].numpy(), cmap="RdYlGn", vmin=-1.0, vmax=1.0, interpolation="nearest")
+        axis.set_title(f"{name}\n{scores.psnr:.2f} dB, {scores.harmed:.1%} harmed", fontsize=9, parse_math=False)
     figure.colorbar(shown, ax=axes, shrink=0.7, label="share of the noise removed")
     save_figure(figure, path)

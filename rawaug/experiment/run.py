@@ -137,10 +137,10 @@ def run(
                 if not leads:
                     continue
                 networks[arm] = task.denoiser(arm, network, cfa)
-                kinds = {"plain": networks[arm]}
+                by_kind = {"plain": networks[arm]}
                 if recipe.self_ensemble:
-                    kinds["self_ensemble"] = task.denoiser(arm, network, cfa, recipe.views)
-                scores = score_arm(task, kinds, trials, noisy_rows, f"{arm}, seed {seed}", arm_folder)
+                    by_kind["self_ensemble"] = task.denoiser(arm, network, cfa, recipe.views)
+                scores = score_arm(task, by_kind, trials, noisy_rows, f"{arm}, seed {seed}", arm_folder)
                 for table, summaries in scores.items():
                     parts = tables.setdefault(table, {"results": {}, "others": {}})
                     parts["results"].setdefault(arm, []).append(summaries)
@@ -310,7 +310,7 @@ def train_arm(task: Task, arm: str, cfa: CFA, seed: int, validation: Sequence[Tr
 
 def score_arm(
     task: Task,
-    denoisers: Mapping[str, Any],
+    by_kind: Mapping[str, Any],
     trials: Sequence[Trial],
     noisy_rows: Mapping[str, list[Row]],
     label: str,
@@ -320,7 +320,7 @@ def score_arm(
 
     Args:
         task: the task.
-        denoisers: the arm's denoisers by kind.
+        by_kind: the arm's denoisers.
         trials: the test frames with their noise.
         noisy_rows: the scores of the noisy input, by table.
         label: arm and seed, for what is printed.
@@ -330,7 +330,7 @@ def score_arm(
     inputs = weights, as_frames(task.frames["test"]).stamps(), task.recipe.scores_settings()
 
     summaries: dict[str, dict[str, Any]] = {}
-    for kind, denoiser in denoisers.items():
+    for kind, denoiser in by_kind.items():
         make = partial(score_denoiser, denoiser, trials, noisy_rows, f"{label}, {kind}")
         scores = cached(folder / f"{kind}.json", [kind, *inputs], make, done="already evaluated")
         for table, scores_of_table in scores["tables"].items():
@@ -343,9 +343,9 @@ def score_denoiser(
     denoiser: Any, trials: Sequence[Trial], noisy_rows: Mapping[str, list[Row]], label: str
 ) -> dict[str, dict[str, Any]]:
     """Compute the summaries of one denoiser in ``tables``, without those whose pattern it does not take; print them."""
-    by_table = {table: [denoiser] for table in noisy_rows}
+    for_all_tables = {table: [denoiser] for table in noisy_rows}
     tables = {}
-    for table, summaries in score_tables(by_table, trials, noisy_rows, f"evaluate {label}").items():
+    for table, summaries in score_tables(for_all_tables, trials, noisy_rows, f"evaluate {label}").items():
         if not summaries:
             continue
         tables[table] = summaries[denoiser.name]
@@ -356,19 +356,19 @@ def score_denoiser(
 
 
 def score_tables(
-    denoisers: Mapping[str, Sequence[Any]], trials: Sequence[Trial], noisy_rows: Mapping[str, list[Row]], label: str
+    by_table: Mapping[str, Sequence[Any]], trials: Sequence[Trial], noisy_rows: Mapping[str, list[Row]], label: str
 ) -> dict[str, dict[str, Any]]:
     """Compute the summaries of denoisers by table and name, with one trial in memory at a time.
 
     Args:
-        denoisers: by table; those that do not take a trial's image are left out.
+        by_table: the denoisers; those that do not take a trial's image are left out.
         trials: the test frames with their noise.
         noisy_rows: the scores of the noisy input, by table.
         label: label of the progress bar.
     """
-    rows: dict[str, list[Row]] = {table: [] for table in denoisers}
+    rows: dict[str, list[Row]] = {table: [] for table in by_table}
     for trial in progress(trials, label=label, unit="image"):
-        rows[trial.table] += score(list(filter(trial.takes, denoisers[trial.table])), [trial])
+        rows[trial.table] += score(list(filter(trial.takes, by_table[trial.table])), [trial])
 
     tables: dict[str, dict[str, Any]] = {}
     for table, of_table in rows.items():
