@@ -88,16 +88,10 @@ def run(
 
     # Prepare: whatever could be missing or wrong is found before anything is fitted.
     folder = require_free(recipe, overwrite)
-    require_trainable(recipe.device, recipe.devices, recipe.train.precision, recipe.train.logger)
+    require_runnable(recipe)
     finished_isp = None
     if recipe.isp is not None:
         finished_isp = recipe.isp.load()
-
-    if len(find_classical(recipe.classical)) < len(recipe.classical):
-        print(f"classical: BM3D is left out: {FILTERS['BM3D'].missing()}")
-    if recipe.noise != "camera":
-        noise_model(recipe.noise_at_iso)
-    require_networks(recipe)
     baselines = []
     for file in map(find_denoiser, recipe.baselines):
         baselines.append(RawDenoiser.of(file, recipe.device, name=file.stem).require_mosaic())
@@ -169,8 +163,20 @@ def run(
 # -- prepare -----------------------------------------------------------------------------------------------------------
 
 
-def require_networks(recipe: Recipe) -> None:
-    """Raise ValueError if a network does not suit its start, its estimator or the recipe's target."""
+def require_runnable(recipe: Recipe) -> None:
+    """Refuse a recipe that cannot run here, before any data are opened; BM3D is left out, and a line says so.
+
+    Raises:
+        MissingExtra: if a library is not installed.
+        ValueError: if the device or a filter is unavailable, the noise is unknown, or a network does not suit its
+            start, its estimator or the recipe's target.
+    """
+    require_trainable(recipe.device, recipe.devices, recipe.train.precision, recipe.train.logger)
+    if len(find_classical(recipe.classical)) < len(recipe.classical):
+        print(f"classical: BM3D is left out: {FILTERS['BM3D'].missing()}")
+    if recipe.noise != "camera":
+        noise_model(recipe.noise_at_iso)
+
     upscale = 1
     if recipe.target == "rgb":
         upscale = 2
