@@ -58,11 +58,11 @@ def convolution_speeds() -> dict[str, float]:
     """
     limit = os.environ.get("ONEDNN_MAX_CPU_ISA", "all")
     threads = torch.get_num_threads()
-    return _speeds_of(f"{processor_name()}, {threads} threads, PyTorch {torch.__version__}, instructions {limit}")
+    return _read_or_measure(f"{processor_name()}, {threads} threads, PyTorch {torch.__version__}, instructions {limit}")
 
 
 @cache
-def _speeds_of(machine: str) -> dict[str, float]:
+def _read_or_measure(machine: str) -> dict[str, float]:
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rawaug"
     path = folder / "convolutions.json"
     kept: dict[str, dict[str, float]] = {}

@@ -59,7 +59,9 @@ def find_defects(frames: Sequence[str | Path | RawFrame], noise: Noise = "auto")
     first: RawFrame | None = None
     common = torch.zeros(())
     for source in frames:
-        frame = _as_mosaic(source if isinstance(source, RawFrame) else read_raw(source, monochrome=True))
+        frame = source if isinstance(source, RawFrame) else read_raw(source, monochrome=True)
+        if frame.cfa == MONOCHROME:  # the mosaic of a grey scene
+            frame = replace(frame, cfa=CFA.RGGB)
         if first is not None and (frame.mosaic.shape, frame.cfa) != (first.mosaic.shape, first.cfa):
             raise ValueError(f"{frame.name}: is not of the same sensor as {first.name}, or was cropped otherwise")
 
@@ -150,10 +152,6 @@ def find_lone_sites(frame: RawFrame, levels: Levels) -> Tensor:
 
     signal = _stabilise(frame.mosaic[None], levels)
     return (mend_mosaic(signal, _planes(frame)) != signal)[0]
-
-
-def _as_mosaic(frame: RawFrame) -> RawFrame:
-    return replace(frame, cfa=CFA.RGGB) if frame.cfa == MONOCHROME else frame
 
 
 def _planes(frame: RawFrame) -> Tensor:

@@ -71,9 +71,10 @@ class Noisy(NamedTuple):
     cfa: str = CFA.RGGB
 
     @classmethod
-    def of(cls, image: Tensor, levels: Levels, cfa: CFA | str) -> Noisy:
+    def of(cls, image: Tensor, levels: Levels | None, cfa: CFA | str) -> Noisy:
         """Make one of packed RAW ``(1, 4, h, w)`` or a mosaic ``(1, 1, H, W)``, with the variance of these levels."""
-        return cls(image, noise_variance(image, *levels), levels, bayer.canonical_cfa(cfa))
+        variance = None if levels is None else noise_variance(image, *levels)
+        return cls(image, variance, levels, bayer.canonical_cfa(cfa))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -336,13 +337,8 @@ class RawDenoiser(ImageDenoiser):
 
         ``levels`` may be None where :attr:`reads_levels` is False.
         """
-        image = bayer.pack_if_bayer(frame.mosaic[None], frame.cfa)
-        noisy = Noisy(image, cfa=frame.cfa)
-        if levels is not None:
-            noisy = Noisy.of(image, levels, frame.cfa)
-
-        denoised = bayer.unpack_if_packed(self(noisy), frame.cfa)
-        return denoised[0].clamp(max=1.0)
+        noisy = Noisy.of(bayer.pack_if_bayer(frame.mosaic[None], frame.cfa), levels, frame.cfa)
+        return bayer.unpack_if_packed(self(noisy), frame.cfa)[0].clamp(max=1.0)
 
 
 # -- by what it is made of ---------------------------------------------------------------------------------------------

@@ -194,14 +194,7 @@ def denoise_folder(
     source, out = Path(source), Path(out)
     listing = kind.listing(source)
     _require_outside(out, source)
-    targets: dict[Path, Path] = {}
-    taken: set[Path] = set()
-    for file in listing.files:
-        target = out / kind.target(file.relative_to(source))
-        if target in taken:
-            raise ValueError(f"{file}: another file of {file.parent} has this stem, and both would become {target}")
-        targets[file] = target
-        taken.add(target)
+    targets = _name_targets(source, out, kind, listing.files)
     previews_of = {}
     if previews is not None:
         previews_of = _name_previews(source, out, Path(previews), kind, targets, overwrite)
@@ -251,6 +244,19 @@ def denoise_folder(
 
     result.remarks = kind.remarks(denoised)
     return result
+
+
+def _name_targets(source: Path, out: Path, kind: Files[T], files: Sequence[Path]) -> dict[Path, Path]:
+    """Name the result of each file; raise ValueError if two files would have the same."""
+    targets: dict[Path, Path] = {}
+    taken: set[Path] = set()
+    for file in files:
+        target = out / kind.target(file.relative_to(source))
+        if target in taken:
+            raise ValueError(f"{file}: another file of {file.parent} has this stem, and both would become {target}")
+        targets[file] = target
+        taken.add(target)
+    return targets
 
 
 def _name_previews(

@@ -120,19 +120,23 @@ class PictureDenoiser(ImageDenoiser):
             return denoiser
         return replace(denoiser, name=f"{denoiser.name}, told {255.0 * level:g}", level=level)
 
-    @torch.inference_mode()
     def __call__(self, noisy: Noisy) -> Tensor:
         """sRGB ``(1, 3, H, W)`` denoised, on the CPU, cut to [0, 1]."""
-        if self.explain_kept(noisy.image) is not None:
-            return noisy.image.clone()
+        return self.denoise(noisy.image)[0]
 
-        return self._compute(self._average_views, noisy.image, shape=noisy.image.shape).clamp_(0.0, 1.0)
+    @torch.inference_mode()
+    def denoise(self, srgb: Tensor) -> tuple[Tensor, str | None]:
+        """Denoise a picture ``(1, 3, H, W)`` unless it was drawn.
 
-    def explain_kept(self, srgb: Tensor) -> str | None:
-        """Explain why a picture ``(1, 3, H, W)`` stays as it is: it was drawn, not taken; None if it is denoised."""
-        if not self.reads_levels or self.level is not None:
-            return None
-        return explain_drawn(srgb)
+        Returns:
+            The result, on the CPU, cut to [0, 1]; and why it is the picture as it was, None if it is not.
+        """
+        if self.reads_levels and self.level is None:
+            kept = explain_drawn(srgb)
+            if kept is not None:
+                return srgb.clone(), kept
+
+        return self._compute(self._average_views, srgb, shape=srgb.shape).clamp_(0.0, 1.0), None
 
     def _average_views(self, srgb: Tensor) -> Tensor:
         total = torch.zeros_like(srgb)
@@ -299,8 +303,8 @@ class PictureFiles(Files[DenoisedPicture]):
         if min(height, width) < 2:
             raise ValueError(f"{source}: is {width} x {height} pixels; at least 2 x 2 needed")
 
-        kept = self.denoiser.explain_kept(srgb[None])
-        denoised = self.denoiser(Noisy(srgb[None]))[0]
+        batch, kept = self.denoiser.denoise(srgb[None])
+        denoised = batch[0]
         deviation = 255.0 * (denoised - srgb).square().mean().sqrt().item()
 
         if out is not None and kept is not None and out.suffix.lower() == source.suffix.lower():

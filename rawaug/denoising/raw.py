@@ -38,7 +38,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA, GreenDifference
 from rawaug.denoising.convolutions import choose_network
 from rawaug.denoising.defects import find_lone_sites, mend_sites, read_defects
-from rawaug.denoising.denoiser import Noisy, RawDenoiser
+from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser
 from rawaug.denoising.folder import Files
 from rawaug.denoising.guard import SECOND, guard_result
 from rawaug.denoising.levels import Noise, find_levels, load_noise, noise_as_json
@@ -266,75 +266,83 @@ class RawFiles(Files[Denoised]):
             ``(3, H, W)``; and what was done.
         """
         start = time.perf_counter()
-        file: Path | None = None
         if isinstance(source, RawFrame):
-            frame = source
+            file, frame = None, source
         else:
             file = source
             frame = isolated(read_raw, file, True) if isolate else read_raw(file, monochrome=True)
 
-        # The denoiser of this pattern; greens that agree; a monochrome frame as the mosaic of a grey scene.
-        denoiser = self.denoiser_for(frame.cfa)
-        difference: GreenDifference | None = None
-        balanced = False
+        frame, rgb, done = self.denoise_frame(frame)
+
+        if out is not None:
+            write_dng(out, frame, file, rgb=rgb)
+        seconds = time.perf_counter() - start
+        if out is not None and preview is not None:
+            self.write_preview(out, preview)
+        return (frame if rgb is None else rgb), replace(done, source=file, out=out, seconds=seconds)
+
+    def denoise_frame(self, frame: RawFrame) -> tuple[RawFrame, Tensor | None, Denoised]:
+        """Denoise a frame.
+
+        Returns:
+            The frame with the denoised mosaic ``(1, H, W)`` and the noise that is left; linear camera RGB ``(3, H, W)``
+            where the denoiser demosaics, and the frame is as it was; and what was done.
+        """
+        # Greens that agree, and the sites of a map mended; a monochrome frame is the mosaic of a grey scene.
+        pattern = frame.cfa
+        denoiser = self.denoiser_for(pattern)
+        unequal, difference = frame, None
         if denoiser.strength > 0:
-            equal, difference = equalise_greens(frame, self.greens)
-            frame, balanced = equal, equal is not frame
-        if self.sites is not None:
-            frame = mend_sites(frame, self.sites)
-        noisy = frame
-        if frame.cfa == MONOCHROME:
+            frame, difference = equalise_greens(frame, self.greens)
+        balanced = frame is not unequal
+        if pattern == MONOCHROME:
             if denoiser.demosaics:
                 raise ValueError(f"{frame.name}: is monochrome; there is nothing to demosaic, omit linear=True")
-            noisy = replace(frame, cfa=CFA.RGGB)
+            frame = replace(frame, cfa=CFA.RGGB)
+        if self.sites is not None:
+            frame = mend_sites(frame, self.sites)
 
-        # The levels of its noise.
+        # The levels of the noise, and how much of it is removed.
         levels, noise_source = None, "not needed"
         if denoiser.reads_levels or self.guard or self.grain or self.defects != "mend":
-            shot_var, read_var, noise_source = find_levels(noisy, self.noise)
+            shot_var, read_var, noise_source = find_levels(frame, self.noise)
             levels = shot_var, read_var
         if self.grain and levels is not None:
             strength = 1.0 - GRAIN / max(_noise_at_mid_grey(*levels), GRAIN)
             denoiser = replace(denoiser, strength=strength)
 
         # The result: full colour, or a mosaic that is no worse than its input, with single sites as they were.
-        image = denoiser.frame(noisy, levels)
+        noisy = Noisy.of(bayer.pack_if_bayer(frame.mosaic[None], frame.cfa), levels, frame.cfa)
+        denoised = denoiser(noisy).clamp(max=1.0)
         blended, kept = 1.0, 0
-        if self.guard and denoiser.strength > 0 and levels is not None and noisy.cfa in CFA.__members__:
-            packed = Noisy.of(bayer.pack(noisy.mosaic[None], noisy.cfa), levels, noisy.cfa)
-            denoised = bayer.pack(image[None], noisy.cfa)
-            guarded, blended = guard_result(denoiser, packed, denoised, denoiser.strength)
-            image = bayer.unpack(guarded, noisy.cfa)[0].clamp(max=1.0)
+        if self.guard and denoiser.strength > 0 and levels is not None and frame.cfa in CFA.__members__:
+            denoised, blended = guard_result(denoiser, noisy, denoised, denoiser.strength)
+        image = bayer.unpack_if_packed(denoised, frame.cfa)[0].clamp(max=1.0)
         if self.defects != "mend" and levels is not None:
-            lone = find_lone_sites(noisy, levels)
-            image = torch.where(lone, noisy.mosaic.clamp(max=1.0), image)
+            lone = find_lone_sites(frame, levels)
+            image = torch.where(lone, frame.mosaic.clamp(max=1.0), image)
             kept = int(lone.sum())
 
-        # What is written: linear RGB, or digital numbers and the noise that is left.
+        # Linear RGB, or digital numbers and the noise that is left.
+        frame = replace(frame, cfa=pattern)
+        rgb = None
         if denoiser.demosaics:
-            below_zero = (image < -0.5 / LINEAR_WHITE).float().mean().item()
+            rgb = image
+            below_zero = (rgb < -0.5 / LINEAR_WHITE).float().mean().item()
         else:
             below_zero = clip_below_zero(image, frame)
-            share_left = (1.0 - denoiser.strength) ** 2
-            profile = levels or frame.noise_profile
-            if profile is not None:
-                profile = (share_left * profile[0], share_left * profile[1]) if share_left else None
+            profile = remaining_noise(levels or frame.noise_profile, denoiser.strength)
             frame = replace(frame, mosaic=image, noise_profile=profile)
-        if out is not None:
-            write_dng(out, frame, file, rgb=image if denoiser.demosaics else None)
-        seconds = time.perf_counter() - start
-        if out is not None and preview is not None:
-            self.write_preview(out, preview)
 
         shot_var, read_var = levels or (0.0, 0.0)
         done = Denoised(
-            source=file,
-            out=out,
+            source=None,
+            out=None,
             shot_var=shot_var,
             read_var=read_var,
             noise_source=noise_source,
             below_zero=below_zero,
-            seconds=seconds,
+            seconds=0.0,
             camera=frame.camera,
             iso=frame.iso,
             greens=difference,
@@ -344,7 +352,7 @@ class RawFiles(Files[Denoised]):
             blended=blended,
             strength=denoiser.strength,
         )
-        return (image if denoiser.demosaics else frame), done
+        return frame, rgb, done
 
     # -- files of a folder ---------------------------------------------------------------------------------------------
 
@@ -389,6 +397,15 @@ class RawFiles(Files[Denoised]):
 
 def _noise_at_mid_grey(shot_var: float, read_var: float) -> float:
     return math.sqrt(shot_var * MID_GREY + read_var) / MID_GREY
+
+
+def remaining_noise(levels: Levels | None, strength: float) -> Levels | None:
+    """Compute the levels of the noise that is left; None if none is, or its levels are unknown."""
+    share = (1.0 - strength) ** 2
+    if levels is None or share == 0.0:
+        return None
+    shot_var, read_var = levels
+    return share * shot_var, share * read_var
 
 
 def equalise_greens(frame: RawFrame, greens: Greens = "auto") -> tuple[RawFrame, GreenDifference | None]:

@@ -28,6 +28,7 @@ from rawaug.io.colour import Colour, colour_from_chromaticities, require_sdr
 from rawaug.io.content import identify_opened, reads_avif, reads_heic
 from rawaug.io.headers import ICC_TAG, Headers, headers_of_opened, mend_jpeg_header, png_fault
 from rawaug.io.isolated import damage_as_os_error
+from rawaug.io.plain import FLOATS, choose_number_type, require_grey_or_rgb, require_plain
 from rawaug.io.tiff_pictures import TiffKind, choose_tiff_reader, decode_tiff_codes, read_tiff_kind
 
 MAX_PIXELS = 2**26
@@ -40,7 +41,6 @@ _WITH_ASSOCIATED_ALPHA = ("TIFF", "OpenEXR")
 """In these formats, colours may already be multiplied by alpha."""
 _UPRIGHT = ("JPEG XL", "HEIC", "JPEG 2000")
 """Decoders of these formats turn pictures upright, whatever EXIF says."""
-_FLOATS = ("half", "float", "double")
 _END_OF_JPEG = b"\xff\xd9"
 
 
@@ -109,8 +109,10 @@ def _decode(path: Path, name: str, max_pixels: int, coarse: bool, headers: Heade
         fault = png_fault(path)
         if fault is not None:
             raise OSError(f"{path}: cannot be read as a picture (PNG: {fault}); copy it again")
-    if name in ("HEIC", "AVIF"):
-        return _decode_heif(path, name, max_pixels, headers)
+    if name == "HEIC":
+        return _decode_heic(path, max_pixels, headers)
+    if name == "AVIF":
+        return _decode_avif(path, max_pixels, headers)
     if name == "BMP":
         return _decode_with_pillow(path, "BMP", max_pixels, headers)
     if name == "TIFF":
@@ -118,21 +120,10 @@ def _decode(path: Path, name: str, max_pixels: int, coarse: bool, headers: Heade
             kind = read_tiff_kind(file)
         if kind is not None and choose_tiff_reader(kind, path) == "tifffile":
             return _decode_with_tifffile(path, max_pixels, headers, kind)
-    if name == "PNM":
-        _require_no_pam(path)
-    if name == "PSD":
-        _require_rgb_in_psd(path)
-    if name == "JPEG 2000":
-        _require_plain_components(path)
     if name == "JPEG":
         return _decode_jpeg(path, max_pixels, coarse, headers)
+    require_plain(path, name)
     return _decode_with_oiio(path, name, max_pixels, coarse, headers)
-
-
-def _require_no_pam(path: Path) -> None:
-    with path.open("rb") as file:
-        if file.read(2) == b"P7":
-            raise ValueError(f"{path}: is PAM, which is not read; convert it to PNM or PNG (pamtopnm, ImageMagick)")
 
 
 _HARMLESS = ("unknown JFIF revision", "extraneous bytes before marker")
@@ -216,13 +207,13 @@ def _decode_with_oiio(path: Path, name: str, max_pixels: int, coarse: bool, head
     spec = source.spec()
     require_size(path, spec.height * spec.depth, spec.width, spec.nchannels, max_pixels)
     stored = str(spec.format)
-    if name == "JPEG" and stored in _FLOATS:
+    if name == "JPEG" and stored in FLOATS:
         source.close()
         return _decode_with_pillow(path, "JPEG", max_pixels, headers)
 
-    has_alpha = _require_grey_or_rgb(spec, path)
+    has_alpha = require_grey_or_rgb(spec, path)
     colour = _find_colour(spec, name, headers)
-    kind = _number_type(stored, path)
+    kind = choose_number_type(stored, path)
     if coarse and kind == "uint16" and colour.is_srgb and not has_alpha:
         kind = "uint8"
 
@@ -327,32 +318,6 @@ def _moves(source: Any, spec: Any) -> bool:
     return source.format_name() == "gif" and bool(source.seek_subimage(1, 0))
 
 
-def _number_type(name: str, path: Path) -> str:
-    """Choose the type that numbers are read in: their own, or the next one that holds them."""
-    if name in _FLOATS:
-        return "float"
-    if name not in ("uint8", "uint16"):
-        raise ValueError(f"{path}: holds {name} numbers; a picture has 8 or 16 bits, or floating point")
-    return name
-
-
-def _require_grey_or_rgb(spec: Any, path: Path) -> bool:
-    """Tell whether there is alpha; raise ValueError if RGB would need a profile or a choice of channels."""
-    stored = spec.get_string_attribute("tiff:ColorSpace") or spec.get_string_attribute("jpeg:ColorSpace")
-    if stored and any(name in stored for name in ("CMYK", "YCCK", "LAB", "separated")):
-        raise ValueError(f"{path}: is {stored}; convert it to sRGB first")
-
-    names = tuple(spec.channelnames)
-    if names == ("R", "G", "B"):
-        return False
-    if names == ("R", "G"):  # grey with alpha in JPEG XL
-        return True
-    more = names[1:] if len(names) < 3 else names[3:]
-    if more not in ((), ("A",)) or "A" in names[:-1]:  # a palette with alpha comes as R, A, B
-        raise ValueError(f"{path}: has channels {', '.join(names)}; expected grey or R, G, B, with optional alpha")
-    return bool(more)
-
-
 # -- other decoders ----------------------------------------------------------------------------------------------------
 
 
@@ -399,18 +364,9 @@ def _of_pillow(image: Any, path: Path, name: str, headers: Headers, orientation:
     )
 
 
-def _decode_heif(path: Path, name: str, max_pixels: int, headers: Headers) -> Decoded:
-    """Decode HEIC by libheif and AVIF by Pillow."""
-    if name == "HEIC":
-        if not reads_heic():
-            raise ValueError(f"{path}: is HEIC, and pillow_heif is not installed; {how_to_install('heif')}")
-        return _decode_heic(path, max_pixels, headers)
+def _decode_avif(path: Path, max_pixels: int, headers: Headers) -> Decoded:
     if not reads_avif():
         raise ValueError(f"{path}: is AVIF, and this Pillow does not read AVIF; {how_to_install('heif')}")
-    return _decode_avif(path, max_pixels, headers)
-
-
-def _decode_avif(path: Path, max_pixels: int, headers: Headers) -> Decoded:
     with extra("heif"):
         from PIL import Image
 
@@ -425,6 +381,8 @@ def _decode_avif(path: Path, max_pixels: int, headers: Headers) -> Decoded:
 
 def _decode_heic(path: Path, max_pixels: int, headers: Headers) -> Decoded:
     """Decode HEIC of 8, 10 or 12 bits. libheif turns it upright; 10 and 12 bits come as 16."""
+    if not reads_heic():
+        raise ValueError(f"{path}: is HEIC, and pillow_heif is not installed; {how_to_install('heif')}")
     with extra("heif"):
         import pillow_heif
 
@@ -469,48 +427,3 @@ def _decode_with_tifffile(path: Path, max_pixels: int, headers: Headers, kind: T
     colours, alpha = _split_alpha(decode_tiff_codes(codes, kind), bool(kind.extra))
     colour = headers.colour or Colour(profile)
     return Decoded(colours, alpha, kind.extra == (1,), "TIFF", colour, headers.orientation or 1, headers)
-
-
-_PSD_MODES = {4: "CMYK", 7: "multichannel", 8: "duotone", 9: "CIELAB"}
-"""These modes of PSD are no RGB. OpenImageIO converts the first without its profile and takes the second for RGB."""
-
-
-def _require_rgb_in_psd(path: Path) -> None:
-    with path.open("rb") as file:
-        head = file.read(26)
-    mode = int.from_bytes(head[24:26], "big")
-    if mode in _PSD_MODES:
-        raise ValueError(f"{path}: is {_PSD_MODES[mode]} in PSD; convert it to sRGB first")
-
-
-_ENUMERATED_SPACES = (16, 17)
-"""JPEG 2000's numbers of sRGB and of grey in sRGB's transfer function."""
-_JP2_SPACES = {12: "CMYK", 14: "CIELAB", 18: "sYCC"}
-
-
-def _require_plain_components(path: Path) -> None:
-    """Raise ValueError for JPEG 2000 whose components are signed, subsampled or unlike, a palette, or no RGB."""
-    with path.open("rb") as file:
-        head = file.read(_MOST_OF_JP2_HEADER)
-
-    colour = head.find(b"colr")
-    if colour >= 0 and head[colour + 4 : colour + 5] == b"\1":
-        space = int.from_bytes(head[colour + 7 : colour + 11], "big")
-        if space not in _ENUMERATED_SPACES:
-            name = _JP2_SPACES.get(space, f"colour space {space}")
-            raise ValueError(f"{path}: is {name} in JPEG 2000; convert it to sRGB first")
-
-    size = head.find(b"\xff\x4f\xff\x51")
-    if size < 0 or size + 42 > len(head):
-        return
-    count = int.from_bytes(head[size + 40 : size + 42], "big")
-    components = {head[offset : offset + 3] for offset in range(size + 42, size + 42 + 3 * count, 3)}
-    depths = {component[:1] for component in components}
-    is_signed = any(depth >= b"\x80" for depth in depths)
-    if is_signed or len(components) > 1 or not components <= {depth + b"\1\1" for depth in depths}:
-        raise ValueError(f"{path}: is JPEG 2000 of signed, subsampled or unlike components; save it as PNG")
-    if b"pclr" in head[:size]:
-        raise ValueError(f"{path}: is JPEG 2000 with a palette; save it as PNG")
-
-
-_MOST_OF_JP2_HEADER = 2**20

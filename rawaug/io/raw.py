@@ -243,26 +243,12 @@ def _read_frame(path: Path, raw: Any, tags: TiffTags, monochrome: bool = False) 
     if not white > black.max():
         raise ValueError(f"{path}: white level {white:g} is not above black level {black.max():g}")
 
-    # Its colours.
-    colours: dict[str, Any] = {"color_known": False}
-    if cfa != MONOCHROME:
-        with np.errstate(all="raise"):
-            matrix, color_known = _color_matrix(raw)
-        daylight = raw.daylight_whitebalance
-        has_gains = min(raw.camera_whitebalance[:3]) > 0
-        white_balance = _green_is_1(raw.camera_whitebalance if has_gains else daylight)
-        colours = {
-            "white_balance": white_balance,
-            "daylight": _green_is_1(daylight) if color_known else white_balance,
-            "color_matrix": torch.from_numpy(matrix).float(),
-            "color_known": color_known,
-        }
-
     # LibRaw takes numbers that EXIF does not know for turns.
     orientation = int(sizes.flip)
     if tags.orientations and not set(range(1, 9)).intersection(tags.orientations):
         orientation = 0
 
+    colours = {"color_known": False} if cfa == MONOCHROME else _read_colours(raw)
     iso = float(getattr(getattr(raw, "other", None), "iso_speed", 0))  # rawpy 0.27 or newer
     return RawFrame(
         mosaic=normalise(numbers, black, white),
@@ -282,6 +268,21 @@ def _read_frame(path: Path, raw: Any, tags: TiffTags, monochrome: bool = False) 
         floating=tags.floating,
         **colours,
     )
+
+
+def _read_colours(raw: Any) -> dict[str, Any]:
+    """Read the gains and the matrix, as attributes of a frame, and whether the matrix is this camera's."""
+    with np.errstate(all="raise"):
+        matrix, color_known = _color_matrix(raw)
+    daylight = raw.daylight_whitebalance
+    has_gains = min(raw.camera_whitebalance[:3]) > 0
+    white_balance = _green_is_1(raw.camera_whitebalance if has_gains else daylight)
+    return {
+        "white_balance": white_balance,
+        "daylight": _green_is_1(daylight) if color_known else white_balance,
+        "color_matrix": torch.from_numpy(matrix).float(),
+        "color_known": color_known,
+    }
 
 
 def _gain_maps(path: Path, raw: Any, tags: TiffTags) -> tuple[GainMap, ...]:

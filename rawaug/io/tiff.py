@@ -143,32 +143,14 @@ def _read_tags(pages: list[Any]) -> TiffTags:
     if page is None:
         return tags
 
-    # How the mosaic is stored.
-    digests: list[bytes | None] = []
-    for code in (_RAW_DIGEST, _NEW_RAW_DIGEST):
-        digest = bytes(pages[0].tags.valueof(code, b""))
-        is_complete = len(digest) == _DIGEST_BYTES and any(digest)  # GoPro cameras write zeros
-        digests.append(digest if is_complete else None)
-
-    floating = page.sampleformat == _FLOATING_POINT
-    has_integers = page.sampleformat == 1 and 8 < page.bitspersample <= 16
-    stored = StoredMosaic(
-        size=(page.imagelength, page.imagewidth),
-        compression=int(page.compression),
-        segments=tuple(zip(page.dataoffsets, page.databytecounts, strict=True)),
-        tiled=bool(page.is_tiled),
-        floating=floating,
-        plain=has_integers and _LINEARIZATION not in page.tags,
-        digest=digests[0],
-        tiled_digest=digests[1],
-    )
-
-    # Its levels, its pattern in the letters R, G and B, and its corrections.
+    # How it is stored, and its levels.
+    stored = _read_storage(page, pages[0])
     black, rows, columns = _black_levels(page)
-    white = 1.0 if floating else None
+    white = 1.0 if stored.floating else None
     if _WHITE in page.tags:
         white = float(np.max(_numbers(page.tags[_WHITE])))
 
+    # Its pattern in the letters R, G and B, and its corrections.
     cfa = None
     height, width = page.tags.valueof(_CFA_REPEATS, (0, 0))[:2]
     colours = page.tags.valueof(_CFA_PATTERN, b"")
@@ -192,6 +174,27 @@ def _read_tags(pages: list[Any]) -> TiffTags:
         area=active_area(page),
         crop=_default_crop(page),
         cfa=cfa,
+    )
+
+
+def _read_storage(mosaic: Any, first: Any) -> StoredMosaic:
+    """Read how a mosaic is stored; the digests of its numbers are in the first directory."""
+    digests: list[bytes | None] = []
+    for code in (_RAW_DIGEST, _NEW_RAW_DIGEST):
+        digest = bytes(first.tags.valueof(code, b""))
+        is_complete = len(digest) == _DIGEST_BYTES and any(digest)  # GoPro cameras write zeros
+        digests.append(digest if is_complete else None)
+
+    has_integers = mosaic.sampleformat == 1 and 8 < mosaic.bitspersample <= 16
+    return StoredMosaic(
+        size=(mosaic.imagelength, mosaic.imagewidth),
+        compression=int(mosaic.compression),
+        segments=tuple(zip(mosaic.dataoffsets, mosaic.databytecounts, strict=True)),
+        tiled=bool(mosaic.is_tiled),
+        floating=mosaic.sampleformat == _FLOATING_POINT,
+        plain=has_integers and _LINEARIZATION not in mosaic.tags,
+        digest=digests[0],
+        tiled_digest=digests[1],
     )
 
 

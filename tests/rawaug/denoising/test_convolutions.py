@@ -21,7 +21,7 @@ CPU = torch.device("cpu")
 @pytest.fixture(autouse=True)
 def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    convolutions._speeds_of.cache_clear()
+    convolutions._read_or_measure.cache_clear()
     return tmp_path / "rawaug" / "convolutions.json"
 
 
@@ -34,7 +34,7 @@ def test_the_measurement_is_made_once_and_kept_by_processor(
     assert convolutions.processor_name() in machine and torch.__version__ in machine
 
     monkeypatch.setattr(convolutions, "measure_convolutions", lambda: pytest.fail("measured twice"))
-    convolutions._speeds_of.cache_clear()
+    convolutions._read_or_measure.cache_clear()
     assert convolutions.convolution_speeds() == speeds
 
 
@@ -64,7 +64,7 @@ def test_bfloat16_is_fast_where_it_was_measured_to_be(
 def test_a_slow_processor_gets_the_small_network(monkeypatch: pytest.MonkeyPatch) -> None:
     for speed, network in ((20.0, "rawaug-small"), (200.0, "rawaug-base")):
         monkeypatch.setattr(convolutions, "measure_convolutions", lambda speed=speed: {"float32": speed})
-        convolutions._speeds_of.cache_clear()
+        convolutions._read_or_measure.cache_clear()
         assert convolutions.choose_network(CPU) == network
         for kept in Path(os.environ["XDG_CACHE_HOME"]).rglob("*.json"):
             kept.unlink()

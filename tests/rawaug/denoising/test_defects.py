@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ import rawaug
 from rawaug import cli
 from rawaug.denoising.defects import mend_sites, read_defects, write_defects
 from rawaug.io import RawFrame, read_raw, write_dng
+from rawaug.io.cells import MONOCHROME
 
 LEVELS = (1e-4, 1e-6)
 HOT = [(20, 31), (21, 31), (20, 30), (40, 9)]
@@ -93,6 +95,16 @@ def test_a_star_is_kept_and_a_defect_of_the_map_is_not(tmp_path: Path) -> None:
     for site in [*HOT, DEAD]:
         assert 0.1 < mapped[site] < 0.6, site
     assert (kept - mended).abs().median() == 0.0
+
+
+def test_a_map_is_of_monochrome_sensors_too(tmp_path: Path) -> None:
+    frame = replace(scene(0), cfa=MONOCHROME)
+    path = tmp_path / "mine.badpixels"
+    write_defects(rawaug.find_defects([frame, replace(scene(1), cfa=MONOCHROME)], LEVELS), path)
+    denoised = rawaug.denoise(frame, denoiser="Wavelet", noise=LEVELS, defects=path)
+    assert denoised.cfa == MONOCHROME
+    for site in [*HOT, DEAD]:
+        assert 0.1 < denoised.mosaic[0][site] < 0.6, site
 
 
 def test_the_command_writes_a_map_that_denoise_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -96,6 +96,18 @@ def test_a_drawn_file_keeps_its_bytes_and_the_line_says_why(tmp_path: Path) -> N
     assert report.deviation == 0.0
 
 
+def test_a_picture_is_judged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    judged = []
+
+    def judge(srgb: torch.Tensor) -> None:
+        judged.append(srgb)
+
+    monkeypatch.setattr("rawaug.denoising.pictures.explain_drawn", judge)
+    screenshot().save(tmp_path / "in.png")
+    PictureFiles("NonLocalMeans").denoise(tmp_path / "in.png", tmp_path / "out.png")
+    assert len(judged) == 1
+
+
 def test_a_level_that_is_told_denoises_a_drawn_picture_too() -> None:
     picture = as_tensor(screenshot())
     assert torch.equal(PictureDenoiser.of("NonLocalMeans")(Noisy(picture)), picture)
