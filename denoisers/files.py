@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +114,16 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
         raise FileNotFoundError(f"{path}: no such file")
 
     metadata, tensors = read_tensors(path, "give one written by rawaug run or denoisers.save, or copy it again")
+    return restore(path, metadata, tensors)
+
+
+def restore(path: Path, metadata: Mapping[str, str], tensors: Mapping[str, Tensor]) -> tuple[Denoiser, dict[str, Any]]:
+    """Build the network that the content of a file describes; see :func:`load`.
+
+    Args:
+        path: the file, for messages.
+        metadata, tensors: its content.
+    """
     if (metadata.get("format"), metadata.get("kind")) != (FORMAT, KIND):
         raise ValueError(f"{path}: not a denoiser of rawaug (its metadata lack format={FORMAT}, kind={KIND})")
     try:

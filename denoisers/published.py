@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from denoisers import anscombe
 from denoisers.domains import fit_levels
 from denoisers.ffdnet import FFDNet
-from denoisers.files import load
+from denoisers.files import restore
 from denoisers.network import PACKED
 from denoisers.pbrid import PBRID
 from denoisers.pmrid import PMRID
@@ -156,7 +156,7 @@ def read_network(path: Path) -> NetworkFile:
     """
     metadata, tensors = read_tensors(path, AGAIN)
     if metadata.get("format") == "rawaug":
-        network, info = load(path)
+        network, info = restore(path, metadata, tensors)
         name = path.stem
         if name == "denoiser":  # rawaug run writes ARM/denoiser.safetensors
             name = path.resolve().parent.name

@@ -57,8 +57,14 @@ def read_anchors(matrix: Any, matrix_is: MatrixKind, white_balance: Any) -> list
     Raises:
         ValueError: if a figure is missing, of another shape or out of range.
     """
-    matrices = _by_light("matrix", matrix, (3, 3))
-    gains = _by_light("white_balance", white_balance, (3,))
+    matrices = _by_light("matrix", matrix)
+    _require_shape("matrix", matrices, (3, 3))
+    gains = _by_light("white_balance", white_balance)
+    _require_shape("white_balance", gains, (3,))
+    for light, stated in gains.items():
+        if not ((stated >= 1 / _MOST_GAIN) & (stated <= _MOST_GAIN)).all():
+            rule = f"must be from {1 / _MOST_GAIN:g} to {_MOST_GAIN:g}"
+            raise ValueError(f"white_balance of light {light} {rule}, got {stated.tolist()!r:.100}")
     if len(matrices) == 1 and gains and not isinstance(white_balance, dict):
         gains = dict.fromkeys(matrices, gains[REFERENCE])  # both are for the same light, that of the matrix
 
@@ -84,7 +90,8 @@ def read_anchors(matrix: Any, matrix_is: MatrixKind, white_balance: Any) -> list
     return anchors
 
 
-def _by_light(key: str, value: Any, shape: tuple[int, ...]) -> dict[str, Tensor]:
+def _by_light(key: str, value: Any) -> dict[str, Tensor]:
+    """Read what a sheet states in each light, or in the one of D65; nothing if it states nothing."""
     if value is None:
         return {}
     if not isinstance(value, dict):
@@ -99,17 +106,16 @@ def _by_light(key: str, value: Any, shape: tuple[int, ...]) -> dict[str, Tensor]
         except (TypeError, ValueError) as error:
             raise ValueError(f"{key} of light {name!r:.40} cannot be read: {error}") from None
 
-        if by_light[name].shape != shape or not by_light[name].isfinite().all():
-            size = " x ".join(map(str, shape))
-            raise ValueError(f"{key} of light {name} must be {size} finite numbers, got {numbers!r:.100}")
-
-        if key == "white_balance" and not _are_gains(by_light[name]):
-            reason = f"must be from {1 / _MOST_GAIN:g} to {_MOST_GAIN:g}"
-            raise ValueError(f"{key} of light {name} {reason}, got {numbers!r:.100}")
-
     if not by_light:
         raise ValueError(f"{key} names no light")
     return by_light
+
+
+def _require_shape(key: str, by_light: Mapping[str, Tensor], shape: tuple[int, ...]) -> None:
+    for light, numbers in by_light.items():
+        if numbers.shape != shape or not numbers.isfinite().all():
+            size = " x ".join(map(str, shape))
+            raise ValueError(f"{key} of light {light} must be {size} finite numbers, got {numbers.tolist()!r:.100}")
 
 
 def _from_srgb(light: str, matrix: Tensor, matrix_is: MatrixKind) -> Tensor:
@@ -160,19 +166,8 @@ def read_shading(shading: Any) -> dict[str, Tensor]:
     Raises:
         ValueError: if a table cannot be read, is of another size, or has values that are no shares of light.
     """
-    if shading is None:
-        return {}
-    if not isinstance(shading, dict):
-        shading = {REFERENCE: shading}
-
     by_light = {}
-    for light, numbers in shading.items():
-        try:
-            light_xyz(str(light))
-            table = torch.tensor(numbers, dtype=torch.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"shading of light {light!r:.40} cannot be read: {error}") from None
-
+    for light, table in _by_light("shading", shading).items():
         if table.ndim == 2:
             table = table.expand(3, -1, -1)
         if table.ndim != 3 or len(table) != 3 or min(table.shape) < 2 or max(table.shape) > _LONGEST_SHADING:
@@ -181,13 +176,8 @@ def read_shading(shading: Any) -> dict[str, Tensor]:
             raise ValueError(f"shading of light {light} {rule}, got {sides or 'a number'}")
         if not bool(((table > 0) & (table <= 1)).all()):
             raise ValueError(f"shading of light {light} must be above 0 and at most 1; are these gains?")
-        by_light[str(light)] = table
+        by_light[light] = table
 
-    if len({table.shape for table in by_light.values()}) != 1:
+    if len({table.shape for table in by_light.values()}) > 1:
         raise ValueError("shading needs tables of one size for all lights")
     return by_light
-
-
-def _are_gains(values: Tensor) -> bool:
-    """Tell whether values are between :data:`_MOST_GAIN` and one over it."""
-    return bool(((values >= 1 / _MOST_GAIN) & (values <= _MOST_GAIN)).all())

@@ -22,6 +22,7 @@ from rawaug.io import RawFrame
 from rawaug.io.pictures import MAX_PIXELS
 
 T = TypeVar("T")
+S = TypeVar("S")
 
 
 class FrameLabel(NamedTuple):
@@ -106,11 +107,11 @@ class Frames(Sequence[T], Generic[T]):
         """The frames at these indices."""
         return _View(self, indices)
 
-    def map(self, change: Callable[[T], T], step: str = "", only: Iterable[int] | None = None) -> Frames[T]:
-        """All frames, each changed as it is read.
+    def map(self, change: Callable[[T], S], step: str = "", only: Iterable[int] | None = None) -> Frames[S]:
+        """All frames, each changed as it is read, or what is made of each, such as its picture.
 
         Args:
-            change: a function from one to another of the same kind.
+            change: a function of one of them.
             step: what it does to the pixels, which becomes a part of the stamps.
             only: the indices of the frames that are changed; all by default.
         """
@@ -135,17 +136,17 @@ class Frames(Sequence[T], Generic[T]):
         return _View(self, range(len(self)), read=pairs.__getitem__)
 
 
-class _View(Frames[T]):
+class _View(Frames[Any]):
     """Some of the frames of a sequence, perhaps changed."""
 
     def __init__(
         self,
-        frames: Frames[T],
+        frames: Frames[Any],
         indices: Iterable[int],
-        change: Callable[[T], T] | None = None,
+        change: Callable[[Any], Any] | None = None,
         step: str = "",
         only: Iterable[int] | None = None,
-        read: Callable[[int], T] | None = None,
+        read: Callable[[int], Any] | None = None,
     ) -> None:
         self.frames = frames
         self.indices = list(indices)
@@ -157,7 +158,7 @@ class _View(Frames[T]):
         if frames.labels:
             self.labels = [frames.labels[index] for index in self.indices]
 
-    def read(self, index: int) -> T:
+    def read(self, index: int) -> Any:
         frame = self.read_frame(self.indices[index])
         if self.change is None or (self.only is not None and index not in self.only):
             return frame
@@ -328,14 +329,3 @@ def skip_broken(pairs: Sequence[Pair], of: str) -> Iterator[Pair]:
 
 OWN_PICTURES = "pairs"
 """The value of ``data.pictures`` for augmenting the pictures of a recipe's own pairs."""
-
-
-class PairPictures(Frames[Tensor]):
-    """The pictures of pairs, uint8 ``(3, H, W)``; a pair is read on access to its picture."""
-
-    def __init__(self, pairs: Sequence[Pair]) -> None:
-        self.pairs = pairs
-        super().__init__(as_frames(pairs).names)
-
-    def read(self, index: int) -> Tensor:
-        return self.pairs[index].srgb

@@ -107,6 +107,7 @@ class Pair:
             cfa,
             white_balance=frame.white_balance,
             color_matrix=frame.color_matrix,
+            color_known=frame.color_known,
             camera=frame.camera,
             iso=frame.iso,
             name=name,

@@ -267,7 +267,17 @@ class RawDenoiser(ImageDenoiser):
             return _of_function(spec, name)
         if isinstance(spec, Mapping) or str(spec) in FILTERS:
             return _of_filter(spec)
-        return _of_file(spec)
+
+        path = Path(spec)
+        if path.suffix == ".onnx":
+            network = OnnxNetwork(path)
+            denoiser = _of_network(path.stem, network, network.info, CFA(network.info.get("cfa", "RGGB")))
+            denoiser = replace(denoiser, network=None)  # ONNX Runtime computes on the CPU
+        else:
+            file = read_named(spec, cls)
+            path = file.path
+            denoiser = _of_network(file.name, file.network, file.info, file.cfa)
+        return replace(denoiser, settings={"denoiser": path.stem, "denoiser_sha256": sha256(path)})
 
     def takes_pattern(self, cfa: str) -> bool:
         """Tell whether it takes mosaics of a pattern: any of Bayer's, and others with ``any_pattern``."""
@@ -367,21 +377,6 @@ def denoiser_file(spec: str | Path) -> Path | None:
     if Path(spec).suffix in (".safetensors", ".onnx") or str(spec) in list_shipped():
         return find_denoiser(spec)
     return None
-
-
-def _of_file(spec: str | Path) -> RawDenoiser:
-    """Make the denoiser of a file, or of a shipped network by its name."""
-    path = Path(spec)
-    if path.suffix == ".onnx":
-        network = OnnxNetwork(path)
-        denoiser = _of_network(path.stem, network, network.info, CFA(network.info.get("cfa", "RGGB")))
-        denoiser = replace(denoiser, network=None)  # ONNX Runtime computes on the CPU
-    else:
-        file = read_named(spec, RawDenoiser)
-        path = file.path
-        denoiser = _of_network(file.name, file.network, file.info, file.cfa)
-
-    return replace(denoiser, settings={"denoiser": path.stem, "denoiser_sha256": sha256(path)})
 
 
 def _of_network(name: str, network: nn.Module, info: Mapping[str, Any], cfa: CFA | None) -> RawDenoiser:

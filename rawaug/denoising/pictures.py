@@ -264,8 +264,7 @@ class PictureFiles(Files[DenoisedPicture]):
             listing.leave_out("rendering", advice, file.suffix.lower())
             listing.files.remove(file)
 
-        if "picture" in listing.left_out:
-            listing.left_out["picture"].advice = "linear light; save it as a developed picture"
+        listing.advice["picture"] = "linear light; save it as a developed picture"
         return self.require_files(folder, listing, extensions)
 
     def target(self, file: Path) -> Path:

@@ -359,8 +359,7 @@ class RawFiles(Files[Denoised]):
     def listing(self, folder: Path) -> Listing:
         """List the RAW files."""
         listing = list_files(folder, RAW_EXTENSIONS, "neither RAW nor a picture that is known")
-        if "RAW file" in listing.left_out:
-            listing.left_out["RAW file"].advice = "there is no decoder for these kinds of RAW"
+        listing.advice["RAW file"] = "there is no decoder for these kinds of RAW"
         return self.require_files(folder, listing, RAW_EXTENSIONS)
 
     def target(self, file: Path) -> Path:

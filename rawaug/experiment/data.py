@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 from rawaug.data import open_pairs, open_pictures
-from rawaug.data.frames import OWN_PICTURES, Cached, PairPictures, Readable, as_frames, left_out, shared_frame
+from rawaug.data.frames import OWN_PICTURES, Cached, Readable, as_frames, left_out, shared_frame
 from rawaug.data.pairs import Pair
 from rawaug.data.selection import select_pairs
 from rawaug.errors import count_of
@@ -87,7 +88,7 @@ def open_frames(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> tuple[di
         of_validation = len(validation)
         _require_unseen(test, validation, "validation")
 
-    pictures: Any = PairPictures(pairs)
+    pictures: Any = as_frames(pairs).map(attrgetter("srgb"))
     if data.pictures != OWN_PICTURES:
         pictures = open_pictures(data.pictures, recipe.train.crop + _MARGIN, data.max_pixels)
     if data.memory_mb:
@@ -186,7 +187,7 @@ def read_frames(recipe: Recipe, frames: dict[str, Any]) -> tuple[dict[str, Any],
 
     pictures = frames["pictures"]
     if recipe.data.pictures == OWN_PICTURES:
-        pictures = PairPictures(readable_pairs)
+        pictures = as_frames(readable_pairs).map(attrgetter("srgb"))
 
     read = {"pairs": readable_pairs, "validation": kept, "test": test.readable(), "pictures": pictures}
     return {**frames, **read}, lines

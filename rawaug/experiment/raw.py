@@ -8,7 +8,7 @@ from dataclasses import replace
 from torch import nn
 
 from rawaug.bayer import CFA
-from rawaug.data.frames import PairPictures
+from rawaug.data.frames import OWN_PICTURES
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.trials import Trial, make_trial, make_trials
 from rawaug.experiment.task import TASKS, Task, change_cfa
@@ -84,10 +84,9 @@ class RawTask(Task):
             clean = [replace(pair, noisy=None, noisy_srgb=None) for pair in self.real]
             return RealCrops(clean, noise, crop, augment.isp.cfa)
 
-        pictures = self.frames["pictures"]
-        if isinstance(pictures, PairPictures) and settings.zoom == 1.0:
-            return OwnPictureCrops(pictures.pairs, augment, crop)
-        return PictureCrops(RawPairs(pictures, augment, crop, zoom=settings.zoom))
+        if self.recipe.data.pictures == OWN_PICTURES and settings.zoom == 1.0:
+            return OwnPictureCrops(self.real, augment, crop)
+        return PictureCrops(RawPairs(self.frames["pictures"], augment, crop, zoom=settings.zoom))
 
     def validation(self, cfa: CFA) -> Sequence[Trial]:
         """Take frames with frozen noise, or as r2r pairs if no arm sees clean ones; without any, pictures as RAW."""

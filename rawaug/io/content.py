@@ -166,49 +166,43 @@ def _of_tiff(file: BinaryIO) -> Content:
 # -- folders of files of many kinds ------------------------------------------------------------------------------------
 
 
-@dataclass
-class LeftOut:
-    """Files of one kind that a command does not read: their number by extension, and what to do with them."""
-
-    what: str
-    advice: str
-    extensions: Counter[str] = field(default_factory=Counter)
-
-    @property
-    def count(self) -> int:
-        """The number of these files."""
-        return self.extensions.total()
-
-    def __str__(self) -> str:
-        counts = []
-        for extension, count in self.extensions.most_common(_MAX_EXTENSIONS):
-            counts.append(f"{escape(extension) or 'no extension'} {count}")
-        names = ", ".join(counts)
-        if len(self.extensions) > _MAX_EXTENSIONS:
-            names += f", {len(self.extensions) - _MAX_EXTENSIONS} other extensions"
-
-        return f"{count_of(self.count, self.what)} left out ({names}): {self.advice}"
-
-
 _MAX_EXTENSIONS = 6
 """A line lists at most this many extensions."""
 
 
 @dataclass
 class Listing:
-    """The files of a folder and its subfolders that are read, sorted by path, and those that are not, by kind."""
+    """The files of a folder and its subfolders.
+
+    Attributes:
+        files: those that are read, sorted by path.
+        left_out: how many others there are of each extension, by kind.
+        advice: what to do with the others, by kind.
+    """
 
     files: list[Path] = field(default_factory=list)
-    left_out: dict[str, LeftOut] = field(default_factory=dict)
+    left_out: dict[str, Counter[str]] = field(default_factory=dict)
+    advice: dict[str, str] = field(default_factory=dict)
 
     def lines(self, elsewhere: Collection[str] = ()) -> list[str]:
         """Write a line for each kind that is left out, but for kinds that are taken care of ``elsewhere``."""
-        return [str(kind) for what, kind in self.left_out.items() if what not in elsewhere]
+        lines = []
+        for kind, extensions in self.left_out.items():
+            if kind in elsewhere:
+                continue
+            counts = []
+            for extension, count in extensions.most_common(_MAX_EXTENSIONS):
+                counts.append(f"{escape(extension) or 'no extension'} {count}")
+            names = ", ".join(counts)
+            if len(extensions) > _MAX_EXTENSIONS:
+                names += f", {len(extensions) - _MAX_EXTENSIONS} other extensions"
+            lines.append(f"{count_of(extensions.total(), kind)} left out ({names}): {self.advice[kind]}")
+        return lines
 
-    def leave_out(self, what: str, advice: str, extension: str) -> None:
+    def leave_out(self, kind: str, advice: str, extension: str) -> None:
         """Count a file that is not read."""
-        kind = self.left_out.setdefault(what, LeftOut(what, advice))
-        kind.extensions[extension] += 1
+        self.advice.setdefault(kind, advice)
+        self.left_out.setdefault(kind, Counter())[extension] += 1
 
 
 def picture_extensions() -> tuple[str, ...]:

@@ -25,7 +25,7 @@ _AREA = struct.Struct(">8I")  # top, left, bottom, right, plane, planes, pitch o
 _GRID = struct.Struct(">2I4dI")  # points, spacing, origin, planes
 _RECTANGLE = struct.Struct(">4I")
 
-Pair = tuple[int, int]
+Extent = tuple[int, int]
 """A number of rows and of columns."""
 
 
@@ -60,7 +60,7 @@ def pack_opcodes(opcodes: Iterable[Opcode]) -> bytes:
     return struct.pack(">I", len(packed)) + b"".join(packed)
 
 
-def move_opcodes(opcodes: bytes, shift: Pair, size: Pair, new_size: Pair) -> tuple[bytes, list[str]]:
+def move_opcodes(opcodes: bytes, shift: Extent, size: Extent, new_size: Extent) -> tuple[bytes, list[str]]:
     """Move the opcodes of a list to a picture that is a part of the one that they were made for.
 
     Args:
@@ -102,14 +102,14 @@ def move_opcodes(opcodes: bytes, shift: Pair, size: Pair, new_size: Pair) -> tup
 # -- what addresses rows and columns -----------------------------------------------------------------------------------
 
 
-def _move_start(start: int, shift: int, pitch: int) -> Pair:
+def _move_start(start: int, shift: int, pitch: int) -> Extent:
     """Find where lines of a pitch begin in the part, and how many of them were cut."""
     start -= shift
     cut = max(0, math.ceil(-start / pitch))
     return start + cut * pitch, cut
 
 
-def _move_lines(body: bytes, shift: Pair, new_size: Pair) -> tuple[bytes, Pair, Pair] | None:
+def _move_lines(body: bytes, shift: Extent, new_size: Extent) -> tuple[bytes, Extent, Extent] | None:
     """Move an area; return it, its rows and columns that were cut, and those that are left; None if none are."""
     top, left, bottom, right, plane, planes, row_pitch, column_pitch = _AREA.unpack_from(body)
     top, cut_rows = _move_start(top, shift[0], row_pitch)
@@ -125,7 +125,7 @@ def _move_lines(body: bytes, shift: Pair, new_size: Pair) -> tuple[bytes, Pair, 
     return area, (cut_rows, cut_columns), (rows, columns)
 
 
-def _move_area(body: bytes, shift: Pair, size: Pair, new_size: Pair) -> bytes | None:
+def _move_area(body: bytes, shift: Extent, size: Extent, new_size: Extent) -> bytes | None:
     """Move MapTable and MapPolynomial."""
     lines = _move_lines(body, shift, new_size)
     if lines is None:
@@ -133,7 +133,7 @@ def _move_area(body: bytes, shift: Pair, size: Pair, new_size: Pair) -> bytes | 
     return lines[0] + body[_AREA.size :]
 
 
-def _move_gain_map(body: bytes, shift: Pair, size: Pair, new_size: Pair) -> bytes | None:
+def _move_gain_map(body: bytes, shift: Extent, size: Extent, new_size: Extent) -> bytes | None:
     lines = _move_lines(body, shift, new_size)
     if lines is None:
         return None
@@ -146,10 +146,10 @@ def _move_gain_map(body: bytes, shift: Pair, size: Pair, new_size: Pair) -> byte
     return lines[0] + _GRID.pack(points_v, points_h, *spacing, *origin, planes) + body[_AREA.size + _GRID.size :]
 
 
-def _move_numbers(of_columns: bool) -> Callable[[bytes, Pair, Pair, Pair], bytes | None]:
+def _move_numbers(of_columns: bool) -> Callable[[bytes, Extent, Extent, Extent], bytes | None]:
     """Make the function that moves an area with a number for each of its rows or columns."""
 
-    def move(body: bytes, shift: Pair, size: Pair, new_size: Pair) -> bytes | None:
+    def move(body: bytes, shift: Extent, size: Extent, new_size: Extent) -> bytes | None:
         lines = _move_lines(body, shift, new_size)
         if lines is None:
             return None
@@ -166,7 +166,7 @@ def _move_numbers(of_columns: bool) -> Callable[[bytes, Pair, Pair, Pair], bytes
 
 
 def _move_rectangle(
-    rectangle: tuple[int, int, int, int], shift: Pair, new_size: Pair
+    rectangle: tuple[int, int, int, int], shift: Extent, new_size: Extent
 ) -> tuple[int, int, int, int] | None:
     top, left = max(0, rectangle[0] - shift[0]), max(0, rectangle[1] - shift[1])
     bottom, right = min(rectangle[2] - shift[0], new_size[0]), min(rectangle[3] - shift[1], new_size[1])
@@ -175,25 +175,25 @@ def _move_rectangle(
     return top, left, bottom, right
 
 
-def _move_bounds(body: bytes, shift: Pair, size: Pair, new_size: Pair) -> bytes | None:
+def _move_bounds(body: bytes, shift: Extent, size: Extent, new_size: Extent) -> bytes | None:
     rectangle = _move_rectangle(_RECTANGLE.unpack_from(body), shift, new_size)
     if rectangle is None:
         return None
     return _RECTANGLE.pack(*rectangle)
 
 
-def _move_phase(phase: int, shift: Pair) -> int:
+def _move_phase(phase: int, shift: Extent) -> int:
     """Find Bayer's phase, whose bits are the row and the column of red."""
     return phase ^ ((shift[0] % 2) << 1 | shift[1] % 2)
 
 
-def _move_constant(body: bytes, shift: Pair, size: Pair, new_size: Pair) -> bytes:
+def _move_constant(body: bytes, shift: Extent, size: Extent, new_size: Extent) -> bytes:
     """Move FixBadPixelsConstant, which names a number and the phase."""
     constant, phase = struct.unpack_from(">2I", body)
     return struct.pack(">2I", constant, _move_phase(phase, shift))
 
 
-def _move_bad_sites(body: bytes, shift: Pair, size: Pair, new_size: Pair) -> bytes | None:
+def _move_bad_sites(body: bytes, shift: Extent, size: Extent, new_size: Extent) -> bytes | None:
     """Move FixBadPixelsList: sites and rectangles."""
     phase, sites, rectangles = struct.unpack_from(">3I", body)
     numbers = struct.unpack_from(f">{2 * sites + 4 * rectangles}I", body, 12)
@@ -221,18 +221,18 @@ def _move_bad_sites(body: bytes, shift: Pair, size: Pair, new_size: Pair) -> byt
 # -- what is stated in parts of the picture ----------------------------------------------------------------------------
 
 
-def _radius(size: Pair, centre: tuple[float, float]) -> float:
+def _radius(size: Extent, centre: tuple[float, float]) -> float:
     """Compute the distance in sites from the centre to the corner that is furthest away."""
     across, down = centre
     width, height = max(across, 1 - across) * size[1], max(down, 1 - down) * size[0]
     return math.hypot(width, height)
 
 
-def _move_centre(centre: tuple[float, float], shift: Pair, size: Pair, new_size: Pair) -> tuple[float, float]:
+def _move_centre(centre: tuple[float, float], shift: Extent, size: Extent, new_size: Extent) -> tuple[float, float]:
     return (centre[0] * size[1] - shift[1]) / new_size[1], (centre[1] * size[0] - shift[0]) / new_size[0]
 
 
-def _move_warp(body: bytes, shift: Pair, size: Pair, new_size: Pair) -> bytes:
+def _move_warp(body: bytes, shift: Extent, size: Extent, new_size: Extent) -> bytes:
     """Move WarpRectilinear: four radial and two tangential numbers for each plane, in parts of the radius."""
     (planes,) = struct.unpack_from(">I", body)
     numbers = struct.unpack_from(f">{6 * planes + 2}d", body, 4)
@@ -247,7 +247,7 @@ def _move_warp(body: bytes, shift: Pair, size: Pair, new_size: Pair) -> bytes:
     return struct.pack(f">I{len(numbers)}d", planes, *moved, *moved_centre)
 
 
-def _move_vignette(body: bytes, shift: Pair, size: Pair, new_size: Pair) -> bytes:
+def _move_vignette(body: bytes, shift: Extent, size: Extent, new_size: Extent) -> bytes:
     """Move FixVignetteRadial: the numbers of r^2, r^4, ... r^10."""
     numbers = struct.unpack_from(">7d", body)
     centre = (numbers[-2], numbers[-1])
@@ -258,7 +258,7 @@ def _move_vignette(body: bytes, shift: Pair, size: Pair, new_size: Pair) -> byte
     return struct.pack(">7d", *moved, *moved_centre)
 
 
-_MOVES: dict[int, Callable[[bytes, Pair, Pair, Pair], bytes | None]] = {
+_MOVES: dict[int, Callable[[bytes, Extent, Extent, Extent], bytes | None]] = {
     1: _move_warp,
     3: _move_vignette,
     4: _move_constant,

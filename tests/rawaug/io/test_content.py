@@ -97,7 +97,7 @@ def test_what_a_folder_leaves_out_is_a_line_for_each_kind_and_adds_up(
     monkeypatch.setattr(content, "reads_heic", lambda: False)
     listing = list_pictures(mixed)
     assert [file.name for file in listing.files] == ["a.jpg", "b.png", "c.jpg"]
-    assert {what: kind.count for what, kind in listing.left_out.items()} == {
+    assert {kind: extensions.total() for kind, extensions in listing.left_out.items()} == {
         "HEIC picture": 2,
         "RAW file": 1,
         "other file": 3,
