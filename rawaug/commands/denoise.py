@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 
 from rawaug.commands import YAML, as_options, network_or_filter, require_results
 from rawaug.denoising.convolutions import USUAL, expect_seconds
-from rawaug.denoising.denoise import files_for, is_mixed, open_denoiser
+from rawaug.denoising.denoise import files_for, is_mixed
 from rawaug.denoising.folder import DenoisedFolder, denoise_file, denoise_folder
-from rawaug.denoising.pictures import PictureDenoiser, PictureFiles
+from rawaug.denoising.pictures import PictureFiles
 from rawaug.denoising.raw import Denoised, Greens, RawFiles, Strength
 from rawaug.errors import count_of, escape
 from rawaug.files import write_json
@@ -92,9 +92,8 @@ def run(
             extension = Path(out).suffix
             raise ValueError(f"{out}: {source} is a folder, and so is its output; give a name without {extension}")
         if spec is None and is_mixed(Path(source)):
-            spec = PictureDenoiser.default
             factor = 1.0 if isinstance(strength, str) else strength
-            pictures = PictureFiles(open_denoiser(PictureDenoiser, spec, factor, self_ensemble, device))
+            pictures = PictureFiles(None, factor, self_ensemble, device)
             result = denoise_folder(
                 source, out, kind, previews=preview, overwrite=overwrite, elsewhere=("rendering", *PICTURE_KINDS)
             )

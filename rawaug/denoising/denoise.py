@@ -6,17 +6,13 @@ import inspect
 from pathlib import Path
 from typing import Any
 
-from denoisers.files import JOINT
-from rawaug.denoising.convolutions import choose_network
-from rawaug.denoising.denoiser import D, RawDenoiser
 from rawaug.denoising.folder import Files, denoise_file
 from rawaug.denoising.levels import Noise
-from rawaug.denoising.pictures import LINEAR, PictureDenoiser, PictureFiles
+from rawaug.denoising.pictures import LINEAR, PictureFiles
 from rawaug.denoising.raw import Greens, RawFiles, Strength
 from rawaug.files import files_below, require_output
 from rawaug.io import RawFrame
 from rawaug.io.content import ALL_PICTURE_EXTENSIONS, RAW_EXTENSIONS, identify_content, picture_extensions
-from rawaug.kernels.runtime import find_device
 
 
 def denoise(
@@ -104,47 +100,17 @@ def files_for(
         FileNotFoundError: if there is no such file.
         ValueError: if it is a file of no kind, or a setting does not fit it.
     """
-    grain = strength == "auto"
+    if _is_raw(source):
+        return RawFiles(denoiser, strength, linear, self_ensemble, device, **for_raw)
+
+    defaults = inspect.signature(RawFiles).parameters
+    stated = ["linear"] if linear else []
+    stated += [argument for argument, value in for_raw.items() if value != defaults[argument].default]
+    if stated:
+        raise ValueError(f"{source}: is a developed picture; {stated[0]}= is for RAW")
     if isinstance(strength, str):
-        if not grain:
-            raise ValueError(f"strength: {strength!r} is unknown; use a number from 0 to 1, or auto")
-        strength = 1.0
-
-    if not _is_raw(source):
-        defaults = inspect.signature(RawFiles).parameters
-        stated = ["linear"] if linear else []
-        stated += [argument for argument, value in for_raw.items() if value != defaults[argument].default]
-        if stated:
-            raise ValueError(f"{source}: is a developed picture; {stated[0]}= is for RAW")
-        if grain:
-            raise ValueError(f"{source}: is a developed picture; strength= is a number for it, by default 1")
-        if denoiser is None:
-            denoiser = PictureDenoiser.default
-        return PictureFiles(open_denoiser(PictureDenoiser, denoiser, strength, self_ensemble, device))
-
-    by_pattern = denoiser is None and not linear
-    if denoiser is None:
-        denoiser = JOINT if linear else choose_network(find_device(device))
-    denoiser = open_denoiser(RawDenoiser, denoiser, strength, self_ensemble, device)
-    if linear and not denoiser.demosaics:
-        raise ValueError(f"{denoiser.name}: denoises the mosaic; linear=True demosaics, too, use {JOINT}")
-    if denoiser.demosaics and not linear:
-        raise ValueError(f"{denoiser.name}: demosaics too, to a linear DNG; add linear=True")
-    return RawFiles(denoiser, by_pattern=by_pattern, grain=grain, **for_raw)
-
-
-def open_denoiser(
-    kind: type[D], spec: Any, strength: float = 1.0, self_ensemble: bool = False, device: str = "auto"
-) -> D:
-    """Open a denoiser of this kind; one that is open is changed only as far as an argument differs from its default."""
-    changes: dict[str, Any] = {}
-    if strength != 1.0:
-        changes["strength"] = strength
-    if self_ensemble:
-        changes["views"] = 8
-    if isinstance(spec, kind) and not changes and device == "auto":
-        return spec
-    return kind.of(spec, device, "auto", **changes)
+        raise ValueError(f"{source}: is a developed picture; strength= is a number for it, by default 1")
+    return PictureFiles(denoiser, strength, self_ensemble, device)
 
 
 def is_mixed(folder: Path) -> bool:

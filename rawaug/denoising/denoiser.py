@@ -179,6 +179,20 @@ class ImageDenoiser(ABC):
         return denoised
 
 
+def open_denoiser(
+    kind: type[D], spec: Any, strength: float = 1.0, self_ensemble: bool = False, device: str = "auto"
+) -> D:
+    """Open a denoiser of this kind; one that is open is changed only as far as an argument differs from its default."""
+    changes: dict[str, Any] = {}
+    if strength != 1.0:
+        changes["strength"] = strength
+    if self_ensemble:
+        changes["views"] = 8
+    if isinstance(spec, kind) and not changes and device == "auto":
+        return spec
+    return kind.of(spec, device, "auto", **changes)
+
+
 def read_named(spec: str | Path, kind: type[ImageDenoiser]) -> NetworkFile:
     """Read the network of a ``.safetensors`` file or of a shipped name, for denoisers of this kind.
 

@@ -30,7 +30,7 @@ from denoisers.classical import FILTERS
 from denoisers.ffdnet import Refilled
 from denoisers.published import Image
 from rawaug import bayer
-from rawaug.denoising.denoiser import ImageDenoiser, Noisy, each_with_progress, read_named
+from rawaug.denoising.denoiser import ImageDenoiser, Noisy, each_with_progress, open_denoiser, read_named
 from rawaug.denoising.drawn import explain_drawn
 from rawaug.denoising.folder import Files
 from rawaug.denoising.picture_levels import estimate_level, white_level
@@ -241,17 +241,21 @@ class PictureFiles(Files[DenoisedPicture]):
     """Developed pictures, which are denoised to pictures with their EXIF, ICC profile and orientation.
 
     Args:
-        denoiser: whatever :meth:`PictureDenoiser.of` takes; it says where and how strongly pictures are denoised.
+        denoiser: whatever :meth:`PictureDenoiser.of` takes; None stands for the shipped one.
+        strength, self_ensemble, device: the factor on the estimated level, whether eight views are averaged, and where
+            it runs.
     """
 
     what = "picture"
     formats = PICTURE_FORMATS
     format_advice = f"the source is a developed picture; its output is one of {', '.join(PICTURE_FORMATS)}"
 
-    def __init__(self, denoiser: Any) -> None:
-        if not isinstance(denoiser, PictureDenoiser):
-            denoiser = PictureDenoiser.of(denoiser, "auto", "auto")
-        self.denoiser: PictureDenoiser = denoiser
+    def __init__(
+        self, denoiser: Any = None, strength: float = 1.0, self_ensemble: bool = False, device: str = "auto"
+    ) -> None:
+        if denoiser is None:
+            denoiser = PictureDenoiser.default
+        self.denoiser = open_denoiser(PictureDenoiser, denoiser, strength, self_ensemble, device)
 
     def listing(self, folder: Path) -> Listing:
         """List the pictures; one with the stem of a RAW file is left out, as the camera's own rendering of it."""

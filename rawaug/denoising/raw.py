@@ -34,11 +34,12 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
+from denoisers.files import JOINT
 from rawaug import bayer
 from rawaug.bayer import CFA, GreenDifference
 from rawaug.denoising.convolutions import choose_network
 from rawaug.denoising.defects import find_lone_sites, mend_sites, read_defects
-from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser
+from rawaug.denoising.denoiser import Levels, Noisy, RawDenoiser, open_denoiser
 from rawaug.denoising.folder import Files
 from rawaug.denoising.guard import SECOND, guard_result
 from rawaug.denoising.levels import Noise, find_levels, load_noise, noise_as_json
@@ -163,11 +164,11 @@ class RawFiles(Files[Denoised]):
     """RAW files and frames, with the denoiser of their pattern and the noise levels of each.
 
     Args:
-        denoiser: whatever :meth:`rawaug.RawDenoiser.of` takes; it says where and how strongly it denoises, and whether
-            it demosaics, too. None stands for the shipped one of Bayer's patterns.
+        denoiser: whatever :meth:`rawaug.RawDenoiser.of` takes; None stands for the shipped one of each frame's pattern,
+            or for the one that demosaics.
+        strength, linear, self_ensemble, device: how strongly it denoises, whether it demosaics, too, whether it
+            averages eight views, and where it runs.
         noise, greens, defects, guard: as in :func:`rawaug.denoise`.
-        by_pattern: denoise frames of patterns that are not Bayer's by the shipped denoiser of those.
-        grain: leave grain of :data:`GRAIN` in every frame, in place of the denoiser's strength.
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -184,22 +185,32 @@ class RawFiles(Files[Denoised]):
     def __init__(
         self,
         denoiser: Any = None,
+        strength: Strength = 1.0,
+        linear: bool = False,
+        self_ensemble: bool = False,
+        device: str = "auto",
         *,
         noise: Noise = "auto",
         greens: Greens = "auto",
         defects: str | Path = "mend",
         guard: bool | None = None,
-        by_pattern: bool = False,
-        grain: bool = False,
     ) -> None:
+        grain = strength == "auto"
+        if isinstance(strength, str):
+            if not grain:
+                raise ValueError(f"strength: {strength!r} is unknown; use a number from 0 to 1, or auto")
+            strength = 1.0
         if greens not in get_args(Greens):
             raise ValueError(f"greens: {greens!r} is unknown; use one of {', '.join(get_args(Greens))}")
 
+        self.by_pattern = denoiser is None and not linear
         if denoiser is None:
-            denoiser = choose_network(find_device("auto"))
-        if not isinstance(denoiser, RawDenoiser):
-            denoiser = RawDenoiser.of(denoiser, "auto", "auto")
-        self.denoiser: RawDenoiser = denoiser
+            denoiser = JOINT if linear else choose_network(find_device(device))
+        denoiser = open_denoiser(RawDenoiser, denoiser, strength, self_ensemble, device)
+        if linear and not denoiser.demosaics:
+            raise ValueError(f"{denoiser.name}: denoises the mosaic; linear=True demosaics, too, use {JOINT}")
+        if denoiser.demosaics and not linear:
+            raise ValueError(f"{denoiser.name}: demosaics too, to a linear DNG; add linear=True")
         if denoiser.demosaics and guard:
             raise ValueError(f"{denoiser.name}: demosaics, too; guard compares mosaics")
         if denoiser.demosaics and defects != "mend":
@@ -209,6 +220,7 @@ class RawFiles(Files[Denoised]):
         if guard is None:
             guard = denoiser.reads_levels and not denoiser.demosaics and "classical" not in denoiser.settings
 
+        self.denoiser: RawDenoiser = denoiser
         self.noise = load_noise(noise, denoiser)
         self.greens = greens
         self.defects = defects
@@ -216,7 +228,6 @@ class RawFiles(Files[Denoised]):
         if defects not in ("mend", "keep"):
             self.sites = read_defects(defects)
         self.guard = guard
-        self.by_pattern = by_pattern
         self.grain = grain
 
     @property

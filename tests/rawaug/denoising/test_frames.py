@@ -489,7 +489,7 @@ def test_a_mixed_folder_is_denoised_whole_but_for_the_cameras_own_renderings(
 
 
 def test_the_shipped_denoiser_of_each_pattern_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    by_pattern = RawFiles(noise=LEVELS, by_pattern=True)
+    by_pattern = RawFiles(noise=LEVELS)
     for cfa in ("GBRG", "XTRANS", "QUAD-RGGB", MONOCHROME):
         expected = OTHER_PATTERNS if cfa in ("XTRANS", "QUAD-RGGB") else "rawaug-base"
         assert by_pattern.denoiser_for(cfa).name == expected
