@@ -16,7 +16,6 @@ import torch
 from benchmarks.measure import arguments, finish, start
 from rawaug.bayer import CFA, crop_to_cfa, pack
 from rawaug.data import open_pairs
-from rawaug.data.frames import as_frames
 from rawaug.data.pairs import centre
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.evaluation.scores import NoisyInput, ScoredDenoiser
@@ -42,14 +41,14 @@ def main(command: Sequence[str] | None = None) -> None:
     )
     args = parser.parse_args(command)
     figures = start(args)
-    noise, pairs = noise_model(args.noise), as_frames(open_pairs(args.data))
+    noise, pairs = noise_model(args.noise), open_pairs(args.data)
     if args.quick:
         pairs = pairs.some(range(1))
     everyone: list[ScoredDenoiser] = [NoisyInput("noisy"), *map(RawDenoiser.of, args.denoisers)]
     side = (96 if args.quick else args.crop) // 2
     for way, together in WAYS.items():
         found: dict[str, list[float]] = {one.name: [] for one in everyone}
-        for pair in progress(as_frames(pairs).binned(args.bin, together), label=f"binned by {way}", unit="frame"):
+        for pair in progress(pairs.binned(args.bin, together), label=f"binned by {way}", unit="frame"):
             raw = pack(crop_to_cfa(pair.clean.mosaic, pair.cfa, CFA.RGGB)[None], CFA.RGGB)
             clean = centre(raw, side, side, step=1)
             params = noise.sample(1, keyed_generator(0, "binning", pair.name))

@@ -22,7 +22,6 @@ from denoisers import NonLocalMeans, anscombe
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
-from rawaug.data.frames import as_frames
 from rawaug.data.pairs import Pair
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import compare_images, to_domain
@@ -87,8 +86,8 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--noise", default="cycleisp_sidd")
     args = parser.parse_args(argv)
     figures = start(args)
-    frames: Any = as_frames(open_pairs(args.data)).binned(args.bin, together=True)
-    pairs = as_frames(frames).middles(256) if args.quick else frames
+    frames = open_pairs(args.data).binned(args.bin, together=True)
+    pairs = frames.middles(256) if args.quick else frames
     networks, noise = [RawDenoiser.of(name) for name in args.denoisers], noise_model(args.noise)
     for cfa in args.patterns:
         rows: dict[str, list[tuple[float, float]]] = {}

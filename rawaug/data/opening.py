@@ -6,7 +6,7 @@ import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from torch.utils.data import ConcatDataset
 
@@ -31,8 +31,8 @@ def open_pairs(
     bin: int = 1,
     developed: bool = False,
     **settings: Any,
-) -> Sequence[Pair]:
-    """Open RAW-sRGB pairs.
+) -> Frames[Any]:
+    """Open RAW-sRGB pairs: a sequence of :class:`rawaug.data.Pair` that are read on access.
 
     Args:
         spec: a RAW file, a folder of RAW files, or ``kind:path`` for a known dataset: ``"pairs:MY_PAIRS"``,
@@ -59,11 +59,14 @@ def open_pairs(
         4
     """
     if bin != 1:
-        return as_frames(open_pairs(spec, split, as_clean, max_pixels, developed=developed, **settings)).binned(bin)
+        return open_pairs(spec, split, as_clean, max_pixels, developed=developed, **settings).binned(bin)
 
     settings = {key: value for key, value in settings.items() if value is not None}
     if not isinstance(spec, (str, Path)):
-        return _as_they_are(spec, settings)
+        _require_none(settings, "a sequence of pairs")
+        if not isinstance(spec, Frames) and not _are_pairs(spec):
+            raise ValueError(f"data must be a path, kind:path or a non-empty list of Pair, got {type(spec).__name__}")
+        return as_frames(spec)
 
     kind, path = _kind_and_path(str(spec))
     if kind is None:
@@ -75,14 +78,14 @@ def open_pairs(
     if is_picture_pairs(str(spec)):
         if not developed:
             raise ValueError(f"{spec} is pairs of developed pictures, for rawaug run srgb; give RAW frames")
-        return cast(Any, open_picture_pairs(str(spec), **settings))
+        return open_picture_pairs(str(spec), **settings)
 
     reader = _reader(DATASETS, str(spec), kind, path, "a RAW file or folder")
     path, split_of_spec = _path_and_split(path)
     if settings:
         settings = check_settings(f"{kind}:", reader, settings, given=("path", "split"))
-    pairs: Sequence[Pair] = reader(path, split_of_spec or split, **settings)
-    if max_pixels is not None and isinstance(pairs, Frames):
+    pairs = as_frames(reader(path, split_of_spec or split, **settings))
+    if max_pixels is not None:
         pairs.max_pixels = max_pixels
     return pairs
 
@@ -93,14 +96,8 @@ def names_dataset(spec: str | Path) -> bool:
     return kind is not None
 
 
-def _as_they_are(pairs: Sequence[Pair], settings: Mapping[str, Any]) -> Sequence[Pair]:
-    _require_none(settings, "a sequence of pairs")
-    if isinstance(pairs, Frames):
-        return pairs
-    is_valid = isinstance(pairs, Sequence) and len(pairs) > 0 and all(isinstance(pair, Pair) for pair in pairs)
-    if not is_valid:
-        raise ValueError(f"data must be a path, kind:path or a non-empty list of Pair, got {type(pairs).__name__}")
-    return pairs
+def _are_pairs(pairs: Any) -> bool:
+    return isinstance(pairs, Sequence) and len(pairs) > 0 and all(isinstance(pair, Pair) for pair in pairs)
 
 
 def _require_none(settings: Mapping[str, Any], spec: object) -> None:

@@ -8,7 +8,7 @@ from operator import attrgetter
 from typing import Any
 
 from rawaug.data import open_pairs, open_pictures
-from rawaug.data.frames import OWN_PICTURES, Cached, Readable, as_frames, left_out, shared_frame
+from rawaug.data.frames import OWN_PICTURES, Cached, Frames, Readable, as_frames, left_out, shared_frame
 from rawaug.data.pairs import Pair
 from rawaug.data.selection import select_pairs
 from rawaug.errors import count_of
@@ -75,20 +75,19 @@ def open_frames(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> tuple[di
     held_out = isinstance(source, str) and source == HELD_OUT
     if held_out and len(every) > 1:
         count -= min(max(1, len(every) // 5), _MOST_HELD_OUT)
-    pairs: Sequence[Pair] = as_frames(every).some(select_pairs(every, count, data.count, data.select))
+    pairs = every.some(select_pairs(every, count, data.count, data.select))
     if data.crop is not None:
-        pairs = as_frames(pairs).middles(data.crop)
+        pairs = pairs.middles(data.crop)
 
-    validation: Sequence[Any]
     if held_out:
-        validation = as_frames(every).some(range(count, len(every)))
+        validation = every.some(range(count, len(every)))
         of_validation = len(every)
     else:
         validation = _open_pairs(recipe, source, "validation", clean)
         of_validation = len(validation)
         _require_unseen(test, validation, "validation")
 
-    pictures: Any = as_frames(pairs).map(attrgetter("srgb"))
+    pictures: Any = pairs.map(attrgetter("srgb"))
     if data.pictures != OWN_PICTURES:
         pictures = open_pictures(data.pictures, recipe.train.crop + _MARGIN, data.max_pixels)
     if data.memory_mb:
@@ -96,7 +95,7 @@ def open_frames(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> tuple[di
 
     frames = {
         "pairs": pairs,
-        "more": as_frames(every).some(range(count)).kept(megabytes=2048),
+        "more": every.some(range(count)).kept(megabytes=2048),
         "validation": _prepare(recipe, validation, "validation"),
         "test": _prepare(recipe, test, "test"),
         "pictures": pictures,
@@ -129,17 +128,17 @@ def open_frames(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> tuple[di
     return frames, lines
 
 
-def _open_pairs(recipe: Recipe, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Any]:
+def _open_pairs(recipe: Recipe, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Frames[Any]:
     """Open the frames that a key of ``data`` names, or a sequence of them; frames of a bare folder may be ``clean``."""
     if spec is None:
-        return []
+        return as_frames([])
 
     data = recipe.data
     developed = recipe.target == "srgb"
     return open_pairs(spec, split, clean, data.max_pixels, developed=developed, **data.pair_settings(spec))
 
 
-def _prepare(recipe: Recipe, frames: Sequence[Any], part: str) -> Sequence[Any]:
+def _prepare(recipe: Recipe, frames: Frames[Any], part: str) -> Frames[Any]:
     """Count, bin and crop the frames of a part, "validation" or "test", as the recipe says; each is read once.
 
     The test frames' own noise is measured on whole frames; binning removes most of it.
@@ -149,15 +148,15 @@ def _prepare(recipe: Recipe, frames: Sequence[Any], part: str) -> Sequence[Any]:
     if part == "test":
         count, crop = data.test_count, data.test_crop
 
-    frames = as_frames(frames).some(range(len(frames))[:count])
+    frames = frames.some(range(len(frames))[:count])
     if part == "test":
         frames = measure_own_noise(frames)
     if data.bin > 1 or recipe.full_colour:
-        frames = as_frames(frames).binned(data.bin, recipe.full_colour)
+        frames = frames.binned(data.bin, recipe.full_colour)
     if crop is not None:
-        frames = as_frames(frames).middles(crop)
+        frames = frames.middles(crop)
 
-    return as_frames(frames).kept()
+    return frames.kept()
 
 
 def _require_unseen(test: Sequence[Any], frames: Sequence[Any], part: str) -> None:

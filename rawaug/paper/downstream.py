@@ -18,7 +18,7 @@ from denoisers import Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
-from rawaug.data.frames import as_frames, skip_broken
+from rawaug.data.frames import skip_broken
 from rawaug.data.pairs import Sample
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.evaluation.scores import Row, score
@@ -115,7 +115,7 @@ def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> list[Row]:
     trials: list[Trial] = []
     for spec in config.test:
         every = open_pairs(spec, split="test", bin=config.bin)
-        frames = as_frames(every).some(range(len(every))[: config.test_count])
+        frames = every.some(range(len(every))[: config.test_count])
         for pair in skip_broken(frames, spec):
             if config.test_crop is not None:
                 pair = pair.middle(config.test_crop)

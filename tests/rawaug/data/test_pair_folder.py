@@ -205,9 +205,10 @@ def test_settings_are_for_pairs_alone(tmp_path: Path, bayer_dng: Dng) -> None:
     assert len(open_pairs(str(tmp_path), cfa=None)) == 1
 
 
-def test_a_sequence_of_pairs_is_taken_as_it_is() -> None:
+def test_the_pairs_of_a_sequence_are_taken_as_they_are() -> None:
     pairs = [Pair("a", RawFrame(torch.zeros(1, 4, 4), CFA.RGGB), torch.zeros(3, 4, 4, dtype=torch.uint8))]
-    assert open_pairs(pairs) is pairs
+    frames = open_pairs(pairs)
+    assert frames.names == ["a"] and frames[0] is pairs[0] and open_pairs(frames) is frames
     for wrong in ([], [1], 5):
         with pytest.raises(ValueError, match=r"list of Pair"):
             open_pairs(wrong)  # type: ignore[arg-type]
