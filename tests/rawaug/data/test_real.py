@@ -17,7 +17,7 @@ from rawaug.io import read_raw
 def test_every_split_is_read_and_states_what_is_known() -> None:
     splits = {split: open_pairs(f"real:{split}") for split in ("train", "validation", "test")}
     assert [len(pairs) for pairs in splits.values()] == [3, 2, 4]
-    assert len({name for pairs in splits.values() for name in pairs.names}) == 9  # type: ignore[attr-defined]
+    assert len({name for pairs in splits.values() for name in pairs.names}) == 9
     cameras = {split: {pair.clean.camera for pair in pairs} for split, pairs in splits.items()}
     assert not cameras["validation"] & (cameras["train"] | cameras["test"])
     for pair in (pair for pairs in splits.values() for pair in pairs):
