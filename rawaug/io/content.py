@@ -99,7 +99,18 @@ def identify_content(path: str | Path) -> Content:
 
 def identify_opened(file: BinaryIO, path: Path) -> Content:
     """Identify a file that is open at its beginning, as :func:`identify_content` does."""
-    content = _by_bytes(file)
+    head = file.read(64)
+    content = _OTHER
+    for offset, signature, of_signature in _SIGNATURES:
+        if head.startswith(signature, offset):
+            return of_signature
+
+    if head.startswith(_TIFF):
+        content = _of_tiff(file)
+    elif head[4:8] == b"ftyp":
+        content = _of_boxes(head)
+    elif head.startswith(_PORTABLE) and head[2:3].isspace():
+        content = Content("picture", "PNM")
     if content.kind != "other" and content.format != "TIFF":
         return content
 
@@ -115,21 +126,6 @@ def identify_opened(file: BinaryIO, path: Path) -> Content:
 def is_raw(path: str | Path) -> bool:
     """Tell whether a file is camera RAW; see :func:`identify_content`."""
     return identify_content(path).kind == "raw"
-
-
-def _by_bytes(file: BinaryIO) -> Content:
-    head = file.read(64)
-    for offset, signature, content in _SIGNATURES:
-        if head.startswith(signature, offset):
-            return content
-
-    if head.startswith(_TIFF):
-        return _of_tiff(file)
-    if head[4:8] == b"ftyp":
-        return _of_boxes(head)
-    if head.startswith(_PORTABLE) and head[2:3].isspace():
-        return Content("picture", "PNM")
-    return _OTHER
 
 
 def _of_boxes(head: bytes) -> Content:

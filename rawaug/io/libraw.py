@@ -94,9 +94,11 @@ def opened_raw(path: Path, unpack: bool = True) -> Iterator[tuple[Any, TiffTags]
 def _require_size(path: Path, raw: Any, tags: TiffTags) -> None:
     """Raise an error if the file is shorter than its tags say, or declares too many pixels."""
     size = path.stat().st_size
-    if tags.mosaic is not None and tags.mosaic.end > size:
-        raise OSError(f"{path}: cannot be read as RAW: truncated, {size} of {tags.mosaic.end} bytes")
-    if tags.mosaic is None and is_cut_short(path):
+    if tags.mosaic is not None:
+        end = max((offset + length for offset, length in tags.mosaic.segments), default=0)
+        if end > size:
+            raise OSError(f"{path}: cannot be read as RAW: truncated, {size} of {end} bytes")
+    elif is_cut_short(path):
         raise OSError(f"{path}: cannot be read as RAW: truncated, {size} of {stated_bytes(path)} bytes")
 
     height, width = raw.sizes.raw_height, raw.sizes.raw_width

@@ -63,14 +63,6 @@ class StoredMosaic:
     digest: bytes | None = None
     tiled_digest: bytes | None = None
 
-    @property
-    def end(self) -> int:
-        """Minimum size of the file in bytes."""
-        end = 0
-        for offset, length in self.segments:
-            end = max(end, offset + length)
-        return end
-
 
 @dataclass(frozen=True)
 class TiffTags:
