@@ -233,6 +233,11 @@ def test_a_tiff_has_the_chromaticities_that_it_states(tmp_path: Path) -> None:
     assert error(tmp_path / "a.tif") < 1.1
 
 
+def test_a_profile_that_is_made_does_not_depend_on_the_time() -> None:
+    profile = ADOBE_RGB.icc()
+    assert profile is not None and struct.unpack(">6H", profile[24:36]) == (1998, 11, 1, 0, 0, 0)
+
+
 def test_the_profile_in_a_bmp_is_applied(tmp_path: Path) -> None:
     profile = colour_from_code_points(12, 13).icc()
     assert profile is not None
