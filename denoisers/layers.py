@@ -53,17 +53,14 @@ def conv(
     if padding is None:
         padding = size // 2
 
-    return nn.utils.skip_init(
-        nn.Conv2d,
-        inputs,
-        outputs,
-        size,
-        stride=stride,
-        padding=padding,
-        groups=groups,
-        bias=bias,
-        device=torch.get_default_device(),
-    )
+    return _Conv2d(inputs, outputs, size, stride=stride, padding=padding, groups=groups, bias=bias)
+
+
+class _Conv2d(nn.Conv2d):
+    """Leaves its weights as they are in memory; ``torch.nn.utils.skip_init`` does so by importing SymPy, 0.4 s."""
+
+    def reset_parameters(self) -> None:
+        """Draw nothing."""
 
 
 def can_fuse(features: Tensor) -> bool:

@@ -91,9 +91,11 @@ def _profile_rows(levels_by_iso: dict[float, list[list[float]]]) -> Tensor:
     """Make rows of log ISO, log shot_var and log read_var, ``(R, 3)``, in ascending order of ISO."""
     rows = []
     for log_iso, levels in sorted(levels_by_iso.items()):
-        mean = torch.tensor(levels, dtype=torch.float64).mean(dim=0)
-        rows.append(torch.cat([mean.new_tensor([log_iso]), mean]))
-    return torch.stack(rows)
+        mean = levels[0]
+        if len(levels) > 1:
+            mean = torch.tensor(levels, dtype=torch.float64).mean(dim=0).tolist()
+        rows.append([log_iso, *mean])
+    return torch.tensor(rows, dtype=torch.float64)
 
 
 class ProfileLevels:
