@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from rawaug.plugin.augment import RawAugment as RawAugment
     from rawaug.plugin.clean_raw import RawNoise as RawNoise
     from rawaug.plugin.dataset import RawPairs as RawPairs
-    from rawaug.plugin.dataset import RawPairStream as RawPairStream
     from rawaug.plugin.degradation import ISPModel as ISPModel
     from rawaug.plugin.draw import Draw as Draw
     from rawaug.plugin.finishing import Finish as Finish
@@ -37,6 +36,7 @@ if TYPE_CHECKING:
     from rawaug.plugin.params import RawPair as RawPair
     from rawaug.plugin.params import load_params as load_params
     from rawaug.plugin.params import save_params as save_params
+    from rawaug.plugin.stream import RawPairStream as RawPairStream
     from rawaug.plugin.targets import Burst as Burst
     from rawaug.plugin.targets import Srgb as Srgb
     from rawaug.synthesis.folder import synth as synth
@@ -53,7 +53,8 @@ _PUBLIC = {
     "rawaug.camera.own": ("Camera",),
     "rawaug.plugin.augment": ("RawAugment",),
     "rawaug.plugin.clean_raw": ("RawNoise",),
-    "rawaug.plugin.dataset": ("RawPairStream", "RawPairs"),
+    "rawaug.plugin.dataset": ("RawPairs",),
+    "rawaug.plugin.stream": ("RawPairStream",),
     "rawaug.plugin.degradation": ("ISPModel",),
     "rawaug.plugin.draw": ("Draw",),
     "rawaug.plugin.finishing": ("Finish",),

@@ -28,19 +28,30 @@ Generators = torch.Generator | Sequence[torch.Generator]
 """One generator for all samples of a batch, or one for each."""
 
 
-def draw_rows(generators: Generators, batch: int, draw: Callable[[torch.Generator, int], torch.Tensor]) -> torch.Tensor:
-    """Draw the rows of a batch from one generator; or from one each, as every sample alone would be drawn.
+def draw_rows(
+    generators: Generators,
+    draw: Callable[..., torch.Tensor],
+    batch: int,
+    *shape: int,
+    dtype: torch.dtype = torch.float32,
+) -> torch.Tensor:
+    """Draw ``(batch, *shape)`` from one generator; or from one each, as every sample alone would be drawn.
+
+    Args:
+        generators: one generator, or ``batch`` of them.
+        draw: ``torch.rand`` or ``torch.randn``, or ``torch.randint`` with its limit.
+        batch, shape, dtype: of the result.
 
     Example:
         >>> alone = [torch.Generator().manual_seed(seed) for seed in (1, 2)]
-        >>> draw_rows(alone, 2, lambda generator, rows: torch.rand(rows, 3, generator=generator)).shape
+        >>> draw_rows(alone, torch.rand, 2, 3).shape
         torch.Size([2, 3])
     """
-    if isinstance(generators, torch.Generator):
-        return draw(generators, batch)
-    if len(generators) == 1:
-        return draw(generators[0], 1)
-    return torch.cat([draw(generator, 1) for generator in generators])
+    if not isinstance(generators, torch.Generator):
+        if len(generators) > 1:
+            return torch.cat([draw_rows(generator, draw, 1, *shape, dtype=dtype) for generator in generators])
+        generators = generators[0]
+    return draw((batch, *shape), generator=generators, device=generators.device, dtype=dtype)
 
 
 def take_generators(generators: Generators, rows: Iterable[int]) -> Generators:
@@ -48,6 +59,13 @@ def take_generators(generators: Generators, rows: Iterable[int]) -> Generators:
     if isinstance(generators, torch.Generator):
         return generators
     return [generators[row] for row in rows]
+
+
+def world_size() -> int:
+    """The number of processes of a distributed run; 1 without one."""
+    if not torch.distributed.is_available() or not torch.distributed.is_initialized():
+        return 1
+    return torch.distributed.get_world_size()
 
 
 def rank_key() -> tuple[int, ...]:

@@ -42,6 +42,17 @@ class _Transform(nn.Module, ABC):
     def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor: ...
 
 
+def draw_corner(frame: tuple[int, int], size: tuple[int, int], generator: torch.Generator) -> tuple[int, int]:
+    """Draw the even top and left of a crop of ``size`` in a frame, both (height, width); ValueError if it is larger."""
+    (height, width), (rows, columns) = frame, size
+    if height < rows or width < columns:
+        raise ValueError(f"{height} x {width} is smaller than the crop {rows} x {columns}; choose a smaller crop")
+
+    top = torch.randint((height - rows) // 2 + 1, (), generator=generator)
+    left = torch.randint((width - columns) // 2 + 1, (), generator=generator)
+    return 2 * int(top), 2 * int(left)
+
+
 class RandomCrop(_Transform):
     """Crops mosaics ``(..., H, W)`` to ``(..., size, size)`` at a random even offset, so that the pattern stays.
 
@@ -70,13 +81,7 @@ class RandomCrop(_Transform):
 
     def sample(self, height: int, width: int, generator: torch.Generator) -> Tensor:
         """Draw the top and left ``(2,)`` of a crop of a mosaic of ``height`` x ``width``."""
-        rows, columns = self.size
-        if height < rows or width < columns:
-            raise ValueError(f"{height} x {width} is smaller than the crop {rows} x {columns}; choose a smaller crop")
-
-        top = torch.randint((height - rows) // 2 + 1, (), generator=generator)
-        left = torch.randint((width - columns) // 2 + 1, (), generator=generator)
-        return 2 * torch.stack([top, left])
+        return torch.tensor(draw_corner((height, width), self.size, generator))
 
     def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor:
         top, left = params.tolist()

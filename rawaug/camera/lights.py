@@ -23,7 +23,8 @@ and beyond the outermost light its figures stay constant.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -158,19 +159,16 @@ def sample_lights(batch: int, generator: Generators, lights: LightRange = _ALL_L
     """
     kelvin, lamps, among, by_day = lights
 
-    def numbers(draw: Callable[..., torch.Tensor], *shape: int) -> Array:
-        rows = draw_rows(generator, batch, lambda g, rows: draw(rows, *shape, generator=g, dtype=torch.float64))
-        array: Array = rows.numpy()
-        return array
+    numbers = partial(draw_rows, generator, dtype=torch.float64)
 
-    uniform = numbers(torch.rand, 4)
-    duv = _DUV_SPREAD * numbers(torch.randn)
+    uniform = numbers(torch.rand, batch, 4).numpy()
+    duv = _DUV_SPREAD * numbers(torch.randn, batch).numpy()
 
     temperature = 1.0 / (1 / kelvin[1] + (1 / kelvin[0] - 1 / kelvin[1]) * uniform[:, 0])
     on_daylight = uniform[:, 1] < 0.5
     if by_day:
-        sunny = numbers(torch.rand) < by_day
-        mired = _DAYLIGHT_MIRED[0] + _DAYLIGHT_MIRED[1] * numbers(torch.randn)
+        sunny = numbers(torch.rand, batch).numpy() < by_day
+        mired = _DAYLIGHT_MIRED[0] + _DAYLIGHT_MIRED[1] * numbers(torch.randn, batch).numpy()
         temperature = np.where(sunny, (1e6 / mired.clip(1.0)).clip(*kelvin), temperature)
         on_daylight |= sunny
     on_daylight &= temperature >= _DAYLIGHT_FROM

@@ -13,6 +13,7 @@ middle of the hull, where cameras are rare. A camera and a light whose gains are
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -39,8 +40,10 @@ CAMERAS_MIXED = 2
 _FROM_XYZ = XYZ_TO_SRGB.numpy().T
 _ROUNDS = 100
 
+Numbers = NDArray[np.int64]
 
-def sparse_shares(batch: int, atoms: int, mixed: int, generator: Generators) -> tuple[Tensor, Tensor]:
+
+def sparse_shares(batch: int, atoms: int, mixed: int, generator: Generators) -> tuple[Numbers, Array]:
     """Draw a few atoms for each picture, with replacement, and their Dirichlet(1/2) shares.
 
     Args:
@@ -53,10 +56,10 @@ def sparse_shares(batch: int, atoms: int, mixed: int, generator: Generators) -> 
         Indices and float64 shares, both ``(batch, mixed)``.
     """
     # Squares of normals, divided by their sum, crowd the corners and edges of a hull.
-    indices = draw_rows(generator, batch, lambda g, rows: torch.randint(atoms, (rows, mixed), generator=g))
-    normals = draw_rows(generator, batch, lambda g, rows: torch.randn(rows, mixed, generator=g, dtype=torch.float64))
-    squares = normals**2
-    return indices, squares / squares.sum(dim=1, keepdim=True)
+    indices = draw_rows(generator, partial(torch.randint, atoms), batch, mixed, dtype=torch.int64).numpy()
+    normals = draw_rows(generator, torch.randn, batch, mixed, dtype=torch.float64).numpy()
+    squares = normals * normals
+    return indices, squares / squares.sum(axis=1, keepdims=True)
 
 
 class CameraSampler:
@@ -96,21 +99,23 @@ class CameraSampler:
 
         matrices = _row_by_row(weights, self.matrices).reshape(-1, 3, 3)
         gains = balance / balance.min(axis=1, keepdims=True)
-        return torch.from_numpy(weights).float(), torch.from_numpy(matrices).float(), torch.from_numpy(gains).float()
+        return _as_tensor(weights), _as_tensor(matrices), _as_tensor(gains)
 
     def _cameras_in_light(self, batch: int, generator: Generators) -> tuple[Array, Array]:
-        """Draw weights ``(B, N)`` and balances ``(B, 3)``."""
-        weights, balance = np.empty((batch, len(self.matrices))), np.empty((batch, 3))
-        missing = np.arange(batch)
-        for _ in range(_ROUNDS):
-            generators = take_generators(generator, missing)
-            cameras, shares = sparse_shares(len(missing), len(self.mixtures), CAMERAS_MIXED, generators)
-            weights[missing], light = self.draw_in_light(cameras.numpy(), shares.numpy(), generators)
-            balance[missing] = self.balance(weights[missing], light)
+        """Draw weights ``(B, N)`` and balances ``(B, 3)``, until they are plausible."""
 
-            missing = missing[~self.is_plausible(balance[missing])]
-            if not len(missing):
+        def draw(count: int, generators: Generators) -> tuple[Array, Array]:
+            cameras, shares = sparse_shares(count, len(self.mixtures), CAMERAS_MIXED, generators)
+            weights, light = self.draw_in_light(cameras, shares, generators)
+            return weights, self.balance(weights, light)
+
+        weights, balance = draw(batch, generator)
+        for _ in range(_ROUNDS):
+            is_plausible = self.is_plausible(balance)
+            if is_plausible.all():
                 return weights, balance
+            (again,) = np.nonzero(~is_plausible)
+            weights[again], balance[again] = draw(len(again), take_generators(generator, again))
 
         low, high = self.plausible
         raise ValueError(f"no light of {self.lights.kelvin} K gives these cameras gains within {low:g} to {high:g}")
@@ -120,7 +125,7 @@ class CameraSampler:
         low, high = self.plausible
         return np.asarray(((balance >= low) & (balance <= high)).all(axis=1))
 
-    def draw_in_light(self, cameras: Array, shares: Array, generator: Generators) -> tuple[Array, Array]:
+    def draw_in_light(self, cameras: Numbers, shares: Array, generator: Generators) -> tuple[Array, Array]:
         """Draw lights for mixtures of cameras, by their numbers and shares ``(B, 2)``.
 
         Returns:
@@ -177,7 +182,7 @@ class DataSheetSampler(CameraSampler):
             lights = light_range(light)
         super().__init__(mixtures, matrices, responses, lights, consistent)
 
-    def draw_in_light(self, cameras: Array, shares: Array, generator: Generators) -> tuple[Array, Array]:
+    def draw_in_light(self, cameras: Numbers, shares: Array, generator: Generators) -> tuple[Array, Array]:
         """Draw lights, or take the one that is named, and weigh each camera's atoms by how near their light is."""
         if self._exact is None:
             light = sample_lights(len(cameras), generator, self.lights)
@@ -201,6 +206,10 @@ class DataSheetSampler(CameraSampler):
 def _row_by_row(rows: Array, matrix: Array) -> Array:
     """Multiply rows ``(B, N)`` by a matrix, with the same bits however many there are, which BLAS does not promise."""
     return np.asarray((rows[:, None] @ matrix)[:, 0])
+
+
+def _as_tensor(array: Array) -> Tensor:
+    return torch.from_numpy(array.astype(np.float32))
 
 
 def _as_array(tensor: Tensor) -> Array:

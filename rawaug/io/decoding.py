@@ -15,6 +15,7 @@ import os
 import tempfile
 import warnings
 from collections.abc import Callable
+from functools import cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -183,6 +184,7 @@ def open_image(path: Path, may_have_alpha: bool = True) -> Any:
     return source
 
 
+@cache
 def load_oiio() -> Any:
     """Import OpenImageIO, which is not done before a picture is read or written."""
     with extra("raw"):

@@ -178,11 +178,7 @@ def project_to_simplex(weights: Tensor) -> Tensor:
 def perturb(weights: Tensor, strength: float, generator: Generators) -> Tensor:
     """Augment weights ``(B, N)``: add ``strength * N(0, I)`` and project them back to the simplex."""
     atoms = weights.shape[1]
-    noise = draw_rows(
-        generator,
-        len(weights),
-        lambda g, rows: torch.randn(rows, atoms, generator=g, device=g.device, dtype=torch.float32),
-    )
+    noise = draw_rows(generator, torch.randn, len(weights), atoms)
     return project_to_simplex(weights + strength * noise.to(weights))
 
 
@@ -190,9 +186,7 @@ def convex_weights(batch: int, atoms: int, generator: Generators) -> Tensor:
     """Draw weights ``(batch, atoms)`` uniformly from the simplex: augmentation without encoders."""
     # Normalised exponentials follow the flat Dirichlet distribution. They do not fill the hull evenly: with more atoms,
     # more of the mixtures are near its middle.
-    uniform = draw_rows(
-        generator, batch, lambda g, rows: torch.rand(rows, atoms, generator=g, device=g.device, dtype=torch.float32)
-    )
+    uniform = draw_rows(generator, torch.rand, batch, atoms)
     exponential = -torch.log1p(-uniform)
     return exponential / exponential.sum(dim=1, keepdim=True)
 

@@ -53,6 +53,8 @@ class BakedISP(nn.Module):
         super().__init__()
         self.config = isp.config
         self._host = _copy_to_host(isp)
+        (red, first_green, second_green, blue) = CFA(isp.config.cfa).sites
+        self._sites = ((*red, 0), (*first_green, 1), (*second_green, 1), (*blue, 2))
 
         table, attention = _tables(isp, nodes)
         self.register_buffer("table", table)
@@ -215,14 +217,10 @@ class BakedISP(nn.Module):
         rise = highlight_rise(floor, knee)
         colour = torch.cat([matrix, matrix.mean(dim=1, keepdim=True), floor, rise], dim=1)
 
-        sites = []
-        for channel, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True):
-            sites.append((i, j, channel))
-
         taps = colour.new_empty(len(srgb), 0)
         if blur is not None:
             taps = blur_taps(blur.to(colour))
-        return Unprocessing(table, curves, self.attention, colour, knee or 0.0, frame, shading, tuple(sites), taps)
+        return Unprocessing(table, curves, self.attention, colour, knee or 0.0, frame, shading, self._sites, taps)
 
 
 class FastForward(nn.Module):

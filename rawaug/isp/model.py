@@ -244,8 +244,9 @@ class DictionaryISP(nn.Module):
 
         colour_weights, matrix, gains = (tensor.to(device) for tensor in cameras.sample(batch, generator))
         tones = no_weights = gains[:, :0]  # the gains follow from the light
-        if self.tone is not None:
-            tones = self.tone.draw(batch, generator)
+        tone = self.tone
+        if tone is not None:
+            tones = tone.draw(batch, generator)
         return ISPParams(colour_weights, no_weights, matrix, gains, tones)
 
     def camera_sampler(self, consistent: bool = True, light: float | str | None = None) -> CameraSampler | None:

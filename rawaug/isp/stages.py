@@ -326,7 +326,7 @@ class WhiteBalance(Stage):
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         """Put one over the gains ``(B, 3)`` of ``params`` into ``batch``; ``place`` and ``size`` do not matter."""
-        return batch._replace(floor=1.0 / params.gains.to(batch.floor)[:, None])
+        return batch._replace(floor=params.gains.to(batch.floor).reciprocal()[:, None])
 
 
 @STAGES.register("shading")

@@ -81,7 +81,11 @@ class ToneDictionary(nn.Module):
     def draw(self, batch: int, generator: Generators) -> Tensor:
         """Draw weights ``(batch, K)``: mixtures of up to three curves, most of them near one curve."""
         atoms, shares = sparse_shares(batch, len(self.curves), _TONES_MIXED, generator)
-        return shares.new_zeros(batch, len(self.curves)).scatter_add_(1, atoms, shares).to(self.curves)
+        weights = np.zeros((batch, len(self.curves)))
+        rows = np.arange(batch)
+        for atom, share in zip(atoms.T, shares.T, strict=True):
+            weights[rows, atom] += share
+        return torch.from_numpy(weights).to(self.curves)
 
     def combine(self, weights: Tensor) -> Tensor:
         """Mix the curves by weights ``(B, K)`` into tables ``(B, 1021)``, with the same bits in a batch of any size."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, TypeVar
@@ -50,13 +51,18 @@ def fastest(name: str, image: Tensor, *args: Any, otherwise: Callable[[], R]) ->
         otherwise: the same pass in PyTorch, for devices without a kernel.
     """
     if name in _PASSES["cuda"] and can_use_triton(image):
-        kernel = getattr(import_module(_PASSES["cuda"][name]), name)
-        return try_kernel(lambda: kernel(image, *args), otherwise)
+        return try_kernel(lambda: _load("cuda", name)(image, *args), otherwise)
 
     if name in _PASSES["cpu"] and image.device.type == "cpu" and runtime.has_numba():
-        result: R = getattr(import_module(_PASSES["cpu"][name]), name)(image, *args)
+        result: R = _load("cpu", name)(image, *args)
         return result
     return otherwise()
+
+
+@cache
+def _load(kind: str, name: str) -> Callable[..., Any]:
+    kernel: Callable[..., Any] = getattr(import_module(_PASSES[kind][name]), name)
+    return kernel
 
 
 def try_kernel(kernel: Callable[[], R], otherwise: Callable[[], R]) -> R:

@@ -52,6 +52,7 @@ def unprocess(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
     scale = np.float32((entries - 1) / largest_code)
 
     codes, pieces, curves = None, None, _present(camera.curves)
+    colour = camera.colour.detach().contiguous().numpy()
     if in_bytes and entries == 256 and curves is not None:
         codes, curves = curves, None
         pieces = np.ascontiguousarray(codes.view(np.uint8).reshape(batch, 256, 4).swapaxes(1, 2)).reshape(batch, 1024)
@@ -63,8 +64,8 @@ def unprocess(srgb: Tensor, camera: Unprocessing, white: float) -> Tensor:
         pieces,
         curves,
         _present(camera.attention),
-        _present(camera.colour),
-        np.float32(camera.knee) if camera.colour[:, 5].any() else None,  # else no gain spares highlights
+        colour,
+        np.float32(camera.knee) if colour[:, 5].any() else None,  # else no gain spares highlights
         _present(camera.frame),
         _present(camera.shading),
         _as_array(camera.sites),

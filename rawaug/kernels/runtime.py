@@ -115,7 +115,7 @@ def one_thread() -> Iterator[None]:
 
 
 def eager(function: Callable[P, R]) -> Callable[P, R]:
-    """Leave the decorated function out of ``torch.compile``, without loading the compiler, which takes seconds.
+    """Run the decorated function without gradients and outside of ``torch.compile``, whose loading takes seconds.
 
     Dynamo cannot trace Numba, and would turn a generator's seed into a constant. A graph break gives the same bits.
     """
@@ -123,8 +123,11 @@ def eager(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling():
-            return torch.compiler.disable(function)(*args, **kwargs)
-        return function(*args, **kwargs)
+            return torch.compiler.disable(torch.no_grad()(function))(*args, **kwargs)
+        if not torch.is_grad_enabled():  # as inside another such function; entering no_grad again takes 10 us
+            return function(*args, **kwargs)
+        with torch.no_grad():
+            return function(*args, **kwargs)
 
     return run
 

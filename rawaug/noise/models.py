@@ -77,7 +77,6 @@ class NoiseModel(ABC):
         """Compute the variance map ``(B, 4, h, w)`` of the noise on a signal, before the clip at white."""
 
     @eager
-    @torch.no_grad()
     def apply(self, clean: Tensor, params: Params) -> Tensor:
         """Make noisy RAW from clean packed RAW, both ``(B, 4, h, w)``; it is clipped at white and not at black.
 
@@ -177,14 +176,12 @@ class ShotReadNoise(ShotReadModel):
         return type(self).apply_with_variance is ShotReadNoise.apply_with_variance
 
     @eager
-    @torch.no_grad()
     def apply(self, clean: Tensor, params: Params) -> Tensor:
         """Make noisy RAW ``(B, 4, h, w)`` in one pass over the pixels; see :meth:`NoiseModel.apply`."""
         _require_batch(clean, params)
         return self._add_noise(clean, params, white=1.0)[0]
 
     @eager
-    @torch.no_grad()
     def apply_with_variance(self, clean: Tensor, params: Params) -> tuple[Tensor, Tensor]:
         """Make noisy RAW and its variance map, both ``(B, 4, h, w)``, in one pass over the pixels."""
         _require_batch(clean, params)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from copy import copy, deepcopy
 from operator import itemgetter
 from pathlib import Path
@@ -248,7 +249,6 @@ class RawAugment(PairMaker):
         return AugmentParams(setting, noise, crop, extras)
 
     @eager
-    @torch.no_grad()
     def sample_each(
         self,
         batch: Tensor,
@@ -382,7 +382,6 @@ class RawAugment(PairMaker):
     # -- back to sRGB -------------------------------------------------------------------------------------------------
 
     @eager
-    @torch.no_grad()
     def develop(self, raw: Tensor, params: AugmentParams, demosaicing: str = "malvar") -> Tensor:
         """Develop a pair's RAW (noisy, clean or denoised) for viewing, by the camera setting that made it.
 
@@ -584,6 +583,8 @@ def _require_finite(raw: Tensor) -> None:
         raise ValueError("the RAW has values that are not finite: the ISP's weights are damaged; fit or copy it again")
 
 
-def _float32(like: Tensor) -> torch.autocast:
+def _float32(like: Tensor) -> AbstractContextManager[Any]:
     """Keep RAW in float32, inside mixed precision too."""
+    if not torch.is_autocast_enabled(like.device.type):
+        return nullcontext()
     return torch.autocast(like.device.type, enabled=False)

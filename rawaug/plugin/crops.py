@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rawaug import bayer
+from rawaug.bayer.transforms import draw_corner
 from rawaug.kernels.runtime import one_thread
 from rawaug.plugin.pictures import to_rgb_tensor, trim_to_even
 
@@ -66,12 +67,12 @@ def draw_crop(
         smaller = draw_crop(frame, _region(size, rows), views, generator)
         return torch.cat([smaller, torch.tensor([rows])])
 
-    corner = bayer.RandomCrop(region).sample(height, width, generator)
-    view = torch.zeros(1, dtype=torch.int64)
+    top, left = draw_corner(frame, region, generator)
+    view = 0
     if views:
         count = bayer.N_VIEWS if region[0] == region[1] else bayer.N_VIEWS // 2  # quarter turns exchange the sides
-        view = torch.randint(count, (1,), generator=generator)
-    return torch.cat([corner, torch.tensor([height, width]), view])
+        view = int(torch.randint(count, (), generator=generator))
+    return torch.tensor([top, left, height, width, view])
 
 
 def draw_patch(
@@ -115,24 +116,24 @@ def read_patch(
         size, views, generator, zoom, bgr: as for :func:`draw_patch`, which draws the same crop.
     """
     start = generator.get_state()
-    crop = torch.zeros(0, dtype=torch.int64)
+    crop, view = torch.empty(0), 0
     fault: ValueError | None = None
 
     def choose(height: int, width: int) -> tuple[int, int, int, int]:
-        nonlocal crop, fault
+        nonlocal crop, view, fault
         generator.set_state(start)  # another file may stand in for one that turns out to be damaged
         try:
             crop = draw_crop((height // 2 * 2, width // 2 * 2), size, views, generator, zoom)
         except ValueError as error:  # the crop is at fault, not the file
             fault = error
             return 0, 0, 2, 2
-        top, left, _, _, _, rows = (*crop.tolist(), 0)[:6]
+        top, left, _, _, view, rows = (*crop.tolist(), 0)[:6]
         return top, left, *_region(size, rows)
 
     region = pictures.read_part(index, choose)
     if fault is not None:
         raise fault
-    return _turn(region.flip(-3) if bgr else region, crop, size), crop
+    return _turn(region.flip(-3) if bgr else region, view, size), crop
 
 
 def cut_patch(picture: Tensor, crop: Tensor, size: tuple[int, int] | None) -> Tensor:
@@ -141,18 +142,18 @@ def cut_patch(picture: Tensor, crop: Tensor, size: tuple[int, int] | None) -> Te
     Raises:
         ValueError: if the crop was drawn for a picture of another size.
     """
-    top, left, height, width, _, rows = (*crop.tolist(), 0)[:6]
+    top, left, height, width, view, rows = (*crop.tolist(), 0)[:6]
     if picture.shape[-2:] != (height, width):
         raise ValueError(f"the parameters belong to a picture of {height} x {width}, got {tuple(picture.shape[-2:])}")
     region = (height, width) if size is None else _region(size, rows)
-    return _turn(bayer.crop(picture, top, left, *region), crop, size)
+    return _turn(bayer.crop(picture, top, left, *region), view, size)
 
 
-def _turn(region: Tensor, crop: Tensor, size: tuple[int, int] | None) -> Tensor:
-    """Enlarge a region of a picture to the size of the crop, and turn it as the drawn crop says."""
+def _turn(region: Tensor, view: int, size: tuple[int, int] | None) -> Tensor:
+    """Enlarge a region of a picture to the size of the crop, and turn it."""
     if size is not None and region.shape[-2:] != size:
         region = enlarge(region, size)
-    return bayer.turn(region, int(crop[4])).contiguous()
+    return bayer.turn(region, view).contiguous()
 
 
 def _region(size: tuple[int, int], rows: int) -> tuple[int, int]:

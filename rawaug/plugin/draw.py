@@ -182,7 +182,7 @@ class SettingSampler:
             return setting
 
         low, high = self.exposure
-        uniform = draw_rows(generator, len(srgb), lambda g, rows: torch.rand(rows, 1, generator=g, dtype=torch.float32))
+        uniform = draw_rows(generator, torch.rand, len(srgb), 1)
         stops = low + (high - low) * uniform
         return setting._replace(gains=setting.gains * torch.exp2(-stops).to(setting.gains))
 

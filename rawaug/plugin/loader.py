@@ -23,20 +23,12 @@ from rawaug.isp.config import ISPParams
 from rawaug.kernels.runtime import find_device
 from rawaug.plugin.crops import crop_size
 from rawaug.plugin.dataset import Maker, as_augment, open_dataset
+from rawaug.plugin.epochs import require_epoch
 from rawaug.plugin.maker import PairMaker
 from rawaug.plugin.params import Keys, PairForm, RawPair, pair_form
 from rawaug.plugin.pictures import find_picture, get_picture, is_picture, replace_picture
-from rawaug.plugin.resume import (
-    KeptOrder,
-    keep_order,
-    numbering,
-    own_share,
-    pack_order,
-    require_epoch,
-    unpack_order,
-    world_size,
-)
-from rawaug.seeding import keyed_generator, rank_key
+from rawaug.plugin.resume import KeptOrder, keep_order, numbering, own_share, pack_order, unpack_order
+from rawaug.seeding import keyed_generator, rank_key, world_size
 
 Batch = TypeVar("Batch", covariant=True)
 

@@ -110,7 +110,6 @@ class PairMaker(nn.Module, ABC):
     # -- draw, apply --------------------------------------------------------------------------------------------------
 
     @eager
-    @torch.no_grad()
     def sample(
         self,
         inputs: Any,
@@ -134,7 +133,6 @@ class PairMaker(nn.Module, ABC):
         return params
 
     @eager
-    @torch.no_grad()
     def sample_each(
         self,
         batch: Tensor,
@@ -154,7 +152,6 @@ class PairMaker(nn.Module, ABC):
         return AugmentParams.concatenate([self.draw_params(*each) for each in inputs])
 
     @eager
-    @torch.no_grad()
     def make_each(
         self,
         batch: Tensor,
@@ -166,7 +163,6 @@ class PairMaker(nn.Module, ABC):
         return self.apply_params(batch, self.sample_each(batch, generators, crops, chosen))
 
     @eager
-    @torch.no_grad()
     def apply(self, inputs: Any, params: AugmentParams | None = None) -> Any:
         """Make the :class:`RawPair` that the parameters describe, bit for bit the same at every call.
 
@@ -189,7 +185,6 @@ class PairMaker(nn.Module, ABC):
         return self.apply_params(batch, params)
 
     @eager
-    @torch.no_grad()
     def make_pair(
         self,
         batch: Tensor,
@@ -211,7 +206,6 @@ class PairMaker(nn.Module, ABC):
     @overload
     def forward(self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None) -> Any: ...
     @eager
-    @torch.no_grad()
     def forward(self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None) -> Any:
         """Draw parameters for a batch and apply them.
 

@@ -196,14 +196,14 @@ def test_a_camera_that_is_drawn_again_brings_its_own_gains(monkeypatch: pytest.M
     rounds: list[np.ndarray] = []
 
     def plausible_at_last(balance: np.ndarray) -> np.ndarray:
-        rounds.append(balance)
+        rounds.append(balance.copy())
         return np.full(len(balance), len(rounds) > 2)
 
     mixtures: list[np.ndarray] = []
     balance = sampler.balance
 
     def recorded(weights: np.ndarray, light: np.ndarray) -> np.ndarray:
-        mixtures.append(weights)
+        mixtures.append(weights.copy())
         return balance(weights, light)
 
     monkeypatch.setattr(sampler, "is_plausible", plausible_at_last)

@@ -8,10 +8,11 @@ from torch import Tensor
 
 from rawaug.isp.config import ISPParams
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import RawPairs, RawPairStream
+from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import AugmentParams
+from rawaug.plugin.stream import RawPairStream
 
 
 def half_dark() -> Tensor:

@@ -17,8 +17,9 @@ from rawaug.data.pairs import Pair
 from rawaug.io import RawFrame
 from rawaug.noise import RowNoise
 from rawaug.plugin.clean_raw import RawNoise
-from rawaug.plugin.dataset import RawPairs, RawPairStream
+from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.loader import wrap
+from rawaug.plugin.stream import RawPairStream
 
 LEVELS = (1e-3, 1e-5)
 

@@ -25,9 +25,10 @@ from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.crops import draw_crop
-from rawaug.plugin.dataset import RawPairs, RawPairStream
+from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
+from rawaug.plugin.stream import RawPairStream
 
 COUNT = 12
 

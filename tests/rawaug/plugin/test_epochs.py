@@ -22,8 +22,9 @@ from torch.utils.data import (
 )
 
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import RawPairs, RawPairStream
-from rawaug.plugin.resume import Passes, Visits
+from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.epochs import Passes, Visits
+from rawaug.plugin.stream import RawPairStream
 
 COUNT = 6
 

@@ -18,10 +18,11 @@ from rawaug.data.demo import demo_photographs
 from rawaug.io import write_picture
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import RawPairs, RawPairStream
+from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import PairForm, pair_form
+from rawaug.plugin.stream import RawPairStream
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,8 @@ import rawaug
 from benchmarks.resuming import Case, Counted, loader_of, outcome, resumable, wrapped
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.epochs import Visits
 from rawaug.plugin.loader import wrap
-from rawaug.plugin.resume import Visits
 
 POOLS = [(0, False), (2, True)]
 """Workers, and whether they are persistent; `fork` is fast."""

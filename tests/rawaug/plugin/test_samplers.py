@@ -28,7 +28,8 @@ from torch.utils.data import (
 import rawaug
 from rawaug.data.folders import PictureFolder
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import RawPairs, RawPairStream
+from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.stream import RawPairStream
 
 COUNT, BATCH, RATIO = 6, 2, 2
 
