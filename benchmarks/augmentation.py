@@ -39,7 +39,7 @@ from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.draw import Draw
 from rawaug.seeding import keyed_generator
-from rawaug.training.crops import OwnPictureCrops, PictureCrops, RealCrops, Source
+from rawaug.training.sources import OwnPictureCrops, PictureCrops, RealCrops, Source
 
 SIDE = 7
 CROP = 64

@@ -41,9 +41,9 @@ from benchmarks import augment, denoise, loader
 from benchmarks.measure import arguments, fastest, finish, seconds, show, start, write_pictures
 from rawaug.data import PictureFolder
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.crops import PictureCrops, freeze_samples
 from rawaug.training.estimators import Supervised
 from rawaug.training.loop import train
+from rawaug.training.sources import PictureCrops, freeze_samples
 from rawaug.training.stream import TrainingStream
 
 Figures = dict[str, dict[str, float]]

@@ -34,7 +34,7 @@ from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.draw import Draw
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.crops import PictureCrops, Source, add_noise
+from rawaug.training.sources import PictureCrops, Source, add_noise
 
 PHONES = ["iPhone 7", "Google Pixel", "Samsung Galaxy S6 Edge", "Motorola Nexus 6", "LG G4"]
 STEPS = 2400

@@ -46,8 +46,8 @@ from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.crops import PictureCrops
 from rawaug.training.loop import train
+from rawaug.training.sources import PictureCrops
 from rawaug.training.stream import TrainingStream
 
 VALIDATION = "real:validation"

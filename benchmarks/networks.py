@@ -34,8 +34,8 @@ from rawaug.evaluation.scores import group_rows, score
 from rawaug.evaluation.trials import make_trial
 from rawaug.noise import noise_model
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.crops import PictureCrops
 from rawaug.training.loop import train, validate
+from rawaug.training.sources import PictureCrops
 from rawaug.training.stream import TrainingStream
 
 SIZES: dict[str, dict[str, Any]] = {

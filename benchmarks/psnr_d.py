@@ -41,7 +41,7 @@ from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.pictures import trim_to_even
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.crops import PictureCrops, RealCrops, Source
+from rawaug.training.sources import PictureCrops, RealCrops, Source
 
 CONFIG = DownstreamConfig(
     denoiser=DenoiserConfig("UNet", {"width": 16, "scales": 4}), train=TrainConfig(steps=1500, batch=8, crop=64)

@@ -28,7 +28,7 @@ from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.draw import Draw
 from rawaug.seeding import keyed_generator
-from rawaug.training.crops import PictureCrops, add_noise
+from rawaug.training.sources import PictureCrops, add_noise
 
 RIDGE = 1e-3
 MIDDLE = 1024

@@ -41,7 +41,7 @@ from rawaug.camera.matrices import gains_in_light, load_cameras
 from rawaug.camera.sheet_colour import Anchor, MatrixKind, check_colours, read_anchors, read_shading
 from rawaug.camera.sheet_noise import Level, check_levels, is_number, read_levels
 from rawaug.camera.softness import MTF50
-from rawaug.camera.transfer import measure_noise
+from rawaug.camera.transfer import measure_photon_transfer
 from rawaug.camera.tuning import read_tuning
 from rawaug.errors import count_of
 from rawaug.files import read_yaml
@@ -411,7 +411,7 @@ class Camera:
             >>> camera.noise[100]["K"]  # doctest: +SKIP
             0.1203
         """
-        noise, lines = measure_noise(darks, flats)
+        noise, lines = measure_photon_transfer(darks, flats)
         frame = flats[0]
         figures: dict[str, Any] = {
             "cfa": str(frame.cfa),

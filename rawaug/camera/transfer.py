@@ -43,7 +43,9 @@ Interval = tuple[float, float, float]
 """An estimate, and the lower and the upper end of its interval of 95 %."""
 
 
-def measure_noise(darks: Iterable[Any], flats: Iterable[Any]) -> tuple[dict[Any, dict[str, float]], list[str]]:
+def measure_photon_transfer(
+    darks: Iterable[Any], flats: Iterable[Any]
+) -> tuple[dict[Any, dict[str, float]], list[str]]:
     """Measure K, sigma and row in DN at each ISO that has two darks and two flats of one level.
 
     Args:
@@ -64,7 +66,7 @@ def measure_noise(darks: Iterable[Any], flats: Iterable[Any]) -> tuple[dict[Any,
     levels: dict[Any, dict[str, float]] = {}
     lines, reasons = [], []
     for iso in sorted({*darks_by_iso, *flats_by_iso}, key=lambda iso: iso or 0.0):
-        where = "without an ISO" if iso is None else f"at ISO {iso:g}"
+        at_iso = "without an ISO" if iso is None else f"at ISO {iso:g}"
         try:
             dark_planes = [_in_dn(frame) for frame in darks_by_iso[iso]]
             sigma, row, dark_count = _measure_darks(dark_planes)
@@ -72,15 +74,15 @@ def measure_noise(darks: Iterable[Any], flats: Iterable[Any]) -> tuple[dict[Any,
             pairs, left_out = _pair_up(flats_by_iso[iso], black)
             gain = _measure_gain(pairs, sigma[0] ** 2, dark_count)
         except ValueError as error:
-            reasons.append(f"{where}: {error}")
+            reasons.append(f"{at_iso}: {error}")
             continue
 
         levels[iso] = {"K": gain[0], "sigma": sigma[0], "row": row[0]}
         figures = f"K {_written(gain)}, sigma {_written(sigma)}, row {_written(row)} DN"
         lines.append(
-            f"{where}: {figures}, from {count_of(len(dark_planes), 'dark')}, {count_of(len(pairs), 'pair')} of flats"
+            f"{at_iso}: {figures}, from {count_of(len(dark_planes), 'dark')}, {count_of(len(pairs), 'pair')} of flats"
         )
-        reasons += [f"{where}: {reason}" for reason in left_out]
+        reasons += [f"{at_iso}: {reason}" for reason in left_out]
 
     if None in levels and len(levels) > 1:
         raise ValueError("some files state an ISO and some do not; measure them separately")

@@ -15,7 +15,7 @@ from rawaug.files import locked, require_output
 from rawaug.isp.fit import FitConfig
 from rawaug.noise import MeasuredLevels, camera_law
 from rawaug.training.camera_fit import fit
-from rawaug.training.camera_noise import noise_figures
+from rawaug.training.noise_fit import noise_figures
 
 
 def run(

@@ -46,7 +46,7 @@ from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.targets import Target
 from rawaug.seeding import derive_seed
-from rawaug.training.crops import MosaicCrops
+from rawaug.training.sources import MosaicCrops
 from rawaug.training.stream import TrainingStream
 
 LIBRAW = ("VNG", "PPG", "AHD", "DCB", "DHT", "AAHD")

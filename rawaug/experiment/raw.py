@@ -16,7 +16,9 @@ from rawaug.noise import CalibratedNoise, NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.seeding import derive_seed
-from rawaug.training.crops import (
+from rawaug.training.estimators import ESTIMATORS, SelfSupervised
+from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, r2r_trials
+from rawaug.training.sources import (
     WATCHED,
     OwnPictureCrops,
     PictureCrops,
@@ -25,8 +27,6 @@ from rawaug.training.crops import (
     draw_statistics,
     freeze_samples,
 )
-from rawaug.training.estimators import ESTIMATORS, SelfSupervised
-from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, r2r_trials
 from rawaug.training.stream import TrainingStream
 
 

@@ -21,7 +21,7 @@ from rawaug.noise import noise_model
 from rawaug.plugin.draw import Draw
 from rawaug.plugin.targets import Srgb, Target
 from rawaug.registry import require_bounds, split_spec
-from rawaug.training.config import MOST, SAME_WEIGHTS, Count, DenoiserConfig, Rate, TrainConfig, Weighing
+from rawaug.training.config import MOST, Count, DenoiserConfig, Rate, TrainConfig, Weighing
 from rawaug.training.estimators import ESTIMATORS
 from rawaug.training.srgb_noise import noise_on_srgb
 from rawaug.training.srgb_samples import Conditioning
@@ -395,14 +395,13 @@ class Recipe:
         for key in (*_NOT_OF_WEIGHTS, *self.scoring):
             del settings[key]
 
-        data, loop = settings["data"], asdict(self.loop(arm))
+        data = settings["data"]
         irrelevant = {"memory_mb", "test", "test_count", "test_crop"}
         if self.data.validation is None:
             irrelevant |= {"validation_count", "validation_crop", "bin"}
-            del loop["validate_every"]
 
         settings["data"] = {key: data[key] for key in data.keys() - irrelevant}
-        settings["train"] = {key: loop[key] for key in loop.keys() - SAME_WEIGHTS}
+        settings["train"] = self.loop(arm).weights_settings(validated=self.data.validation is not None)
         settings["denoiser"] = asdict(self.network(arm))
         settings["arm"] = asdict(self.arms[arm])
         return settings | {"draw": asdict(self.draw), "noise": self.noise_at_iso}

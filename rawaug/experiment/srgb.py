@@ -41,7 +41,7 @@ from rawaug.plugin.targets import Target
 from rawaug.progress import progress
 from rawaug.registry import Spec, spec_label, split_spec
 from rawaug.seeding import derive_seed, keyed_generator
-from rawaug.training.crops import PictureCrops
+from rawaug.training.sources import PictureCrops
 from rawaug.training.srgb_noise import noise_on_srgb
 from rawaug.training.srgb_samples import NoisyPictures, SrgbSamples
 from rawaug.training.stream import TrainingStream

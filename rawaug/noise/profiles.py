@@ -190,10 +190,8 @@ def profile_ends(camera: str) -> list[LevelEnds]:
     ends = []
     for doubling in range(doublings + 1):
         iso = float(low * 2**doubling)
-        shot_var, read_var = ProfileLevels(camera, iso).sample(1, torch.Generator())
-        ends.append(LevelEnds(iso, _spread(float(shot_var), SPREAD[0]), _spread(float(read_var), SPREAD[1])))
+        shot_var, read_var = map(float, ProfileLevels(camera, iso).sample(1, torch.Generator()))
+        (low_shot, high_shot), (low_read, high_read) = SPREAD
+        shot_ends = (shot_var * low_shot, shot_var * high_shot)
+        ends.append(LevelEnds(iso, shot_ends, (read_var * low_read, read_var * high_read)))
     return ends
-
-
-def _spread(level: float, factors: tuple[float, float]) -> tuple[float, float]:
-    return level * factors[0], level * factors[1]

@@ -32,8 +32,8 @@ from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.draw import Draw, Sampling
 from rawaug.seeding import derive_seed
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.crops import PictureCrops, Source, add_noise, freeze_samples
 from rawaug.training.loop import train
+from rawaug.training.sources import PictureCrops, Source, add_noise, freeze_samples
 from rawaug.training.stream import TrainingStream
 
 SHORTEST_CROP = 256

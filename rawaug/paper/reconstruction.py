@@ -28,7 +28,7 @@ from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.evaluation.trials import make_trial
 from rawaug.experiment.folder import claim, require_free, run_folder
 from rawaug.experiment.recipe import EXPERIMENTS
-from rawaug.files import cached, write_json
+from rawaug.files import cached, fingerprint, write_json
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
 from rawaug.noise import noise_model
@@ -50,7 +50,6 @@ from rawaug.paper.pictures import draw_frame
 from rawaug.plugin.pictures import trim_to_even
 from rawaug.progress import progress
 from rawaug.registry import check_settings
-from rawaug.training.config import weights_key
 from rawaug.training.launch import require_trainable
 
 COLUMNS = {
@@ -368,7 +367,9 @@ class ComparisonRun:
                 return result
 
             draws = (*samples, downstream.noise, downstream.exposure, downstream.sampling)
-            weights = weights_key(downstream.denoiser, downstream.train, draws, validation="watched")
+            network = {key: value for key, value in asdict(downstream.denoiser).items() if value is not None}
+            loop = downstream.train.weights_settings(validated=True)
+            weights = fingerprint("weights", network, loop, draws, "watched")
             folder = self.folder / f"{family.replace('/', '_')}-denoisers"
             result["psnr_d"] = []
             for seed in self.seeds:

@@ -22,7 +22,7 @@ from rawaug.data.pairs import Pair
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
-from rawaug.training.camera_noise import measure_camera_noise, plot_camera_noise
+from rawaug.training.noise_fit import measure_camera_noise, plot_camera_noise
 
 _SOFTNESS_FRAMES = 8
 """Softness is measured on so many frames."""
@@ -85,52 +85,61 @@ def fit(
         raise ValueError(f"dark {dark}: has no use with noise: off; leave one of them out")
     start = time.perf_counter()
 
-    mosaics: dict[str, Any] = {}
-    for key, value in (("cfa", cfa), ("black", black), ("white", white)):
-        if value is not None:
-            mosaics[key] = value
-    pairs = _open_pairs(source, camera_jpeg, mosaics)
+    stated = {key: value for key, value in (("cfa", cfa), ("black", black), ("white", white)) if value is not None}
+    pairs = _open_pairs(source, camera_jpeg, stated)
     frames = Readable(pairs)
 
-    watch = None
+    # Held-out frames are decoded once.
+    watched: Readable | None = None
+    scores: list[dict[str, float]] = []
     if held_out is not None:
-        others = _open_pairs(held_out, camera_jpeg, mosaics if str(held_out).startswith("pairs:") else {})
-        shared = shared_frame(others, pairs)
+        held_out_pairs = _open_pairs(held_out, camera_jpeg, stated if str(held_out).startswith("pairs:") else {})
+        shared = shared_frame(held_out_pairs, pairs)
         if shared is not None:
             raise ValueError(f"held-out: {shared} is also fitted; hold out other frames")
-        watch = _Watch(others)
+        watched = Readable(held_out_pairs.kept())
 
+    def score(isp: DictionaryISP) -> str:
+        """Note PSNR_r on a few patches of each held-out frame."""
+        assert watched is not None
+        blind_scores, as_shot_scores = [], []
+        for pair in watched:
+            blind_scores.append(psnr_r(isp, pair, False, WATCHED_PATCHES))
+            as_shot_scores.append(psnr_r(isp, pair, True, WATCHED_PATCHES))
+
+        blind, as_shot = fmean(blind_scores), fmean(as_shot_scores)
+        scores.append({"blind": round(blind, 2), "as_shot": round(as_shot, 2)})
+        return f"held out {blind:.2f} dB, {as_shot:.2f} dB with as-shot gains"
+
+    # The noise comes before the fit, so that failures come early.
     law = None
-    reason = ""
-    if noise != "off":  # before the fit, so that failures come early
+    if noise != "off":
         try:
             law, estimates = measure_camera_noise(frames, dark)
         except ValueError as error:
             if noise == "on":
                 raise
-            reason = str(error)
+            not_measured = str(error)
 
-    figures = None
-    if camera is not None:
-        figures = as_camera(camera)
-    isp = fit_isp(frames, FitConfig(**settings), progress, state, watch, figures)
+    figures = None if camera is None else as_camera(camera)
+    isp = fit_isp(frames, FitConfig(**settings), progress, state, score if watched is not None else None, figures)
     if figures is not None:
         isp.info["started_from"] = figures.name
 
     unreadable = left_out(frames, "the fit")
-    if watch is not None:
-        watch(isp)
-        isp.info["held_out"] = watch.scores
-        unreadable = [*unreadable, *left_out(watch.pairs, "held-out frames")]
+    if watched is not None:
+        score(isp)
+        isp.info["held_out"] = scores
+        unreadable = [*unreadable, *left_out(watched, "held-out frames")]
     if unreadable:
         isp.info["unreadable"] = unreadable
 
-    if reason:
-        isp.info["noise_not_measured"] = reason
-    elif law is not None:
+    if law is not None:
         isp.info["noise"] = law.spec()
         if noise_figure is not None:
             plot_camera_noise(law, estimates, noise_figure)
+    elif noise == "auto":
+        isp.info["noise_not_measured"] = not_measured
 
     blur = measure_blur((pair.clean.mosaic[0].numpy(), pair.cfa) for pair in islice(iter(frames), _SOFTNESS_FRAMES))
     if blur is not None:
@@ -151,47 +160,25 @@ def describe_rendering(pairs: Frames[Pair], frames: int, registered: int) -> str
     return ", ".join(f"{name} ({count} of {frames})" for name, count in counts.items() if count)
 
 
-class _Watch:
-    """Measures PSNR_r of held-out frames, which are decoded once, on a few patches of each."""
-
-    def __init__(self, pairs: Sequence[Pair]) -> None:
-        self.pairs = Readable(as_frames(pairs).kept())
-        self.scores: list[dict[str, float]] = []
-
-    def __call__(self, isp: DictionaryISP) -> str:
-        blind_scores = []
-        as_shot_scores = []
-        for pair in self.pairs:
-            blind_scores.append(psnr_r(isp, pair, False, WATCHED_PATCHES))
-            as_shot_scores.append(psnr_r(isp, pair, True, WATCHED_PATCHES))
-
-        blind, as_shot = fmean(blind_scores), fmean(as_shot_scores)
-        self.scores.append({"blind": round(blind, 2), "as_shot": round(as_shot, 2)})
-        return f"held out {blind:.2f} dB, {as_shot:.2f} dB with as-shot gains"
-
-
 def _open_pairs(
-    source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool, mosaics: Mapping[str, Any]
+    source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool, stated: Mapping[str, Any]
 ) -> Frames[Pair]:
+    """Open files and folders as one folder, a single dataset, or the given pairs; ``stated`` is what files omit."""
     if isinstance(source, (str, Path)):
         source = [source]
     if not hasattr(source, "__getitem__") or not len(source):
         raise ValueError("nothing to fit; give one or more files, folders or pairs")
 
-    if isinstance(source[0], (str, Path)):
-        return _open_named(source, camera_jpeg, mosaics)  # type: ignore[arg-type]
-    if not isinstance(source[0], Pair):
+    if isinstance(source[0], Pair):
+        if stated:
+            raise ValueError(f"{', '.join(stated)} can only be given for pairs:PATH; each Pair has its own")
+        return as_frames(source)  # type: ignore[arg-type]
+    if not isinstance(source[0], (str, Path)):
         raise ValueError(f"a fit takes files, folders or Pairs, got {type(source[0]).__name__}; see docs/fit.md")
-    if mosaics:
-        raise ValueError(f"{', '.join(mosaics)} can only be given for pairs:PATH; each Pair has its own")
-    return as_frames(source)  # type: ignore[arg-type]
 
-
-def _open_named(source: Sequence[str | Path], camera_jpeg: bool, mosaics: Mapping[str, Any]) -> Frames[Pair]:
-    """Open files and folders as one folder, or a single dataset."""
     for item in source:
-        pairs = open_pairs(str(item), split="train", as_clean=False, **mosaics)
-        if not names_dataset(item):
+        pairs = open_pairs(str(item), split="train", as_clean=False, **stated)
+        if not names_dataset(item):  # type: ignore[arg-type]
             continue
         if len(source) > 1:
             raise ValueError(f"{item}: a kind:path dataset cannot be combined with other files; give it alone")

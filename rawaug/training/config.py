@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 from annotated_types import Interval
 
 from denoisers.network import DENOISERS
-from rawaug.files import fingerprint
 from rawaug.registry import require_bounds
 from rawaug.training.losses import LOSSES
 
@@ -48,6 +47,10 @@ class DenoiserConfig:
 
     def __post_init__(self) -> None:
         DENOISERS[self.name]  # an unknown name is answered with the nearest
+
+
+SAME_WEIGHTS = frozenset({"workers", "compile", "checkpoint_every", "logger"})
+"""These keys of :class:`TrainConfig` change the speed of a training, but not its weights."""
 
 
 @dataclass
@@ -120,26 +123,7 @@ class TrainConfig:
 
         return max(1, self.steps // VALIDATIONS)
 
-
-SAME_WEIGHTS = frozenset({"workers", "compile", "checkpoint_every", "logger"})
-"""These keys of :class:`TrainConfig` change the speed of a training, but not its weights."""
-
-
-def weights_key(network: DenoiserConfig, config: TrainConfig, samples: Any, validation: Any) -> str:
-    """Compute a short hash of what the weights depend on; weights with the same key need no new training.
-
-    It leaves out the device, the number of processes, and what is used after the training.
-
-    Args:
-        network: the network to train.
-        config: the settings of the loop.
-        samples: everything that the training samples depend on, as JSON.
-        validation: everything that the validation samples depend on; None if the weights of the last step are kept.
-    """
-    irrelevant = SAME_WEIGHTS
-    if validation is None:
-        irrelevant = SAME_WEIGHTS | {"validate_every"}
-
-    settings = {key: value for key, value in asdict(config).items() if key not in irrelevant}
-    architecture = {key: value for key, value in asdict(network).items() if value is not None}
-    return fingerprint("weights", architecture, settings, samples, validation)
+    def weights_settings(self, validated: bool) -> dict[str, Any]:
+        """Collect the keys that the weights depend on; ``validated`` says whether validation frames choose them."""
+        irrelevant = SAME_WEIGHTS if validated else SAME_WEIGHTS | {"validate_every"}
+        return {key: value for key, value in asdict(self).items() if key not in irrelevant}

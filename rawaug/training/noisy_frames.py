@@ -35,8 +35,8 @@ from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import to_rgb_tensor, trim_to_even
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
-from rawaug.training.crops import packed_crop
 from rawaug.training.estimators import R2R, NoisyCrop, SelfSupervised
+from rawaug.training.sources import packed_crop
 
 
 def signal_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) -> Tensor:

@@ -13,7 +13,7 @@ from rawaug.data.pairs import Sample
 from rawaug.isp.functional import as_float
 from rawaug.plugin.crops import crop_size, draw_patch
 from rawaug.registry import require_between, require_bounds
-from rawaug.training.crops import PictureCrops
+from rawaug.training.sources import PictureCrops
 from rawaug.training.srgb_noise import SrgbNoise
 
 

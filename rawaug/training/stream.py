@@ -17,7 +17,7 @@ from rawaug.data.pairs import Sample
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.params import AugmentParams
 from rawaug.seeding import keyed_generator
-from rawaug.training.crops import PictureCrops, Source
+from rawaug.training.sources import PictureCrops, Source
 
 
 class TrainingStream(Dataset[Any]):

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import rawaug
-from rawaug.camera.transfer import measure_noise
+from rawaug.camera.transfer import measure_photon_transfer
 from rawaug.cli import main
 from rawaug.io import RawFrame, write_dng
 
@@ -50,7 +50,7 @@ class Sensor:
 @pytest.mark.parametrize("pattern", [0.0, 0.01])
 def test_k_is_within_half_a_percent_whatever_the_pattern(pattern: float) -> None:
     sensor = Sensor(gain=0.12, sigma=3.0, row=1.2, pattern=pattern)
-    levels, lines = measure_noise(sensor.darks(), sensor.flats())
+    levels, lines = measure_photon_transfer(sensor.darks(), sensor.flats())
     assert levels[100]["K"] == pytest.approx(0.12, rel=0.005)
     assert levels[100]["sigma"] == pytest.approx((3.0**2 + 1 / 12) ** 0.5, rel=0.005)
     assert levels[100]["row"] == pytest.approx(1.2, rel=0.1)
@@ -61,7 +61,7 @@ def test_the_interval_of_k_holds_it_as_often_as_it_says() -> None:
     inside = 0
     for seed in range(40):
         sensor = Sensor(gain=0.48, sigma=3.0, row=1.2, pattern=0.01, side=64, seed=seed)
-        _, (line,) = measure_noise(sensor.darks(2), sensor.flats(LEVELS[1:3]))
+        _, (line,) = measure_photon_transfer(sensor.darks(2), sensor.flats(LEVELS[1:3]))
         low, high = line.split("(")[1].split(")")[0].split(" to ")
         inside += float(low) <= 0.48 <= float(high)
     assert inside >= 34
@@ -70,18 +70,18 @@ def test_the_interval_of_k_holds_it_as_often_as_it_says() -> None:
 def test_what_is_left_out_is_counted_by_its_reason() -> None:
     sensor = Sensor(gain=0.48, sigma=3.0, row=0.0, pattern=0.0, side=64)
     flats = [*sensor.flats(LEVELS[:1]), sensor.frame(1000.0), sensor.frame(9000.0), *sensor.flats(LEVELS[:1], iso=800)]
-    levels, lines = measure_noise([*sensor.darks(2), *sensor.darks(1, iso=200)], flats)
+    levels, lines = measure_photon_transfer([*sensor.darks(2), *sensor.darks(1, iso=200)], flats)
     assert list(levels) == [100]
     text = " | ".join(lines)
     for reason in ("1 flat clipped", "1 flat without", "ISO 200: 1 dark;", "ISO 800: 0 darks;"):
         assert reason in text
 
     with pytest.raises(ValueError, match="nothing can be measured"):
-        measure_noise([], flats)
+        measure_photon_transfer([], flats)
     with pytest.raises(ValueError, match="no pair of flats"):
-        measure_noise(sensor.darks(2), [sensor.frame(500.0)])
+        measure_photon_transfer(sensor.darks(2), [sensor.frame(500.0)])
     with pytest.raises(ValueError, match="mosaic"):
-        measure_noise(sensor.darks(2), Sensor(0.48, 3.0, 0.0, 0.0, side=32).flats())
+        measure_photon_transfer(sensor.darks(2), Sensor(0.48, 3.0, 0.0, 0.0, side=32).flats())
 
 
 def test_frames_of_which_only_some_state_an_iso_are_refused() -> None:
@@ -89,7 +89,7 @@ def test_frames_of_which_only_some_state_an_iso_are_refused() -> None:
     darks = [*sensor.darks(2), *sensor.darks(2, iso=None)]
     flats = [*sensor.flats(LEVELS[:1]), *sensor.flats(LEVELS[:1], iso=None)]
     with pytest.raises(ValueError, match="ISO"):
-        measure_noise(darks, flats)
+        measure_photon_transfer(darks, flats)
 
 
 def test_a_sheet_is_measured_from_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

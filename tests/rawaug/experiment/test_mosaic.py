@@ -23,7 +23,7 @@ from rawaug.experiment.settings import ArmConfig, ISPSource
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.seeding import keyed_generator
-from rawaug.training.crops import MosaicCrops
+from rawaug.training.sources import MosaicCrops
 
 
 @pytest.fixture(scope="module")

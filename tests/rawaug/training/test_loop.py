@@ -22,9 +22,9 @@ from rawaug.noise import noise_model
 from rawaug.plugin.dataset import RawPairs
 from rawaug.training import loop
 from rawaug.training.config import DenoiserConfig, TrainConfig
-from rawaug.training.crops import RealCrops
 from rawaug.training.estimators import Supervised
 from rawaug.training.journal import Journal
+from rawaug.training.sources import RealCrops
 from rawaug.training.state import TrainingState, first_network, learning_rate_factor
 from rawaug.training.stream import TrainingStream
 

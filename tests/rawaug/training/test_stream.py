@@ -19,7 +19,7 @@ from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.targets import Srgb, Target
 from rawaug.seeding import keyed_generator
-from rawaug.training.crops import OwnPictureCrops, RealCrops
+from rawaug.training.sources import OwnPictureCrops, RealCrops
 from rawaug.training.stream import StepSampler, TrainingStream
 
 

@@ -21,7 +21,7 @@ from rawaug.denoising.levels import find_levels, load_noise
 from rawaug.io import RawFrame
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, camera_law, estimate_noise, noise_model
 from rawaug.training.camera_fit import fit
-from rawaug.training.camera_noise import measure_camera_noise
+from rawaug.training.noise_fit import measure_camera_noise
 from rawaug.training.noisy_frames import noisy_frame
 
 SHOT_VAR, READ_VAR = 1e-3, 4e-5
@@ -90,7 +90,7 @@ def test_the_limits_are_a_slope_above_0_and_half_the_variance_explained(
 
     assert noisy_pair.noisy is not None
     found = estimate_noise(noisy_pair.noisy.mosaic, noisy_pair.cfa)
-    monkeypatch.setattr("rawaug.training.camera_noise.estimate_noise", estimate)
+    monkeypatch.setattr("rawaug.training.noise_fit.estimate_noise", estimate)
     if accepted:
         assert measure_camera_noise([noisy_pair])[0].at(None)[0] == shot_var
     else:

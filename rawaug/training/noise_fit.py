@@ -71,23 +71,23 @@ def _measure(
     iso: float | None, frames: Sequence[RawFrame], dark: dict[float | None, list[RawFrame]] | None
 ) -> NoiseEstimate:
     """Fit the line of the frames of one ISO."""
-    where = "" if iso is None else f" at ISO {iso:g}"
+    at_iso = "" if iso is None else f" at ISO {iso:g}"
 
     read_var = None
     if dark is not None:
         matching = dark.get(iso) or dark.get(None)
         if matching is None:
-            raise ValueError(f"dark: has no frame{where}; give dark frames at every measured ISO")
+            raise ValueError(f"dark: has no frame{at_iso}; give dark frames at every measured ISO")
         read_var = estimate_dark_noise(*_align(matching)).read_var
 
     try:
         estimate = estimate_noise(*_align(frames), read_var=read_var)
     except ValueError as error:
-        raise ValueError(f"noise{where}: {error}") from None
+        raise ValueError(f"noise{at_iso}: {error}") from None
 
     if estimate.shot_var <= 0.0 or estimate.r2 < WORST_FIT:
         advice = "use one camera at one ISO" if iso is None else "use unprocessed RAW files with flat areas"
-        raise ValueError(f"noise{where}: the frames do not fit one noise law (R^2 {estimate.r2:.2f}); {advice}")
+        raise ValueError(f"noise{at_iso}: the frames do not fit one noise law (R^2 {estimate.r2:.2f}); {advice}")
     return estimate
 
 
