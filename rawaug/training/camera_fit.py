@@ -182,6 +182,6 @@ def _open_pairs(
             continue
         if len(source) > 1:
             raise ValueError(f"{item}: a kind:path dataset cannot be combined with other files; give it alone")
-        return as_frames(pairs)
+        return pairs
 
     return RawFolder(map(str, source), camera_jpeg=camera_jpeg)
