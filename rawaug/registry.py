@@ -17,7 +17,7 @@ import inspect
 import pkgutil
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import import_module
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
@@ -127,6 +127,13 @@ def require_between(key: str, value: object, least: float, most: float) -> None:
         raise ValueError(f"{key} must be a {noun} from {least} to {most}, got {value!r:.100}")
 
 
+@cache
+def field_types(settings: type[Any]) -> dict[str, Any]:
+    """Evaluate the types of the fields of a dataclass, which are text in its source."""
+    return get_type_hints(settings)
+
+
+@cache
 def list_bounds(settings: type[Any]) -> dict[str, Interval]:
     """List the bounds of the fields of a dataclass, as ``Annotated[int, Interval(ge=1, le=9)]`` states them.
 
@@ -151,7 +158,8 @@ def require_bounds(settings: Any, above: str = "") -> None:
     Raises:
         ValueError: as :func:`require_between` does; None has no bounds.
     """
-    for name, bounds in list_bounds(type(settings)).items():
+    kind: Any = type(settings)
+    for name, bounds in list_bounds(kind).items():
         value = getattr(settings, name)
         if value is None:
             continue
@@ -160,7 +168,7 @@ def require_bounds(settings: Any, above: str = "") -> None:
         elif not bounds.ge <= value < bounds.lt:
             raise ValueError(f"{above}{name} must be at least {bounds.ge} and below {bounds.lt}, got {value!r:.100}")
 
-    for name, hint in get_type_hints(type(settings)).items():
+    for name, hint in field_types(kind).items():
         choices = get_args(hint)
         if get_origin(hint) is Literal and getattr(settings, name) not in choices:
             choices_in_words = " or ".join(map(str, choices))

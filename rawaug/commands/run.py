@@ -7,7 +7,8 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import MISSING, fields, is_dataclass
-from typing import Annotated, Any, get_args, get_type_hints
+from functools import cache
+from typing import Annotated, Any, get_args
 
 from annotated_types import Interval
 from cyclopts import Parameter
@@ -23,7 +24,7 @@ from rawaug.experiment import run as experiment
 from rawaug.experiment.data import use_all_pairs
 from rawaug.experiment.recipe import find_kind, find_recipe, find_settings, read_recipe, recipe_list
 from rawaug.experiment.settings import Recipe
-from rawaug.registry import list_bounds, suggest
+from rawaug.registry import field_types, list_bounds, suggest
 
 SHARED = ("channels", "variance_map", "deviation", "domain")
 """Settings that all networks share."""
@@ -191,7 +192,7 @@ def drop_old_settings(content: dict[str, Any], key: str, name: Any) -> None:
 # -- settings ----------------------------------------------------------------------------------------------------------
 
 
-def with_values(settings: type[Any], content: Mapping[str, Any], source: object) -> Any:
+def with_values(settings: Any, content: Mapping[str, Any], source: object) -> Any:
     """Make an instance of the dataclass ``settings`` with the values of ``content``, which its types validate.
 
     Args:
@@ -203,7 +204,7 @@ def with_values(settings: type[Any], content: Mapping[str, Any], source: object)
         ValueError: if a key is unknown, or a value is of another type or out of bounds.
     """
     values = dict(content)
-    if "experiment" not in get_type_hints(settings):
+    if "experiment" not in field_types(settings):
         values.pop("experiment", None)
 
     try:
@@ -215,14 +216,10 @@ def with_values(settings: type[Any], content: Mapping[str, Any], source: object)
         raise ValueError(f"{source}: {error}") from None
 
 
-def list_keys(settings: type[Any], above: str = "") -> dict[str, tuple[Any, str]]:
+def list_keys(settings: Any, above: str = "") -> dict[str, tuple[Any, str]]:
     """List the keys of a dataclass and of those in it, dotted: their defaults, and what docstrings say they mean."""
-    hints = get_type_hints(settings)
-    meanings: dict[str, str] = {}
-    for base in reversed(settings.__mro__):
-        for parameter in parse(base.__doc__ or "").params:
-            meanings[parameter.arg_name] = parameter.description or ""
-
+    hints = field_types(settings)
+    meanings = _read_meanings(settings)
     keys: dict[str, tuple[Any, str]] = {}
     bounds = list_bounds(settings)
     for field in fields(settings):
@@ -245,6 +242,16 @@ def list_keys(settings: type[Any], above: str = "") -> dict[str, tuple[Any, str]
             keys |= list_keys(part, f"{name}.NAME." if by_name else f"{name}.")
 
     return keys
+
+
+@cache
+def _read_meanings(settings: type[Any]) -> dict[str, str]:
+    """Read what the docstrings of a dataclass and of its bases say about its fields."""
+    meanings: dict[str, str] = {}
+    for base in reversed(settings.__mro__):
+        for parameter in parse(base.__doc__ or "").params:
+            meanings[parameter.arg_name] = parameter.description or ""
+    return meanings
 
 
 def describe_bounds(bounds: Interval) -> str:
@@ -300,7 +307,7 @@ def _require_keys(settings: Any, content: Any, names: Iterable[str], above: str 
     if not isinstance(content, Mapping):
         return  # pydantic says what it should be
 
-    hints = get_type_hints(settings)
+    hints = field_types(settings)
     for key, value in content.items():
         if key not in hints:
             raise ValueError(f"{above}{key}: no such key{suggest(f'{above}{key}', names)}")
