@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, RandomSampler, Sampler, WeightedRandomSampler
 
 import rawaug
+from benchmarks import resuming
 from benchmarks.resuming import Case, Counted, loader_of, outcome, resumable, wrapped
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
@@ -23,6 +24,18 @@ from rawaug.plugin.loader import wrap
 
 POOLS = [(0, False), (2, True)]
 """Workers, and whether they are persistent; `fork` is fast."""
+
+
+@pytest.fixture(scope="module")
+def camera() -> RawAugment:
+    return resuming.make_augment()
+
+
+@pytest.fixture(autouse=True)
+def short_epochs(camera: RawAugment, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seven batches: when a training is broken off, two are used, and two workers have fetched four ahead."""
+    monkeypatch.setattr(resuming, "PICTURES", 14)
+    monkeypatch.setattr(resuming, "make_augment", lambda: copy.deepcopy(camera))
 
 
 @pytest.fixture

@@ -137,9 +137,12 @@ def broken_off(loader: Any, batches: int = 1) -> tuple[Any, list[Tensor], list[T
     return state, seen, noises(running)
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("wrapper", WRAPPERS)
-@pytest.mark.parametrize("sampler", SAMPLERS)
+IN_ONE_PROCESS = [(sampler, wrapper, 0) for sampler in SAMPLERS for wrapper in WRAPPERS]
+WITH_WORKERS = [(sampler, wrapper, 2) for sampler, wrapper in zip(SAMPLERS, WRAPPERS, strict=True)]
+"""Samplers run in the main process and wrappers in the workers, so that each of them is once enough."""
+
+
+@pytest.mark.parametrize(("sampler", "wrapper", "workers"), [*IN_ONE_PROCESS, *WITH_WORKERS])
 def test_every_sampler_over_every_wrapper_goes_on_exactly_and_repeats_no_draw(
     make: Callable[..., Any], sampler: str, wrapper: str, workers: int
 ) -> None:
