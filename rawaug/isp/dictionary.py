@@ -1,15 +1,9 @@
-r"""Dictionaries of camera parameters: atoms, their convex hull, and settings drawn from it.
+"""Dictionaries of camera parameters: atoms, and weights of their convex hull.
 
 ``C = sum_i w_i D_ccm[i]`` and ``1 / g = sum_i w_i / D_wb[i]``, with ``w`` on the simplex (Conde et al., AAAI 2022,
 "Parameter Dictionaries"). Colour atoms act from sRGB to camera. Each of their rows (a column in the paper, where pixels
 are row vectors) has l1 norm 1. The atoms of published cameras have rows of sum 1 instead, with or without negative
 entries.
-
-*Sampling.* One draw is a camera in a light (:mod:`rawaug.camera.samplers`), a mixture of tone curves and an exposure,
-
-.. math:: y = h(C\,T(x);\, g \, 2^{-e}), \quad T = \textstyle\sum_k v_k T_k
-
-with h Brooks' highlight-preserving inverse gains, a mixture v of up to three inverse tone curves, and e in stops.
 """
 
 from __future__ import annotations
@@ -22,10 +16,6 @@ from rawaug.camera.lights import XYZ_TO_SRGB
 from rawaug.camera.matrices import camera_from_srgb, daylight_gains
 from rawaug.seeding import Generators, draw_rows
 
-EXPOSURE = (-0.5, 1.0)
-"""Limits of the uniform draw in stops. The headroom that cameras leave between the white of RAW and that of their
-pictures is not published. With these the mean RAW of photographs is 0.136, and 71 % of the cells whose green is clipped
-have red to spare, as in real files; with a ceiling of 1.5 stops it is 45 %."""
 _STEPS = 400
 
 

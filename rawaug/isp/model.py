@@ -4,7 +4,8 @@ r"""The dictionary ISP: sRGB to RAW and back, in six stages whose parameters com
 
 Source: Conde et al., "Model-Based Image Signal Processors via Learnable Dictionaries", AAAI 2022. The stages are in
 :mod:`rawaug.isp.stages`, the dictionaries in :mod:`rawaug.isp.dictionary`, the encoders that choose their atoms in
-:mod:`rawaug.isp.encoders`, what a file states of a shot in :mod:`rawaug.isp.fusion`, the mosaic in :mod:`rawaug.bayer`.
+:mod:`rawaug.isp.encoders`, settings drawn at random in :mod:`rawaug.isp.sampling`, what a file states of a shot in
+:mod:`rawaug.isp.fusion`, the mosaic in :mod:`rawaug.bayer`.
 """
 
 from __future__ import annotations
@@ -20,9 +21,7 @@ from torch import Tensor, nn
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.camera.lights import light_range
-from rawaug.camera.own import Camera, is_camera_file, own_cameras
-from rawaug.camera.samplers import CameraSampler, DataSheetSampler
+from rawaug.camera.own import Camera, is_camera_file
 from rawaug.errors import count_of
 from rawaug.files import find_weights, parse_object, read_tensors, to_json, write_tensors
 from rawaug.isp import functional, fusion
@@ -35,12 +34,12 @@ from rawaug.isp.cameras import (
     read_cameras,
 )
 from rawaug.isp.config import ISPConfig, ISPInfo, ISPParams, ISPResult
-from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, GainDictionary, convex_weights
+from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, GainDictionary
 from rawaug.isp.encoders import AtomEncoder, Encoders, thumbnail
 from rawaug.isp.fusion import Tone
 from rawaug.isp.stages import STAGES, FallOff, Stages
 from rawaug.isp.tone import ToneCurve, ToneDictionary
-from rawaug.seeding import Generators, derive_seed, initialise_from
+from rawaug.seeding import derive_seed, initialise_from
 
 _ADVICE = "fit or copy it again"
 _INFINITE = ("colour.spread",)
@@ -222,50 +221,6 @@ class DictionaryISP(nn.Module):
         if tone_weights is None:
             tone_weights = self.typical_tones().expand(len(matrix), -1)
         return ISPParams(colour_weights, gain_weights, matrix, gains, tone_weights)
-
-    def draw_setting(self, batch: int, generator: Generators, cameras: CameraSampler | None = None) -> ISPParams:
-        """Draw the settings of ``batch`` pictures without looking at them.
-
-        If the atoms are published cameras, it draws a camera in a light, else mixtures of atoms with uniform weights.
-
-        Args:
-            batch: number of pictures.
-            generator: a generator on the CPU, or one for each picture.
-            cameras: what :meth:`camera_sampler` has made, to draw from it many times.
-        """
-        config, device = self.config, self.colour.matrices.device
-        cameras = cameras or self.camera_sampler()
-        if cameras is None:
-            weights = []
-            for atoms in (config.colour_atoms, config.gain_atoms, config.tone_atoms):
-                if atoms:
-                    weights.append(convex_weights(batch, atoms, generator).to(device))
-            return self.params_from_weights(*weights)
-
-        colour_weights, matrix, gains = (tensor.to(device) for tensor in cameras.sample(batch, generator))
-        tones = no_weights = gains[:, :0]  # the gains follow from the light
-        tone = self.tone
-        if tone is not None:
-            tones = tone.draw(batch, generator)
-        return ISPParams(colour_weights, no_weights, matrix, gains, tones)
-
-    def camera_sampler(self, consistent: bool = True, light: float | str | None = None) -> CameraSampler | None:
-        """Make the sampler that draws cameras in a light; None unless the colour atoms are published cameras.
-
-        Later changes to the atoms do not affect it.
-
-        Args:
-            consistent: whether colour and gains are of one camera in one light; if not, gains are drawn separately.
-            light: a colour temperature in kelvin or one of :data:`rawaug.camera.lights.LAMPS`; any light by default.
-        """
-        if not isinstance(self.colour, CameraDictionary):
-            return None
-
-        atoms = self.colour.known, self.colour.atoms(), self.colour.responses()
-        sheets = own_cameras(self.info)
-        if sheets:
-            return DataSheetSampler(sheets, *atoms, light, consistent)
-        return CameraSampler(*atoms, light_range(light), consistent)
 
     def choose(self, srgb: Tensor) -> ISPParams:
         """Choose the settings of pictures ``(B, 3, H, W)`` by the reverse encoders, or by their constants."""

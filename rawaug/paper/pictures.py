@@ -20,6 +20,7 @@ from rawaug.files import write_bytes
 from rawaug.io.pictures import encode_png, encode_srgb
 from rawaug.isp.functional import frame_coordinates
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.sampling import draw_setting
 from rawaug.paper.methods import Method, raw_maker, settings
 from rawaug.seeding import keyed_generator
 
@@ -61,7 +62,7 @@ def draw_frame(family: str, model: Method, pair: Pair, folder: Path) -> None:
     if not isinstance(model, DictionaryISP):
         return
 
-    drawn = model.draw_setting(SAMPLES, keyed_generator("samples of one picture"))
+    drawn = draw_setting(model, SAMPLES, keyed_generator("samples of one picture"))
     samples = model.reverse(patch.expand(SAMPLES, -1, -1, -1), drawn, coordinates=place).raw
     shown = show_raw(samples * exposure, pair.cfa)
     strip = torch.cat(list(F.avg_pool2d(shown, 2)), dim=-1)

@@ -21,9 +21,10 @@ from torch import Tensor
 
 from rawaug.camera.own import own_cameras
 from rawaug.isp.config import ISPParams
-from rawaug.isp.dictionary import EXPOSURE, perturb
+from rawaug.isp.dictionary import perturb
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.sampling import EXPOSURE, camera_sampler, draw_setting
 from rawaug.kernels.runtime import one_thread
 from rawaug.registry import suggest
 from rawaug.seeding import Generators, draw_rows
@@ -148,7 +149,7 @@ class SettingSampler:
         usual = EXPOSURE if has_cameras else (0.0, 0.0)
         self.exposure: tuple[float, float] = draw.exposure_range or usual
         self.blur: tuple[float, float] = draw.blur_range or isp_blur(isp)
-        self._cameras = isp.camera_sampler(draw.sampling == "convex", draw.light)
+        self._cameras = camera_sampler(isp, draw.sampling == "convex", draw.light)
         self._tone = None if draw.tone is None else tone_weights(isp, draw.tone)
 
     @property
@@ -207,7 +208,7 @@ class SettingSampler:
                 setting = self._perturb(setting, generator)
             return setting
 
-        setting = self.host.draw_setting(len(srgb), generator, self._cameras)
+        setting = draw_setting(self.host, len(srgb), generator, self._cameras)
         if self._tone is None:
             return setting
         return setting._replace(tone_weights=self._tone.to(setting.tone_weights).expand_as(setting.tone_weights))

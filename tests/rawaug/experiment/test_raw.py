@@ -16,7 +16,7 @@ from rawaug.experiment.settings import ArmConfig, DataConfig, ISPSource, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 from rawaug.plugin.targets import Srgb, Target
-from rawaug.training import crops
+from rawaug.training import sources
 from rawaug.training.config import TrainConfig
 
 
@@ -78,7 +78,7 @@ def test_an_arm_sees_as_many_real_crops_with_further_ones_as_without() -> None:
 
 
 def test_pairs_have_the_stated_psnr_whatever_the_isp(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crops, "_CALIBRATED_ON", 96)
+    monkeypatch.setattr(sources, "_CALIBRATED_ON", 96)
     source = ISPSource("phones")
     recipe = Recipe(data=DataConfig(pairs=None), isp=source, noise={"pair_psnr": 36.0}, arms={"one": ArmConfig(1.0)})
     recipe = replace(recipe, train=TrainConfig(crop=32))

@@ -24,6 +24,7 @@ from rawaug.isp.dictionary import (
 )
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.sampling import camera_sampler, draw_setting
 from rawaug.isp.tone import STEPS
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
@@ -100,7 +101,7 @@ def generator(seed: int = 0) -> torch.Generator:
 
 
 def test_white_and_grey_are_divided_by_the_gains(universal: DictionaryISP) -> None:
-    setting = universal.draw_setting(8, generator())
+    setting = draw_setting(universal, 8, generator())
     assert universal.tone is not None
     curve = universal.tone.combine(setting.tone_weights)
     for code in (100, 255):
@@ -131,13 +132,13 @@ def test_raw_is_as_bright_as_cameras() -> None:
 
 def test_gains_follow_the_light(universal: DictionaryISP) -> None:
     """Light that needs more blue needs less red: gains drawn on their own would not correlate."""
-    gains = universal.draw_setting(2000, generator()).gains
+    gains = draw_setting(universal, 2000, generator()).gains
     red, blue = (gains[:, c].div(gains[:, 1]).log() for c in (0, 2))
     assert torch.corrcoef(torch.stack([red, blue]))[0, 1] < -0.5
 
 
 def test_the_balance_in_a_light_is_that_of_the_matrix_from_xyz(universal: DictionaryISP) -> None:
-    sampler = universal.camera_sampler()
+    sampler = camera_sampler(universal)
     assert sampler is not None and isinstance(universal.colour, CameraDictionary)
     weights, light = universal.colour.known[::100], sample_lights(7, generator())
     expected = gains_in_light(universal.colour.xyz_to_camera(weights), torch.from_numpy(light))
@@ -166,7 +167,7 @@ def test_independent_gains_are_those_of_other_light(universal: DictionaryISP, mo
 def test_one_named_camera_has_its_own_matrix_and_balance(universal: DictionaryISP) -> None:
     own = load_cameras().select(["Nikon D750"])
     nikon = universal.with_cameras("nikon d750")
-    setting = nikon.draw_setting(5, generator())
+    setting = draw_setting(nikon, 5, generator())
     torch.testing.assert_close(setting.matrix, camera_from_srgb(own).float().expand(5, 3, 3))
     assert setting.gains.std(dim=0).max() > 0.1
     assert isinstance(nikon.colour, CameraDictionary)

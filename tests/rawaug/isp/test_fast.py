@@ -10,6 +10,7 @@ from rawaug import bayer
 from rawaug.isp.config import POINTWISE_STAGES, ISPConfig, ISPParams
 from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.sampling import camera_sampler, draw_setting
 from rawaug.isp.stages import LensShading, ToneMap
 from rawaug.kernels import runtime
 from rawaug.metrics import psnr
@@ -133,8 +134,8 @@ def test_fast_forward_is_the_isp_above_60_db(name: str) -> None:
     isp.requires_grad_(False)
     generator = torch.Generator().manual_seed(1)
     srgb = torch.rand(3, 3, 32, 48, generator=generator)
-    drawn = isp.camera_sampler() is not None
-    params = isp.draw_setting(3, generator) if drawn else isp.choose(srgb)
+    drawn = camera_sampler(isp) is not None
+    params = draw_setting(isp, 3, generator) if drawn else isp.choose(srgb)
     raw = isp.reverse(srgb, params).raw
     x5 = bayer.demosaic(raw + 0.01 * torch.randn(raw.shape, generator=generator), isp.cfa)
     made = FastForward(isp)(x5, params)
@@ -169,7 +170,7 @@ def test_fast_forward_undoes_the_mask_where_the_crop_was(view: int) -> None:
 def test_a_saturated_sensor_develops_to_a_neutral_highlight(name: str) -> None:
     isp = DictionaryISP.from_pretrained(name).requires_grad_(False)
     white = torch.ones(2, 3, 4, 4)
-    params = isp.draw_setting(2, torch.Generator().manual_seed(1)) if isp.config.cameras else isp.choose(white)
+    params = draw_setting(isp, 2, torch.Generator().manual_seed(1)) if isp.config.cameras else isp.choose(white)
     centre = torch.tensor([[998, 1498, 2000, 3000]]).expand(2, 4)  # where the mask leaves all light
     srgb = FastForward(isp)(white, params, centre)
     assert (srgb.amax(dim=1) - srgb.amin(dim=1)).max() < 0.02 and srgb.min() > 0.95
@@ -178,7 +179,7 @@ def test_a_saturated_sensor_develops_to_a_neutral_highlight(name: str) -> None:
 @pytest.mark.usefixtures("either_way")
 def test_gradients_of_fast_forward_are_those_of_the_isp() -> None:
     isp = DictionaryISP.from_pretrained("universal").requires_grad_(False)
-    params = isp.draw_setting(1, torch.Generator().manual_seed(2))
+    params = draw_setting(isp, 1, torch.Generator().manual_seed(2))
     x5 = 0.1 + 0.1 * torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
     found = []
     for forward in (FastForward(isp), isp.stages.forward):
@@ -194,7 +195,7 @@ def test_gradients_of_fast_forward_are_those_of_the_isp() -> None:
 def test_a_choice_of_direction_sees_nothing_below_black(method: str) -> None:
     """RAW developers clip before they compare directions, so that noise around black does not choose."""
     isp = DictionaryISP.from_pretrained("universal").requires_grad_(False)
-    params, forward = isp.draw_setting(1, torch.Generator().manual_seed(1)), FastForward(isp)
+    params, forward = draw_setting(isp, 1, torch.Generator().manual_seed(1)), FastForward(isp)
     raw = 0.02 * torch.randn(1, 1, 32, 48, generator=torch.Generator().manual_seed(0)) + 0.01
     below, clipped = forward.develop([raw, raw.clamp_min(0.0)], [method], params)
     assert torch.equal(below, clipped) and clipped.std() > 0.01
@@ -205,7 +206,7 @@ def test_a_choice_of_direction_sees_nothing_below_black(method: str) -> None:
 def test_mosaics_are_demosaiced_by_their_own_method_and_developed(cfa: bayer.CFA) -> None:
     isp, methods = DictionaryISP.from_pretrained("universal"), ["malvar", "bilinear", "malvar"]
     isp.configure(cfa=cfa)
-    params, forward = isp.draw_setting(3, torch.Generator().manual_seed(1)), FastForward(isp.requires_grad_(False))
+    params, forward = draw_setting(isp, 3, torch.Generator().manual_seed(1)), FastForward(isp.requires_grad_(False))
     raw = 0.3 * torch.rand(3, 1, 6, 530, generator=torch.Generator().manual_seed(0))
     linear = torch.cat([bayer.demosaic(one, cfa, method) for one, method in zip(raw.split(1), methods, strict=True)])
     torch.testing.assert_close(forward.develop([raw], methods, params)[0], forward(linear, params), atol=1e-4, rtol=0)

@@ -20,6 +20,7 @@ from rawaug.camera.matrices import camera_from_srgb, load_cameras
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.dictionary import CameraDictionary
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.sampling import draw_setting
 from rawaug.isp.tone import NODES, srgb_to_linear
 from rawaug.metrics import psnr
 
@@ -64,7 +65,7 @@ def test_gain_atoms_hold_lights_that_they_were_not_chosen_for(universal: Diction
 
 def test_readings_find_tone_and_camera_as_well(universal: DictionaryISP) -> None:
     srgb = torch.rand(1, 3, 32, 32, generator=generator()) * 0.85
-    truth = universal.draw_setting(1, generator(3))
+    truth = draw_setting(universal, 1, generator(3))
     raw = universal.reverse(srgb, truth).raw
     place = torch.randint(32, (1, 64, 2), generator=generator(4))
     value = raw[0, 0, place[0, :, 0], place[0, :, 1]]

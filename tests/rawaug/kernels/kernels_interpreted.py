@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from rawaug import bayer, kernels
 from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.sampling import draw_setting
 from rawaug.kernels import cpu, gpu, gpu_srgb, reference
 from rawaug.noise.levels import FixedLevels
 from rawaug.noise.models import ShotReadNoise
@@ -56,7 +57,7 @@ def check_raw(settings: dict[str, Any], dtype: torch.dtype, blur: torch.Tensor |
 
 def check_developed(settings: dict[str, Any]) -> None:
     isp = full_isp(**settings)
-    forward, params = FastForward(isp), isp.draw_setting(4, torch.Generator().manual_seed(1))
+    forward, params = FastForward(isp), draw_setting(isp, 4, torch.Generator().manual_seed(1))
     generator = torch.Generator().manual_seed(0)
     raw = F.interpolate(torch.rand(4, 1, 6, 9, generator=generator), (18, 30), mode="bicubic").mul_(0.5)
     raw += 0.02 * torch.randn(raw.shape, generator=generator)

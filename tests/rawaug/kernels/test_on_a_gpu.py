@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from rawaug import kernels
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.sampling import draw_setting
 from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, ShotReadNoise
 from rawaug.plugin.augment import RawAugment
@@ -53,7 +54,7 @@ def test_the_kernels_are_the_ones_that_run() -> None:
 def test_raw_is_that_of_the_cpu_and_of_pytorch(name: str, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
     isp, srgb = full_isp(**CONFIGURATIONS[name]), pictures(dtype)
     baked, place = BakedISP(isp), torch.tensor([[6, 34, 140, 260, 5], [0, 0, 66, 130, 0], [2, 4, 80, 140, 3]])
-    params = isp.draw_setting(len(srgb), torch.Generator().manual_seed(1))
+    params = draw_setting(isp, len(srgb), torch.Generator().manual_seed(1))
     expected = baked(srgb, params, place, white=0.3)
     baked, there, params = baked.to(DEVICE), srgb.to(DEVICE), type(params)(*(p.to(DEVICE) for p in params))
     raw = baked(there, params, place, white=0.3)
