@@ -231,7 +231,7 @@ def main() -> None:
     quick = parser.parse_args().quick
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
-    multiprocessing.set_forkserver_preload(["benchmarks.resuming"])
+    multiprocessing.set_forkserver_preload(["rawaug.plugin.loader"])
 
     for name, make in ways().items():
         print(f"{name}:", flush=True)

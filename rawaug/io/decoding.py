@@ -15,7 +15,6 @@ import os
 import tempfile
 import warnings
 from collections.abc import Callable
-from functools import cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -184,7 +183,6 @@ def open_image(path: Path, may_have_alpha: bool = True) -> Any:
     return source
 
 
-@cache
 def load_oiio() -> Any:
     """Import OpenImageIO, which is not done before a picture is read or written."""
     with extra("raw"):
@@ -287,7 +285,8 @@ def decode_part(
         if file.read() != _END_OF_JPEG or headers.animated or headers.unread:
             return None
 
-    source = load_oiio().ImageInput.open(str(path))
+    oiio = load_oiio()
+    source = oiio.ImageInput.open(str(path))
     if source is None:
         return None
     spec = source.spec()
@@ -298,7 +297,7 @@ def decode_part(
         return None
 
     top, left, rows, columns = choose(spec.height, spec.width)
-    pixels = source.read_scanlines(top, top + rows, 0, 0, 3, load_oiio().UINT8)
+    pixels = source.read_scanlines(top, top + rows, 0, 0, 3, oiio.UINT8)
     fault = reason(source)
     source.close()
     if pixels is None or fault:
