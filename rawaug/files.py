@@ -25,7 +25,6 @@ from torch import Tensor
 P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")
-Content = bytes | memoryview
 
 OF_NO_DATASET = (".DS_Store", "Thumbs.db")
 """Files that macOS and Windows leave in folders."""
@@ -279,7 +278,7 @@ def require_folder(folder: str | Path, output: str | Path | None = None) -> None
         raise OSError(f"{path}: cannot be written: {above}: {error.strerror}") from None
 
 
-def write_bytes(content: Content, path: str | Path) -> None:
+def write_bytes(content: bytes | memoryview, path: str | Path) -> None:
     """Write a file, completely or not at all.
 
     Encoders of pictures, figures and archives write to memory first: some of them do not report a full disk, and one

@@ -15,7 +15,6 @@ from rawaug.denoising.denoiser import RawDenoiser, shipped_of_mosaics
 from rawaug.denoising.guard import Guarded
 from rawaug.denoising.pictures import PictureDenoiser
 from rawaug.evaluation.benchmark import (
-    ON_PAGE,
     benchmark,
     benchmark_trials,
     choose_strengths,
@@ -35,10 +34,10 @@ from rawaug.evaluation.trials import measure_own_noise
 from rawaug.files import require_output, write_json, write_text
 from rawaug.registry import require_between
 
-ALWAYS = "NonLocalMeans"
+_ALWAYS = "NonLocalMeans"
 """The filter that is in every table, as are the shipped denoisers of mosaics."""
 
-FRAMES, CROP = 6, 384
+_COUNT, _CROP = 6, 384
 """Number of frames of RAW, and the side of their middles in pixels of the mosaic."""
 
 
@@ -106,12 +105,12 @@ def run(
         compare_pictures(denoisers, data, count, crop, device, json)
         return
 
-    count, crop = count or FRAMES, crop or CROP
+    count, crop = count or _COUNT, crop or _CROP
     strengths = choose_strengths(noise, iso)
 
     # The denoisers of the table; one whose name is taken goes by its spec.
     by_name: dict[str, RawDenoiser] = {}
-    for spec in dict.fromkeys((ALWAYS, *shipped_of_mosaics(), *denoisers)):
+    for spec in dict.fromkeys((_ALWAYS, *shipped_of_mosaics(), *denoisers)):
         denoiser = named_denoiser(spec, device).require_mosaic()
         if denoiser.name in by_name:
             denoiser = replace(denoiser, name=spec)
@@ -147,7 +146,7 @@ def run(
         write_text(latex_benchmark(result, command_line()), table)
         print(f"table: {table}")
     if figure:
-        print(f"figure: {save_picture(list(make_crops(compared, trials, ON_PAGE)), Path(figure))}")
+        print(f"figure: {save_picture(list(make_crops(compared, trials)), Path(figure))}")
     if report:
         settings = {"denoisers": list(denoisers), "data": data, "bin": bin, "count": count, "crop": crop}
         settings |= {"noise": noise, "iso": iso, "seed": seed, "table": table, "figure": figure, "harm": harm}

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import pattern
-from rawaug.evaluation.figures import FIGURES, new_figure, save_figure
+from rawaug.evaluation.figures import FIGURE_FORMATS, new_figure, save_figure
 from rawaug.explore.views import stage_pictures
 from rawaug.files import require_output
 from rawaug.io.pictures import MAX_PIXELS
@@ -59,7 +59,7 @@ def run(
     path = Path(out)
     if not path.suffix:
         path = Path(f"{out}.png")
-    require_output(path, overwrite, FIGURES, [picture])
+    require_output(path, overwrite, FIGURE_FORMATS, [picture])
 
     augment = RawAugment.from_pretrained(isp, cfa=cfa)
     srgb = trim_to_even(read_shot(picture, max_pixels))

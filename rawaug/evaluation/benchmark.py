@@ -61,7 +61,7 @@ _SENSOR: dict[str, Any] = {
 _OF_SENSORS = ("phone", "strong")
 """The strengths at which real sensors are simulated."""
 
-ON_PAGE = 4
+_MOST_SHOWN = 4
 """Largest number of frames on the page, and in the figure."""
 
 _TILE = 510
@@ -349,12 +349,12 @@ def display_strength(strengths: Collection[str]) -> str:
     return last
 
 
-def make_crops(denoisers: Sequence[RawDenoiser], trials: Iterable[Trial], most: int) -> Iterator[Panels]:
-    """Make pictures for the page: the first ``most`` frames with noise of :func:`display_strength`, by denoiser."""
+def make_crops(denoisers: Sequence[RawDenoiser], trials: Iterable[Trial]) -> Iterator[Panels]:
+    """Make pictures for the page: the first few frames with noise of :func:`display_strength`, by denoiser."""
     trials = list(trials)
     strength = display_strength(_strengths_in(trials))
     count = 0
     for trial in trials:
-        if trial.condition == TOLD and trial.strength == strength and count < most:
+        if trial.condition == TOLD and trial.strength == strength and count < _MOST_SHOWN:
             yield make_panels(denoisers, trial)
             count += 1

@@ -7,7 +7,7 @@ from typing import Any
 
 from rawaug.denoising.denoiser import RawDenoiser
 from rawaug.errors import count_of
-from rawaug.evaluation.benchmark import ON_PAGE, TOLD, benchmark_tables, collect_costs, display_strength, make_crops
+from rawaug.evaluation.benchmark import TOLD, benchmark_tables, collect_costs, display_strength, make_crops
 from rawaug.evaluation.figures import plot_costs
 from rawaug.evaluation.harm import harm_tables
 from rawaug.evaluation.page import Figure, Page
@@ -56,7 +56,7 @@ def benchmark_page(result: Mapping[str, Any], denoisers: Sequence[RawDenoiser], 
     page.add("Quality and cost", figures=[chart])
 
     page.add("Pictures", texts=[f"Noise: {strength}, levels told; PSNR of RAW."])
-    for panels in make_crops(denoisers, trials, ON_PAGE):
+    for panels in make_crops(denoisers, trials):
         page.add_frame(panels, result["crop"])
 
     return page

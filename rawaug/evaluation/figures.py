@@ -25,8 +25,8 @@ from rawaug.evaluation.trials import Trial
 from rawaug.files import write_bytes
 from rawaug.metrics import psnr
 
-FIGURES = (".png", ".jpg", ".pdf", ".svg")
-"""Extensions of files of figures."""
+FIGURE_FORMATS = (".png", ".jpg", ".pdf", ".svg")
+"""Extensions of the files of figures."""
 
 WINDOW = 64
 """Side of an enlarged window, in packed pixels."""

@@ -29,9 +29,6 @@ from rawaug.evaluation.verdict import CLEANER_TEST
 from rawaug.noise import NoiseModel, own_noise
 from rawaug.seeding import keyed_generator
 
-Domain = Literal["raw", "rgb", "srgb"]
-"""The form in which results are compared: packed RAW ``(1, 4, h, w)``, linear camera RGB or sRGB ``(1, 3, H, W)``."""
-
 TEST_NOISE = "test noise"
 """The part of the key of test frames' noise that is the same for all of them."""
 
@@ -50,7 +47,8 @@ class Trial:
         clean: the truth, in the form of ``domain``.
         variance: variance of the noise of each value at the noisy signal, in the shape of ``noisy``; None if unknown.
         frame: name of the frame.
-        domain: the form in which results are compared with the truth.
+        domain: the form in which results are compared with the truth: packed RAW ``(1, 4, h, w)``, linear camera RGB or
+            sRGB ``(1, 3, H, W)``.
         condition: what the denoiser is told, or how the sensor behaves; rows carry it.
         strength: the name of the noise's strength; rows carry it.
         levels: (shot_var, read_var) that the denoiser is given, if the noise has any.
@@ -68,7 +66,7 @@ class Trial:
     clean: Tensor
     variance: Tensor | None = None
     frame: str = ""
-    domain: Domain = "raw"
+    domain: Literal["raw", "rgb", "srgb"] = "raw"
     condition: str = ""
     strength: str = ""
     levels: Levels | None = None

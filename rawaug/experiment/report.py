@@ -28,12 +28,12 @@ from rawaug.registry import spec_label, split_spec
 _MOST_ROWS = 3
 """Largest number of test frames of RAW in ``picture.png``."""
 
-Tables = Mapping[str, Mapping[str, Mapping[str, Any]]]
+ScoresByTable = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """By table, ``results`` has the summaries ``plain`` and ``self_ensemble`` for each seed of an arm, and ``others`` the
 summary of each denoiser that arms are compared with, by name."""
 
 
-def write_results(task: Task, folder: Path, tables: Tables, unreadable: Sequence[str]) -> dict[str, Any]:
+def write_results(task: Task, folder: Path, tables: ScoresByTable, unreadable: Sequence[str]) -> dict[str, Any]:
     """Write ``results.json`` and return the scores of the arms; a table without a name is not named there either.
 
     Args:
@@ -64,7 +64,7 @@ def write_results(task: Task, folder: Path, tables: Tables, unreadable: Sequence
 def write_report(
     task: Task,
     folder: Path,
-    tables: Tables,
+    tables: ScoresByTable,
     panels: Sequence[Panels],
     training_note: str,
     unreadable: Sequence[str],
@@ -191,7 +191,7 @@ def explain_methods(recipe: Recipe) -> dict[str, str]:
 # -- what to use -------------------------------------------------------------------------------------------------------
 
 
-def usage(recipe: Recipe, folder: Path, tables: Tables, uses: Mapping[str, str]) -> list[str]:
+def usage(recipe: Recipe, folder: Path, tables: ScoresByTable, uses: Mapping[str, str]) -> list[str]:
     """List the files of weights, and the command for what each table recommends; an arm has its best seed's weights.
 
     Args:

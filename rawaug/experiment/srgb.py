@@ -52,7 +52,7 @@ BLACK, WHITE = 8192.0, 65535.0
 _DEVIATIONS = (0.01, 0.015, 0.022, 0.033, 0.05, 0.075, 0.11, 0.16)
 """The standard deviations of white noise among which validation chooses a filter's strength."""
 
-REAL = "real"
+REAL_PAIRS = "real"
 """The name of the table of real pairs, whose level is not known."""
 
 _WITHOUT_PLANES = ("NonLocalMeans", "TotalVariation", "Wavelet")
@@ -163,7 +163,7 @@ def srgb_trials(pairs: Sequence[Any], levels: Sequence[Levels], label: str) -> l
     for pair in progress(pairs, label=label, unit="frame"):
         if isinstance(pair, PicturePair):
             (trial,) = picture_trials([pair])
-            trials.append(replace(trial, condition="", strength=REAL))
+            trials.append(replace(trial, condition="", strength=REAL_PAIRS))
         else:
             trials += _drawn_trials(pair, levels)
 

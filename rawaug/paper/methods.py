@@ -41,8 +41,6 @@ SAMPLES = 64
 PIXELS = 8192
 """Number of pixels of a frame on which the forward pass is scored."""
 Method = BaselineISP | DictionaryISP
-Maker = Callable[[Tensor, Tensor], Tensor]
-"""A function from an sRGB patch ``(1, 3, h, w)`` and its coordinates in the frame to a mosaic ``(1, 1, h, w)``."""
 
 
 class Fitted(NamedTuple):
@@ -192,8 +190,11 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None, balanced: bool =
     }
 
 
-def raw_maker(model: Method, setting: Any) -> Maker:
-    """Make the function that turns a patch into RAW under a setting."""
+def raw_maker(model: Method, setting: Any) -> Callable[[Tensor, Tensor], Tensor]:
+    """Make the function that turns a patch into RAW under a setting.
+
+    It maps an sRGB patch ``(1, 3, h, w)`` and its coordinates in the frame to a mosaic ``(1, 1, h, w)``.
+    """
     if isinstance(model, DictionaryISP):
         return lambda patch, coordinates: model.reverse(patch, setting, coordinates=coordinates).raw
     return lambda patch, coordinates: model.reverse(patch, setting)

@@ -148,7 +148,7 @@ def replay_pair(
     return pair
 
 
-class PictureTask:
+class PictureJob:
     """The pairs of one picture.
 
     Args:
@@ -208,8 +208,8 @@ def _is_whole(params: Path, picture_sha256: str | None) -> bool:
     return origin["picture_sha256"] == picture_sha256 and all(are_whole)
 
 
-def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: int) -> Iterator[PictureTask]:
-    """Make one task for each picture; pictures that differ only in their extension keep it in their pairs' names.
+def picture_jobs(pictures: Sequence[Path], source: Path, out: Path, per_image: int) -> Iterator[PictureJob]:
+    """Make one job for each picture; pictures that differ only in their extension keep it in their pairs' names.
 
     Args:
         pictures: sRGB files below ``source``.
@@ -231,7 +231,7 @@ def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: 
             raise ValueError(f"{picture}: its pairs would have the same names as those of {namesake.name}; rename one")
 
         stem = out / stem.relative_to(source).with_name(_short(stem.name))
-        yield PictureTask(picture, picture.relative_to(source).as_posix(), stem, per_image)
+        yield PictureJob(picture, picture.relative_to(source).as_posix(), stem, per_image)
 
 
 def _short(name: str) -> str:

@@ -29,12 +29,12 @@ from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.config import AugmentConfig
 from rawaug.progress import progress
 from rawaug.synthesis import shards
-from rawaug.synthesis.files import TARGETS, Format, PictureTask, Settings, Synthesiser, picture_tasks
-from rawaug.synthesis.shards import PER_SHARD, ShardTask
+from rawaug.synthesis.files import TARGETS, Format, PictureJob, Settings, Synthesiser, picture_jobs
+from rawaug.synthesis.shards import PER_SHARD, ShardJob
 
-Task = PictureTask | ShardTask
+Job = PictureJob | ShardJob
 _Outcome = tuple[int, int, dict[str, str]]
-"""The numbers of pairs that a task made and that were there, and the reason for each picture that it cannot read."""
+"""The numbers of pairs that a job made and that were there, and the reason for each picture that it cannot read."""
 
 
 @dataclass
@@ -113,19 +113,19 @@ def synth(
         lock = f"rawaug-{part}-of-{parts}.lock"
 
     content = run_settings.to_json()
-    tasks: list[Task] = []
+    jobs: list[Job] = []
     with locked(out / lock):
         if format == "webdataset":
-            tasks += shards.shard_tasks(pictures, source, out, per_image, per_shard)
+            jobs += shards.shard_jobs(pictures, source, out, per_image, per_shard)
             content["isp"] = Path(run_settings.config.isp).name  # its path differs between machines
             content |= shards.shard_settings(pictures, source, per_image, per_shard, max_pixels)
         else:
-            tasks += picture_tasks(pictures, source, out, per_image)
+            jobs += picture_jobs(pictures, source, out, per_image)
         require_same_settings(out / "synth.json", content)
 
-        result = _run(out, tasks[part - 1 :: parts], run_settings, max_pixels, workers)
+        result = _run(out, jobs[part - 1 :: parts], run_settings, max_pixels, workers)
         if format == "webdataset":
-            shards.write_index(out, len(tasks), run_settings)
+            shards.write_index(out, len(jobs), run_settings)
 
     result.left_out = listing.lines()
     result.seconds = time.perf_counter() - start
@@ -160,10 +160,10 @@ def _settings(format: Format, per_image: int, seed: int, config: AugmentConfig) 
     return Settings(format, replace(config, isp=str(isp)), sha256(find_weights(isp)), seed)
 
 
-def _run(out: Path, tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Synthesis:
-    result = Synthesis(out, pictures=sum(task.pictures for task in tasks))
-    outcomes = _run_tasks(tasks, settings, max_pixels, workers)
-    for made, existing, broken in progress(outcomes, label="synth", unit="file", total=len(tasks), leave=True):
+def _run(out: Path, jobs: Sequence[Job], settings: Settings, max_pixels: int, workers: int | None) -> Synthesis:
+    result = Synthesis(out, pictures=sum(job.pictures for job in jobs))
+    outcomes = _run_jobs(jobs, settings, max_pixels, workers)
+    for made, existing, broken in progress(outcomes, label="synth", unit="file", total=len(jobs), leave=True):
         result.made += made
         result.existing += existing
         result.broken |= broken
@@ -177,14 +177,14 @@ def _run(out: Path, tasks: Sequence[Task], settings: Settings, max_pixels: int, 
 _maker: Synthesiser
 
 
-def _run_tasks(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[_Outcome]:
+def _run_jobs(jobs: Sequence[Job], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[_Outcome]:
     if workers is None:
         workers = os.cpu_count() or 1
-    workers = min(len(tasks), workers)
+    workers = min(len(jobs), workers)
     if workers < 1:
         _prepare(settings, max_pixels)
-        for task in tasks:
-            yield _make(task)
+        for job in jobs:
+            yield _make(job)
         return
 
     method = "spawn"
@@ -193,7 +193,7 @@ def _run_tasks(tasks: Sequence[Task], settings: Settings, max_pixels: int, worke
     context = multiprocessing.get_context(method)
     pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(settings, max_pixels))
     try:
-        for future in as_completed([pool.submit(_make, task) for task in tasks]):
+        for future in as_completed([pool.submit(_make, job) for job in jobs]):
             yield future.result()
     except BrokenProcessPool:
         raise OSError(
@@ -224,5 +224,5 @@ def _prepare(settings: Settings, max_pixels: int) -> None:
     _maker = Synthesiser(settings, max_pixels)
 
 
-def _make(task: Task) -> _Outcome:
-    return task.make(_maker)
+def _make(job: Job) -> _Outcome:
+    return job.make(_maker)

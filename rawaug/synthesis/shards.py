@@ -38,7 +38,7 @@ PER_SHARD = 500
 _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 
 
-class ShardTask:
+class ShardJob:
     """One shard.
 
     Args:
@@ -119,9 +119,9 @@ def _read_record(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return record, info
 
 
-def shard_tasks(
+def shard_jobs(
     pictures: Sequence[Path], source: Path, out: Path, per_image: int, per_shard: int = PER_SHARD
-) -> list[ShardTask]:
+) -> list[ShardJob]:
     """Divide pictures into shards.
 
     Args:
@@ -135,11 +135,11 @@ def shard_tasks(
         raise ValueError(f"per_shard must be at least 1, got {per_shard}")
 
     names = _names(pictures, source)
-    tasks = []
+    jobs = []
     for number, first in enumerate(range(0, len(names), per_shard)):
         shard = _shard_path(out, number)
-        tasks.append(ShardTask(shard, first, source, names[first : first + per_shard], per_image))
-    return tasks
+        jobs.append(ShardJob(shard, first, source, names[first : first + per_shard], per_image))
+    return jobs
 
 
 def shard_settings(

@@ -21,7 +21,7 @@ from rawaug.evaluation.trials import Trial
 from rawaug.experiment.data import open_frames
 from rawaug.experiment.run import run
 from rawaug.experiment.settings import ArmConfig, DataConfig, ISPSource
-from rawaug.experiment.srgb import REAL, SrgbRecipe, best_filter, developed, srgb_trials
+from rawaug.experiment.srgb import REAL_PAIRS, SrgbRecipe, best_filter, developed, srgb_trials
 from rawaug.io.pictures import write_picture
 from rawaug.metrics import psnr
 from rawaug.training.config import DenoiserConfig, TrainConfig
@@ -148,7 +148,7 @@ def test_real_pairs_choose_the_weights_and_are_scored(tmp_path: Path) -> None:
         RECIPE, data=DataConfig(pairs=None, pictures="tiny:", validation=seen, test=unseen), out=str(tmp_path)
     )
     found = run(recipe, True)
-    plain = found["gaussian"][0]["plain"] if REAL not in found else found[REAL]["gaussian"][0]["plain"]
+    plain = found["gaussian"][0]["plain"] if REAL_PAIRS not in found else found[REAL_PAIRS]["gaussian"][0]["plain"]
     assert all(20 < plain[key] < 40 for key in ("psnr", "psnr_noisy"))
     (row,) = read_log(tmp_path / "a" / "seed0" / "gaussian" / "log.csv")
     assert 20 < float(row["psnr"]) < 40

@@ -172,7 +172,7 @@ def test_what_cannot_go_on_is_refused(pictures: Path, whole: Path, tmp_path: Pat
     with pytest.raises(ValueError, match="per_image"):
         shards(pictures, whole, per_image=1)
     with pytest.raises(ValueError, match="per_shard"):
-        pair_shards.shard_tasks([pictures / "a.png"], pictures, tmp_path, 1, 0)
+        pair_shards.shard_jobs([pictures / "a.png"], pictures, tmp_path, 1, 0)
     for shard in ("0/4", "5/4", "3", "1/0", "a/b", "-1/2", "1/2/3"):
         with pytest.raises(ValueError, match="shard"):
             parse_shard(shard)
