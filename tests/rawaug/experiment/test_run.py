@@ -55,6 +55,10 @@ def test_a_run_says_that_bm3d_is_missing_and_goes_on(
     with pytest.raises(ValueError, match="'upii'"):
         run(replace(recipe, classical=["BM3D"], noise="upii"))
     assert "BM3D is left out: bm3d is not installed" in capsys.readouterr().out
+    monkeypatch.setattr(running, "is_leader", lambda: False)
+    with pytest.raises(ValueError, match="'upii'"):
+        run(replace(recipe, classical=["BM3D"], noise="upii"))
+    assert not capsys.readouterr().out, "another process says so"
 
 
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
