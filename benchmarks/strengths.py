@@ -38,7 +38,7 @@ GMAC = "GMAC"
 """The key of the operations a mosaic megapixel, by denoiser, beside those of the trials; a guard samples a frame."""
 
 GUARD = "+guard"
-"""Ends the name of a denoiser whose results are guarded."""
+"""End of the name of a denoiser whose results are guarded."""
 
 
 def main(command: Sequence[str] | None = None) -> None:
@@ -50,6 +50,7 @@ def main(command: Sequence[str] | None = None) -> None:
     options.add_argument(
         "--noise", type=parse_value, help="noise in place of the four strengths, as for rawaug benchmark"
     )
+    options.add_argument("--strengths", nargs="+", help="those of the strengths that are scored; by default all")
     options.add_argument("--crop", type=int, default=256, help="side of the middles, in pixels of the mosaic")
     options.add_argument("--middle", type=int, help="draw the noise on a middle of this side, of frames that are large")
     options.add_argument("--sensors", action="store_true", help="score sensors as they are, too")
@@ -61,9 +62,10 @@ def main(command: Sequence[str] | None = None) -> None:
     conditions = [TOLD, REAL] if args.sensors else [TOLD]
 
     for name in args.sets:
-        everything = [
-            trial for trial in frozen_trials(name, args.crop, args.noise, args.middle) if trial.condition in conditions
-        ]
+        everything = []
+        for trial in frozen_trials(name, args.crop, args.noise, args.middle):
+            if trial.condition in conditions and (not args.strengths or trial.strength in args.strengths):
+                everything.append(trial)
         for spec in ["noisy", *args.denoisers]:
             add_scores(table, name, spec, everything, args.table)
     add_costs(table, args.denoisers, args.table)
