@@ -176,8 +176,8 @@ class OwnPictureCrops:
             params.extras.pop("blur", None)  # a camera's own pictures are as soft as it is
             parameters.append(params)
 
-        made = self.augment.apply(torch.cat(patches), AugmentParams.concatenate(parameters))
-        return list(map(Sample, made.noisy, made.clean, made.variance))
+        pairs = self.augment.apply(torch.cat(patches), AugmentParams.concatenate(parameters))
+        return list(map(Sample, pairs.noisy, pairs.clean, pairs.variance))
 
     def draw_patch(self, pair: Pair, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Cut a patch ``(3, crop, crop)`` out of a pair's picture, turned, with its place as AugmentParams keep it."""
@@ -220,9 +220,8 @@ class MosaicCrops:
 
     def draw(self, generator: torch.Generator) -> Sample:
         """Draw a sample: noisy RAW and planes ``(4, crop, crop)``, clean RAW and variance ``(1, crop, crop)``."""
-        kind = int(torch.multinomial(self.shares, 1, generator=generator))
-        pairs = self.pairs[kind]
-        pattern = self.patterns[kind]
+        number = int(torch.multinomial(self.shares, 1, generator=generator))
+        pairs, pattern = self.pairs[number], self.patterns[number]
         pair = pairs.draw(int(torch.randint(len(pairs), (), generator=generator)), generator)
 
         cell = 2 * torch.randint(pattern.period // 2, (2,), generator=generator)

@@ -105,19 +105,19 @@ class SrgbSamples:
         """Draw one sample for each generator; those of the camera are made together."""
         samples: dict[int, Sample] = {}
         of_camera: dict[int, torch.Generator] = {}
-        for place, generator in enumerate(generators):
+        for number, generator in enumerate(generators):
             if self.drawn is not None and (self.camera is None or self._is_drawn(generator)):
-                samples[place] = self.drawn.draw(generator)
+                samples[number] = self.drawn.draw(generator)
             else:
-                of_camera[place] = generator
+                of_camera[number] = generator
 
         if self.camera is not None and of_camera:
             batch = self.camera.draw_batch(list(of_camera.values()))
             samples.update(zip(of_camera, batch, strict=True))
 
         in_order = []
-        for place, generator in enumerate(generators):
-            sample = samples[place]
+        for number, generator in enumerate(generators):
+            sample = samples[number]
             if self.noise_level is not None:
                 sample = self.noise_level.apply(sample, self.noise_level.sample(generator))
             in_order.append(sample)

@@ -35,7 +35,7 @@ from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.descent import Descent, adam, cycle_error, draw_batch, mean_psnr, reading_error, trained_tensors
 from rawaug.isp.fit.end_to_end import Refit, gain_left_out, train_encoders, train_jointly
 from rawaug.isp.fit.samples import FitFrames, FramePair, FrameSummary, PixelSamples, sample_pixels
-from rawaug.isp.fit.start import FEWEST_PIXELS, FrameColour, fit_colours, fit_fall_off, linear_light, set_curve, tie
+from rawaug.isp.fit.start import FEWEST_PIXELS, FrameColour, fit_colours, fit_fall_off, set_curve, shaded_light, tie
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import Gamma, LensShading, ToneMap
 from rawaug.isp.tone import ToneCurve, to_linear
@@ -217,8 +217,8 @@ def fit_reverse(
 
     colour = _fit_curve(isp, frames, config, descent, part, known_matrix)
     if config.start is not None:
-        other = DictionaryISP.from_pretrained(config.start)
-        colour = _start_from(isp, other, colour, frames.pixels, known_matrix)
+        start = DictionaryISP.from_pretrained(config.start)
+        colour = _start_from(isp, start, colour, frames.pixels, known_matrix)
     _fit_tone(isp, colour, frames, config, descent, part, report)
     set_dictionaries(isp, colour, frames, config)
     return isp, colour
@@ -241,19 +241,19 @@ def _fit_curve(
     for curve in _STANDARD_CURVES:
         set_curve(isp, *curve)
         with torch.no_grad():
-            colour, error = fit_colours(linear_light(isp, frames.pixels), frames.pixels, known_matrix)
+            colour, error = fit_colours(shaded_light(isp, frames.pixels), frames.pixels, known_matrix)
         starts.append((error, curve, colour))
     _, curve, colour = min(starts, key=lambda start: start[0])
     set_curve(isp, *curve)
 
     def loss(generator: torch.Generator) -> Tensor:
         chosen, pixels = draw_batch(frames.pixels, config.batch, generator)
-        predicted = functional.correct_colour(linear_light(isp, pixels), colour.pick(chosen).product())
+        predicted = functional.correct_colour(shaded_light(isp, pixels), colour.pick(chosen).product())
         return reading_error(predicted, pixels) + tie(colour, frames)
 
     def current_error() -> float:
         with torch.no_grad():
-            predicted = functional.correct_colour(linear_light(isp, frames.pixels), colour.product())
+            predicted = functional.correct_colour(shaded_light(isp, frames.pixels), colour.product())
             return float(reading_error(predicted, frames.pixels))
 
     shading = isp.stages.find(LensShading)
@@ -266,7 +266,7 @@ def _fit_curve(
     keeps_mask = False
     if shading is not None and mode != "off":
         with torch.no_grad():
-            mean, precision = fit_fall_off(linear_light(isp, frames.pixels), frames.pixels, colour.product())
+            mean, precision = fit_fall_off(shaded_light(isp, frames.pixels), frames.pixels, colour.product())
         keeps_mask = mode == "on" or _darkens_corners(mean, precision)
 
     if shading is not None and keeps_mask:
@@ -300,7 +300,7 @@ def _darkens_corners(mean: Tensor, precision: Tensor) -> bool:
 
 
 def _start_from(
-    isp: DictionaryISP, other: DictionaryISP, colour: FrameColour, pixels: PixelSamples, known_matrix: Tensor | None
+    isp: DictionaryISP, start: DictionaryISP, colour: FrameColour, pixels: PixelSamples, known_matrix: Tensor | None
 ) -> FrameColour:
     """Start the tone from that of another ISP, or the best of its curves, if that improves the frames.
 
@@ -309,18 +309,18 @@ def _start_from(
 
     @torch.no_grad()
     def fit_under(curve: Callable[[Tensor], Tensor]) -> tuple[FrameColour, float]:
-        return fit_colours(linear_light(isp, pixels, curve), pixels, known_matrix)
+        return fit_colours(shaded_light(isp, pixels, curve), pixels, known_matrix)
 
-    curves: list[Callable[[Tensor], Tensor]] = [other.stages.linear]
-    if other.tone is not None:
-        curves = [partial(_apply_table, table) for table in other.tone.curves]
+    curves: list[Callable[[Tensor], Tensor]] = [start.stages.linear]
+    if start.tone is not None:
+        curves = [partial(_apply_table, table) for table in start.tone.curves]
     errors = [fit_under(curve)[1] for curve in curves]
     best = curves[errors.index(min(errors))]
     _, error = fit_under(isp.stages.linear)
     if min(errors) >= error:
         return colour
 
-    # Descend towards x2 by the other's tone, on greys and on the colours of a cube.
+    # Descend towards x2 by its tone, on greys and on the colours of a cube.
     greys = torch.linspace(0.0, 1.0, 256).expand(1, 3, 1, -1)
     colours = torch.cat([greys, stages.node_colours(9).flatten(2)[:, :, None]], dim=3)
     with torch.no_grad():

@@ -50,7 +50,7 @@ def set_curve(isp: DictionaryISP, gamma: float, toe: float) -> None:
         table.slopes = torch.zeros(len(table.dictionary.curves), PIECES)
 
 
-def linear_light(isp: DictionaryISP, pixels: PixelSamples, curve: Callable[[Tensor], Tensor] | None = None) -> Tensor:
+def shaded_light(isp: DictionaryISP, pixels: PixelSamples, curve: Callable[[Tensor], Tensor] | None = None) -> Tensor:
     """Compute x2 times the mask ``(F, 3, 1, P)``, which ``M_f`` takes to RAW; by default by the ISP's own curve."""
     x = (curve or isp.stages.linear)(pixels.srgb)
     shading = isp.stages.find(LensShading)
