@@ -29,9 +29,7 @@ if TYPE_CHECKING:
     from rawaug.plugin.draw import Draw as Draw
     from rawaug.plugin.finishing import Finish as Finish
     from rawaug.plugin.loader import ResumableLoader as ResumableLoader
-    from rawaug.plugin.loader import WrappedLoader as WrappedLoader
     from rawaug.plugin.loader import resumable as resumable
-    from rawaug.plugin.loader import wrap as wrap
     from rawaug.plugin.params import AugmentParams as AugmentParams
     from rawaug.plugin.params import RawPair as RawPair
     from rawaug.plugin.params import load_params as load_params
@@ -39,6 +37,8 @@ if TYPE_CHECKING:
     from rawaug.plugin.stream import RawPairStream as RawPairStream
     from rawaug.plugin.targets import Burst as Burst
     from rawaug.plugin.targets import Srgb as Srgb
+    from rawaug.plugin.wrapped import WrappedLoader as WrappedLoader
+    from rawaug.plugin.wrapped import wrap as wrap
     from rawaug.synthesis.folder import synth as synth
     from rawaug.training.camera_fit import fit as fit
 
@@ -58,9 +58,10 @@ _PUBLIC = {
     "rawaug.plugin.degradation": ("ISPModel",),
     "rawaug.plugin.draw": ("Draw",),
     "rawaug.plugin.finishing": ("Finish",),
-    "rawaug.plugin.loader": ("ResumableLoader", "WrappedLoader", "resumable", "wrap"),
+    "rawaug.plugin.loader": ("ResumableLoader", "resumable"),
     "rawaug.plugin.params": ("AugmentParams", "RawPair", "load_params", "save_params"),
     "rawaug.plugin.targets": ("Burst", "Srgb"),
+    "rawaug.plugin.wrapped": ("WrappedLoader", "wrap"),
     "rawaug.synthesis.folder": ("synth",),
     "rawaug.training.camera_fit": ("fit",),
 }

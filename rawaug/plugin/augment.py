@@ -7,7 +7,7 @@ white, never at black (Conde et al., AAAI 2022, "Dictionary Augmentations").
 
 :class:`RawAugment` works on batches, on the device of the batch. It first draws its parameters and then applies them;
 the same parameters reproduce the pair bit for bit. :mod:`rawaug.plugin.dataset` applies it to a Dataset,
-:mod:`rawaug.plugin.loader` to a DataLoader.
+:mod:`rawaug.plugin.wrapped` to a DataLoader.
 """
 
 from __future__ import annotations

@@ -18,9 +18,9 @@ from rawaug.noise import FixedLevels, ShotReadNoise
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.finishing import Finish
 from rawaug.plugin.jpeg import compress_jpeg
-from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
 from rawaug.plugin.targets import Burst, Srgb
+from rawaug.plugin.wrapped import wrap
 from tests.rawaug.kernels.full_isp import CONFIGURATIONS, full_isp
 
 pytestmark = pytest.mark.gpu

@@ -10,9 +10,9 @@ from rawaug.isp.config import ISPParams
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.draw import Draw
-from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import AugmentParams
 from rawaug.plugin.stream import RawPairStream
+from rawaug.plugin.wrapped import wrap
 
 
 def half_dark() -> Tensor:

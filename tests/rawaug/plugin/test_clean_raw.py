@@ -18,8 +18,8 @@ from rawaug.io import RawFrame
 from rawaug.noise import RowNoise
 from rawaug.plugin.clean_raw import RawNoise
 from rawaug.plugin.dataset import RawPairs
-from rawaug.plugin.loader import wrap
 from rawaug.plugin.stream import RawPairStream
+from rawaug.plugin.wrapped import wrap
 
 LEVELS = (1e-3, 1e-5)
 

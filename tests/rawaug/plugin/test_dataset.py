@@ -26,9 +26,9 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.crops import draw_crop
 from rawaug.plugin.dataset import RawPairs
-from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
 from rawaug.plugin.stream import RawPairStream
+from rawaug.plugin.wrapped import wrap
 
 COUNT = 12
 

@@ -20,9 +20,9 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.draw import Draw
-from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import PairForm, pair_form
 from rawaug.plugin.stream import RawPairStream
+from rawaug.plugin.wrapped import wrap
 
 
 @pytest.fixture(scope="module")

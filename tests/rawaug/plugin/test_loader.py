@@ -16,8 +16,8 @@ from torch.utils.data import DataLoader, TensorDataset
 
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
+from rawaug.plugin.wrapped import wrap
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from benchmarks.resuming import Case, Counted, loader_of, outcome, resumable, wr
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.epochs import Visits
-from rawaug.plugin.loader import wrap
+from rawaug.plugin.wrapped import wrap
 
 POOLS = [(0, False), (2, True)]
 """Workers, and whether they are persistent; `fork` is fast."""

@@ -15,9 +15,9 @@ from torch.utils.data import BatchSampler, DataLoader, DistributedSampler, Rando
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.draw import Draw
-from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
 from rawaug.plugin.stream import RawPairStream
+from rawaug.plugin.wrapped import wrap
 
 LEVELS = range(0, 200, 25)
 """Grey levels of eight pictures, which show in what becomes of them."""
