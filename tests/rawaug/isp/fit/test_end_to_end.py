@@ -13,7 +13,7 @@ from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig, end_to_end, fit_isp, pipeline
 from rawaug.isp.fit.atoms import measure_lights
 from rawaug.isp.fit.descent import Descent, mean_psnr
-from rawaug.isp.fit.end_to_end import CURVE_POINTS, joint_steps, train_jointly
+from rawaug.isp.fit.end_to_end import joint_steps, train_jointly
 from rawaug.isp.fit.samples import FitFrames, sample_pixels
 from rawaug.isp.fit.start import FrameColour
 from rawaug.isp.model import DictionaryISP
@@ -138,7 +138,10 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return train
 
 
-def test_the_watched_frame_gains(isp: DictionaryISP, frames: list[Pair], trained: Callable[..., None]) -> None:
+def test_the_watched_frame_gains(
+    isp: DictionaryISP, frames: list[Pair], trained: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(end_to_end, "CURVE_POINTS", 3)
     assert "joint" not in isp.info
     with torch.no_grad():
         isp.gain.log_gains.add_(0.1)
@@ -148,6 +151,9 @@ def test_the_watched_frame_gains(isp: DictionaryISP, frames: list[Pair], trained
     gain, info = mean_psnr(isp, drawn.some([0])) - before, isp.info["joint"]
     assert gain > 3.0 and info["gain_db"] == pytest.approx(gain, abs=0.006)
     assert info["steps"] == 20 and info["kept_step"] in (5, 10, 15, 20)
+    first, _, last = info["curve"]  # of five scores
+    assert first == pytest.approx(before, abs=0.006)
+    assert (last == pytest.approx(before + gain, abs=0.006)) == (info["kept_step"] == 20)
 
 
 def test_where_every_step_is_worse_the_start_remains(
@@ -157,7 +163,7 @@ def test_where_every_step_is_worse_the_start_remains(
     trained(isp, sample_pixels(frames, CONFIG.pixels, CONFIG.seed), steps=10, learning_rate=1.0)
     record = isp.info["joint"]
     assert (record["steps"], record["kept_step"], record["gain_db"]) == (10, 0, 0.0)
-    assert record["curve"][0] == max(record["curve"]) and len(record["curve"]) <= CURVE_POINTS
+    assert record["curve"][0] == max(record["curve"])
     assert all(torch.equal(value, before[key]) for key, value in isp.state_dict().items())
 
 
