@@ -366,7 +366,9 @@ class RawPairs(Pairs[Sample]):
                 raise ValueError(f"picture {names}: {error}") from error
 
             for row, number in enumerate(group):
-                pair = pairs.map(operator.itemgetter(row))
+                pair = RawPair(pairs.noisy[row], pairs.clean[row], pairs.variance[row], pairs.params)
+                if self.form.reads_params:  # to take a row of ten small tensors costs as much as to make its pixels
+                    pair = pair._replace(params=pairs.params.map(operator.itemgetter(row)))
                 name = None
                 if self.form.fields and "name" in self.form.fields:
                     name = self._sample_name(indices[number])

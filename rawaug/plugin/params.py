@@ -180,6 +180,11 @@ class PairForm:
     keys: tuple[str, ...] | None = None
     planes: tuple[int, ...] | None = None
 
+    @property
+    def reads_params(self) -> bool:
+        """Whether the parameters of a pair are handed over, or looked at."""
+        return self.fields is None or "params" in self.fields or "level" in self.fields
+
     def __call__(self, pair: RawPair, name: str | None = None, picture: Tensor | None = None) -> Any:
         """Hand over a pair, with or without B.
 
