@@ -94,4 +94,4 @@ $(VENV)/.uv: | $(BIN)/python
 
 $(WHEEL): setup.cfg $(VENV)/.uv
 	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/resolve .
-	echo "rawaug[test,docs] @ file://$(CURDIR)/$$(ls build/resolve/rawaug-*.whl)" > $@
+	echo "rawaug[test,docs,openvino] @ file://$(CURDIR)/$$(ls build/resolve/rawaug-*.whl)" > $@

@@ -38,7 +38,7 @@ from denoisers.layers import PACKED
 from denoisers.network import DENOISERS, Shared
 from rawaug.data import open_pictures
 from rawaug.data.frames import Cached
-from rawaug.evaluation.benchmark import STRENGTHS, TOLD
+from rawaug.evaluation.benchmark import STRENGTHS
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.recipe import find_recipe, read_recipe
@@ -263,8 +263,7 @@ def validation_trials() -> list[Trial]:
     """The middles of the validation frames at each strength, which stands for the condition: a column of the log."""
     trials = []
     for trial in frozen_trials(VALIDATION, MIDDLE):
-        if trial.condition == TOLD:
-            trials.append(replace(trial, condition=trial.strength, develop=None))
+        trials.append(replace(trial, condition=trial.strength, develop=None))
     return trials
 
 

@@ -35,7 +35,6 @@ from rawaug import bayer
 from rawaug.bayer import noise_variance
 from rawaug.denoising.denoiser import Noisy, RawDenoiser
 from rawaug.denoising.risk import estimate_risk, probe_denoiser
-from rawaug.evaluation.benchmark import TOLD
 from rawaug.evaluation.judge import judge_noisy
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Trial
@@ -239,7 +238,7 @@ def main(command: Sequence[str] | None = None) -> None:
         return
 
     for name in args.sets if denoisers else ():
-        everything = [trial for trial in frozen_trials(name, args.crop) if trial.condition == TOLD]
+        everything = frozen_trials(name, args.crop)
         chosen = list(dict.fromkeys(trial.frame for trial in everything))[: args.count]
         for trial in everything:
             frames = table.setdefault(f"{name}, {trial.strength}", {})

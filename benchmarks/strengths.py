@@ -62,18 +62,23 @@ def main(command: Sequence[str] | None = None) -> None:
     conditions = [TOLD, REAL] if args.sensors else [TOLD]
 
     for name in args.sets:
-        everything = []
-        for trial in frozen_trials(name, args.crop, args.noise, args.middle):
-            if trial.condition in conditions and (not args.strengths or trial.strength in args.strengths):
-                everything.append(trial)
+        everything = frozen_trials(name, args.crop, args.noise, args.middle, conditions)
+        if args.strengths:
+            everything = [trial for trial in everything if trial.strength in args.strengths]
         for spec in ["noisy", *args.denoisers]:
             add_scores(table, name, spec, everything, args.table)
     add_costs(table, args.denoisers, args.table)
     print_table(table)
 
 
-def frozen_trials(spec: str, crop: int, noise: NoiseSpec | None = None, middle: int | None = None) -> list[Trial]:
-    """The middles of all frames of a set, such as ``FOLDER@4``, under every condition and strength.
+def frozen_trials(
+    spec: str,
+    crop: int,
+    noise: NoiseSpec | None = None,
+    middle: int | None = None,
+    conditions: Sequence[str] = (TOLD,),
+) -> list[Trial]:
+    """The middles of all frames of a set, such as ``FOLDER@4``, under these conditions at every strength.
 
     Noise is drawn on whole frames, or on a ``middle`` of this side.
     """
@@ -82,7 +87,7 @@ def frozen_trials(spec: str, crop: int, noise: NoiseSpec | None = None, middle: 
     frames = measure_own_noise(pairs, len(pairs)).binned(int(factor or 1))
     if middle is not None:
         frames = frames.middles(middle)
-    return benchmark_trials(frames, crop, strengths=choose_strengths(noise))
+    return benchmark_trials(frames, crop, strengths=choose_strengths(noise), conditions=conditions)
 
 
 def add_scores(table: Scores, name: str, spec: str, everything: Sequence[Trial], path: Path) -> None:

@@ -17,6 +17,7 @@ from benchmarks import (
     denoise,
     figures,
     gpu,
+    grain,
     ingredients,
     judging,
     measure,
@@ -150,6 +151,12 @@ def test_ingredients_are_trained_once_for_a_table(
     assert [point["step"] for point in both["1"]["curve"]] == [1, 2, 3, 4, 5]
     assert both["1"]["curve"][-1]["psnr_phone"] != both["0"]["curve"][-1]["psnr_phone"]
     assert "±" in capsys.readouterr().out
+
+
+def test_grain_of_one_per_cent_of_mid_grey_stays() -> None:
+    strong = math.sqrt(7e-3 * 0.18 + 1.8e-4) / 0.18
+    assert (1.0 - grain.share_removed(7e-3, 1.8e-4)) * strong == pytest.approx(0.01)
+    assert grain.share_removed(1e-7, 1e-9) == 0.0, "weaker noise stays as it is"
 
 
 def test_patterns_are_compared_in_full_colour(tmp_path: Path) -> None:

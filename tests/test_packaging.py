@@ -25,7 +25,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[1]
 PYTHONS = ("3.11", "3.12", "3.13")
 PLATFORMS = {"linux": ("Linux", "x86_64"), "darwin": ("Darwin", "arm64"), "win32": ("Windows", "AMD64")}
-LOCKED = ("raw", "train", "data", "test", "docs", "export", "explore")
+LOCKED = ("raw", "train", "data", "test", "docs", "export", "explore", "openvino")
 
 
 def environment(python: str, platform: str) -> dict[str, str]:

@@ -91,7 +91,11 @@ def choose_strengths(noise: NoiseSpec | None = None, isos: Sequence[float] | Non
 
 
 def benchmark_trials(
-    frames: Iterable[Pair], crop: int, seed: int = 0, strengths: Mapping[str, NoiseLevels] | None = None
+    frames: Iterable[Pair],
+    crop: int,
+    seed: int = 0,
+    strengths: Mapping[str, NoiseLevels] | None = None,
+    conditions: Collection[str] = _CONDITIONS,
 ) -> list[Trial]:
     """Make the middles of all frames under every condition and strength; same frames and seed give the same bits.
 
@@ -102,21 +106,26 @@ def benchmark_trials(
         crop: side of the middles in pixels of the mosaic.
         seed: seed of the noise.
         strengths: noise levels by name, see :func:`choose_strengths`.
+        conditions: which of the three are wanted, by the names of their tables.
     """
     strengths = strengths or choose_strengths()
     with_faults = set(_OF_SENSORS).intersection(strengths) or set(strengths)
+    if REAL not in conditions:
+        with_faults = set()
 
     trials: list[Trial] = []
     for frame in progress(frames, label="noise", unit="frame"):
         middle = frame.middle(crop)
         for name, levels in strengths.items():
             exact = draw_noisy(frame, name, levels, seed)
-            trials.append(_middle(exact, middle, crop, TOLD, name))
+            if TOLD in conditions:
+                trials.append(_middle(exact, middle, crop, TOLD, name))
 
-            with suppress(ValueError):  # too little of the frame is flat
-                estimate = estimate_noise(bayer.unpack(exact.image, frame.cfa)[0], frame.cfa)
-                estimated = Noisy.of(exact.image, (estimate.shot_var, estimate.read_var), frame.cfa)
-                trials.append(_middle(estimated, middle, crop, ESTIMATED, name))
+            if ESTIMATED in conditions:
+                with suppress(ValueError):  # too little of the frame is flat
+                    estimate = estimate_noise(bayer.unpack(exact.image, frame.cfa)[0], frame.cfa)
+                    estimated = Noisy.of(exact.image, (estimate.shot_var, estimate.read_var), frame.cfa)
+                    trials.append(_middle(estimated, middle, crop, ESTIMATED, name))
 
             if name in with_faults:
                 faulty = draw_noisy(frame, name, levels, seed, real=True)
