@@ -12,7 +12,6 @@ by numbers or by EXIF, is converted by :mod:`rawaug.io.colour`. Pictures that ar
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -252,27 +251,8 @@ def encode_png(srgb: Tensor) -> bytes:
 _EXPOSURE_TIME, _F_NUMBER, _ISO, _EXPOSURE_INDEX = 33434, 33437, 34855, 34866
 
 
-def read_exposure(path: str | Path) -> float:
-    """Read the exposure in stops, ``log2(t S / (100 N^2))``, from EXIF's seconds t, ISO S and f-number N.
-
-    One stop more is twice the RAW value; unlike the exposure value of ISO 2720, it grows with exposure.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the EXIF lacks one of the three.
-    """
-    require_file(path, "picture file")
-    exposure = _exposure_tags(Path(path))
-    missing = [name for name, value in exposure.items() if not 0 < value < math.inf]
-    if missing:
-        raise ValueError(f"{path}: its EXIF has no {' or '.join(missing)}; give the exposures as ev=")
-
-    seconds, f_number, speed = exposure.values()
-    return math.log2(seconds * speed / (100.0 * f_number**2))
-
-
-def _exposure_tags(path: Path) -> dict[str, float]:
-    """Read seconds, f-number and ISO as EXIF states them, with 0 for none."""
+def read_exposure(path: Path) -> dict[str, float]:
+    """Read exposure time in seconds, f-number and ISO as the EXIF of a picture states them, with 0 for none."""
     values = {"exposure time": 0.0, "f-number": 0.0, "ISO": 0.0}
     exif = read_exif(path, identify_content(path).format)
     if exif is None:

@@ -39,24 +39,27 @@ def read_shot(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
 
 
 def read_shot_exposure(path: str | Path) -> float:
-    """Read the exposure in stops as :func:`rawaug.io.pictures.read_exposure` defines it.
+    """Read the exposure in stops, ``log2(t S / (100 N^2))``, of seconds t, ISO S and f-number N.
+
+    One stop more is twice the RAW value; unlike the exposure value of ISO 2720, it grows with exposure.
 
     Raises:
         FileNotFoundError, OSError: if the file is missing or damaged.
-        ValueError: if it does not state its exposure.
+        ValueError: if it does not state one of the three.
     """
-    if not is_raw(path):
-        return read_exposure(path)
+    path = Path(path)
+    if is_raw(path):
+        frame = read_raw(path)
+        exposure = {
+            "exposure time": frame.exposure.seconds or 0.0,
+            "f-number": frame.exposure.f_number or 0.0,
+            "ISO": frame.iso or 0.0,
+        }
+    else:
+        exposure = read_exposure(path)
 
-    frame = read_raw(path)
-    exposure = {
-        "exposure time": frame.exposure.seconds or 0.0,
-        "f-number": frame.exposure.f_number or 0.0,
-        "ISO": frame.iso or 0.0,
-    }
-    missing = [name for name, value in exposure.items() if not value]
+    missing = [name for name, value in exposure.items() if not 0 < value < math.inf]
     if missing:
         raise ValueError(f"{path}: does not state its {' or '.join(missing)}; give the exposures as ev=")
-
     seconds, f_number, speed = exposure.values()
     return math.log2(seconds * speed / (100.0 * f_number**2))

@@ -15,7 +15,8 @@ from rawaug.commands.hdr import exposures, hdr
 from rawaug.commands.hdr import run as hdr_command
 from rawaug.data.demo import demo_photographs
 from rawaug.io import read_picture, write_picture
-from rawaug.io.pictures import decode_srgb, encode_srgb, read_exposure
+from rawaug.io.pictures import decode_srgb, encode_srgb
+from rawaug.io.shots import read_shot_exposure
 from rawaug.io.stored import read_stored
 
 
@@ -43,7 +44,7 @@ def test_exif_gives_stops_relative_to_the_median(tmp_path: Path) -> None:
         shot(tmp_path / "iso.jpg", 90, 1 / 120, iso=200),
     ]
     assert exposures(paths, None) == pytest.approx([2.0, -2.0, 0.0], abs=1e-3)
-    assert read_exposure(paths[0]) == pytest.approx(math.log2(1 / 15 / 16), abs=1e-3)
+    assert read_shot_exposure(paths[0]) == pytest.approx(math.log2(1 / 15 / 16), abs=1e-3)
 
 
 def test_the_command_writes_the_merged_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -69,7 +70,7 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
     first, second = shot(tmp_path / "a.jpg", 60, 1 / 60), shot(tmp_path / "b.jpg", 90)
     wide = shot(tmp_path / "wide.jpg", 90, 1 / 15, size=(8, 16))
     for pictures, stops, message in (
-        ([first, second], None, r"b\.jpg: its EXIF has no exposure time or f-number or ISO; give .* as ev=$"),
+        ([first, second], None, r"b\.jpg: does not state its exposure time or f-number or ISO; give .* as ev=$"),
         ([first, wide], None, r"wide\.jpg: is 8 x 16, but .*a\.jpg is 8 x 12; align and crop"),
         ([first, second], [0.0], r"--ev: one exposure for each picture is needed, got 1 for 2$"),
         ([first, second], [0.0, math.inf], r"an exposure must be a number from -30.0 to 30.0, got inf"),
@@ -102,7 +103,7 @@ def test_a_handheld_bracket_is_written_in_16_bits_with_exif_and_as_linear_light(
 
     stored = read_stored(tmp_path / "merged.tif")
     assert stored.colours.dtype == np.uint16
-    assert read_exposure(tmp_path / "merged.tif") == pytest.approx(read_exposure(paths[1]), abs=1e-3)
+    assert read_shot_exposure(tmp_path / "merged.tif") == pytest.approx(read_shot_exposure(paths[1]), abs=1e-3)
     tripod = hdr(still, align=False)
     error = (stored.srgb - tripod).square().mean()
     assert error < 0.1 * (hdr(paths, align=False) - tripod).square().mean()
