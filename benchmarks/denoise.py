@@ -66,10 +66,11 @@ def command(noisy: Tensor, denoiser: str, device: torch.device, repeats: int) ->
     """``rawaug denoise``, reading and writing included."""
     shot = small_frame(bayer.unpack(noisy[0].cpu(), "RGGB"), bayer.CFA.RGGB)
     method = RawDenoiser.of(denoiser, device, "auto")
+    files = RawFiles(method, linear=method.demosaics)
     with tempfile.TemporaryDirectory() as folder:
         source, out = Path(folder, "noisy.dng"), Path(folder, "denoised.dng")
         write_dng(source, shot)
-        runs = [denoise_file(source, out, RawFiles(method), overwrite=True)[1].seconds for _ in range(1 + repeats)]
+        runs = [denoise_file(source, out, files, overwrite=True)[1].seconds for _ in range(1 + repeats)]
     return {"seconds": min(runs[1:]), "Mpix/s": noisy.numel() / min(runs[1:]) / 1e6}
 
 
