@@ -78,8 +78,8 @@ def run(
     spec = network_or_filter(denoiser, classical, self_ensemble, linear)
     require_results(json, None, overwrite, [source])
     guarded = None if guard == "auto" else guard == "on"
-    for_raw = {"noise": noise, "greens": greens, "defects": defects, "guard": guarded}
-    kind = files_for(source, spec, strength, linear, self_ensemble, device, **for_raw)
+    for_raw = {"linear": linear, "noise": noise, "greens": greens, "defects": defects, "guard": guarded}
+    kind = files_for(source, spec, strength, self_ensemble, device, **for_raw)
     if spec is None and isinstance(kind, RawFiles) and kind.denoiser.name == "rawaug-small":
         seconds = expect_seconds("rawaug-base", USUAL)
         print(

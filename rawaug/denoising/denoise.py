@@ -67,8 +67,8 @@ def denoise(
         >>> frame = rawaug.denoise("in.dng", "out.dng", denoiser="rawaug-base")  # doctest: +SKIP
         >>> srgb = rawaug.denoise("in.jpg")  # doctest: +SKIP
     """
-    for_raw = {"noise": noise, "greens": greens, "defects": defects, "guard": guard}
-    files = files_for(source, denoiser, strength, linear, self_ensemble, device, **for_raw)
+    for_raw = {"linear": linear, "noise": noise, "greens": greens, "defects": defects, "guard": guard}
+    files = files_for(source, denoiser, strength, self_ensemble, device, **for_raw)
     if not isinstance(source, RawFrame):
         image, _ = denoise_file(source, out, files, preview=preview, overwrite=overwrite)
         return image
@@ -83,7 +83,6 @@ def files_for(
     source: str | Path | RawFrame,
     denoiser: Any = None,
     strength: Strength = 1.0,
-    linear: bool = False,
     self_ensemble: bool = False,
     device: str = "auto",
     **for_raw: Any,
@@ -93,19 +92,18 @@ def files_for(
     Args:
         source: a file, a folder or a frame.
         denoiser: None for the shipped one.
-        strength, linear, self_ensemble, device: as in :func:`denoise`, for the denoiser.
-        for_raw: ``noise``, ``greens``, ``defects`` and ``guard`` of :func:`denoise`; a picture takes none.
+        strength, self_ensemble, device: as in :func:`denoise`, for the denoiser.
+        for_raw: ``linear``, ``noise``, ``greens``, ``defects`` and ``guard`` of :func:`denoise`; a picture takes none.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is a file of no kind, or a setting does not fit it.
     """
     if _is_raw(source):
-        return RawFiles(denoiser, strength, linear, self_ensemble, device, **for_raw)
+        return RawFiles(denoiser, strength, self_ensemble, device, **for_raw)
 
     defaults = inspect.signature(RawFiles).parameters
-    stated = ["linear"] if linear else []
-    stated += [argument for argument, value in for_raw.items() if value != defaults[argument].default]
+    stated = [argument for argument, value in for_raw.items() if value != defaults[argument].default]
     if stated:
         raise ValueError(f"{source}: is a developed picture; {stated[0]}= is for RAW")
     if isinstance(strength, str):

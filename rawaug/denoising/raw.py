@@ -166,9 +166,8 @@ class RawFiles(Files[Denoised]):
     Args:
         denoiser: whatever :meth:`rawaug.RawDenoiser.of` takes; None stands for the shipped one of each frame's pattern,
             or for the one that demosaics.
-        strength, linear, self_ensemble, device: how strongly it denoises, whether it demosaics, too, whether it
-            averages eight views, and where it runs.
-        noise, greens, defects, guard: as in :func:`rawaug.denoise`.
+        strength, self_ensemble, device: how strongly it denoises, whether it averages eight views, and where it runs.
+        linear, noise, greens, defects, guard: as in :func:`rawaug.denoise`.
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -186,10 +185,10 @@ class RawFiles(Files[Denoised]):
         self,
         denoiser: Any = None,
         strength: Strength = 1.0,
-        linear: bool = False,
         self_ensemble: bool = False,
         device: str = "auto",
         *,
+        linear: bool = False,
         noise: Noise = "auto",
         greens: Greens = "auto",
         defects: str | Path = "mend",
