@@ -251,6 +251,12 @@ def test_a_folder_a_file_and_a_list(shots: Path) -> None:
         pairs[2]
 
 
+def test_a_pair_says_whether_its_colours_are_known(tmp_path: Path, bayer_dng: Dng) -> None:
+    bayer_dng(tmp_path / "known.dng", NUMBERS)
+    bayer_dng(tmp_path / "unknown.dng", NUMBERS, color_matrix=None)
+    assert [pair.clean.color_known for pair in RawFolder(tmp_path)] == [True, False]
+
+
 def test_a_link_to_itself_is_one_unreadable_frame_of_a_folder(shots: Path) -> None:
     (shots / "sub" / "b.dng").symlink_to(shots / "sub" / "b.dng")
     pairs = Readable(RawFolder(shots))
