@@ -111,7 +111,7 @@ class RawAugment(PairMaker):
         if self.pattern is not None and self.pattern.name in CFA.__members__:
             isp, self.pattern = deepcopy(isp), None
             isp.configure(cfa=str(cfa))
-        self.isp = freeze(isp)
+        self.isp = freeze(deepcopy(isp))
         self.baked = freeze(BakedISP(isp))
 
         self.srgb: Srgb | None = None
@@ -546,15 +546,14 @@ M = TypeVar("M", bound=nn.Module)
 
 
 def freeze(module: M) -> M:
-    """Copy a module in eval mode, with its tensors as buffers that no ``state_dict`` holds."""
-    frozen = deepcopy(module).eval()
-    for part in frozen.modules():
+    """Put a module in eval mode, with its tensors as buffers that no ``state_dict`` holds."""
+    for part in module.eval().modules():
         tensors = {**part._parameters, **part._buffers}
         for name, tensor in tensors.items():
             if tensor is not None:
                 delattr(part, name)
                 part.register_buffer(name, tensor.detach(), persistent=False)
-    return frozen
+    return module
 
 
 def _isp_of_camera(camera: Camera | str | Path) -> DictionaryISP:
