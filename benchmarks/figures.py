@@ -10,7 +10,7 @@ shipped networks among its columns. Figures are texts by row and column, as page
 that was measured.
 
 A row of drawn noise has the mean PSNR over frames, RAW / developed sRGB, bold where a denoiser is ahead of every other
-one by paired differences. Two more rows have the mean difference to PBRID in RAW and its 95 % interval,
+one by paired differences, of PBRID, too. Two more rows have the mean difference to PBRID in RAW and its 95 % interval,
 
 .. math:: d_n = \mathrm{PSNR}_n - \mathrm{PSNR}^\mathrm{PBRID}_n .
 """
@@ -104,7 +104,7 @@ def figures_of_drawn_noise(row: str, scores: Scores) -> dict[str, dict[str, str]
         cells = []
         for k in range(2):
             text = f"{fmean(frame[k] for frame in frames):.2f}"
-            if _leads(name, scores, k):
+            if REFERENCE in scores and _leads(name, scores, k):
                 text = f"**{text}**"
             cells.append(text)
         figures[row][name] = " / ".join(cells)
