@@ -33,7 +33,7 @@ class Pair:
     Attributes:
         name: name of the shot, for reports.
         clean: the clean frame, of a Bayer pattern. Its ``noise_profile`` is its own noise, if that was measured.
-            Without ``color_known`` no ISP can be fitted to it.
+            Without ``color_known`` and a white balance no ISP can be fitted to it.
         srgb: the picture of ``clean``, uint8 ``(3, H, W)``, in the sensor's orientation.
         noisy: a noisy frame of the same scene, like ``clean``, if one was captured. Its ``noise_profile`` has
             (shot_var, read_var): its variance is shot_var * clean + read_var.
@@ -121,6 +121,7 @@ class Pair:
 
     @property
     def balance_known(self) -> bool:
+        """Whether the clean frame states its white balance."""
         return self.clean.white_balance != (1.0, 1.0, 1.0)
 
     def with_levels(self) -> Pair:

@@ -244,7 +244,7 @@ def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[P
     real = {name: arm for name, arm in recipe.arms.items() if arm.augmented < 1.0}
 
     for pair in pairs:
-        if recipe.isp is None and not pair.clean.color_known:
+        if recipe.isp is None and not (pair.clean.color_known or pair.balance_known):
             raise ValueError(
                 f"{pair.name}: its white balance and colour matrix are unknown, so no ISP can be fitted to it; "
                 "use a shipped one: isp: universal"

@@ -68,6 +68,10 @@ class FramePair(Protocol):
         """The clean frame."""
 
     @property
+    def balance_known(self) -> bool:
+        """Whether the frame states its white balance."""
+
+    @property
     def noisy(self) -> Frame | None:
         """The captured noisy frame, if there is one."""
 
@@ -171,7 +175,7 @@ def sample_pixels(pairs: Iterable[FramePair], pixels: int, seed: int, noisy: boo
     frames = []
     shots = []
     for pair in pairs:
-        if not pair.clean.color_known:
+        if not (pair.clean.color_known or pair.balance_known):
             unknown = "its white balance and colour matrix are unknown"
             raise ValueError(f"{pair.name}: {unknown}; use an ISP such as universal")
         frame = pair.noisy if noisy else pair.clean

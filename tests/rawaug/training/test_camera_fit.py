@@ -18,6 +18,7 @@ from rawaug.files import write_tensors
 from rawaug.io import read_picture, read_raw_and_develop, write_picture
 from rawaug.isp.fit import descent
 from rawaug.isp.fit.descent import Descent
+from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.model import DictionaryISP
 
 QUICK = ["--steps", "4", "--curve-steps", "10", "--pixels", "512", "--batch", "128", "--noise", "off"]
@@ -152,7 +153,9 @@ def test_the_cameras_jpeg_is_taken_unless_it_is_refused(tmp_path: Path, shoot: S
 
 def test_pairs_are_fitted_as_they_are() -> None:
     pairs, other = rawaug.data.demo_pairs("train", count=2), rawaug.data.demo_pairs("validation", count=1)
-    unknown = replace(pairs[0], clean=replace(pairs[0].clean, color_known=False))
+    no_matrix = replace(pairs[0], clean=replace(pairs[0].clean, color_known=False))
+    assert sample_pixels([no_matrix], pixels=8, seed=0).shots[0].white_balance == pairs[0].clean.white_balance
+    unknown = replace(no_matrix, clean=replace(no_matrix.clean, white_balance=(1.0, 1.0, 1.0)))
     with pytest.raises(ValueError, match=r"train_00_astronaut: .*balance"):
         rawaug.fit([unknown], progress=False, noise="off", **SETTINGS)
     isp = rawaug.fit(pairs, progress=False, noise="off", held_out=other, **SETTINGS)
