@@ -209,7 +209,7 @@ def _row_by_row(rows: Array, matrix: Array) -> Array:
 
 
 def _as_tensor(array: Array) -> Tensor:
-    return torch.from_numpy(array.astype(np.float32))
+    return torch.from_numpy(array).float()
 
 
 def _as_array(tensor: Tensor) -> Array:

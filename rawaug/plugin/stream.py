@@ -36,7 +36,7 @@ class RawPairStream(Pairs[Any], IterableDataset[Any]):
         divide: give sample i to worker i mod W, for a dataset that every worker would otherwise go through in full.
 
     Example:
-        >>> from rawaug.isp.model import DictionaryISP
+        >>> from rawaug import DictionaryISP, RawAugment
         >>> stream = RawPairStream(iter([torch.rand(3, 40, 48)]), RawAugment(DictionaryISP()), crop=32)
         >>> [pair.noisy.shape for pair in stream]
         [torch.Size([4, 16, 16])]

@@ -126,16 +126,16 @@ class CycleISP(CropTrainedISP):
 
         with initialise_from(derive_seed(seed, "baseline")):
             self.reverse_network = RGB2RAW(features, groups, blocks, reduction)
-            for layer in self.reverse_network.modules():  # a trunk leaves its weights as they are in memory
+            for layer in self.reverse_network.modules():  # a trunk's layers draw nothing when they are made
                 if isinstance(layer, nn.Conv2d):
-                    layer.reset_parameters()
+                    nn.Conv2d.reset_parameters(layer)
 
         with initialise_from(derive_seed(seed, "baseline, the other way")):
             self.raw2rgb = RAW2RGB(features, groups, blocks, reduction)
             self.colour_branch = ColourBranch(features, reduction)
             for layer in (*self.raw2rgb.modules(), *self.colour_branch.modules()):
                 if isinstance(layer, nn.Conv2d):
-                    layer.reset_parameters()
+                    nn.Conv2d.reset_parameters(layer)
 
         self.raw2rgb.requires_grad_(both)
         self.colour_branch.requires_grad_(both)

@@ -19,6 +19,7 @@ from rawaug.isp.fit.atoms import best_constants, reach_atoms, set_dictionaries, 
 from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.fit.start import TIE, TIE_RANGE, FrameColour, fit_fall_off, least_squares, tie
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.stages import Stages
 from rawaug.metrics import psnr
 
 QUICK = FitConfig(steps=0, curve_steps=20, pixels=2048, batch=512, shading="off")  # the curve is the start's
@@ -128,13 +129,13 @@ def test_many_frames_pass_the_networks_a_few_at_a_time(
     colour = FrameColour.from_product(torch.eye(3).expand(len(frames), 3, 3))
     isp = DictionaryISP(ISPConfig(colour_atoms=4, gain_atoms=4))
     counts: list[int] = []
-    reverse = isp.stages.reverse
+    reverse = Stages.reverse
 
-    def counted(x: torch.Tensor, *args: Any) -> torch.Tensor:
+    def counted(stages: Stages, x: torch.Tensor, *args: Any) -> torch.Tensor:
         counts.append(len(x))
-        return reverse(x, *args)
+        return reverse(stages, x, *args)
 
-    monkeypatch.setattr(isp.stages, "reverse", counted)
+    monkeypatch.setattr(Stages, "reverse", counted)
     set_dictionaries(isp, colour, drawn, FitConfig(prior_steps=1))
     assert max(counts) < len(frames) // 2  # a network's activations are some ten times as large as its picture
     assert sum(counts) % len(frames) == 0  # and each frame passes every time
