@@ -230,6 +230,9 @@ def killed(folder: Path, name: str, number: signal.Signals, delay: float, whole:
     status = child.wait()
     if status not in (0, -number, 128 + number) or "Traceback" in child.said():
         return f"{name}, {number.name} after {delay:.2f} s: status {status}: {child.said()}"
+    if not differences(folder / OUT, whole):
+        return None  # it had written everything before the signal came, and fit does not replace a file
+
     again = Child(folder, COMMANDS[name])
     if (status := again.wait()) or "Traceback" in again.said():
         return f"{name}, {number.name} after {delay:.2f} s, run again: status {status}: {again.said()}"
