@@ -56,6 +56,10 @@ def main(command: Sequence[str] | None = None) -> None:
     options.add_argument("--sensors", action="store_true", help="score sensors as they are, too")
     options.add_argument("--threads", type=int, default=torch.get_num_threads())
     args = options.parse_args(command)
+    stems = [Path(spec).stem for spec in args.denoisers]
+    for stem in stems:
+        if stems.count(stem) > 1:
+            options.error(f"two denoisers are called {stem}: a column is named after its file; rename one")
     torch.set_num_threads(args.threads)
 
     table: Scores = json.loads(args.table.read_text()) if args.table.is_file() else {}
